@@ -1,0 +1,124 @@
+"""Relative pose of two views: rotation alone, and the essential matrix.
+
+``R_b_a`` and ``t_b_a`` map points of camera a to camera b; t has unit length, for the scale of two
+views is unknown.  Points are on the plane z = 1, so errors are in units of the focal length.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import F64, BoolArray
+
+_ROTATION_ITERATIONS = 6
+_CONFIDENCE = 0.9999
+
+_SAMPLES = 300
+"""Enough for 50 % outliers; with more of them nothing good can start."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelativePose:
+    """Two views by the essential matrix.
+
+    T_b_a: (4, 4), translation of length 1.  inliers: (N,) points that agree and lie before both
+    cameras.  parallax_rad: (N,) angle between the two rays of each point.
+    """
+
+    T_b_a: F64
+    inliers: BoolArray
+    parallax_rad: F64
+
+
+def rays(points_n: F64) -> F64:
+    """(N, 2) points on the plane z = 1 to (N, 3) unit rays."""
+    homogeneous = np.column_stack([points_n, np.ones(len(points_n))])
+    return homogeneous / np.linalg.norm(homogeneous, axis=1, keepdims=True)
+
+
+def rotation_between(points_a: F64, points_b: F64, *, scale: float) -> tuple[F64, F64]:
+    """The rotation R_b_a that explains two views best, as if the camera had only turned.
+
+    Weighted Kabsch with Geman-McClure weights of the given scale, from the least squares start.
+    Returns R_b_a (3, 3) and the residual of each point on b's plane z = 1, inf where the turned ray
+    points backwards.
+    """
+    rays_a, rays_b = rays(points_a), rays(points_b)
+    weights = np.ones(len(rays_a))
+    rotation, residuals = np.eye(3), np.zeros(len(rays_a))
+    for _ in range(_ROTATION_ITERATIONS):
+        U, _, Vt = np.linalg.svd((rays_b * weights[:, None]).T @ rays_a)
+        U[:, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+        rotation = U @ Vt
+        turned = rays_a @ rotation.T
+        ahead = turned[:, 2] > 1e-3
+        z = np.where(ahead, turned[:, 2], 1.0)
+        difference = np.linalg.norm(turned[:, :2] / z[:, None] - points_b, axis=1)
+        residuals = np.where(ahead, difference, np.inf)
+        # The scale shrinks from the spread of the residuals to the given one.
+        spread = max(scale, 1.5 * float(np.median(residuals)))
+        weights = 1.0 / (1.0 + (residuals / spread) ** 2) ** 2
+    return rotation, residuals
+
+
+def relative_pose(points_a: F64, points_b: F64, *, gate: float) -> RelativePose | None:
+    """Essential matrix by RANSAC, and the decomposition that puts most points before both cameras.
+
+    points_a, points_b: (N, 2), the same points on the plane z = 1 of each view.  ``gate`` is the
+    largest epipolar error of an inlier.  OpenCV seeds this RANSAC itself at every call, so the
+    result depends on the arguments alone.  None where no essential matrix fits.
+    """
+    if len(points_a) < 8:
+        return None
+    found: Any = cv2.findEssentialMat(
+        points_a, points_b, np.eye(3), method=cv2.RANSAC, prob=_CONFIDENCE, threshold=gate,
+        maxIters=_SAMPLES,
+    )  # fmt: skip
+    E, mask = found
+    if E is None or E.shape != (3, 3) or not np.isfinite(E).all():
+        return None
+    agreeing = mask.ravel() > 0
+    rays_a, rays_b = rays(points_a), rays(points_b)
+    best: RelativePose | None = None
+    for T_b_a in decompose_essential(E):
+        depth_a, depth_b, parallax = two_view_depths(T_b_a, rays_a, rays_b)
+        inliers = agreeing & (depth_a > 0.0) & (depth_b > 0.0)
+        if best is None or inliers.sum() > best.inliers.sum():
+            best = RelativePose(T_b_a=T_b_a, inliers=inliers, parallax_rad=parallax)
+    return best
+
+
+def decompose_essential(E: F64) -> list[F64]:
+    """The four (4, 4) motions T_b_a, of unit translation, that an essential matrix allows."""
+    U, _, Vt = np.linalg.svd(E)
+    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    motions: list[F64] = []
+    for turn in (W, W.T):
+        rotation = U @ turn @ Vt
+        rotation *= np.sign(np.linalg.det(rotation))
+        for sign in (1.0, -1.0):
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = rotation, sign * U[:, 2]
+            motions.append(T)
+    return motions
+
+
+def two_view_depths(T_b_a: F64, rays_a: F64, rays_b: F64) -> tuple[F64, F64, F64]:
+    """Lengths along unit rays (N, 3) of the nearest points of each pair, and the angle between.
+
+    Returns (length along a, length along b, parallax in radians), each (N,).  Parallel rays have
+    length 0, which is never before the camera.
+    """
+    a = rays_a @ T_b_a[:3, :3].T
+    t = T_b_a[:3, 3]
+    cosine = (a * rays_b).sum(axis=1)
+    sine2 = 1.0 - cosine**2
+    apart = sine2 > 1e-12
+    safe = np.where(apart, sine2, 1.0)
+    ta, tb = a @ t, rays_b @ t
+    length_a = np.where(apart, (cosine * tb - ta) / safe, 0.0)
+    length_b = np.where(apart, (tb - cosine * ta) / safe, 0.0)
+    parallax = np.arctan2(np.linalg.norm(np.cross(a, rays_b), axis=1), cosine)
+    return length_a, length_b, parallax

@@ -1,0 +1,50 @@
+"""The one way in which Pliant compiles a numba kernel.
+
+``error_model="numpy"`` matters most: Python's own model puts division checks into loops and
+keeps LLVM from vectorising them.  Nothing is compiled with ``parallel=True``, so that results do
+not depend on threads.  ``fast_kernel`` lets LLVM reassociate sums and contract multiply-adds (the
+result is still the same on every run of the same machine); NaN and infinity keep their meaning.
+A kernel is kept on disk until one of the modules that it is built from changes.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+
+from pliant.algorithms.kernel_cache import SourcesCache
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+_FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
+
+
+def kernel(function: _Function) -> _Function:
+    """Compile with strict floating point.  Cached on disk, keyed by CPU."""
+    return _compile(function)
+
+
+def fast_kernel(function: _Function) -> _Function:
+    """Compile with reassociation and fused multiply-add allowed, so that reductions vectorise."""
+    return _compile(function, fastmath=_FAST)
+
+
+def inline_kernel(function: _Function) -> _Function:
+    """Compile a small helper that LLVM may inline into the kernels that call it."""
+    return _compile(function, inline="never", fastmath=_FAST)
+
+
+def leaf_kernel(function: _Function) -> _Function:
+    """Compile as ``fast_kernel`` does, without reference counts.  It must not make an array.
+
+    Numba counts a reference, atomically, for every array passed to every function.  In a loop over
+    tracks, whose helpers take a dozen arrays each, that costs several times more than the work.
+    """
+    return _compile(function, fastmath=_FAST, _nrt=False)
+
+
+def _compile(function: _Function, **options: Any) -> _Function:
+    dispatcher: Any = numba.njit(**_OPTIONS, **options)(function)
+    dispatcher._cache = SourcesCache(dispatcher.py_func)
+    return cast(_Function, dispatcher)

@@ -1,0 +1,400 @@
+"""The map segment that is being built: its points, keyframes, window and linked tracks."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.mapping.links import UNLINKED, TrackLinks
+from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, MERGED, Keyframe, PointRows
+from pliant.algorithms.mapping.maxima_grid import MaximaGrid
+from pliant.algorithms.mapping.neighbours import (
+    MAX_MISSES,
+    focus_of,
+    missing_rows,
+    most_shared,
+    near_keyframes,
+    rows_of,
+)
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.patches import cut_patches, sample_colours
+from pliant.algorithms.mapping.reacquisition import Reacquired
+from pliant.algorithms.mapping.start import Start, WaitingFrame
+from pliant.algorithms.mapping.tables import (
+    columns_in_state,
+    count_cameras,
+    has_parallax,
+    seen_in_state,
+)
+from pliant.algorithms.mapping.window import Window
+from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.triangulation import triangulate
+
+_TRACK_AT_MAXIMUM_PX = 1.5
+"""A track this close to a maximum is the track of that maximum."""
+
+_SAME_DEPTH_SHARE = 0.05
+"""Points found at one place of the image are the same when their distances differ by less."""
+
+_NEAR_KEYFRAMES = 24
+"""Keyframes older than the window whose points are looked for: bounds the work of long runs."""
+
+_CLEAR_SHARE = 0.7
+"""Share of the least parallax under which noise does not make rays differ enough."""
+
+_MAX_STRIKES = 3
+"""Bad frames in a row after which a track is taken from its point."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations:
+    """What a frame sees of the map: rows (n,), each once, and points_px (n, 2)."""
+
+    rows: I32
+    points_px: F32
+
+
+class ActiveMap:
+    """One segment of the map.
+
+    points: rows shared by all segments.    keyframes: of this segment, oldest first.
+    window: those under adjustment.    links: rows of the living tracks.
+    removed_ids: points removed since the last call of ``take_removed``.
+    """
+
+    def __init__(
+        self,
+        segment: int,
+        points: PointRows,
+        first_keyframe_id: int,
+        camera: PinholeCamera,
+        parameters: MappingParameters,
+    ) -> None:
+        self.segment = segment
+        self.points = points
+        self.camera = camera
+        self.parameters = parameters
+        self.keyframes: list[Keyframe] = []
+        self.links = TrackLinks()
+        self.window = self._window([], fixed=0, outside=0)
+        self._next_keyframe_id = first_keyframe_id
+        self._removed: list[I64] = []
+        self._nearby: I32 = np.zeros(0, np.int32)
+        self._marks: I64 = np.zeros(0, np.int64)
+
+    def _window(self, keyframes: list[Keyframe], *, fixed: int, outside: int) -> Window:
+        return Window(
+            keyframes,
+            fixed=fixed,
+            outside=outside,
+            points=self.points,
+            camera=self.camera,
+            lens_radius=self.parameters.window.lens_radius,
+        )
+
+    @property
+    def next_keyframe_id(self) -> int:
+        return self._next_keyframe_id
+
+    def begin(
+        self, start: Start, waiting: list[WaitingFrame], grey: U8 | None, colour: U8 | None
+    ) -> None:
+        """Take over a start.  The images are those of the newest of the waiting frames."""
+        newest = waiting[-1]
+        rows = self.points.allocate(len(start.ids))
+        self.points.segment[rows] = self.segment
+        self.points.first_keyframe[rows] = self._next_keyframe_id
+        self.points.xyz[rows] = start.points_world
+        self.points.promote(rows)
+        self.links.ids, self.links.rows = start.ids, rows
+        self.links.follow(newest.ids)
+        self._link_new_tracks(newest.points_px)
+        self._paint(self.links.rows, newest.points_px, colour if colour is not None else grey)
+        self.points.kappas[self.links.rows] = newest.kappas
+        frames = {frame.frame: frame for frame in waiting}
+        for k, number in enumerate(start.frames.tolist()):
+            supported = start.keyframe_index == k
+            _, i, j = np.intersect1d(
+                frames[number].ids, newest.ids, assume_unique=True, return_indices=True
+            )
+            others = self.points.state[self.links.rows[j]] == CANDIDATE
+            self._append_keyframe(
+                number,
+                start.T_world_camera[k],
+                np.concatenate([rows[start.point_index[supported]], self.links.rows[j[others]]]),
+                np.concatenate([start.points_px[supported], frames[number].points_px[i[others]]]),
+            )
+        self._settle(self.keyframes[-1], grey)
+
+    def linked(self, state: int) -> I64:
+        """Indices of the living tracks whose row has the given state."""
+        rows = self.links.rows
+        return np.flatnonzero((rows != UNLINKED) & (self.points.state[rows] == state))
+
+    def missing(self, frame: int) -> I32:
+        """Rows of mapped points without a track that are worth looking for in this frame.
+
+        Points looked for in vain again and again, for instance occluded ones, wait their turn.
+        """
+        points = self.points
+        if len(self._marks) < len(points.state):
+            self._marks = np.full(len(points.state), -1, np.int64)
+        return missing_rows(
+            self._nearby, self.links.rows, points.state, points.misses, self._marks, frame
+        )
+
+    def judge_tracks(self, tracks: I64, errors: F32) -> None:
+        """Take tracks from points that they missed in several frames in a row."""
+        rows = self.links.rows[tracks]
+        bad = errors > 2.0 * self.parameters.localisation.inlier_px
+        strikes = np.where(bad, self.points.strikes[rows] + 1, 0).astype(np.uint8)
+        self.points.strikes[rows] = strikes
+        lost = strikes >= _MAX_STRIKES
+        self.points.strikes[rows[lost]] = 0
+        self.links.rows[tracks[lost]] = UNLINKED
+
+    def take_over(self, again: Reacquired, tracks: FrameTracks) -> Observations:
+        """Let tracks at the maxima of points found again belong to those points.
+
+        What such a track belonged to merges into the point, where both can be the same.  Returns
+        the points found where no track is.
+        """
+        self.points.misses[again.visible] = np.minimum(
+            self.points.misses[again.visible], MAX_MISSES - 1
+        )
+        self.points.misses[again.visible] += 1
+        self.points.misses[again.rows] = 0
+        camera = self.camera
+        places = np.column_stack([tracks.points_px, tracks.kappas])
+        nearby = MaximaGrid.build(places, camera.width, camera.height)
+        track = nearby.nearest(tracks.maxima[again.maxima, :2], _TRACK_AT_MAXIMUM_PX)
+        alone = track < 0
+        new = again.rows[~alone]
+        track = track[~alone]
+        former = self.links.rows[track]
+        differ = former != new
+        mapped = (former != UNLINKED) & (self.points.state[former] == MAPPED)
+        near = self._same_depth(former, new)
+        taken = differ & (~mapped | near)
+        self.links.rows[track[taken]] = new[taken]
+        for old, to in zip(former[taken].tolist(), new[taken].tolist(), strict=True):
+            if old != UNLINKED:
+                self._merge(old, to)
+        return Observations(rows=again.rows[alone], points_px=again.points_px[alone])
+
+    def _same_depth(self, a: I32, b: I32) -> BoolArray:
+        """Whether points that lie on nearly the same ray are as far from the newest keyframe."""
+        centre = self.keyframes[-1].T_world_camera[:3, 3]
+        distance_a = np.linalg.norm(self.points.xyz[a] - centre, axis=1)
+        distance_b = np.linalg.norm(self.points.xyz[b] - centre, axis=1)
+        return np.abs(distance_a - distance_b) < _SAME_DEPTH_SHARE * distance_b
+
+    def observed(self, points_px: F32, found: Observations) -> tuple[I32, F32]:
+        """Rows and pixels of the mapped points that the current frame sees."""
+        linked = self.linked(MAPPED)
+        rows = np.concatenate([self.links.rows[linked], found.rows])
+        return rows, np.concatenate([points_px[linked], found.points_px])
+
+    def see(self, T_world_camera: F64, points_px: F32, found: Observations) -> None:
+        """Put the current frame into the window."""
+        linked = self.links.rows != UNLINKED
+        self.window.see(
+            T_world_camera,
+            np.concatenate([self.links.rows[linked], found.rows]),
+            np.concatenate([points_px[linked], found.points_px]),
+        )
+
+    def _merge(self, old: int, new: int) -> None:
+        points = self.points
+        if points.state[old] == MAPPED:
+            self._note_removed(np.array([old], np.int32))
+        points.state[old] = MERGED
+        points.alias[old] = new
+        points.first_keyframe[new] = min(points.first_keyframe[old], points.first_keyframe[new])
+
+    def _note_removed(self, rows: I32) -> None:
+        """Points go that have been told; nobody knows of the others."""
+        told = np.isfinite(self.points.told[rows, 0])
+        self._removed.append(self.points.ids[rows[told]])
+
+    def take_removed(self) -> I64:
+        """Ids of the points removed since the last call."""
+        removed, self._removed = self._removed, []
+        return np.concatenate([*removed, np.zeros(0, np.int64)])
+
+    def mature(self) -> None:
+        """Make points of the candidates whose rays now meet under enough parallax."""
+        window, limits = self.window, self.parameters.point
+        if window.seen[-1].any():
+            candidates = seen_in_state(
+                window.rows, self.points.state, CANDIDATE, window.seen, len(window.keyframes),
+                limits.min_observations,
+            )  # fmt: skip
+            # Rays that hardly differ need no triangulation to be turned down.
+            columns = has_parallax(
+                candidates, len(window.keyframes), window.T_world_camera[:, :3, :3], window.u,
+                window.v, window.seen, window.lens,
+                float(np.cos(_CLEAR_SHARE * np.radians(limits.min_parallax_deg))),
+            )  # fmt: skip
+        else:
+            candidates = columns_in_state(window.rows, self.points.state, CANDIDATE)
+            seen = count_cameras(candidates, window.seen, 0, len(window.seen))
+            columns = candidates[seen >= limits.min_observations].astype(np.int64)
+        xyz, errors, parallax, sigmas = triangulate(
+            window.T_world_camera, window.u, window.v, window.seen, columns, self.camera
+        )
+        good = (parallax >= np.radians(limits.min_parallax_deg)) & (errors < limits.max_error_px)
+        rows = window.rows[columns[good]]
+        self.points.xyz[rows] = xyz[good]
+        self.points.parallax_rad[rows] = parallax[good]
+        self.points.sigmas[rows] = sigmas[good]
+        self.points.promote(rows)
+
+    def insert_keyframe(
+        self,
+        frame: int,
+        T_world_camera: F64,
+        points_px: F32,
+        found: Observations,
+        grey: U8 | None,
+        colour: U8 | None,
+    ) -> Keyframe:
+        """Make the frame a keyframe and adjust the window.
+
+        points_px: of all living tracks.    found: points that it sees without a track.
+        """
+        new = self._link_new_tracks(points_px)
+        image = colour if colour is not None else grey
+        self._paint(self.links.rows[new], points_px[new], image)
+        keyframe = self._append_keyframe(
+            frame,
+            T_world_camera,
+            np.concatenate([self.links.rows, found.rows]),
+            np.concatenate([points_px, found.points_px]),
+        )
+        self._settle(keyframe, grey)
+        return keyframe
+
+    def _settle(self, newest: Keyframe, grey: U8 | None) -> None:
+        """Adjust the window after a keyframe has come to it."""
+        self.collect_garbage()
+        self.rebuild_window()
+        self.mature()
+        sizes = self.parameters.window
+        self.window.adjust(
+            self.camera,
+            self.parameters,
+            iterations=sizes.keyframe_iterations,
+            points_per_keyframe=sizes.points_per_keyframe,
+        )
+        self.remove_outliers()
+        self.window.update_statistics(self.camera)
+        if grey is not None:
+            mapped = self.points.state[newest.rows] == MAPPED
+            rows, points_px = newest.rows[mapped], newest.points_px[mapped]
+            cut_patches(grey, points_px, rows, self.points.patches)
+
+    def _link_new_tracks(self, points_px: F32) -> I64:
+        """Give candidate rows to tracks that have none.  Returns the indices of those tracks."""
+        new = np.flatnonzero(self.links.rows == UNLINKED)
+        rows = self.points.allocate(len(new))
+        self.links.rows[new] = rows
+        self.points.segment[rows] = self.segment
+        self.points.first_keyframe[rows] = self._next_keyframe_id
+        return new
+
+    def _paint(self, rows: I32, points_px: F32, image: U8 | None) -> None:
+        if image is not None:
+            self.points.colours[rows] = sample_colours(image, points_px)
+
+    def _append_keyframe(
+        self, frame: int, T_world_camera: F64, rows: I32, points_px: F32
+    ) -> Keyframe:
+        rows, first = np.unique(rows, return_index=True)
+        keyframe = Keyframe(
+            id=self._next_keyframe_id,
+            frame=frame,
+            segment=self.segment,
+            T_world_camera=T_world_camera.copy(),
+            rows=rows,
+            points_px=points_px[first],
+        )
+        self._next_keyframe_id += 1
+        self.keyframes.append(keyframe)
+        return keyframe
+
+    def collect_garbage(self) -> None:
+        """Give back the rows of dead candidates and of merged points."""
+        points = self.points
+        used = points.state[: points.count]
+        dead = (used == CANDIDATE) & (points.segment[: points.count] == self.segment)
+        dead[self.links.rows[self.links.rows != UNLINKED]] = False
+        merged = used == MERGED
+        gone = np.flatnonzero(dead | merged).astype(np.int32)
+        # A point may have been merged into one that was merged in its turn.
+        while (points.alias[points.alias[gone]] != points.alias[gone]).any():
+            points.alias[gone] = points.alias[points.alias[gone]]
+        first = points.first_keyframe[: points.count]
+        first_dead = int(first[dead].min()) if dead.any() else self._next_keyframe_id
+        first_merged = int(first[merged].min()) if merged.any() else self._next_keyframe_id
+        for keyframe in self.keyframes:
+            if keyframe.id >= first_merged:
+                keyframe.follow_aliases(points)
+            if keyframe.id >= first_dead:
+                keyframe.keep(~dead[keyframe.rows])
+        points.free(gone)
+
+    def rebuild_window(self) -> None:
+        """The newest keyframes move; older ones that see the same points are fixed."""
+        sizes = self.parameters.window
+        moving = self.keyframes[-sizes.keyframes :]
+        outside = self.keyframes[: -sizes.keyframes]
+        for keyframe in outside[-1:]:
+            self._leave_window(keyframe)
+        older = near_keyframes(outside, moving[-1], _NEAR_KEYFRAMES)
+        if older:
+            fixed = most_shared(older, moving, self.points)[: sizes.fixed]
+        else:
+            fixed = []
+        chosen = sorted(fixed, key=lambda keyframe: keyframe.id) + moving
+        held = max(len(fixed), min(2, len(moving) - 1))
+        self.window = self._window(chosen, fixed=held, outside=len(fixed))
+        self._nearby = rows_of(older, self.window.rows, len(self.points.state))
+
+    def adjust_all(self) -> F64:
+        """Adjust all but the first keyframe; returns ``Window.adjust``'s correction."""
+        sizes = self.parameters.window
+        self.window = self._window(self.keyframes, fixed=1, outside=0)
+        correction = self.window.adjust(
+            self.camera, self.parameters,
+            iterations=sizes.final_iterations,
+            points_per_keyframe=sizes.final_points_per_keyframe,
+            uncertainty=self.parameters.calibration,
+        )  # fmt: skip
+        self.points.base_keyframes[self.window.rows] = 0
+        self.points.base_parallax_rad[self.window.rows] = 0.0
+        self.remove_outliers()
+        self.window.update_statistics(self.camera)
+        return correction
+
+    def _leave_window(self, keyframe: Keyframe) -> None:
+        self.points.base_keyframes[keyframe.rows] += 1
+        self.points.base_parallax_rad[keyframe.rows] = self.points.parallax_rad[keyframe.rows]
+        keyframe.focus = focus_of(keyframe, self.points)
+
+    def remove_outliers(self) -> None:
+        """Forget observations that miss their point, and points with too few observations."""
+        window = self.window
+        columns = window.mapped_columns()
+        bad = window.errors(columns, self.camera) > self.parameters.window.outlier_px
+        window.forget(columns, bad)
+        rows = window.rows[columns]
+        remaining = count_cameras(columns, window.seen, 0, len(window.seen))
+        remaining += self.points.base_keyframes[rows]
+        gone = rows[remaining < 2]
+        self._note_removed(gone)
+        # As candidates they may come back while their track lives, and are garbage afterwards.
+        self.points.state[gone] = CANDIDATE
+        self.points.ids[gone] = -1
+        self.points.told[gone] = np.nan

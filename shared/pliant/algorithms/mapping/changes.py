@@ -1,0 +1,120 @@
+"""What has been told of the map, and so what the next MapDelta must tell."""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I32, I64, U8
+from pliant.algorithms.geometry import inverse, matrix_to_pose
+from pliant.algorithms.kernel import kernel
+from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+
+_MOVED_SHARE = 2e-3
+"""Points are told again when they moved by this share of their distance to the camera."""
+
+
+class Changes:
+    """Collects what one frame changes and makes its MapDelta."""
+
+    def __init__(self) -> None:
+        self._poses: list[tuple[int, int, int, F64, int]] = []
+        self._removed: list[I64] = []
+
+    def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
+        """The pose of a frame is new, and hangs on a keyframe."""
+        T_keyframe_camera = inverse(keyframe.T_world_camera) @ T_world_camera
+        pose = matrix_to_pose(T_keyframe_camera)
+        self._poses.append((frame, keyframe.segment, keyframe.id, pose, inliers))
+
+    def remove_points(self, ids: I64) -> None:
+        """Points are gone; those that were never told are left out later."""
+        self._removed.append(ids)
+
+    def tell(
+        self,
+        *,
+        state: int,
+        reason: str,
+        segment: int,
+        inliers: int,
+        keyframes: list[Keyframe],
+        points: PointRows,
+        rows: I32,
+        centre: F64,
+        repeat: bool,
+    ) -> MapDelta:
+        """The delta: what differs, of ``keyframes`` and points in ``rows``, from what was told.
+
+        centre: (3,) camera position, which says how much a movement matters.  repeat: tell all.
+        """
+        poses, self._poses = sorted(self._poses, key=lambda pose: pose[0]), []
+        removed, self._removed = self._removed, []
+        moved = [k for k in keyframes if repeat or _differs(k)]
+        for keyframe in moved:
+            keyframe.told = keyframe.T_world_camera.copy()
+        rows = _untold(
+            rows, points.state, points.xyz, points.told, points.keyframes, points.told_keyframes,
+            centre, repeat,
+        )  # fmt: skip
+        return MapDelta(
+            state=state,
+            reason=reason,
+            segment=segment,
+            inliers=inliers,
+            pose_frames=np.array([pose[0] for pose in poses], np.int64),
+            pose_segments=np.array([pose[1] for pose in poses], np.int32),
+            pose_keyframes=np.array([pose[2] for pose in poses], np.int64),
+            poses_keyframe_camera=np.array([pose[3] for pose in poses]).reshape(-1, 7),
+            pose_inliers=np.array([pose[4] for pose in poses], np.int32),
+            keyframe_ids=np.array([k.id for k in moved], np.int64),
+            keyframe_frames=np.array([k.frame for k in moved], np.int64),
+            keyframe_segments=np.array([k.segment for k in moved], np.int32),
+            keyframe_poses=matrix_to_pose(np.array([k.T_world_camera for k in moved]))
+            if moved
+            else np.zeros((0, 7)),
+            point_ids=points.ids[rows],
+            point_segments=points.segment[rows],
+            points_world=points.xyz[rows],
+            point_colours=points.colours[rows],
+            point_keyframes=points.keyframes[rows],
+            point_parallax_rad=points.parallax_rad[rows],
+            point_sigmas=points.sigmas[rows],
+            snapshot=repeat,
+            removed_point_ids=np.sort(np.concatenate([*removed, np.zeros(0, np.int64)])),
+        )
+
+
+@kernel
+def _untold(
+    rows: I32,
+    state: U8,
+    xyz: F64,
+    told: F64,
+    keyframes: I32,
+    told_keyframes: I32,
+    centre: F64,
+    repeat: bool,
+) -> I32:
+    """Those of the mapped rows that must be told; they are noted as told."""
+    chosen = np.empty(rows.size, np.int32)
+    count = 0
+    for i in range(rows.size):
+        row = rows[i]
+        if state[row] != MAPPED:
+            continue
+        distance2, moved2 = 0.0, 0.0
+        for k in range(3):
+            distance2 += (xyz[row, k] - centre[k]) ** 2
+            moved2 += (xyz[row, k] - told[row, k]) ** 2
+        # Points never told compare with NaN, which is never small.
+        still = moved2 <= _MOVED_SHARE * _MOVED_SHARE * distance2
+        if repeat or not still or told_keyframes[row] != keyframes[row]:
+            for k in range(3):
+                told[row, k] = xyz[row, k]
+            told_keyframes[row] = keyframes[row]
+            chosen[count] = row
+            count += 1
+    return chosen[:count].copy()
+
+
+def _differs(keyframe: Keyframe) -> bool:
+    return keyframe.told is None or not np.array_equal(keyframe.told, keyframe.T_world_camera)

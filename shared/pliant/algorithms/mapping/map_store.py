@@ -1,0 +1,131 @@
+"""The map: points as growing arrays, keyframes with the observations that they made."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
+from pliant.algorithms.kernel import kernel
+from pliant.algorithms.mapping.patches import PATCH
+
+FREE, CANDIDATE, MAPPED, MERGED = 0, 1, 2, 3
+"""State of a row: nothing, a track that still lacks parallax, a point of the map, the alias of
+another row until the keyframes have been told."""
+
+
+class PointRows:
+    """Points and candidates, one row each; arrays grow by doubling, rows of candidates are reused.
+
+    state: FREE, CANDIDATE, MAPPED or MERGED.    ids: of mapped points, never reused; else -1.
+    alias: the row that a MERGED one stands for; itself otherwise.
+    xyz: world position of mapped points.    told: position last published, NaN before.
+    told_keyframes: ``keyframes`` when last published.    segment: of the map.
+    first_keyframe: keyframe id of the first observation.
+    keyframes, parallax_rad, sigmas: as MapDelta defines them.
+    base_keyframes, base_parallax_rad: what of those is due to keyframes out of the window.
+    kappas: curvature when last seen.    strikes: bad frames of its track in a row.
+    misses: frames in a row in which it should have been found again, and was not.
+    patches: grey levels around the point when a keyframe last saw it.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.state: U8 = np.zeros(1024, np.uint8)
+        self.ids: I64 = np.zeros(1024, np.int64)
+        self.alias: I32 = np.zeros(1024, np.int32)
+        self.segment: I32 = np.zeros(1024, np.int32)
+        self.xyz: F64 = np.zeros((1024, 3))
+        self.told: F64 = np.zeros((1024, 3))
+        self.told_keyframes: I32 = np.zeros(1024, np.int32)
+        self.colours: U8 = np.zeros((1024, 3), np.uint8)
+        self.first_keyframe: I32 = np.zeros(1024, np.int32)
+        self.base_keyframes: I32 = np.zeros(1024, np.int32)
+        self.base_parallax_rad: F32 = np.zeros(1024, np.float32)
+        self.keyframes: I32 = np.zeros(1024, np.int32)
+        self.parallax_rad: F32 = np.zeros(1024, np.float32)
+        self.sigmas: F32 = np.zeros(1024, np.float32)
+        self.kappas: F32 = np.zeros(1024, np.float32)
+        self.strikes: U8 = np.zeros(1024, np.uint8)
+        self.misses: U8 = np.zeros(1024, np.uint8)
+        self.patches: U8 = np.zeros((1024, PATCH, PATCH), np.uint8)
+        self._free: I32 = np.zeros(0, np.int32)
+        self._next_id = 0
+
+    def allocate(self, count: int) -> I32:
+        """Rows of ``count`` new candidates, cleared."""
+        reused = self._free[:count]
+        self._free = self._free[count:]
+        fresh = count - len(reused)
+        names = [name for name, value in vars(self).items() if isinstance(value, np.ndarray)]
+        names.remove("_free")
+        while self.count + fresh > len(self.state):
+            for name in names:
+                old = getattr(self, name)
+                setattr(self, name, np.concatenate([old, np.zeros_like(old)]))
+        rows = np.concatenate([reused, np.arange(self.count, self.count + fresh, dtype=np.int32)])
+        self.count += fresh
+        for name in names:
+            getattr(self, name)[rows] = 0
+        self.state[rows] = CANDIDATE
+        self.ids[rows] = -1
+        self.alias[rows] = rows
+        self.told[rows] = np.nan
+        return rows
+
+    def free(self, rows: I32) -> None:
+        """Give back rows that nothing refers to any more."""
+        self.state[rows] = FREE
+        self._free = np.concatenate([self._free, rows])
+
+    def promote(self, rows: I32) -> None:
+        """Make candidates points of the map: they get their ids, in the order given."""
+        self.state[rows] = MAPPED
+        self.ids[rows] = np.arange(self._next_id, self._next_id + len(rows))
+        self._next_id += len(rows)
+
+    def mapped(self, segment: int) -> I32:
+        """Rows of all points of a segment."""
+        used = slice(0, self.count)
+        here = (self.state[used] == MAPPED) & (self.segment[used] == segment)
+        return np.flatnonzero(here).astype(np.int32)
+
+
+@dataclass(kw_only=True)
+class Keyframe:
+    """A keyframe and what it observed.
+
+    rows: (n,) rows of points or candidates, each at most once.    points_px: (n, 2).
+    told: T_world_camera when last published.
+    focus: (3,) where it looks: on its axis, at the median depth of its points.  Set when it leaves
+    the window; NaN where it sees no point of the map.
+    """
+
+    id: int
+    frame: int
+    segment: int
+    T_world_camera: F64
+    rows: I32
+    points_px: F32
+    told: F64 | None = None
+    focus: F64 | None = None
+
+    def keep(self, mask: BoolArray) -> None:
+        """Forget the observations that are not in the mask."""
+        if mask.all():
+            return
+        self.rows, self.points_px = self.rows[mask], self.points_px[mask]
+
+    def follow_aliases(self, points: PointRows) -> None:
+        """Let observations of merged rows stand for the rows that took them in."""
+        if not _has_aliases(self.rows, points.alias):
+            return
+        self.rows, first = np.unique(points.alias[self.rows], return_index=True)
+        self.points_px = self.points_px[first]
+
+
+@kernel
+def _has_aliases(rows: I32, alias: I32) -> bool:
+    found = 0
+    for i in range(rows.size):
+        found += alias[rows[i]] != rows[i]
+    return found > 0

@@ -1,0 +1,317 @@
+"""The mapper: from the tracks of each frame to its pose and a dense map.
+
+VITAMIN-E section 3: start by essential matrix, poses by P3P and RANSAC, points by triangulation,
+and bundle adjustment on every frame by the subspace Gauss-Newton method; on top of it, Schur LM
+over the window at keyframes and re-acquisition of points that lost their track.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse
+from pliant.algorithms.keyframe_delta import KeyframeDelta
+from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, MapDelta
+from pliant.algorithms.mapping.active_map import ActiveMap, Observations
+from pliant.algorithms.mapping.changes import Changes
+from pliant.algorithms.mapping.keyframe_report import KeyframeReport
+from pliant.algorithms.mapping.localisation import locate, refine
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.maxima_grid import MaximaGrid
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.reacquisition import reacquire
+from pliant.algorithms.mapping.reprojection import reprojection_errors
+from pliant.algorithms.mapping.start import Start, WaitingFrame, find_start
+from pliant.algorithms.stages import StageTimer, no_stages
+from pliant.algorithms.tracks import FrameTracks
+
+
+class Mapper:
+    """Builds the map and localises every frame in it.
+
+    A pure function of camera, parameters, seed and the frames given, one after the other.
+    """
+
+    def __init__(
+        self,
+        camera: PinholeCamera,
+        parameters: MappingParameters,
+        seed: int,
+    ) -> None:
+        self._camera = camera
+        self._parameters = parameters
+        self._generator = np.random.default_rng(seed)
+        self._timer: StageTimer = no_stages
+        self._points = PointRows()
+        self._changes = Changes()
+        self._report = KeyframeReport(self._points)
+        self._waiting: list[WaitingFrame] = []
+        self._map: ActiveMap | None = None
+        self._segments = 0
+        self._keyframes = 0
+        self._recent_poses: list[F64] = []
+        self._lost_frames = 0
+        self._since_keyframe = 0
+        self._told_frames = 0
+
+    def process(
+        self,
+        frame: int,
+        tracks: FrameTracks,
+        grey: U8 | None,
+        colour: U8 | None,
+        timer: StageTimer = no_stages,
+    ) -> MapDelta:
+        """Localise a frame and let the map grow.  grey: (H, W).  colour: (H, W, 3) RGB."""
+        self._timer = timer
+        if self._map is None:
+            return self._wait(frame, tracks, grey, colour)
+        self._map.links.follow(tracks.ids)
+        with self._timer("localisation"):
+            located = self._localise(self._map, tracks)
+        if located is None:
+            return self._miss(self._map, frame, tracks)
+        with self._timer("reacquisition"):
+            T_world_camera, found = self._reacquire(self._map, frame, located, tracks, grey)
+        with self._timer("subspace adjustment"):
+            T_world_camera, inliers = self._adjust(self._map, T_world_camera, found, tracks)
+        with self._timer("triangulation"):
+            self._map.mature()
+        hanging = self._map.keyframes[-1]
+        if self._keyframe_is_due(self._map):
+            with self._timer("keyframe"):
+                hanging = self._map.insert_keyframe(
+                    frame, T_world_camera, tracks.points_px, found, grey, colour
+                )
+            T_world_camera = hanging.T_world_camera
+            self._since_keyframe = 0
+        self._since_keyframe += 1
+        self._lost_frames = 0
+        self._recent_poses = [*self._recent_poses[-1:], T_world_camera]
+        self._changes.add_pose(frame, hanging, T_world_camera, inliers)
+        return self._tell(TRACKING, "", inliers)
+
+    def skip(self, frame: int) -> MapDelta:
+        """Pass over a frame without pixels (dropped or broken): it gets no pose.
+
+        Whether the camera is lost is for frames with pixels to decide: the state stays as it was.
+        """
+        if self._map is None:
+            state = WAITING
+        else:
+            state = LOST if self._lost_frames else TRACKING
+        return self._tell(state, "the frame has no pixels", 0)
+
+    @property
+    def point_count(self) -> int:
+        """Points of the map now, of all segments."""
+        return int(np.count_nonzero(self._points.state == MAPPED))
+
+    def finish(self) -> MapDelta:
+        """What is still to be corrected at the end of the stream."""
+        if self._map is None:
+            return self._tell(WAITING, "the stream has ended", 0, repeat=True)
+        limits = self._parameters.window
+        correction: tuple[float, ...] = ()
+        if limits.final_adjustment and len(self._map.keyframes) <= limits.final_max_keyframes:
+            self._map.collect_garbage()
+            found = self._map.adjust_all()
+            if self._parameters.calibration.sigmas.any():
+                correction = tuple(found.tolist())
+        self._report.leave(self._map.keyframes)
+        delta = self._tell(TRACKING, "", 0, repeat=True)
+        return dataclasses.replace(delta, calibration_correction=correction)
+
+    def tell_keyframes(self) -> KeyframeDelta:
+        """What the last frame, or ``finish``, tells of keyframes."""
+        if self._map is None:
+            return self._report.tell(None)
+        self._report.leave(self._map.keyframes[: -self._parameters.window.keyframes])
+        return self._report.tell(self._map.keyframes[-1])
+
+    def _wait(
+        self, frame: int, tracks: FrameTracks, grey: U8 | None, colour: U8 | None
+    ) -> MapDelta:
+        waiting = WaitingFrame(
+            frame=frame, ids=tracks.ids, points_px=tracks.points_px, kappas=tracks.kappas
+        )
+        self._waiting = [*self._waiting[1 - self._parameters.start.max_frames :], waiting]
+        with self._timer("start"):
+            start = find_start(self._waiting, self._camera, self._parameters)
+        if isinstance(start, str):
+            return self._tell(WAITING, start, 0)
+        with self._timer("start"):
+            inliers = self._begin(start, tracks, grey, colour)
+        return self._tell(TRACKING, "", inliers)
+
+    def _begin(self, start: Start, tracks: FrameTracks, grey: U8 | None, colour: U8 | None) -> int:
+        """Let the map start, and give poses to the frames that waited, backwards."""
+        self._map = ActiveMap(
+            self._segments, self._points, self._keyframes, self._camera, self._parameters
+        )
+        self._segments += 1
+        self._map.begin(start, self._waiting, grey, colour)
+        keyframes = {keyframe.frame: keyframe for keyframe in self._map.keyframes}
+        T_world_camera = self._map.keyframes[-1].T_world_camera
+        hanging = self._map.keyframes[-1]
+        poses: list[F64] = []
+        inliers = 0
+        for waiting in reversed(self._waiting):
+            _, i, j = np.intersect1d(
+                waiting.ids, start.ids, assume_unique=True, return_indices=True
+            )
+            if waiting.frame in keyframes:
+                hanging = keyframes[waiting.frame]
+                T_world_camera = hanging.T_world_camera
+            if len(i) < self._parameters.localisation.min_inliers:
+                continue
+            located = refine(
+                T_world_camera,
+                start.points_world[j],
+                waiting.points_px[i],
+                self._camera,
+                self._parameters.localisation,
+            )
+            count = int(located.inliers.sum())
+            if count < self._parameters.localisation.min_inliers:
+                continue
+            if waiting.frame not in keyframes:
+                T_world_camera = located.T_world_camera
+            self._changes.add_pose(waiting.frame, hanging, T_world_camera, count)
+            poses.append(T_world_camera)
+            inliers = inliers or count
+        self._recent_poses = poses[1::-1]
+        self._waiting = []
+        self._since_keyframe = 1
+        return inliers
+
+    def _localise(self, active: ActiveMap, tracks: FrameTracks) -> F64 | None:
+        """T_world_camera of the frame from the tracks of mapped points, None where it fails."""
+        linked = active.linked(MAPPED)
+        limits = self._parameters.localisation
+        if len(linked) < limits.min_inliers:
+            return None
+        last, previous = self._recent_poses[-1], self._recent_poses[0]
+        located = locate(
+            [last @ inverse(previous) @ last, last],
+            self._points.xyz[active.links.rows[linked]],
+            tracks.points_px[linked],
+            self._camera,
+            limits,
+            self._generator,
+        )
+        if located.inliers.sum() < limits.min_inliers:
+            return None
+        return located.T_world_camera
+
+    def _miss(self, active: ActiveMap, frame: int, tracks: FrameTracks) -> MapDelta:
+        """The frame has no pose.  After several such frames the segment is closed."""
+        seen = len(active.linked(MAPPED))
+        reason = f"lost: the pose of frame {frame} is not supported, {seen} mapped tracks"
+        self._lost_frames += 1
+        delta = self._tell(LOST, reason, 0)
+        if self._lost_frames > self._parameters.localisation.max_lost_frames:
+            self._report.leave(active.keyframes)
+            self._keyframes = active.next_keyframe_id
+            self._map = None
+        return delta
+
+    def _reacquire(
+        self,
+        active: ActiveMap,
+        frame: int,
+        T_world_camera: F64,
+        tracks: FrameTracks,
+        grey: U8 | None,
+    ) -> tuple[F64, Observations]:
+        """Find points without a track among the maxima, and refine the pose with them."""
+        points = self._points
+        none = Observations(rows=np.zeros(0, np.int32), points_px=np.zeros((0, 2), np.float32))
+        if not self._parameters.reacquisition.enabled:
+            return T_world_camera, none
+        grid = MaximaGrid.build(tracks.maxima, self._camera.width, self._camera.height)
+        again = reacquire(
+            T_world_camera,
+            active.missing(frame),
+            points.xyz,
+            points.kappas,
+            points.patches,
+            grid,
+            grey,
+            self._camera,
+            self._parameters.reacquisition,
+        )
+        found = active.take_over(again, tracks)
+        linked = active.linked(MAPPED)
+        rows = np.concatenate([active.links.rows[linked], found.rows])
+        points_px = np.concatenate([tracks.points_px[linked], found.points_px])
+        located = refine(
+            T_world_camera,
+            points.xyz[rows],
+            points_px,
+            self._camera,
+            self._parameters.localisation,
+            near=True,
+        )
+        points.kappas[active.links.rows[linked]] = tracks.kappas[linked]
+        return located.T_world_camera, found
+
+    def _adjust(
+        self, active: ActiveMap, T_world_camera: F64, found: Observations, tracks: FrameTracks
+    ) -> tuple[F64, int]:
+        """Eq. 6 over the window and this frame.  Returns its pose and the number of inliers."""
+        limits = self._parameters.localisation
+        linked = active.linked(MAPPED)
+        errors = reprojection_errors(
+            T_world_camera,
+            self._points.xyz[active.links.rows[linked]],
+            tracks.points_px[linked],
+            self._camera,
+        )
+        active.judge_tracks(linked, errors)
+        active.see(T_world_camera, tracks.points_px, found)
+        if self._parameters.window.sweeps > 0:
+            T_world_camera = active.window.sweep_current(self._camera, self._parameters)
+        rows, points_px = active.observed(tracks.points_px, found)
+        errors = reprojection_errors(
+            T_world_camera, self._points.xyz[rows], points_px, self._camera
+        )
+        return T_world_camera, int((errors < limits.inlier_px).sum())
+
+    def _keyframe_is_due(self, active: ActiveMap) -> bool:
+        limits = self._parameters.keyframe
+        share, flow = active.window.flow_since_keyframe()
+        unit = self._camera.width / 640.0
+        if share < limits.min_shared_share or flow > limits.max_flow_px * unit:
+            return True
+        return self._since_keyframe >= limits.max_frames and flow > limits.min_flow_px * unit
+
+    def _tell(self, state: int, reason: str, inliers: int, *, repeat: bool = False) -> MapDelta:
+        # Now and then everything active is told again, for those who came late.
+        self._timer = no_stages  # the frame is done: nothing of its caller stays with the map
+        self._told_frames += 1
+        repeat = repeat or self._told_frames % self._parameters.snapshot_frames == 0
+        active = self._map
+        if active is None:
+            keyframes: list[Keyframe] = []
+            rows, centre = np.zeros(0, np.int32), np.zeros(3)
+        else:
+            keyframes = active.window.keyframes
+            # Between keyframes only points that the frame sees can move or be new.
+            everything = repeat or self._since_keyframe <= 1
+            rows = active.window.rows if everything else active.window.current_rows()
+            centre = active.keyframes[-1].T_world_camera[:3, 3].copy()
+            self._changes.remove_points(active.take_removed())
+        return self._changes.tell(
+            state=state,
+            reason=reason,
+            segment=self._segments - 1,
+            inliers=inliers,
+            keyframes=keyframes,
+            points=self._points,
+            rows=rows,
+            centre=centre,
+            repeat=repeat,
+        )

@@ -1,0 +1,86 @@
+"""Which points of the map a frame may see: those of the window and of the keyframes near it.
+
+Only they are looked for, so that the work for a frame does not grow with the length of the run.
+"""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I32, I64, U8
+from pliant.algorithms.kernel import kernel
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+
+MAX_MISSES = 8
+"""Frames in which a point may be looked for in vain before it waits."""
+
+_RETRY_FRAMES = 8
+"""Frames between two searches for a point that waits."""
+
+
+def focus_of(keyframe: Keyframe, points: PointRows) -> F64:
+    """(3,) the point on the axis of a keyframe at the median depth of what it sees, or NaN."""
+    rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
+    centre, axis = keyframe.T_world_camera[:3, 3], keyframe.T_world_camera[:3, 2]
+    if len(rows) == 0:
+        return np.full(3, np.nan)
+    return centre + axis * float(np.median((points.xyz[rows] - centre) @ axis))
+
+
+def near_keyframes(keyframes: list[Keyframe], newest: Keyframe, count: int) -> list[Keyframe]:
+    """At most ``count`` of the keyframes, those that look where the newest does, in their order.
+
+    Nearness: how far the places looked at lie apart, added to half of how far the cameras do.
+    """
+    if len(keyframes) <= count:
+        return keyframes
+    last = keyframes[-1]
+    centre = newest.T_world_camera[:3, 3]
+    depth = 0.0
+    if last.focus is not None:
+        depth = float(np.linalg.norm(last.focus - last.T_world_camera[:3, 3]))
+    focus = centre + newest.T_world_camera[:3, 2] * depth
+    places = np.array([np.zeros(3) if k.focus is None else k.focus for k in keyframes])
+    centres = np.array([k.T_world_camera[:3, 3] for k in keyframes])
+    apart = np.linalg.norm(places - focus, axis=1) + 0.5 * np.linalg.norm(centres - centre, axis=1)
+    order = np.argsort(np.where(np.isfinite(apart), apart, np.inf), kind="stable")[:count]
+    return [keyframes[i] for i in np.sort(order).tolist()]
+
+
+def most_shared(older: list[Keyframe], moving: list[Keyframe], points: PointRows) -> list[Keyframe]:
+    """Older keyframes that share points with the moving ones, those that share most first."""
+    marked = np.zeros(len(points.state), np.bool_)
+    for keyframe in moving:
+        marked[keyframe.rows] = True
+    marked &= points.state == MAPPED
+    shared = [int(marked[keyframe.rows].sum()) for keyframe in older]
+    order = np.argsort(-np.array(shared), kind="stable").tolist()
+    return [older[i] for i in order if shared[i] > 0]
+
+
+def rows_of(keyframes: list[Keyframe], rows: I32, capacity: int) -> I32:
+    """Ascending rows that any of the keyframes observes, and the rows given."""
+    marked = np.zeros(capacity, np.bool_)
+    marked[rows] = True
+    for keyframe in keyframes:
+        marked[keyframe.rows] = True
+    return np.flatnonzero(marked).astype(np.int32)
+
+
+@kernel
+def missing_rows(rows: I32, linked: I32, state: U8, misses: U8, marks: I64, frame: int) -> I32:
+    """Those of the rows that are mapped, are due to be looked for and have no track.
+
+    linked: row of each track, negative where it has none.   marks: (capacity,) written: the last
+    frame in which a row had a track.
+    """
+    for i in range(linked.size):
+        if linked[i] >= 0:
+            marks[linked[i]] = frame
+    wanted = np.empty(rows.size, np.int32)
+    count = 0
+    for i in range(rows.size):
+        row = rows[i]
+        due = misses[row] < MAX_MISSES or (row + frame) % _RETRY_FRAMES == 0
+        if due and state[row] == MAPPED and marks[row] != frame:
+            wanted[count] = row
+            count += 1
+    return wanted[:count].copy()

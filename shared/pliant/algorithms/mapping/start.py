@@ -1,0 +1,271 @@
+"""How a map starts: the frames seen so far become a small reconstruction, or a reason why not.
+
+Every new frame is held against the best earlier one: many shared tracks, and flow that no rotation
+explains.  The essential matrix of the two gives a first structure, frames in between join it by
+their tracks, and all are adjusted together.  Only a start that many points in several frames
+support is accepted, so that slow, rotating or still beginnings merely wait.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, I64
+from pliant.algorithms.bundle import BundleProblem, shared_intrinsics, solve_schur
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.epipolar import (
+    RelativePose,
+    rays,
+    relative_pose,
+    rotation_between,
+    two_view_depths,
+)
+from pliant.algorithms.geometry import inverse
+from pliant.algorithms.mapping.localisation import refine
+from pliant.algorithms.mapping.parameters import MappingParameters, StartParameters
+
+_TRIED_REFERENCES = 8
+"""Earlier frames held against a new one."""
+
+_ROTATION_SAMPLE = 400
+"""Tracks that decide whether a rotation explains the flow."""
+
+_NOISE_PX = 1.0
+"""Error of a track that is no parallax."""
+
+_MIN_FRAMES = 3
+"""Frames that a start needs: a point of two frames always agrees with some depth."""
+
+_ADJUSTMENTS = 3
+"""Rounds of adjusting and removing outliers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaitingFrame:
+    """What is kept of a frame until the map starts."""
+
+    frame: int
+    ids: I64
+    points_px: F32
+    kappas: F32
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """A first map.  The world is the camera of the first keyframe; the median depth in it is 1.
+
+    frames: (K,) frame numbers of the keyframes, ascending.   T_world_camera: (K, 4, 4).
+    ids: (N,) track of each point, ascending.   points_world: (N, 3).
+    keyframe_index, point_index, points_px: (O,) observations that support the points.
+    """
+
+    frames: I64
+    T_world_camera: F64
+    ids: I64
+    points_world: F64
+    keyframe_index: I32
+    point_index: I32
+    points_px: F32
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pair:
+    """Tracks shared by an earlier frame and the newest, and the flow that no rotation explains."""
+
+    reference: int
+    indices_reference: I64
+    indices_newest: I64
+    residual_px: float
+    flow_px: float
+
+
+def find_start(
+    waiting: list[WaitingFrame], camera: PinholeCamera, parameters: MappingParameters
+) -> Start | str:
+    """The map that starts with the newest of the waiting frames, or the reason why it cannot."""
+    start = parameters.start
+    if len(waiting) < _MIN_FRAMES:
+        return f"too few frames: {len(waiting)} of {_MIN_FRAMES}"
+    pairs = _pairs(waiting, camera, start)
+    if not pairs:
+        return f"too few tracks: {_most_shared(waiting)} of {start.min_tracks}"
+    if max(pair.residual_px for pair in pairs) < 2.0 * _NOISE_PX:
+        return _no_parallax(pairs, camera, start)
+    reason = ""
+    # The more parallax the better; shared tracks count less, for there are many.
+    pairs.sort(key=lambda pair: -pair.residual_px * len(pair.indices_newest) ** 0.5)
+    for pair in pairs[:2]:
+        found = _start_from(pair, waiting, camera, parameters)
+        if not isinstance(found, str):
+            return found
+        reason = reason or found
+    return reason
+
+
+def _pairs(
+    waiting: list[WaitingFrame], camera: PinholeCamera, parameters: StartParameters
+) -> list[_Pair]:
+    newest = waiting[-1]
+    pairs: list[_Pair] = []
+    earlier = len(waiting) - 1
+    tried = np.unique(np.linspace(0, earlier - 1, min(earlier, _TRIED_REFERENCES)).astype(int))
+    for index in tried.tolist():
+        reference = waiting[index]
+        _, a, b = np.intersect1d(reference.ids, newest.ids, assume_unique=True, return_indices=True)
+        if len(a) < parameters.min_tracks:
+            continue
+        every = max(1, len(a) // _ROTATION_SAMPLE)
+        points_a, points_b = reference.points_px[a[::every]], newest.points_px[b[::every]]
+        _, residuals = rotation_between(
+            _normalise(camera, points_a), _normalise(camera, points_b), scale=_NOISE_PX / camera.fx
+        )
+        pairs.append(
+            _Pair(
+                reference=index,
+                indices_reference=a,
+                indices_newest=b,
+                residual_px=float(np.median(residuals)) * camera.fx,
+                flow_px=float(np.median(np.linalg.norm(points_a - points_b, axis=1))),
+            )
+        )
+    return pairs
+
+
+def _normalise(camera: PinholeCamera, points_px: F32) -> F64:
+    return camera.normalise(points_px.astype(np.float64))
+
+
+def _most_shared(waiting: list[WaitingFrame]) -> int:
+    if len(waiting) < 2:
+        return 0
+    return len(np.intersect1d(waiting[0].ids, waiting[-1].ids, assume_unique=True))
+
+
+def _no_parallax(pairs: list[_Pair], camera: PinholeCamera, parameters: StartParameters) -> str:
+    if max(pair.flow_px for pair in pairs) > 20.0 * _NOISE_PX:
+        return "pure rotation: a turn explains all of the motion"
+    largest = max(pair.residual_px for pair in pairs)
+    parallax = float(np.degrees(largest / camera.fx))
+    return f"too little parallax: {parallax:.2f} of {parameters.min_parallax_deg:.2f} deg"
+
+
+def _start_from(
+    pair: _Pair, waiting: list[WaitingFrame], camera: PinholeCamera, parameters: MappingParameters
+) -> Start | str:
+    start = parameters.start
+    a = _normalise(camera, waiting[pair.reference].points_px[pair.indices_reference])
+    b = _normalise(camera, waiting[-1].points_px[pair.indices_newest])
+    two_views = relative_pose(a, b, gate=start.epipolar_gate_px / camera.fx)
+    if two_views is None:
+        return "no essential matrix fits the tracks"
+    share = float(two_views.inliers.mean())
+    if share < start.min_inlier_share:
+        return f"too few tracks agree with one motion: {share:.0%} of {start.min_inlier_share:.0%}"
+    parallax = float(np.degrees(np.median(two_views.parallax_rad[two_views.inliers])))
+    if parallax < start.min_parallax_deg:
+        return f"too little parallax: {parallax:.2f} of {start.min_parallax_deg:.2f} deg"
+    return _reconstruct(pair, two_views, waiting, camera, parameters)
+
+
+def _reconstruct(
+    pair: _Pair,
+    two_views: RelativePose,
+    waiting: list[WaitingFrame],
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+) -> Start | str:
+    start = parameters.start
+    newest = len(waiting) - 1
+    spread = np.linspace(pair.reference, newest, min(start.keyframes, newest - pair.reference + 1))
+    chosen = [waiting[i] for i in np.unique(np.round(spread).astype(int)).tolist()]
+    # Seed: points of the two views; the frames between them join by the tracks they share.
+    good = two_views.inliers
+    ids = waiting[pair.reference].ids[pair.indices_reference[good]]
+    rays_a = rays(
+        _normalise(camera, waiting[pair.reference].points_px[pair.indices_reference[good]])
+    )
+    rays_b = rays(_normalise(camera, waiting[-1].points_px[pair.indices_newest[good]]))
+    points = rays_a * two_view_depths(two_views.T_b_a, rays_a, rays_b)[0][:, None]
+    # Depths of nearly parallel rays are noise; they come back once the poses are better.
+    firm = two_views.parallax_rad[good] > np.radians(0.5 * start.min_parallax_deg)
+    ids, points = ids[firm], points[firm]
+    T_world_camera = np.tile(np.eye(4), (len(chosen), 1, 1))
+    T_world_camera[-1] = inverse(two_views.T_b_a)
+    for k in range(1, len(chosen) - 1):
+        _, i, j = np.intersect1d(chosen[k].ids, ids, assume_unique=True, return_indices=True)
+        if len(i) < start.min_points:
+            return f"too few tracks last through the start: {len(i)} of {start.min_points}"
+        located = refine(
+            T_world_camera[k - 1], points[j], chosen[k].points_px[i], camera,
+            parameters.localisation,
+        )  # fmt: skip
+        T_world_camera[k] = located.T_world_camera
+    scale = 1.0 / float(np.median(points[:, 2]))
+    points *= scale
+    T_world_camera[:, :3, 3] *= scale
+    return _adjust(chosen, T_world_camera, ids, points, camera, parameters)
+
+
+def _observations(chosen: list[WaitingFrame], ids: I64) -> tuple[I32, I32, F32]:
+    keyframe_index: list[I32] = []
+    point_index: list[I32] = []
+    points_px: list[F32] = []
+    for k, frame in enumerate(chosen):
+        _, i, j = np.intersect1d(frame.ids, ids, assume_unique=True, return_indices=True)
+        keyframe_index.append(np.full(len(i), k, np.int32))
+        point_index.append(j.astype(np.int32))
+        points_px.append(frame.points_px[i])
+    return np.concatenate(keyframe_index), np.concatenate(point_index), np.concatenate(points_px)
+
+
+def _adjust(
+    chosen: list[WaitingFrame],
+    T_world_camera: F64,
+    ids: I64,
+    points: F64,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+) -> Start | str:
+    start = parameters.start
+    order = np.argsort(ids, kind="stable")
+    ids, points = ids[order], points[order]
+    keyframe_index, point_index, points_px = _observations(chosen, ids)
+    fixed = np.zeros(len(chosen), np.bool_)
+    fixed[0] = True
+    median = np.inf
+    for _ in range(_ADJUSTMENTS):
+        problem = BundleProblem(
+            T_world_camera=T_world_camera,
+            points_world=points,
+            camera_index=keyframe_index,
+            point_index=point_index,
+            points_px=points_px,
+            intrinsics=shared_intrinsics(camera, len(chosen)),
+            fixed_cameras=fixed,
+        )
+        result = solve_schur(problem, parameters.bundle)
+        T_world_camera = result.T_world_camera
+        error = np.sqrt(result.squared_residuals)
+        median = float(np.median(error))
+        keep = error < parameters.window.outlier_px
+        # A point needs three frames: two always agree with some depth.
+        seen = np.bincount(point_index[keep], minlength=len(ids))
+        stays = seen >= 3
+        keep &= stays[point_index]
+        renumber = np.cumsum(stays) - 1
+        ids, points = ids[stays], result.points_world[stays]
+        keyframe_index, points_px = keyframe_index[keep], points_px[keep]
+        point_index = renumber[point_index[keep]].astype(np.int32)
+        if len(ids) < start.min_points:
+            return f"too few points: {len(ids)} of {start.min_points}"
+    if median > start.max_median_error_px:
+        return f"no consistent start: error {median:.1f} of {start.max_median_error_px:.1f} px"
+    return Start(
+        frames=np.array([frame.frame for frame in chosen]),
+        T_world_camera=T_world_camera,
+        ids=ids,
+        points_world=points,
+        keyframe_index=keyframe_index,
+        point_index=point_index,
+        points_px=points_px,
+    )

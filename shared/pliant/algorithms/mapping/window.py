@@ -1,0 +1,226 @@
+"""The keyframes under adjustment, and the current frame, as dense camera x point arrays."""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, BoolArray
+from pliant.algorithms.bundle import (
+    BundleResult,
+    BundleWindow,
+    CalibrationUncertainty,
+    ideal_pixels,
+    refine_points,
+    shared_intrinsics,
+    solve_calibrating,
+    solve_schur,
+    solve_subspace,
+)
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.reprojection import window_errors
+from pliant.algorithms.mapping.tables import (
+    choose,
+    columns_in_state,
+    count_cameras,
+    flows,
+    gather,
+    observe,
+    seen_in_state,
+)
+from pliant.algorithms.triangulation import spread_of_rays
+
+OUTSIDE = -1
+
+_POINT_STEPS = 3
+"""Gauss-Newton steps of the points that Schur LM leaves out: they start near their optimum."""
+
+
+class Window:
+    """Fixed keyframes, then those that move, then the current frame in the last slot.
+
+    keyframes: (M,) list, the first ``fixed`` do not move, the first ``outside`` are older than the
+    window and only hold it.
+      rows: (N,) rows seen by any of them.
+    columns: (capacity,) column of each row, OUTSIDE where it is not in the window.
+    u, v, seen: (M + 1, N).    w: weights of what is seen.    T_world_camera: (M + 1, 4, 4).
+    """
+
+    def __init__(
+        self,
+        keyframes: list[Keyframe],
+        *,
+        fixed: int,
+        outside: int,
+        points: PointRows,
+        camera: PinholeCamera,
+        lens_radius: float,
+    ) -> None:
+        self.keyframes = keyframes
+        self.fixed = fixed
+        self.outside = outside
+        self.points = points
+        self.lens: F32 = np.array(
+            [camera.fx, camera.fy, camera.cx, camera.cy, lens_radius], np.float32
+        )
+        self.columns: I32 = np.full(len(points.state), OUTSIDE, np.int32)
+        for keyframe in keyframes:
+            self.columns[keyframe.rows] = 0
+        rows = np.flatnonzero(self.columns >= 0).astype(np.int32)
+        # Points born together stand together, so that solvers skip the blocks a camera never saw.
+        self.rows: I32 = rows[np.argsort(points.first_keyframe[rows], kind="stable")]
+        self.columns[self.rows] = np.arange(len(self.rows), dtype=np.int32)
+        size = (len(keyframes) + 1, len(self.rows))
+        self.u: F32 = np.zeros(size, np.float32)
+        self.v: F32 = np.zeros(size, np.float32)
+        self.w: F32 = np.zeros(size, np.float32)
+        self.seen: BoolArray = np.zeros(size, np.bool_)
+        self.T_world_camera: F64 = np.zeros((len(keyframes) + 1, 4, 4))
+        self.T_world_camera[-1] = np.eye(4)
+        for slot, keyframe in enumerate(keyframes):
+            self.T_world_camera[slot] = keyframe.T_world_camera
+            self._observe(slot, keyframe.rows, keyframe.points_px)
+
+    def _observe(self, slot: int, rows: I32, points_px: F32) -> None:
+        observe(rows, points_px, self.columns, slot, self.lens, self.u, self.v, self.w, self.seen)
+
+    def see(self, T_world_camera: F64, rows: I32, points_px: F32) -> None:
+        """Put the current frame into the last slot."""
+        self.seen[-1] = False
+        self.T_world_camera[-1] = T_world_camera
+        self._observe(len(self.keyframes), rows, points_px)
+
+    def sweep_current(self, camera: PinholeCamera, parameters: MappingParameters) -> F64:
+        """A few subspace Gauss-Newton sweeps (Eq. 11-12) with the current frame.
+
+        The frame and the points that it sees move, and the newest keyframes where the parameters
+        say so.  Returns the pose of the frame.
+        """
+        columns = seen_in_state(
+            self.rows, self.points.state, MAPPED, self.seen, len(self.keyframes), 1
+        )
+        problem = self._problem(columns, camera)
+        held = len(self.keyframes) - parameters.window.sweep_keyframes
+        problem.fixed_cameras[: max(held, 0)] = True
+        bundle = parameters.bundle.model_copy(update={"max_sweeps": parameters.window.sweeps})
+        self._take(columns, solve_subspace(problem, bundle))
+        return self.T_world_camera[-1].copy()
+
+    def adjust(
+        self,
+        camera: PinholeCamera,
+        parameters: MappingParameters,
+        *,
+        iterations: int,
+        points_per_keyframe: int,
+        uncertainty: CalibrationUncertainty | None = None,
+    ) -> F64:
+        """Schur LM over the keyframes and the best observed points, then the other points alone.
+
+        uncertainty: of the calibration, which is corrected with them; None or zeros: it is right.
+        Returns the correction (3,), see ``solve_calibrating``.  The window's u and v become those
+        of ``camera``, so that all that follows goes on with a pinhole camera.
+        """
+        columns = self.mapped_columns()
+        count = count_cameras(columns, self.seen, 0, len(self.seen))
+        columns, count = columns[count >= 2], count[count >= 2]
+        best = self._best_observed(columns, count, points_per_keyframe)
+        bundle = parameters.bundle.model_copy(update={"max_iterations": iterations})
+        chosen = columns[best]
+        problem, correction = self._problem(chosen, camera), np.zeros(3)
+        if uncertainty is None or not uncertainty.sigmas.any():
+            result = solve_schur(problem, bundle)
+        else:
+            result, correction = solve_calibrating(problem, bundle, uncertainty)
+        self._take(chosen, result)
+        if correction.any():
+            seen = self.seen
+            self.u[seen], self.v[seen] = ideal_pixels(
+                self.u[seen], self.v[seen], camera, correction
+            )
+        others = columns[~best]
+        found = refine_points(self._problem(others, camera), bundle, iterations=_POINT_STEPS)
+        self._take(others, found)
+        return correction
+
+    def _best_observed(self, columns: I32, observations: I32, wanted: int) -> BoolArray:
+        """Mask of ``columns`` that gives every keyframe its ``wanted`` most observed points."""
+        # The most observed first, once for all keyframes.
+        order = np.argsort(-observations, kind="stable")
+        chosen = np.zeros(len(columns), np.bool_)
+        for slot in range(len(self.keyframes) - 1, -1, -1):
+            choose(order, columns, self.seen[slot], wanted, chosen)
+        return chosen
+
+    def flow_since_keyframe(self) -> tuple[float, float]:
+        """Share of the newest keyframe's mapped points still seen, and their median flow, px."""
+        before, moved = flows(self.rows, self.points.state, MAPPED, self.u, self.v, self.seen)
+        if len(moved) == 0:
+            return 0.0, 0.0
+        return len(moved) / before, float(np.median(moved))
+
+    def current_rows(self) -> I32:
+        """Rows that the current frame sees."""
+        return self.rows[self.seen[-1]]
+
+    def mapped_columns(self) -> I32:
+        """Columns of the points of the map."""
+        return columns_in_state(self.rows, self.points.state, MAPPED)
+
+    def _problem(self, columns: I32, camera: PinholeCamera) -> BundleWindow:
+        fixed = np.zeros(len(self.keyframes) + 1, np.bool_)
+        fixed[: self.fixed] = True
+        fixed[-1] = not self.seen[-1].any()
+        table = np.zeros((3, len(self.seen), len(columns)), np.float32)
+        gather(columns, self.u, self.v, self.w, self.seen, table[0], table[1], table[2])
+        return BundleWindow(
+            T_world_camera=self.T_world_camera,
+            points_world=self.points.xyz[self.rows[columns]],
+            u=table[0],
+            v=table[1],
+            weights=table[2],
+            intrinsics=shared_intrinsics(camera, len(fixed)),
+            fixed_cameras=fixed,
+        )
+
+    def _take(self, columns: I32, result: BundleResult) -> None:
+        self.points.xyz[self.rows[columns]] = result.points_world
+        self.T_world_camera = result.T_world_camera
+        for slot, keyframe in enumerate(self.keyframes):
+            keyframe.T_world_camera = self.T_world_camera[slot]
+
+    def errors(self, columns: I32, camera: PinholeCamera) -> F32:
+        """(M, C) reprojection errors of the keyframes in px, 0 where they do not see a point."""
+        return window_errors(
+            self.T_world_camera[:-1],
+            self.points.xyz[self.rows[columns]],
+            self.u,
+            self.v,
+            self.seen,
+            columns,
+            camera,
+        )
+
+    def forget(self, columns: I32, bad: BoolArray) -> None:
+        """Forget observations of the keyframes: (M, C) mask over ``columns``."""
+        for slot, keyframe in enumerate(self.keyframes):
+            wrong = columns[bad[slot]]
+            if len(wrong):
+                self.seen[slot, wrong] = False
+                rejected = np.zeros(len(self.columns), np.bool_)
+                rejected[self.rows[wrong]] = True
+                keyframe.keep(~rejected[keyframe.rows])
+
+    def update_statistics(self, camera: PinholeCamera) -> None:
+        """Keyframes, parallax and uncertainty of the points of the self."""
+        points = self.points
+        mapped = self.mapped_columns()
+        columns, rows = mapped.astype(np.int64), self.rows[mapped]
+        moving = count_cameras(mapped, self.seen, self.outside, len(self.keyframes))
+        points.keyframes[rows] = points.base_keyframes[rows] + moving
+        parallax, sigmas = spread_of_rays(
+            self.T_world_camera, self.seen, columns, points.xyz[rows], focal_px=camera.fx
+        )
+        points.parallax_rad[rows] = np.maximum(parallax, points.base_parallax_rad[rows])
+        known = np.isfinite(sigmas)
+        points.sigmas[rows[known]] = sigmas[known]
+        points.sigmas[rows[~known]] = np.maximum(points.sigmas[rows[~known]], 1e-3)

@@ -1,0 +1,41 @@
+"""Images and pixels as the corrected camera sees them, where the calibration was found wrong."""
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import F32, U8
+from pliant.algorithms.bundle.calibration import ideal_pixels
+from pliant.algorithms.camera import PinholeCamera
+
+
+class CorrectedView:
+    """Moves what was seen to where the ideal camera would have seen it.
+
+    correction: (s, k1, k2) as MapDelta.calibration_correction, or () for none.
+    """
+
+    def __init__(self, camera: PinholeCamera, correction: tuple[float, ...]) -> None:
+        self._camera = camera
+        self._correction = np.array(correction if len(correction) == 3 else (0.0, 0.0, 0.0))
+
+    def pixels(self, points_px: F32) -> F32:
+        """(N, 2) pixels of the rectified image in the ideal one."""
+        if not self._correction.any():
+            return points_px
+        u, v = np.ascontiguousarray(points_px.T)
+        return np.stack(ideal_pixels(u, v, self._camera, self._correction), axis=1)
+
+    def image(self, pixels: U8) -> U8:
+        """(H, W, 3) the ideal image of a rectified one."""
+        if not self._correction.any():
+            return pixels
+        camera = self._camera
+        s, k1, k2 = self._correction.tolist()
+        x = (np.arange(camera.width) - camera.cx) / camera.fx
+        y = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
+        squared = x * x + y * y
+        factor = np.exp(s) * (1.0 + k1 * squared + k2 * squared**2)
+        u = (x * factor * camera.fx + camera.cx).astype(np.float32)
+        v = (y * factor * camera.fy + camera.cy).astype(np.float32)
+        moved = cv2.remap(pixels, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+        return np.asarray(moved, np.uint8)

@@ -1,0 +1,127 @@
+"""A depth map with weights, rasterised from a triangle mesh, as the TSDF takes it in.
+
+Inverse depth along z is affine in the image on a plane (1 / z = n . ray / d), so interpolating it
+linearly in pixels is the perspective-correct interpolation of depth.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, Shape
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.kernel import kernel
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth along z, 0 where no triangle is, and the weight of each pixel in [0, 1], 0 likewise."""
+
+    depths: Annotated[F32, Shape("H", "W")]
+    weights: Annotated[F32, Shape("H", "W")]
+
+
+def render_depth(
+    triangles: I32, points_px: F32, inverse_depths: F32, sigmas: F32, camera: PinholeCamera
+) -> DepthMap:
+    """The nearest surface at every pixel centre (integer coordinates).
+
+    triangles: (T, 3), turning either way.    points_px: (M, 2).    inverse_depths, sigmas: (M,)
+    inverse depth along z and its standard deviation.    Triangles with a corner that is not finite
+    or not in front of the camera are left out.
+
+    The weight is the cosine of the slant, over 1 + the variance of depth in units of (1 % of
+    depth)^2.  A pixel centre on an edge belongs to the triangle on whose upper or left side it is,
+    so that two triangles that share an edge leave no gap and cover nothing twice.
+    """
+    shape = (camera.height, camera.width)
+    nearest, weights = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    _rasterise(
+        triangles, points_px.astype(np.float64), inverse_depths.astype(np.float64),
+        sigmas.astype(np.float64), camera.fx, camera.fy, camera.cx, camera.cy, nearest, weights,
+    )  # fmt: skip
+    depths = np.zeros(shape, np.float32)
+    np.divide(np.float32(1.0), nearest, out=depths, where=nearest > 0.0)
+    return DepthMap(depths, weights)
+
+
+@kernel
+def _rasterise(
+    triangles: I32, pixels: F64, inverse: F64, sigmas: F64,
+    fx: float, fy: float, cx: float, cy: float, nearest: F32, weights: F32,
+) -> None:  # fmt: skip
+    height, width = nearest.shape
+    for t in range(len(triangles)):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        if not (min(inverse[a], inverse[b], inverse[c]) > 0.0):
+            continue
+        total = pixels[a, 0] + pixels[b, 0] + pixels[c, 0] + pixels[a, 1] + pixels[b, 1]
+        total += pixels[c, 1] + inverse[a] + inverse[b] + inverse[c]
+        if not (abs(total) < np.inf):
+            continue
+        ua, va = pixels[a, 0], pixels[a, 1]
+        eu, ev, fu, fv = pixels[b, 0] - ua, pixels[b, 1] - va, pixels[c, 0] - ua, pixels[c, 1] - va
+        area = eu * fv - ev * fu
+        if area == 0.0:
+            continue
+        # The plane: inverse depth g + gu u + gv v.  Its normal is (fx gu, fy gv, g at the centre).
+        ri, rf = inverse[b] - inverse[a], inverse[c] - inverse[a]
+        gu, gv = (ri * fv - rf * ev) / area, (rf * eu - ri * fu) / area
+        nu, nv, nw = fx * gu, fy * gv, inverse[a] + gu * (cx - ua) + gv * (cy - va)
+        normal = math.sqrt(nu * nu + nv * nv + nw * nw)
+        su, sv = sigmas[b] - sigmas[a], sigmas[c] - sigmas[a]
+        hu, hv = (su * fv - sv * ev) / area, (sv * eu - su * fu) / area
+        low = min(va, pixels[b, 1], pixels[c, 1])
+        high = max(va, pixels[b, 1], pixels[c, 1])
+        for v in range(max(0, _ceil(low, height)), min(height - 1, _floor(high, height)) + 1):
+            left, right = -np.inf, np.inf
+            left, right = _cut(pixels, a, b, v, area > 0.0, left, right)
+            left, right = _cut(pixels, b, c, v, area > 0.0, left, right)
+            left, right = _cut(pixels, c, a, v, area > 0.0, left, right)
+            # Half open, [left, right): what is on the right edge is the neighbour's.
+            if not (-np.inf < left < right < np.inf):
+                continue
+            first, end = max(0, _ceil(left, width)), min(width, _ceil(right, width))
+            for u in range(first, end):
+                x = inverse[a] + gu * (u - ua) + gv * (v - va)
+                if not x > nearest[v, u]:
+                    continue
+                nearest[v, u] = x
+                ray_u, ray_v = (u - cx) / fx, (v - cy) / fy
+                # n . ray is the inverse depth itself.
+                cosine = x / (normal * math.sqrt(1.0 + ray_u * ray_u + ray_v * ray_v))
+                relative = 100.0 * (sigmas[a] + hu * (u - ua) + hv * (v - va)) / x
+                weights[v, u] = min(cosine, 1.0) / (1.0 + relative * relative)
+
+
+@kernel
+def _cut(
+    pixels: F64, i: int, j: int, v: int, turns_right: bool, left: float, right: float
+) -> tuple[float, float]:
+    """Narrow a row's interval by one edge: rows from the upper end to before the lower one."""
+    if pixels[i, 1] == pixels[j, 1]:
+        return left, right
+    downwards = pixels[j, 1] > pixels[i, 1]
+    # Always from the upper end: both triangles at an edge must compute the same crossing.
+    top, bottom = (i, j) if downwards else (j, i)
+    if v < pixels[top, 1] or v >= pixels[bottom, 1]:
+        return left, right
+    slope = (pixels[bottom, 0] - pixels[top, 0]) / (pixels[bottom, 1] - pixels[top, 1])
+    u = pixels[top, 0] + slope * (v - pixels[top, 1])
+    # With positive area in (u, v) the inside is on the left of an edge that goes up.
+    if downwards == turns_right:
+        return left, u
+    return u, right
+
+
+@kernel
+def _ceil(value: float, limit: int) -> int:
+    """The ceiling, within -1 and limit, whatever the value."""
+    return math.ceil(min(max(value, -1.0), float(limit)))
+
+
+@kernel
+def _floor(value: float, limit: int) -> int:
+    return math.floor(min(max(value, -1.0), float(limit)))

@@ -1,0 +1,209 @@
+"""The surface that one keyframe sees: from its points to a depth map (VITAMIN-E, section 4)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from pliant.algorithms.arrays import F32, F64, I32, I64
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse
+from pliant.algorithms.meshing.delaunay import Triangulation, triangulate
+from pliant.algorithms.meshing.depth_rendering import DepthMap, render_depth
+from pliant.algorithms.meshing.laplacian import laplacian
+from pliant.algorithms.meshing.nltgv import (
+    NltgvParameters,
+    NltgvResult,
+    NltgvStart,
+    carry_duals,
+    smooth,
+)
+from pliant.algorithms.meshing.triangle_filter import TriangleFilterParameters, filter_triangles
+from pliant.algorithms.parameters import Parameters
+from pliant.algorithms.stages import StageTimer, no_stages
+
+_MIN_POINTS = 3
+_MIN_SHARED = 0.3
+"""Share of the vertices that must live on for the last surface to be worth starting from."""
+_MAX_DIFFERENCE = 0.2
+"""Share of the inverse depth by which the last surface may differ from a point that it meets."""
+
+
+class SurfaceParameters(Parameters):
+    """How the points of a keyframe become a surface."""
+
+    smoothing: Literal["nltgv", "laplacian", "none"] = Field(
+        default="nltgv", description="How inverse depth is smoothed; the others are to compare."
+    )
+    max_error_px: float = Field(
+        default=2.0, gt=0.0, description="Points that project farther from where they are seen, px"
+    )
+    noise_px: float = Field(
+        default=0.5,
+        gt=0.0,
+        description="Standard deviation of an observation, px: scales the uncertainty of points.",
+    )
+    nltgv: NltgvParameters = NltgvParameters(data_weight=1.0)
+    triangles: TriangleFilterParameters = TriangleFilterParameters()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenPoints:
+    """The points that a keyframe observes, in ascending order of their ids.
+
+    ids: (N,).    points_px: (N, 2) where they are seen.    points_world: (N, 3).
+    sigmas: (N,) standard deviation along the ray for a noise of 1 px, as a share of the depth.
+    keyframes: (N,) how many keyframes observe each.
+    """
+
+    ids: I64
+    points_px: F32
+    points_world: F64
+    sigmas: F32
+    keyframes: I32
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """A keyframe's depth map, or why there is none.
+
+    problem: "" or one line.    vertices, triangles, iterations: of its mesh and of NLTGV.
+    median_depth: of its vertices, 0 without any.
+    """
+
+    depth_map: DepthMap | None
+    problem: str = ""
+    vertices: int = 0
+    triangles: int = 0
+    iterations: int = 0
+    median_depth: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Last:
+    """The last surface.  planes: (M, 3) n with n . X = 1 in its camera, at each vertex."""
+
+    ids: I64
+    T_world_camera: F64
+    planes: F64
+    duals: F32
+    edges: I32
+
+
+class KeyframeSurfaces:
+    """Makes surfaces one after the other, each starting from the last where points live on."""
+
+    def __init__(self, camera: PinholeCamera, parameters: SurfaceParameters) -> None:
+        self._camera = camera
+        self._parameters = parameters
+        self._last: _Last | None = None
+
+    def surface(
+        self,
+        T_world_camera: F64,
+        points: SeenPoints,
+        timer: StageTimer = no_stages,
+    ) -> Surface:
+        """The surface of a keyframe at its pose."""
+        if not np.isfinite(T_world_camera).all():
+            return Surface(depth_map=None, problem="its pose is not finite")
+        points, inverses = self._in_front(T_world_camera, points)
+        if len(inverses) < _MIN_POINTS:
+            return Surface(depth_map=None, problem=f"{len(inverses)} points with depth")
+        with timer("triangulation"):
+            mesh = triangulate(points.points_px)
+        if len(mesh.triangles) == 0:
+            return Surface(depth_map=None, problem="its points lie on one line")
+        rows = mesh.vertices
+        pixels, data = points.points_px[rows], inverses[rows]
+        sigmas = points.sigmas[rows] * np.float32(self._parameters.noise_px) * data
+        with timer("smoothing"):
+            smoothed, iterations = self._smooth(
+                T_world_camera, points.ids[rows], pixels, data, sigmas, mesh
+            )
+        with timer("rasterisation"):
+            kept = filter_triangles(
+                mesh.triangles, pixels, smoothed, sigmas, points.keyframes[rows],
+                self._camera, self._parameters.triangles,
+            )  # fmt: skip
+            depth_map = render_depth(mesh.triangles[kept], pixels, smoothed, sigmas, self._camera)
+        count = int(np.count_nonzero(kept))
+        return Surface(
+            depth_map=depth_map if count else None,
+            problem="" if count else "none of its triangles is surface",
+            vertices=len(rows),
+            triangles=count,
+            iterations=iterations,
+            median_depth=float(1.0 / np.median(data)),
+        )
+
+    def _in_front(self, T_world_camera: F64, points: SeenPoints) -> tuple[SeenPoints, F32]:
+        """The points that can be where they are seen, and their inverse depths."""
+        in_camera = (points.points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+        with np.errstate(all="ignore"):
+            inverses = 1.0 / in_camera[:, 2]
+            error = self._camera.project(in_camera) - points.points_px
+            good = (inverses > 0.0) & (
+                np.square(error).sum(axis=1) < self._parameters.max_error_px**2
+            )
+        good &= np.isfinite(inverses) & np.isfinite(points.sigmas) & (points.sigmas > 0.0)
+        rows = np.flatnonzero(good)
+        chosen = SeenPoints(
+            ids=points.ids[rows],
+            points_px=points.points_px[rows],
+            points_world=points.points_world[rows],
+            sigmas=points.sigmas[rows],
+            keyframes=points.keyframes[rows],
+        )
+        return chosen, inverses[rows].astype(np.float32)
+
+    def _smooth(
+        self, T: F64, ids: I64, pixels: F32, data: F32, sigmas: F32, mesh: Triangulation
+    ) -> tuple[F32, int]:
+        kind = self._parameters.smoothing
+        if kind == "none":
+            return data, 0
+        if kind == "laplacian":
+            return laplacian(data, mesh.edges), 0
+        begin = self._start(T, ids, pixels, data, mesh.edges)
+        result = smooth(pixels, data, sigmas, mesh.edges, self._parameters.nltgv, begin)
+        self._keep(ids, T, pixels, result, mesh.edges)
+        return result.inverse_depths, result.iterations
+
+    def _start(self, T: F64, ids: I64, pixels: F32, data: F32, edges: I32) -> NltgvStart | None:
+        """The last surface where its vertices live on, as it looks from here."""
+        if self._last is None:
+            return None
+        last = self._last
+        _, new, old = np.intersect1d(ids, last.ids, assume_unique=True, return_indices=True)
+        if len(new) < _MIN_SHARED * len(ids):
+            return None
+        T_last_new = inverse(last.T_world_camera) @ T
+        with np.errstate(all="ignore"):
+            share = 1.0 / (1.0 - last.planes[old] @ T_last_new[:3, 3])
+        planes = last.planes[old] @ T_last_new[:3, :3] * share[:, None]
+        rays = np.concatenate([self._camera.normalise(pixels[new]), np.ones((len(new), 1))], axis=1)
+        values = np.full(len(ids), np.nan, np.float32)
+        slopes = np.full((len(ids), 2), np.nan, np.float32)
+        values[new] = (planes * rays).sum(axis=1)
+        slopes[new] = planes[:, :2] / (self._camera.fx, self._camera.fy)
+        # Seen from elsewhere a vertex may lie behind the camera, or far off its point.
+        with np.errstate(invalid="ignore"):
+            wrong = ~(np.abs(values - data) < _MAX_DIFFERENCE * data)
+        values[wrong], slopes[wrong] = np.nan, np.nan
+        duals = carry_duals(
+            last.duals, last.edges, last.ids.astype(np.int32), edges, ids.astype(np.int32)
+        )
+        return NltgvStart(values, slopes, duals)
+
+    def _keep(self, ids: I64, T: F64, pixels: F32, result: NltgvResult, edges: I32) -> None:
+        """Remember a surface: at each vertex the plane n . X = 1 in its camera, so that it can be
+        seen from another one."""
+        camera = self._camera
+        planes = np.empty((len(ids), 3))
+        planes[:, 0] = result.slopes[:, 0] * camera.fx
+        planes[:, 1] = result.slopes[:, 1] * camera.fy
+        rays = camera.normalise(pixels)
+        planes[:, 2] = result.inverse_depths - (planes[:, :2] * rays).sum(axis=1)
+        self._last = _Last(ids, T, planes, result.duals, edges)

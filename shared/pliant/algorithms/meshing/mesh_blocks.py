@@ -1,0 +1,185 @@
+"""The mesh as blocks that change: what the mesher sends, and what it and its viewers hold."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, I32, U8, BoolArray, Shape
+from pliant.algorithms.meshing.tsdf_blocks import SIDE, pack
+
+LATTICE = SIDE + 1
+"""Lattice points along the side of a block's cubes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshBlocks:
+    """The whole surface of some blocks; it takes the place of what was known of them.
+
+    Vertices and triangles stand block after block, in the order of the keys.
+
+    keys: blocks, ascending.    vertex_counts, triangle_counts: of each; none: it is empty now.
+    edges: the lattice edge of its block on which a vertex lies, ascending within a block:
+    ((z * LATTICE + y) * LATTICE + x) * 3 + axis.  Blocks that touch share those on their faces.
+    positions, normals: world frame; normals are unit and point to where the cameras were.
+    colours: RGB.    triangles: rows of the block's own vertices, anticlockwise from outside.
+    """
+
+    keys: Annotated[I32, Shape("B", 3)]
+    vertex_counts: Annotated[I32, Shape("B")]
+    triangle_counts: Annotated[I32, Shape("B")]
+    edges: Annotated[I32, Shape("V")]
+    positions: Annotated[F32, Shape("V", 3)]
+    normals: Annotated[F32, Shape("V", 3)]
+    colours: Annotated[U8, Shape("V", 3)]
+    triangles: Annotated[I32, Shape("T", 3)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TriangleMesh:
+    """A welded mesh.  Fields as in MeshBlocks; triangles are rows of the vertices here."""
+
+    positions: Annotated[F32, Shape("V", 3)]
+    normals: Annotated[F32, Shape("V", 3)]
+    colours: Annotated[U8, Shape("V", 3)]
+    triangles: Annotated[I32, Shape("T", 3)]
+
+
+def no_blocks() -> MeshBlocks:
+    """No block at all."""
+    return MeshBlocks(
+        keys=np.zeros((0, 3), np.int32),
+        vertex_counts=np.zeros(0, np.int32),
+        triangle_counts=np.zeros(0, np.int32),
+        edges=np.zeros(0, np.int32),
+        positions=np.zeros((0, 3), np.float32),
+        normals=np.zeros((0, 3), np.float32),
+        colours=np.zeros((0, 3), np.uint8),
+        triangles=np.zeros((0, 3), np.int32),
+    )
+
+
+class BlockMesh:
+    """A mesh that grows and changes by blocks.  It holds no empty ones."""
+
+    def __init__(self) -> None:
+        self._blocks: dict[int, MeshBlocks] = {}
+
+    def __len__(self) -> int:
+        return len(self._blocks)
+
+    def changes(self, blocks: MeshBlocks) -> MeshBlocks:
+        """Those of the blocks that differ from what is held, for whoever holds the same."""
+        starts, faces = _bounds(blocks.vertex_counts), _bounds(blocks.triangle_counts)
+        differ = np.zeros(len(blocks.keys), np.bool_)
+        for row, key in enumerate(pack(blocks.keys).tolist()):
+            held = self._blocks.get(key)
+            vertices = slice(starts[row], starts[row + 1])
+            triangles = slice(faces[row], faces[row + 1])
+            if held is None:
+                differ[row] = blocks.triangle_counts[row] > 0
+            else:
+                differ[row] = not _same(held, blocks, vertices, triangles)
+        return select_blocks(blocks, differ)
+
+    def apply(self, blocks: MeshBlocks) -> None:
+        """Put the blocks in the place of what is held of them."""
+        starts, faces = _bounds(blocks.vertex_counts), _bounds(blocks.triangle_counts)
+        for row, key in enumerate(pack(blocks.keys).tolist()):
+            if blocks.triangle_counts[row] == 0:
+                self._blocks.pop(key, None)
+                continue
+            at, face = slice(starts[row], starts[row + 1]), slice(faces[row], faces[row + 1])
+            self._blocks[key] = MeshBlocks(
+                keys=blocks.keys[row : row + 1].copy(),
+                vertex_counts=blocks.vertex_counts[row : row + 1].copy(),
+                triangle_counts=blocks.triangle_counts[row : row + 1].copy(),
+                edges=blocks.edges[at].copy(),
+                positions=blocks.positions[at].copy(),
+                normals=blocks.normals[at].copy(),
+                colours=blocks.colours[at].copy(),
+                triangles=blocks.triangles[face].copy(),
+            )
+
+    def snapshot(self) -> MeshBlocks:
+        """Everything held, for a viewer that joins late."""
+        return _joined([self._blocks[key] for key in sorted(self._blocks)])
+
+    def mesh(self) -> TriangleMesh:
+        """One mesh, welded across blocks.  It depends on what is held, not on how it came."""
+        return weld(self.snapshot())
+
+
+def weld(blocks: MeshBlocks) -> TriangleMesh:
+    """One mesh: vertices on the same lattice edge are one, in the order of first use.
+
+    Blocks must be of one time: what they share on their faces must be the same in both.
+    """
+    block = np.repeat(np.arange(len(blocks.keys)), blocks.vertex_counts)
+    at, axis = blocks.edges // 3, blocks.edges % 3
+    local = np.stack([at % LATTICE, at // LATTICE % LATTICE, at // LATTICE**2], axis=1)
+    lattice = blocks.keys[block].astype(np.int64) * SIDE + local
+    # 20 bits a coordinate and two for the axis.
+    shifted = lattice + (1 << 19)
+    ids = (((shifted[:, 0] << 20 | shifted[:, 1]) << 20 | shifted[:, 2]) << 2) | axis
+    _, first, where = np.unique(ids, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    rows = first[order]
+    starts = np.concatenate([[0], np.cumsum(blocks.vertex_counts)[:-1]]).astype(np.int64)
+    corners = (
+        blocks.triangles + np.repeat(starts, blocks.triangle_counts)[:, None]
+        if len(blocks.triangles)
+        else blocks.triangles.astype(np.int64)
+    )
+    return TriangleMesh(
+        positions=blocks.positions[rows],
+        normals=blocks.normals[rows],
+        colours=blocks.colours[rows],
+        triangles=rank[where[corners]].astype(np.int32).reshape(-1, 3),
+    )
+
+
+def select_blocks(blocks: MeshBlocks, chosen: BoolArray) -> MeshBlocks:
+    """The (B,) chosen ones."""
+    vertices = np.repeat(chosen, blocks.vertex_counts)
+    return MeshBlocks(
+        keys=blocks.keys[chosen],
+        vertex_counts=blocks.vertex_counts[chosen],
+        triangle_counts=blocks.triangle_counts[chosen],
+        edges=blocks.edges[vertices],
+        positions=blocks.positions[vertices],
+        normals=blocks.normals[vertices],
+        colours=blocks.colours[vertices],
+        triangles=blocks.triangles[np.repeat(chosen, blocks.triangle_counts)],
+    )
+
+
+def _bounds(counts: I32) -> list[int]:
+    return [0, *np.cumsum(counts).tolist()]
+
+
+def _same(held: MeshBlocks, blocks: MeshBlocks, at: slice, face: slice) -> bool:
+    return (
+        np.array_equal(held.triangles, blocks.triangles[face])
+        and np.array_equal(held.edges, blocks.edges[at])
+        and np.array_equal(held.positions, blocks.positions[at])
+        and np.array_equal(held.normals, blocks.normals[at])
+        and np.array_equal(held.colours, blocks.colours[at])
+    )
+
+
+def _joined(parts: list[MeshBlocks]) -> MeshBlocks:
+    if not parts:
+        return no_blocks()
+    return MeshBlocks(
+        keys=np.concatenate([p.keys for p in parts]),
+        vertex_counts=np.concatenate([p.vertex_counts for p in parts]),
+        triangle_counts=np.concatenate([p.triangle_counts for p in parts]),
+        edges=np.concatenate([p.edges for p in parts]),
+        positions=np.concatenate([p.positions for p in parts]),
+        normals=np.concatenate([p.normals for p in parts]),
+        colours=np.concatenate([p.colours for p in parts]),
+        triangles=np.concatenate([p.triangles for p in parts]),
+    )

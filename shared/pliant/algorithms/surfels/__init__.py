@@ -1,0 +1,16 @@
+"""Surfels that move on their own, followed through the images of one camera (DSDT)."""
+
+from pliant.algorithms.surfels.joint import learn_equilibrium
+from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.tracker import SurfelTracker
+from pliant.algorithms.surfels.warm_up import warm_up
+
+__all__ = [
+    "SurfelFrame",
+    "SurfelParameters",
+    "SurfelState",
+    "SurfelTracker",
+    "learn_equilibrium",
+    "warm_up",
+]

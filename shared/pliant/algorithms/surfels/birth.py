@@ -1,0 +1,171 @@
+"""New surfels from an image and its depth (DSDT, section III)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I64, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.surfels.align import Templates
+from pliant.algorithms.surfels.corners import find_corners
+from pliant.algorithms.surfels.motion import identity_poses
+from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.sampling import (
+    INVALID,
+    A,
+    B,
+    Grid,
+    Level,
+    X,
+    homography,
+    make_grid,
+    sample_patch,
+)
+from pliant.algorithms.surfels.sums import FEATURES, TEMPLATE_IMAGES, frame_sums, make_features
+from pliant.algorithms.surfels.tangent import fit_inverse_depth, tangent_jacobian
+
+_FAR = 0.5 * INVALID
+_MIN_VARIANCE = 4.0  # DN^2: a patch with less contrast is noise
+
+
+@dataclass(frozen=True)
+class Births:
+    """N new surfels in the camera frame."""
+
+    poses: F64  # (N, POSE_FLOATS)
+    templates: list[Templates]  # one for each level
+
+
+def find_births(
+    pyramid: list[Level],
+    depth: F64,
+    camera: PinholeCamera,
+    parameters: SurfelParameters,
+    occupied: F64,
+    count: int,
+) -> Births:
+    """At most ``count`` surfels where there is texture, depth and room.
+
+    pyramid: of the image.  depth: (H, W) metres, 0 or NaN for holes.  occupied: (M, 2) pixels near
+    which nothing may be born.
+    """
+    p, level = parameters, pyramid[0]
+    image = level.pixels.reshape(level.height, level.width)
+    allowed = _allowed(depth, image, occupied, p)
+    corners = find_corners(
+        image,
+        allowed,
+        window=p.corner_window_px,
+        threshold=p.min_strength,
+        radius=p.spacing_px,
+        margin=p.patch_px // 2 + 1,
+    )
+    poses = place(corners[:, :2], depth, camera, p)
+    templates = [
+        make_templates(poses, each, p.patch_px, p.highlight, p.min_template) for each in pyramid
+    ]
+    rows = np.flatnonzero(templates[0].usable)[: max(count, 0)]
+    return Births(poses[rows], [select(each, rows) for each in templates])
+
+
+def _allowed(depth: F64, image: F32, occupied: F64, p: SurfelParameters) -> U8:
+    allowed = ((depth > 0.0) & (image <= p.highlight)).astype(np.uint8)
+    height, width = depth.shape
+    radius = p.spacing_px
+    for column, row in np.rint(occupied).astype(np.int64):
+        top, left = max(row - radius, 0), max(column - radius, 0)
+        if row + radius >= 0 and column + radius >= 0 and top < height and left < width:
+            allowed[top : row + radius + 1, left : column + radius + 1] = 0
+    return allowed
+
+
+def place(points_px: F64, depth: F64, camera: PinholeCamera, p: SurfelParameters) -> F64:
+    """(M, POSE_FLOATS) surfels at those of (N, 2) pixels that have a surface (Eq. 3 and 4)."""
+    radius = p.tangent_px // 2
+    fits, supported = np.zeros((len(points_px), 4)), np.zeros(len(points_px), np.bool_)
+    for k, (column, row) in enumerate(points_px):
+        share = fit_inverse_depth(depth, column, row, radius, p.depth_jump, p.depth_noise, fits[k])
+        supported[k] = share >= p.min_depth_share and fits[k, 3] <= p.max_depth_residual
+    fits, points = fits[supported], points_px[supported]
+    rays = camera.normalise(points)
+    z = 1.0 / fits[:, 0]
+    # dz/du = -z^2 d(1/z)/du, and a pixel is 1/f of a normalised coordinate.
+    dz_dx, dz_dy = -(z**2) * fits[:, 1] * camera.fx, -(z**2) * fits[:, 2] * camera.fy
+    facing = (z - rays[:, 0] * dz_dx - rays[:, 1] * dz_dy) > 0.0
+    slope = np.hypot(dz_dx, dz_dy) / z
+    good = facing & (slope <= p.max_slope) & np.isfinite(z)
+    rays, z, dz_dx, dz_dy = rays[good], z[good], dz_dx[good], dz_dy[good]
+    poses = identity_poses(len(z))
+    poses[:, X : X + 2], poses[:, X + 2] = rays * z[:, None], z
+    tangents = tangent_jacobian(rays[:, 0], rays[:, 1], z, dz_dx, dz_dy)
+    poses[:, A : A + 3], poses[:, B : B + 3] = tangents[:, :, 0], tangents[:, :, 1]
+    return poses
+
+
+def make_templates(
+    poses: F64, level: Level, side: int, highlight: float, min_share: float
+) -> Templates:
+    """Textures on the surfels' own grids at one level, and their derivatives along the grid."""
+    n = len(poses)
+    templates = Templates(
+        np.zeros((n, TEMPLATE_IMAGES, side * side), np.float32),
+        np.zeros(n),
+        np.zeros((n, FEATURES, FEATURES)),
+        np.zeros(n, np.uint8),
+    )
+    scratch = make_features(side)
+    _fill(poses, level, make_grid(side + 2), highlight, min_share, templates, scratch)
+    return templates
+
+
+@fast_kernel
+def _fill(
+    poses: F64, level: Level, wide: Grid, highlight: float, min_share: float,
+    templates: Templates, scratch: F32,
+) -> None:  # fmt: skip
+    h, sums = np.empty(9), np.empty(FEATURES)
+    side = wide.side - 2
+    for s in range(len(poses)):
+        if not homography(poses[s], level, h) or not sample_patch(h, level, wide, highlight):
+            continue
+        images = templates.images[s]
+        count, total, squares = 0, 0.0, 0.0
+        for row in range(side):
+            for column in range(side):
+                k, n = (row + 1) * wide.side + column + 1, row * side + column
+                v = wide.values[k]
+                vu = np.float32(0.5) * (wide.values[k + 1] - wide.values[k - 1])
+                vv = np.float32(0.5) * (wide.values[k + wide.side] - wide.values[k - wide.side])
+                images[0, n] = v
+                good = abs(vu) < _FAR * 0.5 and abs(vv) < _FAR * 0.5 and v < _FAR
+                images[1, n] = vu if good else np.float32(0.0)
+                images[2, n] = vv if good else np.float32(0.0)
+                if v < _FAR:
+                    count, total, squares = count + 1, total + v, squares + v * v
+        if count < min_share * side * side:
+            continue
+        mean = total / count
+        templates.means[s] = mean
+        # A sample that the template lacks is saturated in every frame.
+        for n in range(side * side):
+            if images[0, n] < _FAR:
+                images[0, n] -= np.float32(mean)
+        frame_sums(images, wide, mean, 1.0, 0.0, 1.0, scratch, templates.matrices[s], sums)
+        templates.usable[s] = 1 if squares / count - mean * mean > _MIN_VARIANCE else 0
+
+
+def select(templates: Templates, rows: I64) -> Templates:
+    """The templates of some surfels, copied."""
+    t = templates
+    return Templates(t.images[rows], t.means[rows], t.matrices[rows], t.usable[rows])
+
+
+def join(first: Templates, second: Templates) -> Templates:
+    """The templates of two groups of surfels, one after the other."""
+    return Templates(
+        np.concatenate([first.images, second.images]),
+        np.concatenate([first.means, second.means]),
+        np.concatenate([first.matrices, second.matrices]),
+        np.concatenate([first.usable, second.usable]),
+    )

@@ -1,0 +1,176 @@
+"""Camera and surfels together, one level of the pyramid at a time (DSDT, section V)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, U8, BoolArray
+from pliant.algorithms.geometry import hat, so3_exp, transform
+from pliant.algorithms.surfels import joint_kernels as kernels
+from pliant.algorithms.surfels.align import Limits, Templates, Workspace
+from pliant.algorithms.surfels.motion import MOST_PARAMETERS
+from pliant.algorithms.surfels.sampling import BIAS, GAIN, Level
+from pliant.algorithms.surfels.sums import FEATURES
+from pliant.algorithms.surfels.table import move_poses
+
+_STILL_SHARE = 0.02
+"""A level is done when no more than this share of the surfels still moves."""
+_RIDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """Where N surfels rest and how far they may stray (Eq. 20)."""
+
+    positions: F64  # (N, 3) metres, world
+    weights: F64  # (N, 3, 3) omega_E Sigma^-1, world axes, DN^2 / m^2
+
+    def seen_from(self, T_camera_world: F64) -> tuple[F64, F64]:
+        """Positions and weights in the axes of a camera."""
+        R = T_camera_world[:3, :3]
+        turned = np.ascontiguousarray(R @ self.weights @ R.T)
+        return np.ascontiguousarray(transform(T_camera_world, self.positions)), turned
+
+
+def se3_exp(zeta: F64) -> F64:
+    """(4, 4) motion of a (6,) twist (rho, phi), Eq. 22."""
+    T = np.eye(4)
+    rho, phi = zeta[:3], zeta[3:]
+    angle = float(np.linalg.norm(phi))
+    T[:3, :3] = so3_exp(phi)
+    W = hat(phi)
+    small = angle < 1e-4
+    b = 0.5 if small else (1.0 - np.cos(angle)) / angle**2
+    c = 1.0 / 6.0 if small else (angle - np.sin(angle)) / angle**3
+    T[:3, 3] = rho + b * (W @ rho) + c * (W @ W @ rho)
+    return T
+
+
+class _Sums:
+    """Costs and sums of N surfels at their present poses."""
+
+    def __init__(self, count: int) -> None:
+        self.costs = np.zeros(count)
+        self.sums = np.zeros((count, FEATURES))
+        self.matrices = np.zeros((count, FEATURES, FEATURES))
+
+
+def align_rigid(
+    poses: F64, active: U8, T_camera_world: F64, level: Level, templates: Templates,
+    limits: Limits, work: Workspace,
+) -> F64:  # fmt: skip
+    """Move the camera alone: all surfels stand still in the world.
+
+    poses: (N, POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
+    """
+    now = _Sums(len(poses))
+    usable = active.copy()
+    kernels.evaluate_all(
+        poses, usable, level, templates, limits, work, now.costs, now.sums, now.matrices
+    )
+    light = np.zeros((len(poses), 2, 7))
+    M, v = np.zeros((6, 6)), np.zeros(6)
+    damping, accepted = limits.start_lambda, 0
+    for _ in range(limits.iterations):
+        rows: BoolArray = usable > 0
+        if not rows.any():
+            break
+        kernels.rigid_system(
+            poses, usable, level, limits, work, now.sums, now.matrices, light, M, v
+        )
+        bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
+        zeta = _solve(M, v, bound)
+        motion = se3_exp(zeta)
+        moved = move_poses(poses, motion)
+        moved[:, GAIN] = np.maximum(moved[:, GAIN] + light[:, 0] @ np.r_[1.0, zeta], 0.05)
+        moved[:, BIAS] += light[:, 1] @ np.r_[1.0, zeta]
+        after, still_usable = _Sums(len(poses)), usable.copy()
+        kernels.evaluate_all(
+            moved, still_usable, level, templates, limits, work,
+            after.costs, after.sums, after.matrices,
+        )  # fmt: skip
+        both: BoolArray = still_usable > 0
+        if 2 * np.count_nonzero(both) > np.count_nonzero(rows) and (
+            after.costs[both].sum() < now.costs[both].sum() * (1.0 + limits.slack)
+        ):
+            poses[:] = np.where(active[:, None] > 0, moved, move_poses(poses, motion))
+            T_camera_world = motion @ T_camera_world
+            now, usable, accepted = after, still_usable, accepted + 1
+            damping = bound / limits.lambda_down
+        else:
+            damping = bound * limits.lambda_up
+        # The step of a point at the depth of the scene, in pixels.
+        depth = float(np.median(poses[rows, 2]))
+        moved_px = level.fx * (np.abs(zeta[:3]).max() / depth + np.abs(zeta[3:]).max())
+        if moved_px * (1.0 + bound) < limits.min_step_px:
+            break
+    return T_camera_world
+
+
+def align_jointly(
+    poses: F64, active: U8, T_camera_world: F64, equilibrium: Equilibrium, level: Level,
+    templates: Templates, limits: Limits, work: Workspace,
+) -> F64:  # fmt: skip
+    """Minimise Eq. 21 from the present poses and camera, both of which are updated.
+
+    poses: (N, POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
+    """
+    n = len(poses)
+    now, usable = _Sums(n), active.copy()
+    kernels.evaluate_all(
+        poses, usable, level, templates, limits, work, now.costs, now.sums, now.matrices
+    )
+    own, follow = np.zeros((n, MOST_PARAMETERS)), np.zeros((n, MOST_PARAMETERS, 6))
+    M, v = np.zeros((6, 6)), np.zeros(6)
+    damping = np.full(n, limits.start_lambda)
+    for iteration in range(limits.iterations):
+        if not usable.any():
+            break
+        if iteration < limits.damped_steps:
+            damping = np.maximum(damping, limits.first_lambda)
+        points, weights = equilibrium.seen_from(T_camera_world)
+        kernels.joint_system(
+            poses, usable, level, limits, work, now.sums, now.matrices, points, weights,
+            damping, own, follow, M, v,
+        )  # fmt: skip
+        zeta = _solve(M, v, 0.0)
+        T_camera_world = se3_exp(zeta) @ T_camera_world
+        points, weights = equilibrium.seen_from(T_camera_world)
+        steps = own + follow @ zeta
+        moving = kernels.step_all(
+            poses, usable, level, templates, limits, work, steps, points, weights, damping,
+            now.costs, now.sums, now.matrices,
+        )  # fmt: skip
+        if moving <= _STILL_SHARE * usable.sum():
+            break
+    return T_camera_world
+
+
+def _solve(M: F64, v: F64, damping: float) -> F64:
+    """Damped step, scaled by the diagonal (Eq. 14-15); zero where nothing is known."""
+    diagonal: F64 = np.diag(M) * (1.0 + damping)
+    finite = np.isfinite(M).all() and np.isfinite(v).all()
+    if not finite or not bool(np.min(diagonal) > 0.0):
+        return np.zeros(6)
+    scale: F64 = np.sqrt(1.0 / diagonal)
+    scaled = M * scale[:, None] * scale[None, :]
+    np.fill_diagonal(scaled, 1.0 + _RIDGE)
+    return scale * np.linalg.solve(scaled, scale * v)
+
+
+def learn_equilibrium(trajectories: F64, min_sigma_m: float) -> tuple[F64, F64]:
+    """Mean and covariance of points whose trajectory is known in advance (section V).
+
+    trajectories: (T, N, 3) metres, world, NaN where a point was not seen; each point is seen at
+    least once.  min_sigma_m: no direction is held tighter.  Returns (N, 3) and (N, 3, 3).  Raises
+    ValueError for a point that was never seen.
+    """
+    seen = np.asarray(np.isfinite(trajectories).all(axis=2), np.bool_)
+    counts = seen.sum(axis=0)
+    if (counts == 0).any():
+        raise ValueError(f"point {int(np.argmin(counts))} of the trajectories was never seen")
+    filled = np.where(seen[:, :, None], trajectories, 0.0)
+    mean = filled.sum(axis=0) / counts[:, None]
+    offset = np.where(seen[:, :, None], trajectories - mean, 0.0)
+    covariance = np.einsum("tni,tnj->nij", offset, offset) / counts[:, None, None]
+    return mean, covariance + min_sigma_m**2 * np.eye(3)

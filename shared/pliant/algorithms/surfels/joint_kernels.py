@@ -1,0 +1,228 @@
+"""Normal equations of camera and surfels together (DSDT, section V).
+
+Everything is in the camera's frame.  What an image sees of surfel i is its motion p relative to
+the camera alone (the floating map ambiguity, Eq. 16-19).  So p is the unknown, and the camera's
+step zeta = (rho, phi) of Eq. 22 enters only through the equilibrium of Eq. 20: its distance is
+
+    X_i - T_cw X_i^0  ->  e + p_t - G zeta,     G = [I, -[T_cw X_i^0]x].
+
+Each surfel's p is eliminated from its own 8x8 block, which leaves a 6x6 system for zeta.  A rigid
+scene has p = Ad zeta instead, with the adjoint of the surfel's own position.
+"""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.surfels import motion
+from pliant.algorithms.surfels.align import Limits, Templates, Workspace, evaluate, patch_step_px
+from pliant.algorithms.surfels.damped import factorise, solve
+from pliant.algorithms.surfels.sampling import GAIN, POSE_FLOATS, Level, X, homography
+
+_MIN_GAIN = 0.05
+
+
+@fast_kernel
+def evaluate_all(
+    poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
+    costs: F64, sums: F64, matrices: F64,
+) -> None:  # fmt: skip
+    """Photometric cost (N,), sums (N, FEATURES) and matrix (N, FEATURES, FEATURES) of surfels.
+
+    Surfels that are not in front of the camera, or have no template here, become inactive.
+    """
+    for s in range(len(poses)):
+        if not active[s]:
+            continue
+        if not templates.usable[s]:
+            active[s] = 0
+            continue
+        if limits.by_template:
+            matrices[s] = templates.matrices[s]
+        cost, _ = evaluate(
+            poses[s], level, templates.images[s], templates.means[s], limits, work,
+            sums[s], matrices[s],
+        )  # fmt: skip
+        if cost < 0.0:
+            active[s] = 0
+        else:
+            costs[s] = cost
+
+
+@fast_kernel
+def rigid_system(
+    poses: F64, active: U8, level: Level, limits: Limits, work: Workspace, sums: F64,
+    matrices: F64, light: F64, M: F64, v: F64,
+) -> None:  # fmt: skip
+    """Add up M zeta = v of a rigid scene.  light: (N, 2, 7): gain and bias from (1, zeta)."""
+    n = 8
+    A, Q = np.zeros((6, 6)), np.zeros((6, 6))
+    q = np.zeros(6)
+    M[:] = 0.0
+    v[:] = 0.0
+    for s in range(len(poses)):
+        if not active[s]:
+            continue
+        motion.mixing(poses[s], level, motion.ISOMETRIC, limits.by_template, work.mix)
+        motion.normal_equations(matrices[s], sums[s], work.mix, n, work.product, work.H, work.g)
+        H, g = work.H, work.g
+        # Gain and bias, the last two, are eliminated from the surfel's block.
+        det = H[6, 6] * H[7, 7] - H[6, 7] * H[7, 6]
+        if not det > 1e-6 * H[6, 6] * H[7, 7]:
+            light[s] = 0.0
+            continue
+        i00, i01, i11 = H[7, 7] / det, -H[6, 7] / det, H[6, 6] / det
+        b0, b1 = i00 * g[6] + i01 * g[7], i01 * g[6] + i11 * g[7]
+        _adjoint(poses[s], A)
+        for r in range(6):
+            q[r] = g[r] - H[r, 6] * b0 - H[r, 7] * b1
+            for c in range(6):
+                w0 = i00 * H[6, c] + i01 * H[7, c]
+                w1 = i01 * H[6, c] + i11 * H[7, c]
+                Q[r, c] = H[r, c] - H[r, 6] * w0 - H[r, 7] * w1
+        light[s, 0, 0], light[s, 1, 0] = -b0, -b1
+        for c in range(6):
+            l0 = l1 = 0.0
+            for k in range(6):
+                l0 -= (i00 * H[6, k] + i01 * H[7, k]) * A[k, c]
+                l1 -= (i01 * H[6, k] + i11 * H[7, k]) * A[k, c]
+            light[s, 0, 1 + c], light[s, 1, 1 + c] = l0, l1
+        for r in range(6):
+            for k in range(6):
+                v[r] -= A[k, r] * q[k]
+            for c in range(6):
+                total = 0.0
+                for k in range(6):
+                    for m in range(6):
+                        total += A[k, r] * Q[k, m] * A[m, c]
+                M[r, c] += total
+
+
+@fast_kernel
+def _adjoint(pose: F64, A: F64) -> None:
+    """Step of a surfel that stands still in the world: (rho + phi x X, phi)."""
+    x, y, z = pose[X], pose[X + 1], pose[X + 2]
+    A[:] = 0.0
+    for k in range(6):
+        A[k, k] = 1.0
+    A[0, 4], A[0, 5] = z, -y
+    A[1, 3], A[1, 5] = -z, x
+    A[2, 3], A[2, 4] = y, -x
+
+
+@fast_kernel
+def joint_system(
+    poses: F64, active: U8, level: Level, limits: Limits, work: Workspace, sums: F64,
+    matrices: F64, equilibrium: F64, weights: F64, damping: F64, own: F64, follow: F64,
+    M: F64, v: F64,
+) -> None:  # fmt: skip
+    """Add up M zeta = v with every surfel eliminated.
+
+    equilibrium: (N, 3) T_cw X^0.  weights: (N, 3, 3) omega_E Sigma^-1, camera axes.  damping: (N,)
+    lambda.  own: (N, P) and follow: (N, P, 6) receive the surfels' steps own + follow zeta.
+    """
+    n = motion.parameter_count(limits.model)
+    G, WG = np.zeros((3, 6)), np.zeros((3, 6))
+    e, we = np.zeros(3), np.zeros(3)
+    rhs = np.zeros(motion.MOST_PARAMETERS)
+    M[:] = 0.0
+    v[:] = 0.0
+    for s in range(len(poses)):
+        own[s] = 0.0
+        follow[s] = 0.0
+        if not active[s]:
+            continue
+        W = weights[s]
+        motion.mixing(poses[s], level, limits.model, limits.by_template, work.mix)
+        motion.normal_equations(matrices[s], sums[s], work.mix, n, work.product, work.H, work.g)
+        motion.add_deformation_energy(poses[s], limits.model, limits.omega_i, work.H, work.g)
+        _equilibrium_rows(equilibrium[s], G)
+        for r in range(3):
+            e[r] = poses[s, X + r] - equilibrium[s, r]
+        for r in range(3):
+            we[r] = W[r, 0] * e[0] + W[r, 1] * e[1] + W[r, 2] * e[2]
+            for c in range(6):
+                WG[r, c] = W[r, 0] * G[0, c] + W[r, 1] * G[1, c] + W[r, 2] * G[2, c]
+            for c in range(3):
+                work.H[r, c] += W[r, c]
+        if not factorise(work.H, n, n - 2, damping[s], work.L, work.scale):
+            continue
+        for k in range(n):
+            rhs[k] = work.g[k] + (we[k] if k < 3 else 0.0)
+        solve(work.L, work.scale, n, rhs, own[s])
+        for c in range(6):
+            for k in range(n):
+                rhs[k] = -WG[k, c] if k < 3 else 0.0
+            solve(work.L, work.scale, n, rhs, work.step)
+            for k in range(n):
+                follow[s, k, c] = work.step[k]
+        for r in range(6):
+            for k in range(3):
+                v[r] += G[k, r] * we[k] + WG[k, r] * own[s, k]
+            for c in range(6):
+                for k in range(3):
+                    M[r, c] += G[k, r] * WG[k, c] - WG[k, r] * follow[s, k, c]
+
+
+@fast_kernel
+def _equilibrium_rows(x: F64, G: F64) -> None:
+    """[I, -[x]x]: how a point of the world moves in the camera's frame under a step of T_cw."""
+    G[:] = 0.0
+    G[0, 0] = G[1, 1] = G[2, 2] = 1.0
+    G[0, 4], G[0, 5] = x[2], -x[1]
+    G[1, 3], G[1, 5] = -x[2], x[0]
+    G[2, 3], G[2, 4] = x[1], -x[0]
+
+
+@fast_kernel
+def equilibrium_cost(pose: F64, equilibrium: F64, W: F64) -> float:
+    """omega_E times Eq. 20."""
+    total = 0.0
+    for r in range(3):
+        for c in range(3):
+            er, ec = pose[X + r] - equilibrium[r], pose[X + c] - equilibrium[c]
+            total += er * W[r, c] * ec
+    return float(np.float64(total))
+
+
+@fast_kernel
+def step_all(
+    poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
+    steps: F64, equilibrium: F64, weights: F64, damping: F64, costs: F64, sums: F64, matrices: F64,
+) -> int:  # fmt: skip
+    """Take every surfel's step where it lowers its own cost under the new camera.
+
+    equilibrium, weights: those of the new camera.  Returns how many surfels still moved.
+    """
+    half = float(np.sqrt(np.float64(templates.images.shape[2])) // 2)
+    before = np.empty(9)
+    moving = 0
+    for s in range(len(poses)):
+        if not active[s]:
+            continue
+        candidate = work.pose
+        motion.apply_step(poses[s], steps[s], limits.model, candidate)
+        candidate[GAIN] = max(candidate[GAIN], _MIN_GAIN)
+        if limits.by_template:
+            work.next_matrix[:] = matrices[s]
+        if not homography(poses[s], level, before):
+            continue
+        cost, _ = evaluate(
+            candidate, level, templates.images[s], templates.means[s], limits, work,
+            work.next_sums, work.next_matrix,
+        )  # fmt: skip
+        new = cost + limits.omega_i * motion.deformation_energy(candidate)
+        new += equilibrium_cost(candidate, equilibrium[s], weights[s])
+        old = costs[s] + limits.omega_i * motion.deformation_energy(poses[s])
+        old += equilibrium_cost(poses[s], equilibrium[s], weights[s])
+        if cost >= 0.0 and new < old * (1.0 + limits.slack):
+            if patch_step_px(before, work.h, half) * (1.0 + damping[s]) > limits.min_step_px:
+                moving += 1
+            poses[s, :POSE_FLOATS] = candidate
+            costs[s] = cost
+            sums[s] = work.next_sums
+            matrices[s] = work.next_matrix
+            damping[s] /= limits.lambda_down
+        else:
+            damping[s] *= limits.lambda_up
+    return moving

@@ -1,0 +1,200 @@
+"""What a surfel may do (DSDT, Eq. 6 and Table I), and how its patch follows.
+
+The parameters of a step are: translation of the centre (3, metres), rotation about it (3, rad,
+applied from the left), those of F (Table I), gain and bias.  All in the camera frame.
+
+Table I prints the equiareal tensor as [[alpha, beta], [beta, (1 + beta) / alpha]].  Area is kept
+when det F = 1, that is alpha f22 - beta^2 = 1, hence f22 = (1 + beta^2) / alpha, which is used
+here: the printed entry has lost its square.
+"""
+
+import math
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.surfels.sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, Level, X
+from pliant.algorithms.surfels.sums import FEATURES
+
+ISOMETRIC, CONFORMAL, EQUIAREAL, GENERAL = 0, 1, 2, 3
+MODELS = ("isometric", "conformal", "equiareal", "general")
+"""Columns of Table I."""
+
+RIGID = 6
+MOST_PARAMETERS = RIGID + 3 + 2
+
+_MIN_STRETCH, _MAX_STRETCH = 0.2, 5.0
+
+
+@fast_kernel
+def parameter_count(model: int) -> int:
+    """Parameters of a step: 6, those of F, gain and bias."""
+    return RIGID + model + 2
+
+
+@fast_kernel
+def deformation_directions(model: int, pose: F64, k: int) -> tuple[float, float, float]:
+    """Derivative of (f11, f12, f22) with respect to the k-th parameter of F."""
+    if model == CONFORMAL:
+        return 1.0, 0.0, 1.0
+    if model == EQUIAREAL:
+        alpha, beta = pose[F], pose[F + 1]
+        if k == 0:
+            return 1.0, 0.0, -(1.0 + beta * beta) / (alpha * alpha)
+        return 0.0, 1.0, 2.0 * beta / alpha
+    return (1.0, 0.0, 0.0) if k == 0 else ((0.0, 1.0, 0.0) if k == 1 else (0.0, 0.0, 1.0))
+
+
+@fast_kernel
+def mixing(pose: F64, level: Level, model: int, by_template: bool, out: F64) -> None:
+    """The (FEATURES, parameters) matrix that mixes the sums' features into Jacobian rows.
+
+    A displacement dX of the point X + i a + j b moves the patch along its grid by (w1, w2), where
+    dX = w1 a + w2 b + s (X + i a + j b): along the ray nothing changes.  With the rows n1, n2, n3
+    of [a b X]^-1 that is w1 = n1 dX - i n3 dX and w2 = n2 dX - j n3 dX.
+    """
+    su, sv = level.step_u, level.step_v
+    f11, f12, f22 = pose[F], pose[F + 1], pose[F + 2]
+    a0, a1, a2 = pose[A], pose[A + 1], pose[A + 2]
+    b0, b1, b2 = pose[B], pose[B + 1], pose[B + 2]
+    g0, g1, g2 = su * (f11 * a0 + f12 * b0), su * (f11 * a1 + f12 * b1), su * (f11 * a2 + f12 * b2)
+    h0, h1, h2 = sv * (f12 * a0 + f22 * b0), sv * (f12 * a1 + f22 * b1), sv * (f12 * a2 + f22 * b2)
+    x0, x1, x2 = pose[X], pose[X + 1], pose[X + 2]
+    c0, c1, c2 = g1 * h2 - g2 * h1, g2 * h0 - g0 * h2, g0 * h1 - g1 * h0
+    scale = 1.0 / (c0 * x0 + c1 * x1 + c2 * x2)
+    n = (
+        (scale * (h1 * x2 - h2 * x1), scale * (h2 * x0 - h0 * x2), scale * (h0 * x1 - h1 * x0)),
+        (scale * (x1 * g2 - x2 * g1), scale * (x2 * g0 - x0 * g2), scale * (x0 * g1 - x1 * g0)),
+        (scale * c0, scale * c1, scale * c2),
+    )
+    parameters = parameter_count(model)
+    out[:, :parameters] = 0.0
+    for k in range(3):
+        out[0, k], out[1, k], out[2, k], out[5, k] = n[0][k], n[1][k], -n[2][k], -n[2][k]
+    _turn(out, 3, n, (0.0, -g2, g1), (0.0, -h2, h1))
+    _turn(out, 4, n, (g2, 0.0, -g0), (h2, 0.0, -h0))
+    _turn(out, 5, n, (-g1, g0, 0.0), (-h1, h0, 0.0))
+    for k in range(model):
+        d11, d12, d22 = deformation_directions(model, pose, k)
+        _turn(
+            out, RIGID + k, n,
+            (su * (d11 * a0 + d12 * b0), su * (d11 * a1 + d12 * b1), su * (d11 * a2 + d12 * b2)),
+            (sv * (d12 * a0 + d22 * b0), sv * (d12 * a1 + d22 * b1), sv * (d12 * a2 + d22 * b2)),
+        )  # fmt: skip
+    gain = parameters - 2
+    if by_template:
+        # The feature is the template; the residual's derivative is the frame, (T - bias) / gain.
+        out[8, gain], out[9, gain] = 1.0 / pose[GAIN], -pose[BIAS] / pose[GAIN]
+    else:
+        out[8, gain] = 1.0
+    out[9, gain + 1] = 1.0
+
+
+@fast_kernel
+def _turn(
+    out: F64,
+    column: int,
+    n: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]],
+    a: tuple[float, float, float],
+    b: tuple[float, float, float],
+) -> None:
+    """Column of a motion dX = i a + j b, which leaves the centre where it is."""
+    out[2, column] = n[0][0] * a[0] + n[0][1] * a[1] + n[0][2] * a[2]
+    out[3, column] = n[0][0] * b[0] + n[0][1] * b[1] + n[0][2] * b[2]
+    out[4, column] = n[1][0] * a[0] + n[1][1] * a[1] + n[1][2] * a[2]
+    out[5, column] = n[1][0] * b[0] + n[1][1] * b[1] + n[1][2] * b[2]
+    out[6, column] = -(n[2][0] * a[0] + n[2][1] * a[1] + n[2][2] * a[2])
+    out[7, column] = -(n[2][0] * b[0] + n[2][1] * b[1] + n[2][2] * b[2])
+
+
+@fast_kernel
+def normal_equations(
+    matrix: F64, sums: F64, mix: F64, parameters: int, scratch: F64, H: F64, g: F64
+) -> None:
+    """H = mix' matrix mix and g = mix' sums, both of the photometric cost alone.
+
+    scratch: (FEATURES, MOST_PARAMETERS).
+    """
+    for row in range(FEATURES):
+        for column in range(parameters):
+            total = 0.0
+            for k in range(FEATURES):
+                total += matrix[row, k] * mix[k, column]
+            scratch[row, column] = total
+    for row in range(parameters):
+        total = 0.0
+        for k in range(FEATURES):
+            total += mix[k, row] * sums[k]
+        g[row] = total
+        for column in range(row + 1):
+            total = 0.0
+            for k in range(FEATURES):
+                total += mix[k, row] * scratch[k, column]
+            H[row, column] = H[column, row] = total
+
+
+@fast_kernel
+def apply_step(pose: F64, step: F64, model: int, out: F64) -> None:
+    """Eq. 6: move, turn and deform a surfel.  pose, out: (POSE_FLOATS,)."""
+    out[:POSE_FLOATS] = pose[:POSE_FLOATS]
+    for k in range(3):
+        out[X + k] += step[k]
+    _rotate(out, A, step[3], step[4], step[5])
+    _rotate(out, B, step[3], step[4], step[5])
+    if model == CONFORMAL:
+        s = min(max(pose[F] + step[RIGID], _MIN_STRETCH), _MAX_STRETCH)
+        out[F], out[F + 1], out[F + 2] = s, 0.0, s
+    elif model == EQUIAREAL:
+        alpha = min(max(pose[F] + step[RIGID], _MIN_STRETCH), _MAX_STRETCH)
+        beta = pose[F + 1] + step[RIGID + 1]
+        out[F], out[F + 1], out[F + 2] = alpha, beta, (1.0 + beta * beta) / alpha
+    elif model == GENERAL:
+        for k in range(3):
+            out[F + k] += step[RIGID + k]
+        out[F] = min(max(out[F], _MIN_STRETCH), _MAX_STRETCH)
+        out[F + 2] = min(max(out[F + 2], _MIN_STRETCH), _MAX_STRETCH)
+    parameters = parameter_count(model)
+    out[GAIN] = pose[GAIN] + step[parameters - 2]
+    out[BIAS] = pose[BIAS] + step[parameters - 1]
+
+
+@fast_kernel
+def _rotate(pose: F64, start: int, wx: float, wy: float, wz: float) -> None:
+    """Turn one tangent by a rotation vector (Rodrigues)."""
+    x, y, z = pose[start], pose[start + 1], pose[start + 2]
+    squared = wx * wx + wy * wy + wz * wz
+    angle = math.sqrt(squared)
+    if angle < 1e-6:
+        s, c = 1.0 - squared / 6.0, 0.5 - squared / 24.0
+    else:
+        s, c = math.sin(angle) / angle, (1.0 - math.cos(angle)) / squared
+    ux, uy, uz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
+    pose[start] = x + s * ux + c * (wy * uz - wz * uy)
+    pose[start + 1] = y + s * uy + c * (wz * ux - wx * uz)
+    pose[start + 2] = z + s * uz + c * (wx * uy - wy * ux)
+
+
+@fast_kernel
+def deformation_energy(pose: F64) -> float:
+    """||F - I||^2 of Eq. 12, Frobenius: the off-diagonal element counts twice."""
+    return float((pose[F] - 1.0) ** 2 + 2.0 * pose[F + 1] ** 2 + (pose[F + 2] - 1.0) ** 2)
+
+
+@fast_kernel
+def add_deformation_energy(pose: F64, model: int, weight: float, H: F64, g: F64) -> None:
+    """Add omega_I ||F - I||^2 (Eq. 13) to the normal equations."""
+    e11, e12, e22 = pose[F] - 1.0, pose[F + 1], pose[F + 2] - 1.0
+    for k in range(model):
+        p11, p12, p22 = deformation_directions(model, pose, k)
+        g[RIGID + k] += weight * (p11 * e11 + 2.0 * p12 * e12 + p22 * e22)
+        for m in range(model):
+            q11, q12, q22 = deformation_directions(model, pose, m)
+            H[RIGID + k, RIGID + m] += weight * (p11 * q11 + 2.0 * p12 * q12 + p22 * q22)
+
+
+def identity_poses(count: int) -> F64:
+    """(count, POSE_FLOATS) rows with F = I, gain 1, everything else 0."""
+    poses = np.zeros((count, POSE_FLOATS))
+    poses[:, F] = poses[:, F + 2] = poses[:, GAIN] = 1.0
+    return poses

@@ -1,0 +1,74 @@
+"""The pyramid of a frame, level 0 being the image itself, as kernels read it."""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.surfels.sampling import Level
+from pliant.algorithms.tracking.pyramid import halve
+
+
+@fast_kernel
+def smooth(image: U8) -> F32:
+    """Binomial 3x3 blur of (H, W) grey levels.
+
+    Interpolation between pixels blurs as well, by as much as it is off the pixel centres.  Where
+    the noise is already smooth that changes little; on a raw image the cost would have its dips
+    where samples fall between pixels, and not where the texture fits.
+    """
+    height, width = image.shape
+    out = np.empty((height, width), np.float32)
+    rows = np.empty(width, np.float32)
+    quarter, half = np.float32(0.25), np.float32(0.5)
+    for y in range(height):
+        above, here = image[max(y - 1, 0)], image[y]
+        below = image[min(y + 1, height - 1)]
+        for x in range(width):
+            rows[x] = (
+                quarter * np.float32(above[x])
+                + half * np.float32(here[x])
+                + quarter * np.float32(below[x])
+            )
+        target = out[y]
+        for x in range(1, width - 1):
+            target[x] = quarter * rows[x - 1] + half * rows[x] + quarter * rows[x + 1]
+        target[0] = np.float32(0.75) * rows[0] + quarter * rows[min(1, width - 1)]
+        target[width - 1] = np.float32(0.75) * rows[width - 1] + quarter * rows[max(width - 2, 0)]
+    return out
+
+
+def make_pyramid(image: U8, camera: PinholeCamera, levels: int) -> list[Level]:
+    """``levels`` levels, each half the size of the one before.
+
+    image: (H, W) uint8.  Half scale: ``u' = (u + 0.5) / 2 - 0.5``.  Patches have one pixel between
+    samples at every level, so that a patch of the coarsest level covers most of the scene.
+    """
+    out: list[Level] = []
+    pixels = smooth(image)
+    for level in range(levels):
+        scale = float(2**level)
+        fx, fy = camera.fx / scale, camera.fy / scale
+        out.append(
+            Level(
+                pixels.ravel(),
+                pixels.shape[1],
+                pixels.shape[0],
+                fx,
+                fy,
+                (camera.cx + 0.5) / scale - 0.5,
+                (camera.cy + 0.5) / scale - 0.5,
+                1.0 / fx,
+                1.0 / fy,
+            )
+        )
+        pixels = halve(pixels)
+    return out
+
+
+def usable_levels(width: int, height: int, side: int, wanted: int) -> int:
+    """How many levels an image is large enough for: two patches must fit into the coarsest."""
+    levels = 1
+    while levels < wanted and min(width, height) >> levels >= 2 * side:
+        levels += 1
+    return levels

@@ -1,0 +1,129 @@
+"""Position and tangents of a surfel from a depth map (DSDT, Eq. 3 and 4).
+
+A plane has an inverse depth that is affine in the image.  That affine is fitted robustly to the
+pixels around the point, so that noise is averaged, holes are left out, and what lies beyond an
+edge in depth does not bend the tangent.
+"""
+
+import math
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.kernel import fast_kernel
+
+_REWEIGHTINGS = 4
+_TUKEY = 4.685  # 95 % efficiency for Gaussian noise
+_MAD = 1.4826
+
+
+@fast_kernel
+def fit_inverse_depth(
+    depth: F64, column: float, row: float, radius: int, jump: float, noise: float, out: F64
+) -> float:
+    """Fit 1/z = q + p (column' - column) + r (row' - row) around one point.
+
+    depth: (H, W) metres, 0 or NaN for holes.  radius: of the square window, px.  jump: depths that
+    differ by more than this share from the nearest valid one are another surface.  noise: relative
+    depth noise that no fit is expected to get below.  out: (4,) receives q, p, r and the rms of the
+    fit relative to q.  Returns the share of the window that supports the fit, 0 when there is none.
+    """
+    height, width = depth.shape
+    c0, r0 = math.floor(column + 0.5), math.floor(row + 0.5)
+    start = _nearest_depth(depth, c0, r0, min(radius, 3))
+    if start <= 0.0:
+        return 0.0
+    size = 2 * radius + 1
+    xs, ys, qs = np.empty(size * size), np.empty(size * size), np.empty(size * size)
+    count = 0
+    for y in range(max(r0 - radius, 0), min(r0 + radius + 1, height)):
+        for x in range(max(c0 - radius, 0), min(c0 + radius + 1, width)):
+            z = depth[y, x]
+            if z > 0.0 and abs(z - start) < jump * start:
+                xs[count], ys[count], qs[count] = x - column, y - row, 1.0 / z
+                count += 1
+    if count < max(6, size):
+        return 0.0
+    q0 = 1.0 / start
+    scale = 1e9
+    residuals = np.empty(count)
+    a, b, c = q0, 0.0, 0.0
+    inliers, squares = 0, 0.0
+    for _ in range(_REWEIGHTINGS):
+        solved, a, b, c = _weighted_plane(xs, ys, qs, count, a, b, c, scale)
+        if not solved:
+            return 0.0
+        for k in range(count):
+            residuals[k] = abs(qs[k] - a - b * xs[k] - c * ys[k])
+        middle = np.partition(residuals, count // 2)[count // 2]
+        scale = _TUKEY * max(_MAD * middle, noise * q0)
+        inliers, squares = 0, 0.0
+        for k in range(count):
+            if residuals[k] < scale:
+                inliers += 1
+                squares += residuals[k] * residuals[k]
+    if not a > 0.0 or inliers == 0:
+        return 0.0
+    out[0], out[1], out[2] = a, b, c
+    out[3] = math.sqrt(squares / inliers) / a
+    return inliers / float(size * size)
+
+
+@fast_kernel
+def _nearest_depth(depth: F64, column: int, row: int, radius: int) -> float:
+    """The valid depth nearest to a pixel, 0 if there is none within ``radius``."""
+    height, width = depth.shape
+    best, found = 1 << 30, 0.0
+    for y in range(max(row - radius, 0), min(row + radius + 1, height)):
+        for x in range(max(column - radius, 0), min(column + radius + 1, width)):
+            distance = (x - column) ** 2 + (y - row) ** 2
+            if depth[y, x] > 0.0 and depth[y, x] < 1e6 and distance < best:
+                best, found = distance, depth[y, x]
+    return found
+
+
+@fast_kernel
+def _weighted_plane(
+    xs: F64, ys: F64, qs: F64, count: int, a: float, b: float, c: float, scale: float
+) -> tuple[bool, float, float, float]:
+    """Least squares plane with Tukey weights about the plane (a, b, c)."""
+    n = sx = sy = sxx = sxy = syy = sq = sxq = syq = 0.0
+    for k in range(count):
+        x, y, q = xs[k], ys[k], qs[k]
+        t = (q - a - b * x - c * y) / scale
+        if abs(t) >= 1.0:
+            continue
+        w = (1.0 - t * t) ** 2
+        n += w
+        sx += w * x
+        sy += w * y
+        sxx += w * x * x
+        sxy += w * x * y
+        syy += w * y * y
+        sq += w * q
+        sxq += w * x * q
+        syq += w * y * q
+    if n <= 0.0:
+        return False, a, b, c
+    mx, my, mq = sx / n, sy / n, sq / n
+    cxx, cxy, cyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+    cxq, cyq = sxq / n - mx * mq, syq / n - my * mq
+    det = cxx * cyy - cxy * cxy
+    if not det > 1e-3 * cxx * cyy or cxx <= 0.0 or cyy <= 0.0:
+        return False, a, b, c
+    slope_x = (cxq * cyy - cyq * cxy) / det
+    slope_y = (cyq * cxx - cxq * cxy) / det
+    return True, mq - slope_x * mx - slope_y * my, slope_x, slope_y
+
+
+def tangent_jacobian(x: F64, y: F64, z: F64, dz_dx: F64, dz_dy: F64) -> F64:
+    """Eq. 4: (N, 3, 2) tangents of surfaces z(x, y) over normalised coordinates.
+
+    x, y: (N,) normalised coordinates.  z: (N,) metres.  dz_dx, dz_dy: (N,) its derivatives.
+    """
+    rows = [
+        [z + x * dz_dx, x * dz_dy],
+        [y * dz_dx, z + y * dz_dy],
+        [dz_dx, dz_dy],
+    ]
+    return np.moveaxis(np.array(rows, np.float64), -1, 0)

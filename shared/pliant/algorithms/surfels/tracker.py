@@ -1,0 +1,265 @@
+"""Direct and sparse deformable tracking (DSDT, Lamarca et al. 2022)."""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I64, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse
+from pliant.algorithms.surfels import judge
+from pliant.algorithms.surfels.align import Limits, align_all, make_workspace
+from pliant.algorithms.surfels.birth import find_births
+from pliant.algorithms.surfels.joint import Equilibrium, align_jointly, align_rigid
+from pliant.algorithms.surfels.motion import MODELS
+from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.prediction import start_at, targets
+from pliant.algorithms.surfels.pyramid import make_pyramid, usable_levels
+from pliant.algorithms.surfels.sampling import BIAS, GAIN, A, B, F, Level, X, make_grid
+from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.table import SurfelTable, move_poses
+
+_FOUND_AGAIN_ZNCC = 0.9
+"""A surfel that was missing must fit better than one that was followed: chance has had tries."""
+
+
+class SurfelTracker:
+    """Follows surfels that move on their own, each by itself, from a depth map on.
+
+    Deterministic: what comes out depends on images, depths and parameters alone.
+    """
+
+    def __init__(self, parameters: SurfelParameters) -> None:
+        self._parameters = parameters
+        self._work = make_workspace(
+            parameters.patch_px, by_template=parameters.jacobian == "template"
+        )
+        self._grid = make_grid(parameters.patch_px)
+        self._table = SurfelTable()
+        self._camera: PinholeCamera | None = None
+        self._T_world_camera: F64 = np.eye(4)
+        self._frame, self._segment, self._next_id = 0, 0, 0
+        self._lost = True
+
+    def start(
+        self, image: U8, depth: F64, camera: PinholeCamera, T_world_camera: F64 | None = None
+    ) -> SurfelFrame:
+        """Give birth to surfels (section III).
+
+        image: (H, W) uint8.  depth: (H, W) metres, 0 or NaN for holes.  T_world_camera: (4, 4), by
+        default the camera's frame is the world.  Raises ValueError for arrays of another size.
+        """
+        self._camera = camera
+        self._table, self._frame, self._segment, self._next_id = SurfelTable(), 0, 0, 0
+        self._T_world_camera = np.eye(4) if T_world_camera is None else T_world_camera.copy()
+        pyramid = self._pyramid(image)
+        self._give_birth(pyramid, _checked_depth(depth, camera))
+        return self._result()
+
+    def track(
+        self, image: U8, prediction: F64 | None = None, depth: F64 | None = None
+    ) -> SurfelFrame:
+        """Follow all surfels into the next frame.
+
+        image: (H, W) uint8.  prediction: (N, 2) displacements in pixels from the last frame, in the
+        order of the last result, NaN where there is none.  depth: (H, W) metres of this frame, for
+        new surfels where there is room.  Raises ValueError before ``start``, and for arrays of
+        another size.
+        """
+        if self._camera is None:
+            raise ValueError("track() before start(): surfels need a depth map to begin with")
+        pyramid = self._pyramid(image)
+        goals = self._goals(prediction, len(pyramid))
+        self._frame += 1
+        poses = move_poses(self._table.poses, inverse(self._T_world_camera))
+        active = np.ones(len(poses), np.uint8)
+        if self._parameters.camera == "static":
+            self._start_at(goals, pyramid[-1], poses, active)
+            self._align(pyramid, poses, active)
+        else:
+            self._align_with_camera(pyramid, poses, goals)
+        self._judge(pyramid[0], poses, active)
+        if depth is not None:
+            self._give_birth(pyramid, _checked_depth(depth, self._camera))
+        return self._result()
+
+    def set_equilibrium(self, ids: I64, positions: F64, covariances: F64) -> None:
+        """Say where surfels rest and how far they stray, for example from ``learn_equilibrium``.
+
+        ids: (M,).  positions: (M, 3) metres, world.  covariances: (M, 3, 3) m^2, positive definite.
+        Raises ValueError for an id that is not tracked.
+        """
+        rows = np.searchsorted(self._table.ids, ids)
+        rows = np.minimum(rows, max(len(self._table) - 1, 0))
+        if len(self._table) == 0 or (self._table.ids[rows] != ids).any():
+            raise ValueError("set_equilibrium() names a surfel that is not in the map")
+        self._table.rest[rows] = positions
+        self._table.information[rows] = np.linalg.inv(covariances)
+
+    def _pyramid(self, image: U8) -> list[Level]:
+        camera, p = self._camera, self._parameters
+        assert camera is not None
+        if image.shape != (camera.height, camera.width) or image.dtype != np.uint8:
+            raise ValueError(
+                f"expected a uint8 image of shape {(camera.height, camera.width)}, "
+                f"got {image.dtype} {image.shape}"
+            )
+        levels = usable_levels(camera.width, camera.height, p.patch_px, p.levels)
+        return make_pyramid(image, camera, levels)
+
+    def _goals(self, prediction: F64 | None, levels: int) -> F64 | None:
+        """Predicted pixels at the coarsest level."""
+        if prediction is None:
+            return None
+        if prediction.shape != (len(self._table), 2):
+            raise ValueError(
+                f"expected a prediction of shape {(len(self._table), 2)}, got {prediction.shape}"
+            )
+        points = self._table.verdicts[:, judge.U : judge.V + 1]
+        return targets(points, prediction, float(2 ** (levels - 1)))
+
+    def _start_at(self, goals: F64 | None, level: Level, poses: F64, active: U8) -> None:
+        if goals is not None:
+            templates, limits = self._table.templates, self._limits(fine=False)
+            if templates:
+                start_at(poses, active, goals, level, templates[-1], limits, self._work)
+
+    def _align(self, pyramid: list[Level], poses: F64, active: U8) -> None:
+        """Coarse to fine: the solution of a scale is the guess of the next (section VI-A2)."""
+        for number in range(len(pyramid) - 1, -1, -1):
+            align_all(
+                poses, active, pyramid[number], self._table.templates[number],
+                self._limits(fine=number == 0), self._work,
+            )  # fmt: skip
+
+    def _align_with_camera(self, pyramid: list[Level], poses: F64, goals: F64 | None) -> None:
+        """Section V: rigid at the coarsest level first, then Eq. 21 from coarse to fine."""
+        table, p = self._table, self._parameters
+        followed = table.tracked.astype(np.uint8)
+        if int(followed.sum()) < p.min_alive:
+            followed = np.ones(len(table), np.uint8)
+        T_camera_world = inverse(self._T_world_camera)
+        equilibrium = Equilibrium(table.rest, p.omega_e * table.information)
+        for number in range(len(pyramid) - 1, -1, -1):
+            level, templates = pyramid[number], table.templates[number]
+            limits = self._limits(fine=number == 0)
+            if number == len(pyramid) - 1 or p.camera == "static_map":
+                T_camera_world = align_rigid(
+                    poses, followed, T_camera_world, level, templates, limits, self._work
+                )
+            if p.camera == "moving":
+                if number == len(pyramid) - 1:
+                    self._start_at(goals, level, poses, followed)
+                T_camera_world = align_jointly(
+                    poses, followed, T_camera_world, equilibrium, level, templates, limits,
+                    self._work,
+                )  # fmt: skip
+        self._T_world_camera = inverse(T_camera_world)
+        if p.camera == "moving":
+            # What was missing is looked for where the camera says that it should be.
+            missing = 1 - followed
+            rest = move_poses(table.poses, T_camera_world)
+            poses[missing > 0] = rest[missing > 0]
+            self._align(pyramid, poses, missing)
+
+    def _judge(self, level: Level, poses: F64, active: U8) -> None:
+        """Keep what was found; what was not stays where it was last good."""
+        table, p = self._table, self._parameters
+        judge.judge_all(
+            poses, active, level, table.templates[0], self._limits(fine=True), self._grid,
+            self._work, table.verdicts,
+        )  # fmt: skip
+        verdicts = table.verdicts
+        wanted = np.where(table.missing > 0, max(p.min_zncc, _FOUND_AGAIN_ZNCC), p.min_zncc)
+        state = np.full(len(table), SurfelState.TRACKED, np.uint8)
+        state[verdicts[:, judge.CORRELATION] < wanted] = SurfelState.OUTLIER
+        state[verdicts[:, judge.SEEN] < p.min_visible] = SurfelState.OCCLUDED
+        state[verdicts[:, judge.INSIDE] < p.min_visible] = SurfelState.OUTSIDE
+        state[verdicts[:, judge.FRONT] == 0.0] = SurfelState.OUTSIDE
+        good = (state == SurfelState.TRACKED) & np.isfinite(poses).all(axis=1)
+        table.missing = np.where(good, 0, table.missing + 1).astype(np.int32)
+        state[~good & (table.missing > p.lost_after)] = SurfelState.LOST
+        table.state = state
+        table.poses[good] = move_poses(poses[good], self._T_world_camera)
+        self._lost = int(good.sum()) < p.min_alive
+
+    def _give_birth(self, pyramid: list[Level], depth: F64) -> None:
+        table, p, camera = self._table, self._parameters, self._camera
+        assert camera is not None
+        if self._lost and len(table):
+            self._segment += 1
+            table.keep(np.zeros(0, np.int64))
+        table.keep(np.flatnonzero(table.missing <= p.lost_after + p.forget_after))
+        occupied = table.verdicts[table.tracked][:, judge.U : judge.V + 1]
+        births = find_births(
+            pyramid, depth, camera, p, occupied, p.max_surfels - int(table.tracked.sum())
+        )
+        n = len(births.poses)
+        # The heuristic covariance of section V: a share of the surfel's depth, all directions.
+        sigma = p.expected_motion * births.poses[:, X + 2]
+        information = np.eye(3) / np.maximum(sigma, 1e-9)[:, None, None] ** 2
+        table.add(births, self._T_world_camera, self._next_id, self._frame, information)
+        self._next_id += n
+        self._lost = int(table.tracked.sum()) < p.min_alive
+        rows = (table.born == self._frame).astype(np.uint8)
+        judge.judge_all(
+            move_poses(table.poses, inverse(self._T_world_camera)), rows, pyramid[0],
+            table.templates[0], self._limits(fine=True), self._grid, self._work, table.verdicts,
+        )  # fmt: skip
+
+    def _limits(self, *, fine: bool) -> Limits:
+        p = self._parameters
+        return Limits(
+            MODELS.index(p.model),
+            p.jacobian == "template",
+            p.saturation,
+            p.highlight,
+            p.omega_i if p.model != "isometric" else 0.0,
+            p.damped_steps,
+            p.first_lambda,
+            p.start_lambda,
+            p.lambda_up,
+            p.lambda_down,
+            p.fine_iterations if fine else p.coarse_iterations,
+            p.fine_step_px if fine else p.coarse_step_px,
+            p.slack,
+        )
+
+    def _result(self) -> SurfelFrame:
+        table = self._table
+        poses, verdicts = table.poses, table.verdicts
+        f11, f12, f22 = (poses[:, F + k, None] for k in range(3))
+        a, b = poses[:, A : A + 3], poses[:, B : B + 3]
+        means = table.templates[0].means if table.templates else np.zeros(0)
+        # Inside, grey levels have lost the template's mean; outside they are those of Eq. 5.
+        biases = poses[:, BIAS] + means * (1.0 - poses[:, GAIN])
+        return SurfelFrame(
+            frame=self._frame,
+            segment=self._segment,
+            lost=self._lost,
+            T_world_camera=self._T_world_camera.copy(),
+            ids=table.ids.copy(),
+            positions=poses[:, X : X + 3].copy(),
+            tangents=np.stack([f11 * a + f12 * b, f12 * a + f22 * b], axis=2),
+            deformations=poses[:, F : F + 3].copy(),
+            points_px=_f32(verdicts[:, judge.U : judge.V + 1]),
+            zncc=_f32(verdicts[:, judge.CORRELATION]),
+            visible=_f32(verdicts[:, judge.SEEN]),
+            sigma=_f32(verdicts[:, judge.SIGMA]),
+            gains=_f32(poses[:, GAIN]),
+            biases=_f32(biases),
+            state=table.state.copy(),
+            age=(self._frame - table.born).astype(np.int32),
+            born=table.born.copy(),
+        )
+
+
+def _checked_depth(depth: F64, camera: PinholeCamera) -> F64:
+    if depth.shape != (camera.height, camera.width):
+        raise ValueError(
+            f"expected depth of shape {(camera.height, camera.width)}, got {depth.shape}"
+        )
+    depth = np.ascontiguousarray(depth, np.float64)
+    return np.where(np.isfinite(depth) & (depth > 0.0), depth, 0.0)
+
+
+def _f32(values: F64) -> F32:
+    return np.ascontiguousarray(values, np.float32)

@@ -1,0 +1,213 @@
+"""How patches deform: templates turn and grow with the surface that they show.
+
+A patch of the birth frame stops resembling its point once the view has rotated or come nearer, and
+slides along the contours that it shows.  The tracks' own motion gives the deformation: its slope
+over neighbouring cells is exact to about 0.1 % a frame, far better than one patch could tell.
+"""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, I32
+from pliant.algorithms.kernel import fast_kernel, leaf_kernel
+from pliant.algorithms.tracking.local_flow import CELL_PX, agree, grid_shape
+from pliant.algorithms.tracking.patch_sums import (
+    BIRTH_FLOATS,
+    BIRTH_MARGIN,
+    BIRTH_SIZE,
+    PATCH_SIZE,
+    TEMPLATE_FLOATS,
+)
+from pliant.algorithms.tracking.patches import make_template, patch_strength, patch_tensor
+from pliant.algorithms.tracking.track_table import (
+    ENERGY,
+    LEFT,
+    MOTION_U,
+    MOTION_V,
+    SLOT,
+    TOP,
+    U,
+    V,
+)
+from pliant.algorithms.tracking.vector_code import CACHE_LINE_FLOATS, prefetch
+
+WINDOW_SIDE = PATCH_SIZE + 2
+"""Of the samples of a patch with the margin of its gradients."""
+AHEAD = 2
+"""Tracks by which memory is asked for before it is read."""
+MIN_CELL_TRACKS = 3
+"""Tracks of a cell whose mean motion counts."""
+AGREEMENT_PX = np.float32(1.0)
+"""Pixels by which a cell may differ from its neighbours and still show the same surface."""
+MAX_SLOPE = np.float32(0.12)
+"""Pixels per pixel and frame: what exceeds this is a step in depth."""
+MIN_TURN = np.float32(0.06)
+"""Change of a deformation, per pixel, that a template is made anew for: 0.2 px at its rim."""
+MAX_GROWTH, MIN_GROWTH = np.float32(4.0), np.float32(0.4)
+"""Of the area, beyond which what was kept from the birth says too little."""
+
+
+def slopes_of_motion(count: int, floats: F32, affine: F32, height: int, width: int) -> F32:
+    """Slope of the tracks' motion in each cell of the grid of local flow.
+
+    affine: six numbers of [A | b], the dominant flow.  Returns (rows, columns, 4) float32
+    [du/dx, du/dy, dv/dx, dv/dy], pixels per pixel, without the dominant flow's own.
+    """
+    rows, columns = grid_shape(width, height)
+    motion = np.zeros((rows, columns, 2), np.float32)
+    points = np.zeros((rows, columns, 3), np.float32)
+    found = np.zeros((rows, columns), np.bool_)
+    slopes = np.zeros((rows, columns, 4), np.float32)
+    _mean_motion(count, floats, affine, motion, points, found)
+    agree(motion, found, points, AGREEMENT_PX, slopes)
+    return slopes
+
+
+@fast_kernel
+def _mean_motion(
+    count: int, floats: F32, affine: F32, motion: F32, points: F32, found: np.ndarray
+) -> None:
+    rows, columns = found.shape
+    for i in range(count):
+        du, dv = floats[i, MOTION_U], floats[i, MOTION_V]
+        u, v = floats[i, U] - du, floats[i, V] - dv
+        row = min(max(int(v) // CELL_PX, 0), rows - 1)
+        column = min(max(int(u) // CELL_PX, 0), columns - 1)
+        motion[row, column, 0] += du - (affine[0] * u + affine[1] * v + affine[2] - u)
+        motion[row, column, 1] += dv - (affine[3] * u + affine[4] * v + affine[5] - v)
+        points[row, column, 0] += u
+        points[row, column, 1] += v
+        points[row, column, 2] += np.float32(1.0)
+    for row in range(rows):
+        for column in range(columns):
+            n = points[row, column, 2]
+            if n >= np.float32(MIN_CELL_TRACKS):
+                found[row, column] = True
+                motion[row, column, 0] /= n
+                motion[row, column, 1] /= n
+                points[row, column, 0] /= n
+                points[row, column, 1] /= n
+
+
+@leaf_kernel
+def turn_templates(
+    count: int,
+    floats: F32,
+    ints: I32,
+    slopes: F32,
+    affine: F32,
+    births: F32,
+    deformations: F32,
+    templates: F32,
+    window: F32,
+    rows: I32,
+) -> None:
+    """Carry every track's deformation on by one frame, and make anew the templates that lag.
+
+    slopes: from ``slopes_of_motion``.  births, deformations, templates: of the track table.
+    window, rows: scratch for WINDOW_SIDE^2 samples, and for count rows.
+    """
+    turned = _deform(count, floats, ints, slopes, affine, deformations, rows)
+    for rank in range(turned):
+        # What was kept of births is too much for the cache: ask for it before it is needed.
+        ahead = ints[rows[min(rank + AHEAD, turned - 1)], SLOT] * BIRTH_FLOATS
+        for start in range(0, BIRTH_FLOATS, CACHE_LINE_FLOATS):
+            prefetch(births, ahead + start)
+        i = rows[rank]
+        slot = ints[i, SLOT]
+        m = deformations[slot]
+        sample_birth(births, slot * BIRTH_FLOATS, floats[i], m, window)
+        tensor = patch_tensor(window, WINDOW_SIDE, 1, 1)
+        if patch_strength(tensor)[0] <= np.float32(0.0):
+            continue
+        make_template(window, WINDOW_SIDE, 1, 1, tensor, templates, slot * TEMPLATE_FLOATS)
+        floats[i, ENERGY] = tensor[4]
+        m[4], m[5], m[6], m[7] = m[0], m[1], m[2], m[3]
+
+
+@leaf_kernel
+def _deform(
+    count: int, floats: F32, ints: I32, slopes: F32, affine: F32, deformations: F32, lagging: I32
+) -> int:
+    """Carry the deformations on.  Writes the rows whose template lags; returns their number."""
+    rows, columns = slopes.shape[0], slopes.shape[1]
+    lags = 0
+    for i in range(count):
+        prefetch(deformations.reshape(-1), ints[min(i + 4 * AHEAD, count - 1), SLOT] * 8)
+        row = min(max(int(floats[i, V]) // CELL_PX, 0), rows - 1)
+        column = min(max(int(floats[i, U]) // CELL_PX, 0), columns - 1)
+        slope = slopes[row, column]
+        a = affine[0] + min(max(slope[0], -MAX_SLOPE), MAX_SLOPE)
+        b = affine[1] + min(max(slope[1], -MAX_SLOPE), MAX_SLOPE)
+        c = affine[3] + min(max(slope[2], -MAX_SLOPE), MAX_SLOPE)
+        d = affine[4] + min(max(slope[3], -MAX_SLOPE), MAX_SLOPE)
+        m = deformations[ints[i, SLOT]]
+        m00, m01 = a * m[0] + b * m[2], a * m[1] + b * m[3]
+        m10, m11 = c * m[0] + d * m[2], c * m[1] + d * m[3]
+        m[0], m[1], m[2], m[3] = m00, m01, m10, m11
+        off = max(max(abs(m00 - m[4]), abs(m01 - m[5])), max(abs(m10 - m[6]), abs(m11 - m[7])))
+        area = m00 * m11 - m01 * m10
+        if off >= MIN_TURN and area >= MIN_GROWTH and area <= MAX_GROWTH:
+            lagging[lags] = i
+            lags += 1
+    return lags
+
+
+@leaf_kernel
+def sample_birth(births: F32, offset: int, track: F32, m: F32, window: F32) -> None:
+    """Sample what was kept of a birth as a deformation m = [m00 m01 m10 m11] shows it now.
+
+    window: WINDOW_SIDE^2, the patch with a margin of one pixel.  Beyond what was kept its
+    edge goes on.
+    """
+    scale = np.float32(1.0) / (m[0] * m[3] - m[1] * m[2])
+    i00, i01, i10, i11 = m[3] * scale, -m[1] * scale, -m[2] * scale, m[0] * scale
+    first_x, first_y = track[LEFT] - np.float32(1.0), track[TOP] - np.float32(1.0)
+    margin = np.float32(BIRTH_MARGIN)
+    first_u = margin - track[LEFT] + i00 * first_x + i01 * first_y
+    first_v = margin - track[TOP] + i10 * first_x + i11 * first_y
+    reach = np.float32(WINDOW_SIDE - 1)
+    zero, limit = np.float32(0.0), np.float32(BIRTH_SIZE) - np.float32(1.01)
+    # The extremes of a linear map lie at corners; most windows need no clamping.
+    inside = (
+        first_u + min(i00 * reach, zero) + min(i01 * reach, zero) >= zero
+        and first_v + min(i10 * reach, zero) + min(i11 * reach, zero) >= zero
+        and first_u + max(i00 * reach, zero) + max(i01 * reach, zero) <= limit
+        and first_v + max(i10 * reach, zero) + max(i11 * reach, zero) <= limit
+    )
+    start = np.uint64(offset)
+    for row in range(WINDOW_SIDE):
+        row_u, row_v = first_u + i01 * np.float32(row), first_v + i11 * np.float32(row)
+        out = window[row * WINDOW_SIDE : (row + 1) * WINDOW_SIDE]
+        if inside:
+            for column in range(WINDOW_SIDE):
+                u, v = row_u + i00 * np.float32(column), row_v + i10 * np.float32(column)
+                out[column] = _blend(births, start, u, v)
+        else:
+            for column in range(WINDOW_SIDE):
+                u, v = row_u + i00 * np.float32(column), row_v + i10 * np.float32(column)
+                u, v = min(max(u, zero), limit), min(max(v, zero), limit)
+                out[column] = _blend(births, start, u, v)
+
+
+@leaf_kernel
+def _blend(births: F32, start: np.uint64, u: np.float32, v: np.float32) -> np.float32:
+    at_u, at_v = np.int32(u), np.int32(v)
+    fu, fv = u - np.float32(at_u), v - np.float32(at_v)
+    at = start + np.uint64(at_v * np.int32(BIRTH_SIZE) + at_u)
+    one, stride = np.uint64(1), np.uint64(BIRTH_SIZE)
+    above = births[at] + fu * (births[at + one] - births[at])
+    at += stride
+    below = births[at] + fu * (births[at + one] - births[at])
+    return above + fv * (below - above)
+
+
+@leaf_kernel
+def keep_birth(
+    image: F32, width: int, height: int, left: int, top: int, births: F32, offset: int
+) -> None:
+    """Keep the surroundings of a new patch; beyond the image its edge goes on."""
+    for row in range(BIRTH_SIZE):
+        y = min(max(top + row - BIRTH_MARGIN, 0), height - 1)
+        for column in range(BIRTH_SIZE):
+            x = min(max(left + column - BIRTH_MARGIN, 0), width - 1)
+            births[offset + row * BIRTH_SIZE + column] = image[y * width + x]

@@ -1,0 +1,183 @@
+"""The configuration of a run: defaults for every source, a YAML file over them, then ``--set``.
+
+Each algorithm's parameters stand beside the algorithm; this module puts them together.  Every model
+is frozen and refuses unknown keys, also nested ones.
+"""
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, Field, ValidationError
+
+from pliant.algorithms.mapping import MappingParameters
+from pliant.algorithms.meshing import MeshingParameters
+from pliant.algorithms.parameters import Parameters
+from pliant.algorithms.surfels import SurfelParameters
+from pliant.algorithms.tracking import TrackingParameters
+from pliant.errors import ConfigError
+
+
+class IngestParameters(Parameters):
+    """How frames enter."""
+
+    mode: Literal["auto", "lossless", "live"] = Field(
+        default="auto",
+        description="lossless: nobody drops a frame, the slowest reader sets the pace.  live: the "
+        "newest frame wins.  auto: live for a camera, lossless for everything else.",
+    )
+    depth: Literal["first", "all"] = Field(
+        default="first",
+        description="Depth maps for surfels: the first one alone, or those of all frames, from "
+        "which new surfels are born, too.",
+    )
+
+
+class BusParameters(Parameters):
+    """Flow control between services."""
+
+    window: int = Field(
+        default=16,
+        ge=1,
+        le=4096,
+        description="Messages of one topic on the way to its slowest reader; bounds memory.",
+    )
+    patience_s: float = Field(
+        default=60.0,
+        ge=0.0,
+        description="How long a peer or the router may be away before a service gives up.",
+    )
+    checkpoint_frames: int = Field(
+        default=60,
+        ge=1,
+        description="Frames between two checkpoints of a service, where services are restarted.",
+    )
+
+
+class RecorderParameters(Parameters):
+    """The recording."""
+
+    sync_interval_s: float = Field(
+        default=1.0,
+        gt=0.0,
+        le=60.0,
+        description="At most this many seconds are lost in a power cut.",
+    )
+    window_messages: int = Field(
+        default=256,
+        ge=2,
+        le=65536,
+        description="Messages of one topic that are on the way to the disk.  Twice the rate of 60 "
+        "frames/s times the interval of a second, and as much again for a slow disk.",
+    )
+    window_mib: int = Field(
+        default=64,
+        ge=1,
+        le=65536,
+        description="MiB of one topic on the way to the disk.  60 images/s of 752x480 are 21 MiB "
+        "a second; half of the window is what starts writing early, the rest covers that.",
+    )
+    images: bool = Field(
+        default=True,
+        description="False: a small recording without camera/source, from the tracks on.",
+    )
+    roll_mib: int = Field(
+        default=0, ge=0, description="Begin a new file beyond so many MiB; 0 for a single file."
+    )
+    roll_s: float = Field(
+        default=0.0, ge=0.0, description="Begin a new file after so many seconds; 0 for never."
+    )
+
+
+class Config(Parameters):
+    """Everything that a run can be told."""
+
+    seed: int = Field(default=0, ge=0, description="Seeds every random choice.")
+    ingest: IngestParameters = IngestParameters()
+    bus: BusParameters = BusParameters()
+    tracking: TrackingParameters = TrackingParameters()
+    bundle_adjustment: MappingParameters = MappingParameters()
+    meshing: MeshingParameters = MeshingParameters()
+    surfels: SurfelParameters = SurfelParameters()
+    recorder: RecorderParameters = RecorderParameters()
+
+
+def load_config(
+    file: Path | None = None, overrides: Sequence[str] = (), *, seed: int | None = None
+) -> Config:
+    """Defaults, then ``file`` (YAML), then ``overrides`` such as ``"bus.window=8"``.
+
+    Raises ConfigError for a file that cannot be read, an unknown key or an impossible value.
+    """
+    content = _read(file) if file is not None else {}
+    for override in overrides:
+        _apply(content, override)
+    if seed is not None:
+        content["seed"] = seed
+    try:
+        return Config.model_validate(content)
+    except ValidationError as error:
+        raise ConfigError(_explain(error, file)) from None
+
+
+def config_yaml(config: Config) -> str:
+    """The resolved configuration as YAML that ``load_config`` reads back unchanged."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def describe(model: type[BaseModel] = Config, prefix: str = "") -> list[tuple[str, str, str]]:
+    """(key, default, meaning) of every parameter."""
+    rows: list[tuple[str, str, str]] = []
+    for name, info in model.model_fields.items():
+        default: Any = info.get_default(call_default_factory=True)
+        if isinstance(default, BaseModel):
+            rows += describe(type(default), f"{prefix}{name}.")
+        else:
+            rows.append((prefix + name, str(default), " ".join((info.description or "").split())))
+    return rows
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        content: Any = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot read the configuration: {error.strerror}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{file}: not YAML: {' '.join(str(error).split())}") from None
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{file}: expected keys and values, got {type(content).__name__}")
+    return content
+
+
+def _apply(content: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition("=")
+    if not separator or not key:
+        raise ConfigError(f"--set {override}: expected KEY=VALUE, e.g. bus.window=8")
+    try:
+        value: Any = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        raise ConfigError(f"--set {override}: {text!r} is not a value") from None
+    *parents, last = key.split(".")
+    level = content
+    for parent in parents:
+        level = level.setdefault(parent, {})
+        if not isinstance(level, dict):
+            raise ConfigError(f"--set {override}: {parent} is a value, not a group of keys")
+    level[last] = value
+
+
+def _explain(error: ValidationError, file: Path | None) -> str:
+    first = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in first["loc"])
+    where = f"{file}: " if file is not None else ""
+    if first["type"] != "extra_forbidden":
+        return f"{where}{key}: {first['msg']} (got {first['input']!r})"
+    known = [name for name, _, _ in describe()]
+    known += sorted({name.rpartition(".")[0] for name in known} - {""})
+    near = difflib.get_close_matches(key, known, n=3)
+    hint = f"did you mean {' or '.join(near)}?" if near else "`pliant config` lists the keys"
+    return f"{where}unknown key {key}: {hint}"

@@ -1,0 +1,212 @@
+"""Folds map updates into what a run leaves: trajectories, keyframes and points."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.geometry import matrix_to_pose, pose_to_matrix
+from pliant.algorithms.map_delta import MapDelta
+from pliant.trajectory import Trajectory
+
+MIN_INLIERS = 30
+"""A pose counts only if at least this many points of the image support it."""
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """A frame's pose relative to its keyframe, as last told."""
+
+    segment: int
+    keyframe: int
+    pose_keyframe_camera: F64
+    inliers: int
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A keyframe as last told."""
+
+    frame: int
+    segment: int
+    pose_world_camera: F64
+
+
+class _PointTable:
+    """Rows by point id (ids are dense, so an array is the map)."""
+
+    def __init__(self) -> None:
+        self._columns: dict[str, np.ndarray[Any, Any]] = {}
+        self._alive = np.zeros(0, np.bool_)
+        self._first_frame = np.zeros(0, np.int64)
+
+    def update(
+        self, ids: np.ndarray[Any, Any], frame: int, columns: dict[str, np.ndarray[Any, Any]]
+    ) -> None:
+        if len(ids) == 0:
+            return
+        size = int(ids.max()) + 1
+        if size > len(self._alive):
+            size = max(size, 2 * len(self._alive))
+            self._alive = _grown(self._alive, size)
+            self._first_frame = _grown(self._first_frame, size)
+            self._columns = {name: _grown(column, size) for name, column in self._columns.items()}
+        for name, values in columns.items():
+            if name not in self._columns:
+                shape = (len(self._alive), *values.shape[1:])
+                self._columns[name] = np.zeros(shape, values.dtype)
+            self._columns[name][ids] = values
+        fresh = ids[~self._alive[ids]]
+        self._first_frame[fresh] = frame
+        self._alive[ids] = True
+
+    def remove(self, ids: np.ndarray[Any, Any]) -> None:
+        self._alive[ids[ids < len(self._alive)]] = False
+
+    def alive(self) -> I64:
+        """Ids of the points that exist."""
+        return np.flatnonzero(self._alive)
+
+    def of(self, ids: I64) -> "tuple[I64, Points]":
+        """Places in ``ids`` of the points that exist, and those points."""
+        if not self._columns:
+            none = np.zeros(0, np.int64)
+            xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+            return none, Points(none, none, xyz, rgb, none, np.zeros(0), np.zeros(0), none)
+        known = (ids >= 0) & (ids < len(self._alive))
+        known[known] = self._alive[ids[known]]
+        ids = ids[known]
+        columns = {name: column[ids] for name, column in self._columns.items()}
+        found = Points(ids=ids, frames=self._first_frame[ids], **columns)
+        return np.flatnonzero(known), found
+
+
+def _grown(array: np.ndarray[Any, Any], size: int) -> np.ndarray[Any, Any]:
+    grown = np.zeros((size, *array.shape[1:]), array.dtype)
+    grown[: len(array)] = array
+    return grown
+
+
+@dataclass(frozen=True)
+class Points:
+    """The map's points.  Arrays as in MapDelta, one row for each point that exists.
+
+    frames: the frame whose update first told of the point, which observed it.
+    """
+
+    ids: Any
+    segments: Any
+    positions: Any
+    colours: Any
+    keyframes: Any
+    parallax_rad: Any
+    sigmas: Any
+    frames: Any
+
+    def select(self, rows: Any) -> "Points":
+        """Some of the points."""
+        return Points(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+class CurrentMap:
+    """Keyframes and points as last told: what does not grow with time, but with what is seen."""
+
+    def __init__(self) -> None:
+        self.keyframes: dict[int, Keyframe] = {}
+        self._points = _PointTable()
+
+    def take(self, delta: MapDelta, frame: int) -> None:
+        """Take in the keyframes and points of one update."""
+        for row in range(len(delta.keyframe_ids)):
+            self.keyframes[int(delta.keyframe_ids[row])] = Keyframe(
+                int(delta.keyframe_frames[row]),
+                int(delta.keyframe_segments[row]),
+                delta.keyframe_poses[row],
+            )
+        self._points.update(
+            delta.point_ids,
+            frame,
+            {
+                "segments": delta.point_segments,
+                "positions": delta.points_world,
+                "colours": delta.point_colours,
+                "keyframes": delta.point_keyframes,
+                "parallax_rad": delta.point_parallax_rad,
+                "sigmas": delta.point_sigmas,
+            },
+        )
+        self._points.remove(delta.removed_point_ids)
+
+    def points_of(self, ids: I64) -> tuple[I64, Points]:
+        """Those of the points (N,) that exist: their places in ``ids``, and the points."""
+        return self._points.of(ids)
+
+    def points(self) -> Points:
+        """Every point that exists now."""
+        return self._points.of(self._points.alive())[1]
+
+
+class MapHistory(CurrentMap):
+    """Applies updates in order of frame; asks nothing of the mapper but its messages."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stamps_ns: dict[int, int] = {}
+        self.causal: dict[int, tuple[int, F64]] = {}
+        """Segment and T_world_camera of each frame as known when the frame was done."""
+        self.frames: dict[int, FramePose] = {}
+        self.states: dict[int, tuple[int, str]] = {}
+
+    def apply(self, delta: MapDelta, *, frame: int, stamp_ns: int, final: bool = False) -> None:
+        """Take in one update.  ``final``: the one after the last frame."""
+        self.take(delta, frame)
+        for row in range(len(delta.pose_frames)):
+            self.frames[int(delta.pose_frames[row])] = FramePose(
+                int(delta.pose_segments[row]),
+                int(delta.pose_keyframes[row]),
+                delta.poses_keyframe_camera[row],
+                int(delta.pose_inliers[row]),
+            )
+        if final:
+            return
+        self.stamps_ns[frame] = stamp_ns
+        self.states[frame] = (delta.state, delta.reason)
+        known = self.frames.get(frame)
+        if known is not None and known.inliers >= MIN_INLIERS:
+            self.causal[frame] = (known.segment, matrix_to_pose(self._world(known)))
+
+    def final(self) -> dict[int, tuple[int, F64]]:
+        """Segment and T_world_camera of every supported frame, after all corrections."""
+        return {
+            frame: (pose.segment, matrix_to_pose(self._world(pose)))
+            for frame, pose in sorted(self.frames.items())
+            if pose.inliers >= MIN_INLIERS and pose.keyframe in self.keyframes
+        }
+
+    def longest_segment(self) -> int:
+        """The segment with the most supported frames (the earliest of equals); -1 without any."""
+        counts: dict[int, int] = {}
+        for segment, _ in self.final().values():
+            counts[segment] = counts.get(segment, 0) + 1
+        return max(counts, key=counts.__getitem__, default=-1)
+
+    def trajectory(self, poses: dict[int, tuple[int, F64]]) -> Trajectory:
+        """Poses by frame as a trajectory, in order of time."""
+        frames = sorted(poses)
+        if not frames:
+            return Trajectory.empty()
+        stamps = np.array([self.stamps_ns[frame] for frame in frames], np.int64)
+        return Trajectory.from_poses(stamps, np.array([poses[frame][1] for frame in frames]))
+
+    def keyframe_poses(self) -> dict[int, tuple[int, F64]]:
+        """Segment and T_world_camera of each keyframe, by frame."""
+        ordered = sorted(self.keyframes.values(), key=lambda keyframe: keyframe.frame)
+        return {k.frame: (k.segment, k.pose_world_camera) for k in ordered}
+
+    def _world(self, pose: FramePose) -> F64:
+        keyframe = pose_to_matrix(self.keyframes[pose.keyframe].pose_world_camera)
+        return keyframe @ pose_to_matrix(pose.pose_keyframe_camera)

@@ -1,0 +1,187 @@
+"""The state of a service as bytes and back, exactly: what a restarted service goes on from.
+
+A tree of our own objects, containers, numpy arrays and random generators.  Only classes of
+``pliant`` are made again, found by name, so that a file from elsewhere can run no code of its own.
+What is shared stays shared; arrays keep their layout, which decides how a kernel is compiled.
+"""
+
+import importlib
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any, cast
+
+import msgpack
+import numpy as np
+from pydantic import BaseModel
+
+from pliant.errors import StateError
+
+STATE_VERSION = 1
+
+_PLAIN = (type(None), bool, float, str, bytes)
+_LIMIT = 1 << 62
+
+
+def save_state(root: Any) -> bytes:
+    """The bytes of an object and all that it holds.  Raises StateError for what cannot be kept."""
+    writer = _Writer()
+    top = writer.reference(root)
+    packed = msgpack.packb([STATE_VERSION, top, writer.nodes], use_bin_type=True)
+    assert isinstance(packed, bytes)
+    return packed
+
+
+def load_state(data: bytes) -> Any:
+    """The object in ``data``.  Raises StateError for all that ``save_state`` did not make."""
+    try:
+        version, top, nodes = msgpack.unpackb(data, raw=False, strict_map_key=False)
+    except Exception as error:  # msgpack raises many unrelated types on broken bytes
+        raise StateError(f"not a saved state: {error}") from None
+    if version != STATE_VERSION:
+        raise StateError(f"a state of version {version}, this is version {STATE_VERSION}")
+    try:
+        return _Reader(nodes).value(top)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ImportError) as error:
+        raise StateError(f"a broken state: {error}") from None
+
+
+class _Writer:
+    """Numbers every object that it meets; ``nodes`` holds them in that order."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self._numbers: dict[int, int] = {}
+        self._held: list[Any] = []  # an id is only unique while its object lives
+
+    def reference(self, value: Any) -> Any:
+        """A plain value as it is; else ``[number]`` of its node."""
+        if type(value) in _PLAIN or (type(value) is int and abs(value) < _LIMIT):
+            return value
+        number = self._numbers.get(id(value))
+        if number is None:
+            number = len(self.nodes)
+            self._numbers[id(value)] = number
+            self._held.append(value)
+            self.nodes.append(None)
+            self.nodes[number] = self._node(value)
+        return [number]
+
+    def _node(self, value: Any) -> list[Any]:
+        kind = type(value)
+        if kind is int:
+            return ["int", str(value)]
+        if isinstance(value, np.ndarray):
+            return _array_node(cast("np.ndarray[Any, Any]", value))
+        if isinstance(value, np.generic):
+            return ["scalar", value.dtype.str, value.tobytes()]
+        if isinstance(value, np.random.Generator):
+            state = value.bit_generator.state
+            return ["generator", state["bit_generator"], self.reference(state)]
+        if isinstance(value, BaseModel):
+            return ["model", *_name(kind), value.model_dump(mode="json")]
+        if kind in (list, tuple, deque):
+            more = [value.maxlen] if kind is deque else []
+            return [kind.__name__, [self.reference(item) for item in value], *more]
+        if kind is dict:
+            pairs = cast("dict[Any, Any]", value).items()
+            return ["dict", [[self.reference(k), self.reference(v)] for k, v in pairs]]
+        if isinstance(value, tuple):  # a named one
+            return ["named", *_name(kind), [self.reference(item) for item in value]]
+        if callable(value) and hasattr(value, "__qualname__"):
+            return ["name", *_name(value)]
+        attributes = {key: self.reference(item) for key, item in _attributes(value).items()}
+        return ["object", *_name(kind), attributes]
+
+
+class _Reader:
+    def __init__(self, nodes: list[Any]) -> None:
+        self._nodes = nodes
+        self._made: dict[int, Any] = {}
+
+    def value(self, reference: Any) -> Any:
+        if not isinstance(reference, list):
+            return reference
+        (number,) = reference
+        if number not in self._made:
+            self._make(number, *self._nodes[number])
+        return self._made[number]
+
+    def _make(self, number: int, kind: str, *content: Any) -> None:
+        made = self._made
+        if kind == "list":
+            made[number] = target = list[Any]()
+            target += [self.value(item) for item in content[0]]
+        elif kind == "deque":
+            made[number] = queue = deque[Any](maxlen=content[1])
+            queue.extend(self.value(item) for item in content[0])
+        elif kind == "dict":
+            made[number] = table = dict[Any, Any]()
+            for key, item in content[0]:
+                table[self.value(key)] = self.value(item)
+        elif kind == "object":
+            made[number] = instance = object.__new__(_find(*content[:2]))
+            for key, item in content[2].items():
+                object.__setattr__(instance, key, self.value(item))
+        elif kind in ("tuple", "named"):
+            items = [self.value(item) for item in content[-1]]
+            made[number] = tuple(items) if kind == "tuple" else _find(*content[:2])(*items)
+        else:
+            made[number] = self._leaf(kind, *content)
+
+    def _leaf(self, kind: str, *content: Any) -> Any:
+        if kind == "int":
+            return int(content[0])
+        if kind == "array":
+            return _array(*content)
+        if kind == "scalar":
+            return np.frombuffer(content[1], np.dtype(content[0]))[0]
+        if kind == "generator":
+            bits = {"PCG64": np.random.PCG64, "PCG64DXSM": np.random.PCG64DXSM}[content[0]]()
+            bits.state = self.value(content[1])
+            return np.random.Generator(bits)
+        if kind == "model":
+            return _find(*content[:2]).model_validate(content[2])
+        if kind == "name":
+            return _find(*content)
+        raise ValueError(f"a node of kind {kind}")
+
+
+def _array_node(array: np.ndarray[Any, Any]) -> list[Any]:
+    if array.dtype.hasobject:
+        raise StateError(f"an array of {array.dtype} cannot be kept")
+    order = "C" if array.flags.c_contiguous else "F"
+    if not (array.flags.c_contiguous or array.flags.f_contiguous):
+        raise StateError(f"an array of shape {array.shape} that is a view with gaps cannot be kept")
+    kind: Any = array.dtype.descr if array.dtype.names else array.dtype.str
+    flat = (array if order == "C" else array.T).reshape(-1)
+    raw = flat.view(np.uint8).data if array.size else b""  # not copied before it is packed
+    return ["array", kind, list(array.shape), order, array.flags.writeable, raw]
+
+
+def _array(kind: Any, shape: list[int], order: Any, writeable: bool, raw: bytes) -> Any:
+    described = kind if isinstance(kind, str) else [tuple(field) for field in kind]
+    array = np.frombuffer(raw, np.dtype(described)).reshape(shape, order=order).copy(order)
+    array.flags.writeable = writeable
+    return array
+
+
+def _name(thing: Any) -> tuple[str, str]:
+    module, name = str(thing.__module__), str(thing.__qualname__)
+    if not (module.startswith("pliant.") and name.isidentifier()):
+        raise StateError(f"{module}.{name} cannot be kept")
+    return module, name
+
+
+def _find(module: str, name: str) -> Any:
+    if not (module.startswith("pliant.") and name.isidentifier()):
+        raise ValueError(f"{module}.{name} is none of ours")
+    return getattr(importlib.import_module(module), name)
+
+
+def _attributes(value: Any) -> Mapping[str, Any]:
+    if hasattr(value, "__dict__"):
+        return vars(value)
+    if is_dataclass(value):
+        return {field.name: getattr(value, field.name) for field in fields(value)}
+    raise StateError(f"{type(value).__name__} cannot be kept")
