@@ -1,0 +1,1 @@
+"""How services exchange messages: one protocol, one bus over Zenoh, one that replays."""

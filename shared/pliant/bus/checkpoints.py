@@ -1,0 +1,144 @@
+"""Checkpoints of a service: its state and its place in every topic, so that it can start again.
+
+A checkpoint may be used only if no reader can ask for a message from before it, for the service
+will not make those again.  So some are kept, until an older one can never be needed: the newest
+whose outputs every reader has safe.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+from pliant.errors import BusError, StateError
+
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Place:
+    """Messages taken of each input and sent of each output, by topic key; the outputs ended."""
+
+    frame: int
+    inputs: Mapping[str, int]
+    outputs: Mapping[str, int]
+    ended: tuple[str, ...] = ()
+
+    def fits(self, safe: Mapping[str, int]) -> bool:
+        """Whether all that was sent before is safe with every reader."""
+        return all(sent <= safe.get(key, sent) for key, sent in self.outputs.items())
+
+
+class Checkpoints:
+    """The checkpoints of one service in a folder of the session.  Safe to use from two threads."""
+
+    def __init__(self, folder: Path, *, interval: int) -> None:
+        """``interval``: frames between two.  Raises BusError where the folder cannot be made."""
+        self._folder = folder
+        self._interval = interval
+        self._lock = threading.Lock()
+        self._writer: threading.Thread | None = None
+        self._failure: OSError | None = None
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for unfinished in folder.glob("*.part"):
+                unfinished.unlink()
+        except OSError as error:
+            raise BusError(f"{folder}: no checkpoints there: {error.strerror}") from None
+        self._places = {
+            place.frame: place for place in (_read_place(p) for p in folder.glob("*.state"))
+        }
+
+    def due(self, frame: int) -> bool:
+        """Whether this frame closes an interval and the one before is on the disk."""
+        busy = self._writer is not None and self._writer.is_alive()
+        return (frame + 1) % self._interval == 0 and not busy
+
+    def save(self, place: Place, state: bytes, written: Callable[[], None]) -> None:
+        """Write in the background, whole or not at all; then call ``written``.
+
+        Raises BusError where the one before could not be written.
+        """
+        if self._failure is not None:
+            raise BusError(f"{self._folder}: checkpoints cannot be written: {self._failure}")
+        counts = [dict(place.inputs), dict(place.outputs)]
+        header = [_VERSION, place.frame, *counts, list(place.ended)]
+        parts = (msgpack.packb(header), state)
+
+        def write() -> None:
+            try:
+                _write_whole(self._path(place.frame), parts)
+            except OSError as error:
+                self._failure = error
+                return
+            with self._lock:
+                self._places[place.frame] = place
+            written()
+
+        self._writer = threading.Thread(target=write, daemon=True)
+        self._writer.start()
+
+    def usable(self, safe: Mapping[str, int]) -> Place | None:
+        """The newest that fits what the readers have safe; older ones are dropped."""
+        with self._lock:
+            fitting = [frame for frame, place in self._places.items() if place.fits(safe)]
+            if not fitting:
+                return None
+            newest = max(fitting)
+            for frame in sorted(self._places):
+                if frame < newest:
+                    del self._places[frame]
+                    with suppress(OSError):
+                        self._path(frame).unlink()
+            return self._places[newest]
+
+    def restart_from(self, place: Place) -> bytes:
+        """The state at a place; what was saved later will be made again.  Raises BusError."""
+        with self._lock:
+            for frame in [frame for frame in self._places if frame > place.frame]:
+                del self._places[frame]
+                with suppress(OSError):
+                    self._path(frame).unlink()
+        return _unpack(self._path(place.frame))[1]
+
+    def close(self) -> None:
+        """Wait for the one that is being written."""
+        if self._writer is not None:
+            self._writer.join()
+
+    def _path(self, frame: int) -> Path:
+        return self._folder / f"{frame:09d}.state"
+
+
+def _write_whole(path: Path, parts: tuple[Any, ...]) -> None:
+    part = path.with_suffix(".part")
+    with part.open("wb") as file:
+        for data in parts:
+            file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def _read_place(path: Path) -> Place:
+    return _unpack(path)[0]
+
+
+def _unpack(path: Path) -> tuple[Place, bytes]:
+    try:
+        data = path.read_bytes()
+        unpacker = msgpack.Unpacker(max_buffer_size=0)
+        unpacker.feed(data)
+        version, frame, inputs, outputs, ended = unpacker.unpack()
+    except OSError as error:
+        raise BusError(f"{path}: cannot read the checkpoint: {error.strerror}") from None
+    except Exception as error:  # msgpack raises many unrelated types on broken bytes
+        raise StateError(f"{path}: not a checkpoint: {error}") from None
+    if version != _VERSION:
+        raise StateError(f"{path}: a checkpoint of version {version}, this is {_VERSION}")
+    return Place(frame, inputs, outputs, tuple(ended)), data[unpacker.tell() :]

@@ -1,0 +1,64 @@
+"""One topic's incoming messages: in order, each once, whatever the network did.
+
+A message that was taken before (sent again after somebody's restart) is passed over and counted;
+one that comes too early is passed over too, and asked for again.  A state machine: no socket, no
+clock.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from pliant.bus.base import Received
+
+
+@dataclass
+class Inbox:
+    """The messages of one topic that wait to be taken.
+
+    taken: messages taken so far, and so the number of the next.     limit: of messages that wait;
+    a sender never has more than its window on the way, so more are not from one of ours.
+    repeated, early, refused: counts of messages passed over.
+    """
+
+    limit: int
+    taken: int = 0
+    repeated: int = 0
+    early: int = 0
+    refused: int = 0
+    gap: bool = False
+    waiting: deque[Received] = field(default_factory=deque[Received])
+
+    @property
+    def next_sequence(self) -> int:
+        """The number of the message that fits behind those that wait."""
+        return self.taken + len(self.waiting)
+
+    def is_next(self, sequence: int) -> bool:
+        """Whether a message with this number is the one to ``put``; others are counted."""
+        if sequence < self.next_sequence:
+            self.repeated += 1
+        elif sequence > self.next_sequence:
+            self.early += 1
+            self.gap = True
+        elif len(self.waiting) >= self.limit:
+            self.refused += 1
+        else:
+            return True
+        return False
+
+    def put(self, received: Received) -> None:
+        """Append the next message."""
+        self.waiting.append(received)
+        self.gap = False
+
+    def take(self) -> Received:
+        """The next message."""
+        received = self.waiting.popleft()
+        self.taken += 1
+        return received
+
+    def start_from(self, taken: int) -> None:
+        """Go on behind ``taken`` messages; what waited will come again."""
+        self.taken = taken
+        self.waiting.clear()
+        self.gap = False

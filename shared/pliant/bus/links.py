@@ -1,0 +1,158 @@
+"""One topic's connection: the Zenoh side of an inbox and of an outbox.
+
+Callbacks run in Zenoh's threads: under the bus's lock they append and notify, and never call Zenoh.
+"""
+
+import struct
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import zenoh
+
+from pliant.bus.base import Received, Window
+from pliant.bus.inbox import Inbox
+from pliant.bus.outbox import Numbered, Outbox
+from pliant.messages.topics import Topic
+
+DATA, END = 0, 1
+NOTHING, IF_OLD, NOW = 0, 1, 2
+"""What a reader asks its sender to send again."""
+
+_ENVELOPE = struct.Struct("<QB")  # sequence number, kind
+_CREDIT = struct.Struct("<QQQB")  # incarnation, taken, safe, what is asked for
+
+
+@dataclass
+class Shared:
+    """What the links of one bus share.
+
+    changed: the lock, and who waits for something to change.     wake: rouses the keeper.
+    arrivals: messages that have come, over all topics.
+    """
+
+    session: zenoh.Session
+    prefix: str
+    changed: threading.Condition
+    wake: threading.Event
+    arrivals: int = 0
+
+
+class InLink:
+    """An input.
+
+    safe: messages that we will never ask for again.     wanted: the service waits for this topic.
+    arrived: whether one came since the last tick.     ended: its end was kept before we started.
+    """
+
+    def __init__(self, shared: Shared, topic: Topic, sender: str, *, reader: str, limit: int):
+        self.topic = topic
+        self.sender = sender
+        self.box = Inbox(limit)
+        self.safe = 0
+        self.wanted = self.arrived = self.ended = False
+        self._shared = shared
+        self._credit = _publisher(shared, f"credit/{topic.key}/{reader}")
+        key = f"{shared.prefix}/{topic.key}"
+        self._held = shared.session.declare_subscriber(key, self._on_sample)
+
+    def tell(self, incarnation: int, ask: int = NOTHING) -> None:
+        """Tell the sender our counts."""
+        self._credit.put(_CREDIT.pack(incarnation, self.box.taken, self.safe, ask))
+
+    def start_from(self, taken: int) -> None:
+        """Go on behind ``taken`` messages."""
+        self.box.start_from(taken)
+        self.safe = taken
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
+        if len(envelope) != _ENVELOPE.size or len(sample.payload) > self.topic.max_bytes:
+            self.box.refused += 1  # not from a bus of ours
+            return
+        sequence, kind = _ENVELOPE.unpack(envelope)
+        shared = self._shared
+        with shared.changed:
+            if not self.box.is_next(sequence):
+                if self.box.gap:
+                    shared.wake.set()
+                return
+            data = sample.payload.to_bytes()
+            self.box.put(Received(self.topic, shared.arrivals, sequence, kind == END, data))
+            self.arrived = True
+            shared.arrivals += 1
+            shared.changed.notify_all()
+
+
+class OutLink:
+    """An output.  sent_at_tick: what had been sent a while ago, and so must have arrived."""
+
+    def __init__(
+        self,
+        shared: Shared,
+        topic: Topic,
+        readers: Sequence[str],
+        *,
+        window: int,
+        windows: Mapping[str, Window],
+    ) -> None:
+        self.topic = topic
+        self.box = Outbox(topic.key, readers, window=window, windows=windows)
+        self.ended = False
+        self.sent_at_tick = 0
+        self._again_from: int | None = None  # what a reader has asked for
+        self._sending = threading.Lock()
+        self._shared = shared
+        self._publisher = _publisher(shared, topic.key)
+        key = f"{shared.prefix}/credit/{topic.key}/*"
+        self._held = shared.session.declare_subscriber(key, self._on_credit)
+
+    def send(self, kind: int, payload: bytes) -> None:
+        """Number a message, keep it, and send it."""
+        with self._sending:
+            with self._shared.changed:
+                message = self.box.add(kind, payload)  # before its credit can be here
+            self._put(message)
+
+    def send_again(self) -> None:
+        """Send what a reader has asked for.  Raises BusError where it is not kept any more."""
+        with self._shared.changed:
+            sequence, self._again_from = self._again_from, None
+        if sequence is None:
+            return
+        with self._sending:
+            with self._shared.changed:
+                messages = self.box.again(sequence)
+            for message in messages:
+                self._put(message)
+
+    def _put(self, message: Numbered) -> None:
+        attachment = _ENVELOPE.pack(message.sequence, message.kind)
+        self._publisher.put(message.payload, attachment=attachment)
+
+    def _on_credit(self, sample: zenoh.Sample) -> None:
+        reader = str(sample.key_expr).rsplit("/", 1)[1]
+        payload = sample.payload.to_bytes()
+        if reader not in self.box.readers or len(payload) != _CREDIT.size:
+            return
+        incarnation, taken, safe, ask = _CREDIT.unpack(payload)
+        shared = self._shared
+        with shared.changed:
+            came_back = self.box.credit(reader, incarnation, taken, safe)
+            asked = came_back or ask == NOW or (ask == IF_OLD and taken < self.sent_at_tick)
+            if asked and taken < self.box.sent:
+                before = self._again_from
+                self._again_from = taken if before is None else min(before, taken)
+                shared.wake.set()
+            shared.changed.notify_all()
+
+
+def first_arrived(links: Sequence[InLink]) -> InLink:
+    """The link whose first waiting message arrived first."""
+    return min((e for e in links if e.box.waiting), key=lambda e: e.box.waiting[0].arrival)
+
+
+def _publisher(shared: Shared, key: str) -> zenoh.Publisher:
+    return shared.session.declare_publisher(
+        f"{shared.prefix}/{key}", congestion_control=zenoh.CongestionControl.BLOCK, express=True
+    )

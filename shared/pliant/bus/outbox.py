@@ -1,0 +1,138 @@
+"""One topic's outgoing messages: numbers, credit, and what must be kept to be sent again.
+
+A reader tells two counts.  ``taken``: messages that it has taken in; the sender never has more than
+a window of messages on the way to the slowest reader.  ``safe``: messages that it will never ask
+for again, whatever happens to it; what comes after is kept here.  A reader that remembers nothing
+beyond its own process says safe = taken; one that restarts from a checkpoint says the position of
+that checkpoint; the recorder says what is on its disk.  A state machine: no socket, no clock.
+"""
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+from pliant.bus.base import Window
+from pliant.errors import BusError
+
+
+@dataclass
+class Reader:
+    """What a required reader has told.  incarnation: which start of it; -1 before it spoke."""
+
+    incarnation: int = -1
+    taken: int = 0
+    safe: int = 0
+
+
+@dataclass(frozen=True)
+class Numbered:
+    """A message with its sequence number."""
+
+    sequence: int
+    kind: int
+    payload: bytes
+
+
+class Outbox:
+    """Messages of one topic, from the oldest that a reader may still ask for to the newest."""
+
+    def __init__(
+        self,
+        topic: str,
+        readers: Sequence[str],
+        *,
+        window: int,
+        windows: Mapping[str, Window] | None = None,
+    ) -> None:
+        """window: messages on the way to a reader.  windows: of readers that make safe seldom,
+        by name, what is kept for each of them.
+        """
+        self.topic = topic
+        self.readers = {name: Reader() for name in readers}
+        self.sent = 0
+        self._window = window
+        self._windows = {name: w for name, w in (windows or {}).items() if name in self.readers}
+        self._kept: deque[Numbered] = deque()
+
+    def add(self, kind: int, payload: bytes) -> Numbered:
+        """Number a message and keep it."""
+        message = Numbered(self.sent, kind, payload)
+        self.sent += 1
+        if self.readers:
+            self._kept.append(message)
+        return message
+
+    def start_from(self, sequence: int) -> None:
+        """Go on from a number, as after a restart.  Nothing may have been added yet."""
+        self.sent = sequence
+
+    def credit(self, name: str, incarnation: int, taken: int, safe: int) -> bool:
+        """A reader's counts, which never fall but in another incarnation of it.
+
+        Returns whether the reader is another incarnation than before.
+        """
+        reader = self.readers.get(name)
+        if reader is None or incarnation < reader.incarnation:
+            return False
+        came_back = 0 <= reader.incarnation < incarnation
+        if incarnation > reader.incarnation:
+            reader.incarnation, reader.taken, reader.safe = incarnation, taken, min(safe, taken)
+        else:
+            reader.taken = max(reader.taken, taken)
+            reader.safe = max(reader.safe, min(safe, reader.taken))
+        floor = self.safe()
+        while self._kept and self._kept[0].sequence < floor:
+            self._kept.popleft()
+        return came_back
+
+    def safe(self) -> int:
+        """How many messages no reader will ever ask for again."""
+        return min((reader.safe for reader in self.readers.values()), default=self.sent)
+
+    def all_safe(self) -> bool:
+        """Whether no reader will ever ask for any of what was sent."""
+        return self.safe() >= self.sent
+
+    def heard_from_all(self) -> bool:
+        """Whether every required reader has told its counts."""
+        return all(reader.incarnation >= 0 for reader in self.readers.values())
+
+    def has_room(self, size: int = 0) -> bool:
+        """Whether one more message, of so many bytes, may be sent."""
+        if self.on_the_way() >= self._window:
+            return False
+        for name, window in self._windows.items():
+            waiting = self.sent - self.readers[name].safe
+            if waiting >= window.messages:
+                return False
+            newest = islice(reversed(self._kept), max(0, waiting))
+            kept = sum(len(message.payload) for message in newest)
+            if waiting > 0 and kept + size > window.size:
+                return False
+        return True
+
+    def on_the_way(self) -> int:
+        """Messages that the slowest required reader has not taken."""
+        slowest = min((reader.taken for reader in self.readers.values()), default=self.sent)
+        return max(0, self.sent - slowest)
+
+    def slowest(self) -> str:
+        """The name of the reader that is furthest behind; "" where there is none."""
+        return min(self.readers, key=lambda name: (self.readers[name].taken, name), default="")
+
+    def kept(self) -> int:
+        """Messages held here: at most a window and what the slowest checkpoint lies behind."""
+        return len(self._kept)
+
+    def again(self, sequence: int) -> tuple[Numbered, ...]:
+        """Everything from a number on.  Raises BusError where it is not kept any more."""
+        if sequence >= self.sent:
+            return ()
+        if not self._kept or self._kept[0].sequence > sequence:
+            oldest = self._kept[0].sequence if self._kept else self.sent
+            raise BusError(
+                f"{self.topic}: a reader asks for message {sequence}, the oldest kept is {oldest}: "
+                "it restarted without its checkpoint"
+            )
+        return tuple(message for message in self._kept if message.sequence >= sequence)

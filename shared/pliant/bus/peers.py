@@ -1,0 +1,75 @@
+"""Who else is in the session, by the liveliness tokens of its services.
+
+A token says ``ready/<service>/<incarnation>/<wire version>/<release>``.  The incarnation tells one
+start of a service from the next, so that the late end of an old token is not taken for the death
+of the service that has come back.  A state machine: no socket, the time is handed in.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from pliant import __version__
+from pliant.errors import BusError
+
+WIRE_VERSION = 2
+"""Of envelopes and credits; services of different ones refuse each other."""
+
+
+def token_key(service: str, incarnation: int) -> str:
+    """The key of a service's token, without the session's prefix."""
+    return f"ready/{service}/{incarnation}/{WIRE_VERSION}/{__version__}"
+
+
+def service_of(key: str) -> str:
+    """The service whose token a key is."""
+    return key.split("/ready/", 1)[1].split("/")[0]
+
+
+@dataclass
+class Peers:
+    """The services that are here, and since when those that went away are gone."""
+
+    service: str
+    incarnation: int
+    here: dict[str, set[int]] = field(default_factory=dict[str, set[int]])
+    gone_since: dict[str, float] = field(default_factory=dict[str, float])
+    refusal: str = ""
+    """Why this service cannot take part; "" while it can."""
+
+    def on_token(self, key: str, *, alive: bool, now: float) -> str:
+        """Take note of a token that appeared or vanished; returns the service it is of."""
+        name, number, wire, version = key.split("/ready/", 1)[1].split("/")
+        incarnations = self.here.setdefault(name, set())
+        if not alive:
+            incarnations.discard(int(number))
+            if not incarnations:
+                self.gone_since.setdefault(name, now)
+            return name
+        incarnations.add(int(number))
+        self.gone_since.pop(name, None)
+        if int(wire) != WIRE_VERSION:
+            self.refusal = (
+                f"{name} is pliant {version} (wire version {wire}), {self.service} is "
+                f"{__version__} (wire version {WIRE_VERSION}): run one version everywhere"
+            )
+        if name == self.service and int(number) > self.incarnation:
+            self.refusal = f"another {name} took over in this session"
+        return name
+
+    def seen(self, names: Iterable[str]) -> bool:
+        """Whether all of them are here, or have been."""
+        return all(self.here.get(name) or name in self.gone_since for name in names)
+
+    def missing(self, names: Iterable[str]) -> list[str]:
+        """Those that are not here now, sorted."""
+        return sorted(name for name in names if not self.here.get(name))
+
+    def lost(self, names: Iterable[str], *, patience_s: float, now: float) -> list[str]:
+        """Those that have been gone for longer than we wait, sorted."""
+        gone = self.gone_since
+        return sorted(name for name in names if name in gone and now - gone[name] >= patience_s)
+
+    def raise_if_refused(self) -> None:
+        """Raise BusError where versions do not fit or a newer one of us is there."""
+        if self.refusal:
+            raise BusError(self.refusal)

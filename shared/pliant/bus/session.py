@@ -1,0 +1,121 @@
+"""Zenoh sessions as Pliant uses them: explicit endpoints, nothing found by scouting."""
+
+import json
+import socket
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from pliant.errors import BusError
+
+CONNECT_TIMEOUT_S = 7.0  # with the start of Python, a user waits ten seconds at most
+_PATIENCE_MS = 60_000  # Zenoh's defaults lose messages after a stall of 5 to 10 s (its second line)
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A peer's certificate and key, and the authority that vouches for all of them (PEM files)."""
+
+    authority: Path
+    certificate: Path
+    key: Path
+
+    @classmethod
+    def in_folder(cls, folder: Path, name: str) -> "Identity":
+        """The identity ``name`` in a folder that ``pliant certs`` made.
+
+        Raises BusError where it is not there.
+        """
+        own = cls(folder / "ca.pem", folder / f"{name}.pem", folder / f"{name}.key")
+        for path in (own.authority, own.certificate, own.key):
+            if not path.is_file():
+                raise BusError(f"{path}: no such certificate; `pliant certs {folder}` makes them")
+        return own
+
+
+def _config(mode: str, identity: Identity | None) -> zenoh.Config:
+    config = zenoh.Config()
+    config.insert_json5("mode", json.dumps(mode))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("scouting/gossip/enabled", "false")
+    config.insert_json5("transport/link/tx/lease", str(_PATIENCE_MS))
+    config.insert_json5(
+        "transport/link/tx/queue/congestion_control/block/wait_before_close",
+        str(_PATIENCE_MS * 1000),
+    )
+    if identity is not None:
+        side = "listen" if mode == "router" else "connect"
+        tls = {
+            "root_ca_certificate": str(identity.authority),
+            "enable_mtls": True,
+            f"{side}_certificate": str(identity.certificate),
+            f"{side}_private_key": str(identity.key),
+            "verify_name_on_connect": True,
+        }
+        config.insert_json5("transport/link/tls", json.dumps(tls))
+    return config
+
+
+def open_session(endpoints: Sequence[str], identity: Identity | None = None) -> zenoh.Session:
+    """Connect as a client.  ``identity``: for endpoints such as tls/host:7447.
+
+    Raises BusError when no endpoint answers in time.
+    """
+    config = _config("client", identity)
+    _set_endpoints(config, "connect", endpoints)
+    config.insert_json5("connect/timeout_ms", str(int(CONNECT_TIMEOUT_S * 1000)))
+    config.insert_json5("connect/exit_on_failure", "true")
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise BusError(
+            f"cannot reach {', '.join(endpoints)} within {CONNECT_TIMEOUT_S:.0f} s: is the router "
+            f"running there? ({_first_line(error)})"
+        ) from None
+
+
+def open_router(
+    *endpoints: str,
+    identity: Identity | None = None,
+    access_control: Mapping[str, Any] | None = None,
+) -> zenoh.Session:
+    """Listen as a router.  ``access_control``: Zenoh's, by the names in certificates.
+
+    Raises BusError when an endpoint is taken or is not one.
+    """
+    config = _config("router", identity)
+    if access_control is not None:
+        config.insert_json5("access_control", json.dumps(access_control))
+    _set_endpoints(config, "listen", endpoints)
+    config.insert_json5("listen/exit_on_failure", "true")
+    config.insert_json5("listen/timeout_ms", "0")
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise BusError(
+            f"cannot listen on {', '.join(endpoints)}: is the port in use? Choose another with "
+            f"--port ({_first_line(error)})"
+        ) from None
+
+
+def _set_endpoints(config: zenoh.Config, what: str, endpoints: Sequence[str]) -> None:
+    try:
+        config.insert_json5(f"{what}/endpoints", json.dumps(list(endpoints)))
+    except zenoh.ZError:
+        raise BusError(
+            f"{', '.join(endpoints)}: not an endpoint; write it like tcp/127.0.0.1:7447"
+        ) from None
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint on a port that is free now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [""])[0].split(" at /")[0][:200]

@@ -1,0 +1,415 @@
+"""The bus over Zenoh, with our own flow control and our own delivery.
+
+Zenoh's BLOCK is no guarantee (a reader that stalls longer than the transport's patience loses
+messages and ``put`` never says so; a router that dies takes what it holds with it), hence sequence
+numbers and credits: a reader tells how many messages of a topic it has taken, and how many it will
+never ask for again; a sender never has more than a window on the way to its slowest required
+reader, and keeps what may be asked for.  A reader that finds a gap, or waits for what does not
+come, asks for it.  So each message is taken exactly once, in order, and memory is bounded.
+
+Who starts first does not matter: readers subscribe, then declare a liveliness token; a sender waits
+for the tokens of its required readers before its first message.  A peer that stays away for longer
+than our patience is named in an error, so that nothing waits for ever.
+
+With checkpoints a service that died goes on where it was: ``restore`` puts it back to the newest
+checkpoint that its readers allow, senders send again what came after, and what it makes a second
+time is passed over by those who had it.
+
+Callbacks only append to queues and notify: no Zenoh call is ever made inside one.  A thread of its
+own, the keeper, tells counts once a second and sends again.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import Any
+
+import zenoh
+
+from pliant.bus.base import Received, Window
+from pliant.bus.checkpoints import Checkpoints, Place
+from pliant.bus.health import health_key, health_of
+from pliant.bus.links import DATA, END, IF_OLD, NOTHING, NOW, InLink, OutLink, Shared, first_arrived
+from pliant.bus.peers import Peers, token_key
+from pliant.bus.session import Identity, open_session
+from pliant.errors import BusError, MessageError
+from pliant.messages import codec
+from pliant.messages.topics import Topic
+from pliant.messages.types import Header, StreamEnd
+from pliant.state import load_state, save_state
+
+STOP_KEY = "control/stop"
+_TICK_S = 1.0
+_LAST_CREDITS_S = 2.0
+
+
+class ZenohBus:
+    """One service's end of the bus.  A context manager: leaving it flushes, then disconnects."""
+
+    def __init__(
+        self,
+        *,
+        endpoints: Sequence[str],
+        session: str,
+        service: str,
+        inputs: Mapping[Topic, str],
+        outputs: Mapping[Topic, Sequence[str]],
+        window: int,
+        patience_s: float = 0.0,
+        checkpoints: Checkpoints | None = None,
+        keeps_books: bool = False,
+        windows: Mapping[str, Window] | None = None,
+        disturb: Callable[[], None] | None = None,
+        identity: Identity | None = None,
+    ) -> None:
+        """Connect, subscribe to the inputs, and announce that we are ready.
+
+        session: name that keeps two runs on one network apart.     service: our own name.
+        inputs: each topic that we read, with the service that publishes it.
+        outputs: each topic that we publish, with the services that must read every message.
+        window: how many messages may be on the way to the slowest of those.
+        patience_s: how long a peer may be away.
+        checkpoints: where our state is kept; ``restore`` must come before the first message then.
+        keeps_books: we know ourselves what we have; ``start_from`` must come first then.
+        windows: what is kept for readers that acknowledge seldom, by name.
+        disturb: called before each message goes out or is taken; for tests, which delay there.
+        identity: our certificate, for endpoints such as tls/host:7447.
+        Raises BusError when no endpoint answers.
+        """
+        self._patience_s = patience_s
+        self._checkpoints = checkpoints
+        self._disturb = disturb or (lambda: None)
+        self._changed = threading.Condition()
+        self._wake = threading.Event()
+        self._closing = False
+        self._greeting = False  # somebody came: tell our counts
+        self._restored = checkpoints is None and not keeps_books
+        self._done = False
+        self._place = Place(-1, {}, {})
+        self.waiting_for = ""
+        """What the service is waiting for now; for people."""
+        self._peers = Peers(service, time.time_ns())
+        self._session = open_session(endpoints, identity)
+        self._prefix = f"pliant/{session}"
+        self.stop_requested = False
+        """Whether somebody has asked the session to end (``pliant stop``)."""
+        shared = Shared(self._session, self._prefix, self._changed, self._wake)
+        self._outputs = {
+            topic.key: OutLink(shared, topic, readers, window=window, windows=windows or {})
+            for topic, readers in outputs.items()
+        }
+        self._inputs = {
+            topic.key: InLink(shared, topic, sender, reader=service, limit=2 * window)
+            for topic, sender in inputs.items()
+        }
+        # Subscribed before announced: whoever sees the token may send at once.
+        liveliness = self._session.liveliness()
+        tokens, own = f"{shared.prefix}/ready/**", token_key(service, self._peers.incarnation)
+        self._held: list[Any] = [  # they live as long as we do
+            liveliness.declare_subscriber(tokens, self._on_token, history=True),
+            liveliness.declare_token(f"{shared.prefix}/{own}"),
+            self._session.declare_subscriber(f"{shared.prefix}/{STOP_KEY}", self._on_stop),
+        ]
+        self._keeper = threading.Thread(target=self._keep, daemon=True)
+        self._keeper.start()
+
+    def __enter__(self) -> "ZenohBus":
+        return self
+
+    def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
+        try:
+            if error_type is None:
+                self.flush()
+                self._all_is_safe()
+        finally:
+            self._closing = True
+            self._wake.set()
+            self._keeper.join()
+            if self._checkpoints is not None:
+                self._checkpoints.close()
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    # -- sending -------------------------------------------------------------------------------
+
+    def publish(self, topic: Topic, message: Header) -> None:
+        """Send one message, once every required reader is within the window.
+
+        Raises MessageError where the message is larger than its topic's readers take.
+        """
+        payload = codec.encode(message)
+        if len(payload) > topic.max_bytes:
+            raise MessageError(
+                f"{topic.key}: frame {message.frame} takes {len(payload)} bytes, more than the "
+                f"{topic.max_bytes} allowed"
+            )
+        self.publish_encoded(topic, payload)
+
+    def publish_encoded(self, topic: Topic, payload: bytes) -> None:
+        """Send a message that is encoded already, as a recording has it."""
+        self._send(self._outputs[topic.key], DATA, payload)
+
+    def end(self, topic: Topic, *, complete: bool = True) -> None:
+        """Close a topic.  ``complete`` is False after an interruption.  Twice does no harm."""
+        output = self._outputs[topic.key]
+        if output.ended:
+            return
+        closing = StreamEnd(
+            frame=output.box.sent,
+            stamp_ns=0,
+            frame_id="",
+            topic=topic.key,
+            messages=output.box.sent,
+            complete=complete,
+        )
+        self._send(output, END, codec.encode(closing))
+        output.ended = True
+
+    def end_all(self, *, complete: bool = True) -> None:
+        """Close every output that is still open."""
+        for output in self._outputs.values():
+            self.end(output.topic, complete=complete)
+
+    def flush(self) -> None:
+        """Wait until the required readers will never ask for any of what was sent."""
+        for output in self._outputs.values():
+            if output.box.sent:
+                self._wait_for_readers(output, lambda box=output.box: box.all_safe())
+
+    def _send(self, output: OutLink, kind: int, payload: bytes) -> None:
+        if output.ended:
+            raise ValueError(f"{output.topic.key} was published after its end")
+        self._disturb()
+        self._wait_for_readers(output, lambda: output.box.has_room(len(payload)))
+        output.send(kind, payload)
+
+    def _wait_for_readers(self, output: OutLink, enough: Callable[[], bool]) -> None:
+        readers = output.box.readers.keys()
+        with self._changed:
+            while True:
+                self._peers.raise_if_refused()
+                here = self._peers.seen(readers)
+                if here and enough():
+                    self.waiting_for = ""
+                    return
+                patience_s = max(self._patience_s, _LAST_CREDITS_S)  # credits may be on the way
+                lost = self._peers.lost(readers, patience_s=patience_s, now=time.monotonic())
+                if here and lost:
+                    raise BusError(
+                        f"{lost[0]} went away with {output.box.on_the_way()} messages of "
+                        f"{output.topic.key} unread"
+                    )
+                missing = self._peers.missing(readers)
+                whom = ", ".join(missing) if missing else output.box.slowest()
+                self.waiting_for = f"{whom} to take {output.topic.key}"
+                self._changed.wait(_TICK_S)
+
+    # -- receiving -----------------------------------------------------------------------------
+
+    def receive(self, topic: Topic) -> Iterator[Header]:
+        """Every message of the topic in order, until its end.
+
+        Raises BusError when its sender vanishes before the end.
+        """
+        entry = self._inputs[topic.key]
+        while True:
+            received = self._take([entry])
+            assert received is not None
+            if self._checkpoints is None:
+                entry.safe = entry.box.taken
+            self._tell(entry)
+            if received.is_end:
+                return
+            yield codec.decode(topic.message, received.data, max_bytes=topic.max_bytes)
+
+    def is_waiting(self, topic: Topic) -> bool:
+        """Whether something of the topic has come that was not taken yet."""
+        with self._changed:
+            return bool(self._inputs[topic.key].box.waiting)
+
+    def receive_any(self, *, timeout_s: float | None = None) -> Iterator[Received | None]:
+        """Messages of all inputs in order of arrival, ends included, until every input has ended.
+
+        None whenever nothing has come for ``timeout_s``.  Vouches for nothing: see
+        ``acknowledge``.  For the recorder, the one service whose output may depend on arrival.
+        """
+        entries = [entry for entry in self._inputs.values() if not entry.ended]
+        while entries:
+            received = self._take(entries, timeout_s)
+            if received is not None:
+                self._tell(self._inputs[received.topic.key])
+                if received.is_end:
+                    entries = [entry for entry in entries if entry.topic is not received.topic]
+            yield received
+
+    def acknowledge(self) -> None:
+        """Everything taken so far is on the disk: senders need not keep it any longer."""
+        with self._changed:
+            told = [entry for entry in self._inputs.values() if entry.safe != entry.box.taken]
+            for entry in told:
+                entry.safe = entry.box.taken
+        for entry in told:
+            self._tell(entry)
+
+    def _take(self, entries: Sequence[InLink], timeout_s: float | None = None) -> Received | None:
+        self._disturb()
+        deadline = time.monotonic() + timeout_s if timeout_s is not None else None
+        with self._changed:
+            while not any(entry.box.waiting for entry in entries):
+                self._peers.raise_if_refused()
+                senders = [entry.sender for entry in entries]
+                now = time.monotonic()
+                lost = self._peers.lost(senders, patience_s=self._patience_s, now=now)
+                if lost:
+                    keys = ", ".join(e.topic.key for e in entries if e.sender == lost[0])
+                    raise BusError(f"{lost[0]} went away before the end of {keys}")
+                if deadline is not None and now >= deadline:
+                    return None
+                for entry in entries:
+                    entry.wanted = True
+                whom = ", ".join(dict.fromkeys(self._peers.missing(senders) or senders))
+                what = entries[0].topic.key if len(entries) == 1 else f"{len(entries)} topics"
+                self.waiting_for = f"{what} from {whom}"
+                self._changed.wait(_TICK_S if deadline is None else min(_TICK_S, deadline - now))
+            self.waiting_for = ""
+            entry = first_arrived(entries)
+            for other in entries:
+                other.wanted = False
+            return entry.box.take()
+
+    # -- checkpoints ---------------------------------------------------------------------------
+
+    def restore(self) -> Any | None:
+        """Our state at the newest checkpoint that our readers allow; None at a first start.
+
+        Every topic then goes on from there.  Raises StateError for a broken checkpoint.
+        """
+        if self._checkpoints is None:
+            return None
+        outputs = self._outputs.values()
+        for output in outputs:
+            self._wait_for_readers(output, output.box.heard_from_all)
+        with self._changed:
+            place = self._checkpoints.usable({o.topic.key: o.box.safe() for o in outputs})
+        state = None
+        if place is not None:
+            state = load_state(self._checkpoints.restart_from(place))
+            self._start_from(place)
+        self._restored = self._greeting = True
+        self._wake.set()
+        return state
+
+    def start_from(self, taken: Mapping[str, int], ended: Collection[str]) -> None:
+        """For a service that keeps its own books: take up each input where it left it."""
+        for key in ended:
+            self._inputs[key].ended = True
+        self._start_from(Place(-1, taken, {}))
+        self._restored = self._greeting = True
+        self._wake.set()
+
+    def checkpoint(self, frame: int, state: Any) -> None:
+        """Keep our state as it is after a frame, now and then.  Raises StateError, BusError."""
+        if self._checkpoints is None or not self._checkpoints.due(frame):
+            return
+        with self._changed:
+            inputs = {key: entry.box.taken for key, entry in self._inputs.items()}
+            outputs = {key: output.box.sent for key, output in self._outputs.items()}
+            ended = tuple(key for key, output in self._outputs.items() if output.ended)
+        place = Place(frame, inputs, outputs, ended)
+        self._checkpoints.save(place, save_state(state), self._wake.set)
+
+    def _start_from(self, place: Place) -> None:
+        with self._changed:
+            for key, entry in self._inputs.items():
+                entry.start_from(place.inputs.get(key, 0))
+            for key, sent in place.outputs.items():
+                self._outputs[key].box.start_from(sent)
+                self._outputs[key].ended = key in place.ended
+
+    def _all_is_safe(self) -> None:
+        """We are done: no sender needs to keep anything for us."""
+        self._done = True
+        with self._changed:
+            for entry in self._inputs.values():
+                entry.safe = entry.box.taken
+        for entry in self._inputs.values():
+            self._tell(entry)
+
+    # -- the keeper ----------------------------------------------------------------------------
+
+    def _keep(self) -> None:
+        """Tell our counts, and send again what is asked for, until we leave."""
+        last_tick = time.monotonic()
+        while not self._closing:
+            self._wake.wait(max(0.0, last_tick + _TICK_S - time.monotonic()))
+            self._wake.clear()
+            tick = time.monotonic() - last_tick >= _TICK_S
+            last_tick = time.monotonic() if tick else last_tick
+            if self._closing or not self._restored:
+                continue
+            greeting, self._greeting = self._greeting, False
+            try:
+                if tick:
+                    self._tell_health()
+                self._advance_safe()
+                for entry in self._inputs.values():
+                    self._keep_input(entry, tick=tick, greeting=greeting)
+                for output in self._outputs.values():
+                    output.send_again()
+                    if tick:
+                        output.sent_at_tick = output.box.sent
+            except BusError as error:  # for the service's thread to raise
+                with self._changed:
+                    self._peers.refusal = str(error)
+                    self._changed.notify_all()
+
+    def _tell_health(self) -> None:
+        with self._changed:
+            health = health_of(
+                self._peers.service,
+                self._peers.incarnation,
+                self.waiting_for,
+                {key: entry.box for key, entry in self._inputs.items()},
+                {key: output.box for key, output in self._outputs.items()},
+            )
+        self._session.put(f"{self._prefix}/{health_key(health.service)}", codec.encode(health))
+
+    def _advance_safe(self) -> None:
+        """What our newest usable checkpoint has taken will not be asked for again."""
+        if self._checkpoints is None or self._done:
+            return
+        with self._changed:
+            safe = {key: output.box.safe() for key, output in self._outputs.items()}
+        place = self._checkpoints.usable(safe)
+        if place is None or place == self._place:
+            return
+        self._place = place
+        with self._changed:
+            for key, taken in place.inputs.items():
+                self._inputs[key].safe = max(self._inputs[key].safe, taken)
+
+    def _keep_input(self, entry: InLink, *, tick: bool, greeting: bool) -> None:
+        with self._changed:
+            ask = NOTHING
+            if entry.box.gap:
+                entry.box.gap, ask = False, NOW
+            elif tick and entry.wanted and not entry.arrived:
+                ask = IF_OLD
+            if tick:
+                entry.arrived = False
+        if ask or tick or greeting:
+            self._tell(entry, ask)
+
+    def _tell(self, entry: InLink, ask: int = NOTHING) -> None:
+        if self._restored:  # before that, what we took is not ours
+            entry.tell(self._peers.incarnation, ask)
+
+    def _on_stop(self, _: zenoh.Sample) -> None:
+        self.stop_requested = True
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        alive = sample.kind == zenoh.SampleKind.PUT
+        with self._changed:
+            self._peers.on_token(str(sample.key_expr), alive=alive, now=time.monotonic())
+            self._greeting = self._greeting or alive
+            self._wake.set()
+            self._changed.notify_all()

@@ -1,0 +1,78 @@
+"""The one table of topics."""
+
+from dataclasses import dataclass
+
+from pliant.messages.types import (
+    CameraStream,
+    Depth,
+    Extrema,
+    Header,
+    Image,
+    Keyframe,
+    MapUpdate,
+    MeshPiece,
+    MeshUpdate,
+    SourceImage,
+    Status,
+    StreamEnd,
+    Surfels,
+)
+
+_MIB = 1 << 20
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A named stream of messages of one type, each with a sequence number, closed by an end."""
+
+    key: str
+    """Without the session's prefix."""
+    message: type[Header]
+    per_frame: bool
+    """Exactly one message for every frame, possibly empty."""
+    deterministic: bool = True
+    """Same input, same bytes.  False for status and timings."""
+    logged: bool = True
+    max_bytes: int = 16 * _MIB
+    """A larger message is refused before memory is taken for it."""
+    compression: str = "zstd"
+    """How its chunks of a recording are stored: "" as they are, "lz4" or "zstd"."""
+
+
+STREAM = Topic("camera/stream", CameraStream, per_frame=False, max_bytes=_MIB)
+# Not compressed: most images come compressed, and of raw ones zstd saves a tenth.
+SOURCE = Topic("camera/source", SourceImage, per_frame=True, max_bytes=128 * _MIB, compression="")
+# Not logged: made again from camera/source and the calibration.
+IMAGE = Topic("camera/image", Image, per_frame=True, logged=False, max_bytes=128 * _MIB)
+# Empty where nobody but the recorder would read it.
+DEPTH = Topic("camera/depth", Depth, per_frame=True, max_bytes=128 * _MIB, compression="")
+EXTREMA = Topic("tracks/extrema", Extrema, per_frame=True)
+MAP_UPDATE = Topic("map/update", MapUpdate, per_frame=True, max_bytes=64 * _MIB)
+# One message, after the last frame: what is only known once nothing more can come.
+MAP_FINAL = Topic("map/final", MapUpdate, per_frame=False, max_bytes=512 * _MIB)
+KEYFRAME = Topic("map/keyframe", Keyframe, per_frame=True, max_bytes=64 * _MIB)
+# One message, after the last frame: the keyframes that were still in the window.
+KEYFRAME_FINAL = Topic("map/keyframe_final", Keyframe, per_frame=False, max_bytes=64 * _MIB)
+# In live mode, what of the live mesh is told depends on what there was time for.
+MESH_BLOCKS = Topic("mesh/blocks", MeshUpdate, per_frame=False, max_bytes=256 * _MIB)
+MESH_FINAL = Topic("mesh/final", MeshPiece, per_frame=False)
+SURFELS = Topic("surfels/state", Surfels, per_frame=True, max_bytes=64 * _MIB)
+STREAM_END = Topic("stream/end", StreamEnd, per_frame=False, max_bytes=_MIB)
+
+
+def status(service: str) -> Topic:
+    """The status topic of one service."""
+    return Topic(f"status/{service}", Status, per_frame=False, deterministic=False, max_bytes=_MIB)
+
+
+TOPICS = (
+    STREAM, SOURCE, IMAGE, DEPTH, EXTREMA, MAP_UPDATE, MAP_FINAL, KEYFRAME, KEYFRAME_FINAL,
+    MESH_BLOCKS, MESH_FINAL, SURFELS, STREAM_END,
+)  # fmt: skip
+_BY_KEY = {topic.key: topic for topic in TOPICS}
+
+
+def by_key(key: str) -> Topic | None:
+    """The topic of a key, also the status of a service that this table does not name."""
+    parent, _, service = key.partition("/")
+    return status(service) if parent == "status" and service else _BY_KEY.get(key)

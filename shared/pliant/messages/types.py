@@ -1,0 +1,200 @@
+"""Every message.  Each is a frozen record; fields are added with a default, never renamed.
+
+A message that carries the result of an algorithm *is* that result plus a header, so a service
+sends what it computed and an algorithm takes what arrived, without copying fields about.
+"""
+
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, TypeVar
+
+from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.keyframe_delta import KeyframeDelta
+from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.meshing import MeshBlocks
+from pliant.algorithms.surfels.states import SurfelFrame
+from pliant.algorithms.tracks import FrameTracks
+
+CAMERA_FRAME_ID = "camera"
+WORLD_FRAME_ID = "world"
+
+_M = TypeVar("_M", bound="Header")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """frame: sequence number from 0.  stamp_ns: capture time.  frame_id: coordinate frame."""
+
+    frame: int
+    stamp_ns: int
+    frame_id: str
+
+    @classmethod
+    def of(cls: type[_M], header: "Header", content: Any, **more: Any) -> _M:
+        """This message with the time of ``header`` and the fields of ``content``, not copied."""
+        own = {field.name for field in fields(Header)} - {"frame_id"}
+        names = (field.name for field in fields(content) if field.name not in own)
+        values = {name: getattr(content, name) for name in names}
+        values.update(more)
+        return cls(
+            frame=header.frame,
+            stamp_ns=header.stamp_ns,
+            frame_id=values.pop("frame_id", header.frame_id),
+            **values,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraStream(Header):
+    """Opens a stream: which camera it is, before and after rectification.
+
+    source: name of the source.     mode: "lossless" or "live".
+    frames: how many will come, -1 if unknown.
+    calibration: the source's, as YAML, from which the rectified image can be made again.
+    width, height, fx, fy, cx, cy: the rectified pinhole camera, in pixels.
+    scale_is_metric: whether lengths are metres; never so for one camera alone.
+    """
+
+    source: str
+    mode: str
+    frames: int
+    calibration: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    scale_is_metric: bool = False
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The rectified camera."""
+        return PinholeCamera(
+            width=self.width, height=self.height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceImage(Header):
+    """A frame as it came: ``encoding`` says how ``data`` is read.  Empty where it was dropped."""
+
+    encoding: str
+    width: int
+    height: int
+    data: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Depth(Header):
+    """The depth map of a frame as it came, a 16-bit image file; empty where there is none.
+
+    ``pliant.datasets.depth.DepthRectifier`` makes metres of it.
+    """
+
+    data: bytes = b""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Image(Header):
+    """The rectified frame that everybody works on.
+
+    grey: (H, W).     colour: (H, W, 3) RGB, or (0, 0, 3) where the source has none.
+    missing: "" or why there are no pixels ("dropped", "broken: ..."); both arrays are empty then.
+    """
+
+    grey: Annotated[U8, Shape("H", "W")]
+    colour: Annotated[U8, Shape("A", "B", 3)]
+    missing: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extrema(Header, FrameTracks):
+    """Tracks and all maxima of a frame."""
+
+    missing: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapUpdate(Header, MapDelta):
+    """Everything that a frame changes in the map, at once."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keyframe(Header, KeyframeDelta):
+    """What a frame tells of keyframes.
+
+    jpeg: the rectified image of the new keyframe, colour where the source has it; empty without.
+    """
+
+    jpeg: bytes = b""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshUpdate(Header, MeshBlocks):
+    """Blocks of the live mesh: those that changed, or (``again``) some told as they were before.
+
+    segment: of the map; a new one starts with an empty mesh.    voxel_size: in its units.
+    """
+
+    segment: int
+    voxel_size: float
+    again: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshPiece(Header):
+    """A piece of a final mesh: its next vertices, and its next triangles.
+
+    level: "fine" or "coarse".    piece, pieces: this one's number from 0, and how many there are.
+    keyframes: how many were fused.    positions, normals, colours: of the vertices, RGB.
+    triangles: rows of the vertices of all pieces.
+    """
+
+    segment: int
+    level: str
+    voxel_size: float
+    keyframes: int
+    piece: int
+    pieces: int
+    positions: Annotated[F32, Shape("V", 3)]
+    normals: Annotated[F32, Shape("V", 3)]
+    colours: Annotated[U8, Shape("V", 3)]
+    triangles: Annotated[I32, Shape("T", 3)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surfels(Header, SurfelFrame):
+    """All surfels in a frame; ``age`` and ``born`` count the frames that have pixels.
+
+    missing: "" or why the frame has none: no pixels, or no depth so far.     note: "" or what is
+    wrong with the depth of this frame.
+    """
+
+    missing: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status(Header):
+    """How a service fares; never an input of another one.
+
+    stages, seconds: time spent on this frame by stage.   counters, values: what the service counts.
+    note: one line for the user, "" if there is nothing to say.
+    """
+
+    service: str
+    note: str
+    stages: tuple[str, ...]
+    seconds: Annotated[F64, Shape("S")]
+    counters: tuple[str, ...]
+    values: Annotated[F64, Shape("C")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamEnd(Header):
+    """Closes a topic.  messages: how many it carried.   complete: False after an interruption."""
+
+    topic: str
+    messages: int
+    complete: bool

@@ -1,0 +1,1 @@
+"""MCAP recordings: writing them so that nothing is lost, and reading them back."""
