@@ -1,0 +1,164 @@
+"""Where frames come from: one file per format of dataset, and the built-in sequences.
+
+``open_source`` opens any of them; ``FORMATS`` is the list.  A source gives frames as they came and
+the calibration of its camera; ``Rectifier`` turns a frame into the image that everybody works on.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pliant.datasets.base import BrokenFrame, Dataset, SourceFrame
+from pliant.datasets.calibration import Calibration, calibration_from_yaml, calibration_yaml
+from pliant.datasets.calibration_files import read_calibration
+from pliant.datasets.camera_device import CameraDevice, camera_index
+from pliant.datasets.euroc import is_euroc, open_euroc
+from pliant.datasets.folder import (
+    is_bare_folder,
+    is_listed_folder,
+    open_bare_folder,
+    open_listed_folder,
+)
+from pliant.datasets.images import SUFFIXES, SourceOptions
+from pliant.datasets.kitti import is_kitti, open_kitti
+from pliant.datasets.mcap_file import is_mcap, open_mcap
+from pliant.datasets.own_recording import is_own_recording, open_own_recording
+from pliant.datasets.rectifier import Rectifier, decode
+from pliant.datasets.ros_bag import is_ros_bag, open_ros_bag
+from pliant.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
+from pliant.datasets.video import VideoFile
+from pliant.errors import DatasetError
+
+__all__ = [
+    "FORMATS",
+    "BrokenFrame",
+    "Calibration",
+    "CameraDevice",
+    "Dataset",
+    "Rectifier",
+    "SourceFormat",
+    "SourceFrame",
+    "SourceOptions",
+    "VideoFile",
+    "calibration_from_yaml",
+    "calibration_yaml",
+    "decode",
+    "open_source",
+    "read_calibration",
+]
+
+_BUILTIN_PREFIX = "built-in:"
+
+
+@dataclass(frozen=True)
+class SourceFormat:
+    """One kind of source.
+
+    layout: what it looks like, for people.     recognises: whether a source is of this kind.
+    open: opens it; raises DatasetError and CalibrationError.
+    """
+
+    layout: str
+    recognises: Callable[[str], bool]
+    open: Callable[[str, SourceOptions], Dataset]
+    has_topics: bool = False
+    has_depth: bool = False
+
+
+def _open_builtin(source: str, options: SourceOptions) -> Dataset:
+    from pliant.datasets.builtin import builtin_folder
+
+    return open_listed_folder(str(builtin_folder(source)), options, name=source)
+
+
+def _is_camera(source: str) -> bool:
+    return camera_index(source) is not None and not Path(source).exists()
+
+
+def _open_camera(source: str, options: SourceOptions) -> Dataset:
+    return CameraDevice(camera_index(source) or 0, options)
+
+
+def _open_video(source: str, options: SourceOptions) -> Dataset:
+    path = Path(source)
+    if path.suffix.lower() in (*SUFFIXES, ".txt", ".csv", ".yaml"):
+        raise DatasetError(f"{source}: a single file of this kind is no source; give its folder")
+    return VideoFile(path, options)
+
+
+FORMATS: dict[str, SourceFormat] = {
+    "built-in": SourceFormat(
+        "built-in:NAME",
+        lambda source: source.startswith(_BUILTIN_PREFIX),
+        _open_builtin,
+        has_depth=True,
+    ),
+    "camera": SourceFormat("camera:0", _is_camera, _open_camera),
+    "recording": SourceFormat(
+        "a recording of Pliant's", is_own_recording, open_own_recording, has_depth=True
+    ),
+    "mcap": SourceFormat("an MCAP file", is_mcap, open_mcap, has_topics=True),
+    "ros-bag": SourceFormat(
+        "a ROS 1 bag or the folder of a ROS 2 bag", is_ros_bag, open_ros_bag, has_topics=True
+    ),
+    "video": SourceFormat("a video file", lambda source: Path(source).is_file(), _open_video),
+    "euroc": SourceFormat("EuRoC (mav0/cam0/data.csv)", is_euroc, open_euroc),
+    "kitti": SourceFormat("KITTI odometry (image_0/, times.txt, calib.txt)", is_kitti, open_kitti),
+    "tum-rgbd": SourceFormat("TUM RGB-D (rgb.txt)", is_tum_rgbd, open_tum_rgbd, has_depth=True),
+    "folder": SourceFormat(
+        "a folder with rgb.txt and calib.yaml",
+        is_listed_folder,
+        open_listed_folder,
+        has_depth=True,
+    ),
+    "images": SourceFormat("a folder of images", is_bare_folder, open_bare_folder),
+}
+"""Every kind of source; the first that recognises a source opens it."""
+
+
+def open_source(
+    source: str,
+    *,
+    calibration: Path | None = None,
+    fov_deg: float | None = None,
+    topic: str = "",
+    depth: Literal["none", "first", "all"] = "none",
+) -> Dataset:
+    """Open a source of frames of any of the ``FORMATS``, and check it as far as can be seen.
+
+    calibration: a file that wins over what comes with the source.
+    fov_deg: horizontal field of view, for a guess without any calibration.
+    topic: which images of a file that holds several; "" where there is one.
+    depth: which depth maps the frames bring along; a source without any is refused then.
+
+    Raises DatasetError or CalibrationError: one line with what is wrong, where, and what to do.
+    """
+    if not source or "\0" in source:
+        raise DatasetError(f"source {source!r}: is empty; understood are {understood()}")
+    options = SourceOptions(calibration=calibration, fov_deg=fov_deg, topic=topic, depth=depth)
+    path = Path(source)
+    try:
+        for kind in FORMATS.values():
+            if kind.recognises(source):
+                if topic and not kind.has_topics:
+                    raise DatasetError(f"{source}: has no topics to choose from: leave out --topic")
+                if depth != "none" and not kind.has_depth:
+                    raise DatasetError(
+                        f"{source}: brings no depth along, and surfels need it to start: use "
+                        "a folder with rgb.txt and depth.txt"
+                    )
+                return kind.open(source, options)
+        if not path.exists():
+            raise DatasetError(f"{source}: no such file or folder; understood are {understood()}")
+    except OSError as error:  # a name too long, a folder that may not be entered, a broken disk
+        raise DatasetError(f"{source}: cannot be read: {error.strerror or error}") from None
+    if not path.is_dir():
+        raise DatasetError(f"{source}: neither a file nor a folder; understood are {understood()}")
+    what = "holds none of the sources" if any(path.iterdir()) else "is an empty folder"
+    raise DatasetError(f"{source}: {what}; understood are {understood()}")
+
+
+def understood() -> str:
+    """The sources that are understood, in one line."""
+    return ", ".join(kind.layout for kind in FORMATS.values())

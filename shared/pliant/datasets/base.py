@@ -1,0 +1,96 @@
+"""What every source of frames has in common: the frame as it came, and the protocol of a source."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+from pliant.datasets.calibration import Calibration
+from pliant.errors import DatasetError
+
+
+class BrokenFrame(DatasetError):  # noqa: N818 (an error of one frame, not of the source)
+    """One frame does not decode or has another size; the run goes on without it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceFrame:
+    """One frame as it came.
+
+    index: from 0, without gaps.     stamp_ns: capture time, increasing.
+    encoding: how ``data`` is read: a file format ("jpeg", "png", "bmp", "tiff", "webp", "pnm", or
+    "unknown", left to the decoder) or raw rows without padding ("mono8", "bgr8", "rgb8" and
+    the others of ``rectifier.RAW_BYTES``).
+    data: bytes as they are in the file, or the raw pixels.
+    width, height: of raw pixels; 0 for file formats, which say it themselves.
+    depth: the file of the depth map that belongs to it, as it is; b"" where there is none.
+    """
+
+    index: int
+    stamp_ns: int
+    encoding: str
+    data: bytes
+    width: int = 0
+    height: int = 0
+    depth: bytes = b""
+
+    @property
+    def dropped(self) -> bool:
+        """Whether it was passed over on purpose (an empty file is not: that one is broken)."""
+        return self.encoding == ""
+
+    def without_data(self) -> "SourceFrame":
+        """This frame passed over: its number and time stay."""
+        return replace(self, encoding="", data=b"", width=0, height=0, depth=b"")
+
+
+class Dataset(Protocol):
+    """A source of frames.  Iterating starts it from its first frame, each time anew."""
+
+    @property
+    def name(self) -> str:
+        """Short name for people."""
+        ...
+
+    @property
+    def calibration(self) -> Calibration:
+        """The camera, with distortion."""
+        ...
+
+    @property
+    def is_live(self) -> bool:
+        """Frames come whether somebody is ready or not."""
+        ...
+
+    @property
+    def frame_count(self) -> int | None:
+        """How many frames come; None if unknown.  Of a video file, what its container says."""
+        ...
+
+    @property
+    def ground_truth_path(self) -> Path | None:
+        """The file of true poses that came with it."""
+        ...
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        """The frames.  Raises DatasetError where the source itself fails, not for a bad frame."""
+        ...
+
+
+_MAGIC = (
+    (b"\xff\xd8\xff", "jpeg"),
+    (b"\x89PNG\r\n\x1a\n", "png"),
+    (b"BM", "bmp"),
+    (b"II*\x00", "tiff"),
+    (b"MM\x00*", "tiff"),
+    (b"P5", "pnm"),
+    (b"P6", "pnm"),
+)
+
+
+def encoding_of(data: bytes) -> str:
+    """The format of the bytes of an image file by its first bytes; names of files do lie."""
+    for magic, encoding in _MAGIC:
+        if data.startswith(magic):
+            return encoding
+    return "webp" if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else "unknown"

@@ -1,0 +1,110 @@
+"""Depth maps that come with a source: their list, and from their bytes to rectified metres.
+
+    FOLDER/depth.txt    "seconds file" a line, as in rgb.txt: 16-bit images, in the units and of the
+                        camera that the calibration's ``depth_...`` keys say; 0: nothing measured
+
+A depth map belongs to the image that is nearest in time, if that is within 20 ms (as in the TUM
+benchmark's tools) and it is the nearest to that image.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I64
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.rectification import rectified_camera
+from pliant.datasets.base import BrokenFrame
+from pliant.datasets.calibration import Calibration, DepthImages
+from pliant.datasets.images import ListedImage, SourceOptions, read_list
+from pliant.errors import CalibrationError, DatasetError
+from pliant.trajectory import associate
+
+LIST_NAME = "depth.txt"
+_MAX_DIFFERENCE_NS = 20_000_000
+
+
+def with_depth(
+    images: Sequence[ListedImage], folder: Path, calibration: Calibration, options: SourceOptions
+) -> Sequence[ListedImage]:
+    """The images with the depth maps that are wanted of them.
+
+    Raises DatasetError where there is no list or nothing in it belongs to an image, and
+    CalibrationError where the unit of the depth maps is not known.
+    """
+    if options.depth == "none":
+        return images
+    file = folder / LIST_NAME
+    if not file.is_file():
+        raise DatasetError(
+            f"{folder}: no {LIST_NAME}: surfels need a depth map to start from, listed there like "
+            "the images in rgb.txt"
+        )
+    maps = read_list(file, folder)
+    if calibration.depth is None:
+        raise CalibrationError(
+            f"{folder}: has depth maps, but its calibration has no depth_scale: add the metres per "
+            "unit, e.g. depth_scale: 0.001"
+        )
+    rows, of_maps = associate(_stamps(images), _stamps(maps), max_difference_ns=_MAX_DIFFERENCE_NS)
+    if not len(rows):
+        raise DatasetError(f"{file}: no depth map is within 20 ms of an image; correct its times")
+    wanted = slice(1 if options.depth == "first" else None)
+    pairs = zip(rows[wanted].tolist(), of_maps[wanted].tolist(), strict=True)
+    found = {row: maps[of_map].path for row, of_map in pairs}
+    return [replace(image, depth=found.get(row)) for row, image in enumerate(images)]
+
+
+class DepthRectifier:
+    """Turns depth maps as they came into metres at the pixels of the rectified images."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self._depth = calibration.depth
+        self._maps = None
+        if calibration.depth is not None:
+            camera = rectified_camera(calibration.lens)
+            if camera != calibration.depth.camera:
+                self._maps = _nearest_pixels(calibration.depth, camera)
+
+    def rectify(self, frame: int, data: bytes) -> F64:
+        """(H, W) metres along the optical axis, 0 where nothing was measured.
+
+        Pixels are taken as they are, the nearest one: between two surfaces there is nothing.
+        Raises BrokenFrame where the bytes are no depth map, or one of another size.
+        """
+        if self._depth is None:
+            raise BrokenFrame(f"frame {frame}: a depth map without depth_scale in the calibration")
+        camera = self._depth.camera
+        try:
+            units: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            units = None
+        if units is None or units.dtype != np.uint16 or units.ndim != 2:
+            raise BrokenFrame(f"frame {frame}: its depth map is no 16-bit image of one channel")
+        if units.shape != (camera.height, camera.width):
+            raise BrokenFrame(
+                f"frame {frame}: its depth map has {units.shape[1]}x{units.shape[0]} px, expected "
+                f"{camera.width}x{camera.height}"
+            )
+        if self._maps is not None:
+            border: Any = cv2.BORDER_CONSTANT
+            units = cv2.remap(units, *self._maps, cv2.INTER_NEAREST, borderMode=border)
+        known = ~np.isin(units, (0, *self._depth.invalid))
+        return np.where(known, units * self._depth.scale_m, 0.0)
+
+
+def _nearest_pixels(depth: DepthImages, camera: PinholeCamera) -> tuple[F32, F32]:
+    """The column and row of the depth map that each pixel of the rectified camera sees."""
+    u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(float(camera.height)))
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
+    rays = np.concatenate([camera.normalise(pixels), np.ones((len(pixels), 1))], axis=1)
+    found = depth.camera.project(rays).reshape(camera.height, camera.width, 2).astype(np.float32)
+    return np.ascontiguousarray(found[..., 0]), np.ascontiguousarray(found[..., 1])
+
+
+def _stamps(images: Sequence[ListedImage]) -> I64:
+    return np.array([image.stamp_ns for image in images], np.int64)

@@ -1,0 +1,55 @@
+"""EuRoC and other sequences in ASL format; the left camera is used.
+
+    SEQUENCE/mav0/cam0/data.csv       "nanoseconds,file" a line
+    SEQUENCE/mav0/cam0/data/*.png
+    SEQUENCE/mav0/cam0/sensor.yaml    the calibration (or --calibration FILE, e.g. Kalibr's)
+    SEQUENCE/mav0/state_groundtruth_estimate0/data.csv
+
+The source is SEQUENCE, SEQUENCE/mav0 or SEQUENCE/mav0/cam0 (or another camera's folder).
+"""
+
+from pathlib import Path
+
+from pliant.datasets.base import Dataset
+from pliant.datasets.images import (
+    ImageFiles,
+    SourceOptions,
+    choose_calibration,
+    existing,
+    image_size,
+    read_list,
+)
+from pliant.errors import DatasetError
+
+
+def is_euroc(source: str) -> bool:
+    """Whether it is a sequence in ASL format, or one camera of it."""
+    return _camera_folder(Path(source)) is not None
+
+
+def open_euroc(source: str, options: SourceOptions) -> Dataset:
+    """A sequence in ASL format.  Raises DatasetError and CalibrationError."""
+    camera = _camera_folder(Path(source))
+    if camera is None:
+        raise DatasetError(f"{source}: no mav0/cam0 with data.csv and data/")
+    images = read_list(camera / "data.csv", camera / "data", seconds=False)
+    resolved = camera.resolve()
+    sequence = resolved.parent.parent if resolved.parent.name == "mav0" else resolved.parent
+    return ImageFiles(
+        name=sequence.name if resolved.name == "cam0" else f"{sequence.name}_{resolved.name}",
+        images=images,
+        calibration=choose_calibration(
+            options, image_size(images), found=camera / "sensor.yaml", where=str(camera)
+        ),
+        ground_truth_path=existing(
+            camera.parent / "state_groundtruth_estimate0" / "data.csv",
+            camera.parent / "mocap0" / "data.csv",
+        ),
+    )
+
+
+def _camera_folder(folder: Path) -> Path | None:
+    for camera in (folder / "mav0" / "cam0", folder / "cam0", folder):
+        if (camera / "data").is_dir() and ((camera / "data.csv").is_file() or camera != folder):
+            return camera
+    return None

@@ -1,0 +1,163 @@
+"""What files of recorded messages have in common: the choice of a topic, its frames, its camera."""
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from pliant.datasets import image_messages
+from pliant.datasets.base import BrokenFrame, SourceFrame
+from pliant.datasets.calibration import Calibration
+from pliant.datasets.image_messages import CALIBRATION_TYPES, IMAGE_TYPES, RecordedImage
+from pliant.datasets.images import SourceOptions, choose_calibration
+from pliant.datasets.rectifier import decode
+from pliant.errors import CalibrationError, DatasetError
+
+_TRIED_FOR_SIZE = 20
+
+
+@dataclass(frozen=True)
+class MessageTopic:
+    """A topic of a file.  kind: its type as ``plain_type`` writes it.   count: -1 if unknown."""
+
+    name: str
+    kind: str
+    count: int
+
+
+class OpenMessages(Protocol):
+    """A file of messages that is open."""
+
+    topics: list[MessageTopic]
+
+    def messages(self, topic: MessageTopic) -> Iterator[RecordedImage]:
+        """The messages of one topic in order of time.  Raises DatasetError where they end badly."""
+        ...
+
+
+class MessageFile(Protocol):
+    """A file of messages."""
+
+    path: Path
+
+    def open(self) -> AbstractContextManager[OpenMessages]:
+        """Open it.  Raises DatasetError where it is damaged or a library is missing."""
+        ...
+
+
+class MessageImages:
+    """The images of one topic of a file, as a source of frames."""
+
+    is_live = False
+    ground_truth_path: Path | None = None
+
+    def __init__(self, file: MessageFile, options: SourceOptions) -> None:
+        """Raises DatasetError, which lists the topics where the choice is not clear."""
+        self.name = file.path.resolve().stem
+        self._file = file
+        with file.open() as opened:
+            self._topic = _choose(opened.topics, options.topic, file.path)
+            self._where = f"{file.path}: {self._topic.name}"
+            size = self._size(opened)
+            found = None
+            if options.calibration is None and options.fov_deg is None:
+                found = _calibration(opened, self._topic, self._where)
+            self.calibration = choose_calibration(options, size, found=found, where=self._where)
+        self.frame_count = self._topic.count if self._topic.count >= 0 else None
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        with self._file.open() as opened:
+            last_ns = -1
+            for frame in self._frames(opened):
+                if frame.stamp_ns <= last_ns:
+                    raise DatasetError(
+                        f"{self._where}: the time of image {frame.index} "
+                        f"({frame.stamp_ns / 1e9:.6f} s) does not come after that of the image "
+                        f"before ({last_ns / 1e9:.6f} s); is another recording mixed in?"
+                    )
+                last_ns = frame.stamp_ns
+                yield frame
+
+    def _frames(self, opened: OpenMessages) -> Iterator[SourceFrame]:
+        for index, image in enumerate(opened.messages(self._topic)):
+            yield image_messages.source_frame(self._topic.kind, image, index, self._where)
+
+    def _size(self, opened: OpenMessages) -> tuple[int, int]:
+        """(width, height) of the first image that decodes."""
+        tried = 0
+        for frame in self._frames(opened):
+            try:
+                height, width = decode(frame).shape[:2]
+            except BrokenFrame:
+                tried += 1
+                if tried == _TRIED_FOR_SIZE:
+                    break
+                continue
+            return width, height
+        what = "no messages" if not tried else f"none of the first {tried} images decodes"
+        raise DatasetError(f"{self._where}: {what}; choose another --topic")
+
+
+def _choose(topics: list[MessageTopic], wanted: str, path: Path) -> MessageTopic:
+    images = [topic for topic in topics if topic.kind in IMAGE_TYPES]
+    listed = ", ".join(f"{t.name} ({t.kind})" for t in sorted(images, key=lambda t: t.name))
+    named = [topic for topic in topics if topic.name.strip("/") == wanted.strip("/")]
+    if wanted and not named:
+        raise DatasetError(f"{path}: no topic {wanted}; {_with_images(listed)}")
+    if wanted and named[0] not in images:
+        raise DatasetError(
+            f"{path}: {named[0].name} carries {named[0].kind}, no images; {_with_images(listed)}"
+        )
+    if not images:
+        names = ", ".join(sorted({t.kind for t in topics})) or "nothing"
+        raise DatasetError(f"{path}: no topic with images; it carries {names[:300]}")
+    if not wanted and len(images) > 1:
+        raise DatasetError(f"{path}: several topics with images, choose by --topic: {listed}")
+    return named[0] if wanted else images[0]
+
+
+def _with_images(listed: str) -> str:
+    return f"images are in {listed}" if listed else "none of its topics carries images"
+
+
+def _calibration(opened: OpenMessages, images: MessageTopic, where: str) -> Calibration | None:
+    """The camera that belongs to a topic of images: the topic nearest by name tells it.
+
+    /left/image_raw has /left/camera_info; where two are equally near, nothing is guessed.
+    """
+
+    def shared(name: str) -> int:
+        ours, theirs = images.name.strip("/").split("/"), name.strip("/").split("/")
+        different = [i for i, (a, b) in enumerate(zip(ours, theirs, strict=False)) if a != b]
+        return different[0] if different else min(len(ours), len(theirs))
+
+    able = [t for t in opened.topics if t.kind in CALIBRATION_TYPES and t.count != 0]
+    nearest = max((shared(topic.name) for topic in able), default=0)
+    able = [topic for topic in able if shared(topic.name) == nearest]
+    others = sum(topic.kind in IMAGE_TYPES for topic in opened.topics) > 1
+    if len(able) != 1 or (nearest == 0 and others and "/" in able[0].name.strip("/")):
+        return None
+    message = next(opened.messages(able[0]), None)
+    if message is None:
+        return None
+    rectified = any("rect" in part for part in images.name.split("/"))
+    try:
+        return image_messages.calibration(message.message, rectified=rectified)
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"{where}: the calibration in {able[0].name}: {error}; give --calibration FILE"
+        ) from None
+
+
+def missing_library(path: Path, library: str) -> DatasetError:
+    """What to say where an optional library is not there."""
+    return DatasetError(f"{path}: needs {library} to be read: pip install 'pliant[bags]'")
+
+
+def damaged(path: Path, error: BaseException, hint: str) -> DatasetError:
+    """One line for whatever a library says of a broken file."""
+    said: Any = " ".join(str(error).split())[:120]
+    return DatasetError(
+        f"{path}: is cut off or damaged ({said or type(error).__name__}); mend it with {hint}"
+    )

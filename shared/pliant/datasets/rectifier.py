@@ -1,0 +1,142 @@
+"""From the bytes of a frame to the rectified image: a pure function of the frame and the camera.
+
+A replay makes the same images again from what was recorded, so nothing here may depend on files,
+time or earlier frames.
+"""
+
+from typing import cast
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.rectification import rectification_maps, rectified_camera, resample
+from pliant.datasets.base import BrokenFrame, SourceFrame
+from pliant.datasets.calibration import Calibration
+
+_BAYER = {
+    "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
+    "bayer_bggr8": cv2.COLOR_BayerBGGR2RGB,
+    "bayer_gbrg8": cv2.COLOR_BayerGBRG2RGB,
+    "bayer_grbg8": cv2.COLOR_BayerGRBG2RGB,
+}
+RAW_BYTES = {
+    "mono8": 1,
+    "mono16": 2,
+    "bgr8": 3,
+    "rgb8": 3,
+    "bgra8": 4,
+    "rgba8": 4,
+    **dict.fromkeys(_BAYER, 1),
+}
+"""Bytes of a pixel of each raw encoding; mono16 is little-endian."""
+
+
+def decode(frame: SourceFrame) -> U8:
+    """(H, W) grey or (H, W, 3) RGB pixels of a frame.
+
+    More than 8 bits a channel are reduced to 8, transparency is dropped, and the orientation that
+    a JPEG states is applied, all as ``cv2.imread`` does.
+
+    Raises BrokenFrame, naming the frame, where the bytes are no whole image.
+    """
+    if frame.dropped:
+        raise BrokenFrame(f"frame {frame.index}: it was dropped, there is nothing to decode")
+    if frame.encoding in RAW_BYTES:
+        return _decode_raw(frame)
+    if not frame.data:
+        raise BrokenFrame(f"frame {frame.index}: the image file is empty or gone")
+    if not _whole(frame):
+        raise BrokenFrame(f"frame {frame.index}: the {frame.encoding} image is cut off")
+    try:
+        pixels = cv2.imdecode(np.frombuffer(frame.data, np.uint8), cv2.IMREAD_ANYCOLOR)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        kind = "image" if frame.encoding == "unknown" else f"{frame.encoding} image"
+        raise BrokenFrame(f"frame {frame.index}: the {kind} does not decode")
+    decoded = cast(U8, pixels)
+    return _rgb(decoded) if decoded.ndim == 3 else decoded
+
+
+class Rectifier:
+    """Turns frames of one camera into the rectified images that everybody works on."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self._size = (calibration.width, calibration.height)
+        lens = calibration.lens
+        self._camera = rectified_camera(lens)  # Calibration has seen to it that there is one
+        self._maps = rectification_maps(lens, self._camera) if lens.distorts else None
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """The camera of the rectified images."""
+        return self._camera
+
+    @property
+    def changes_nothing(self) -> bool:
+        """Whether rectified images are the source's."""
+        return self._maps is None
+
+    def rectify(self, frame: SourceFrame) -> tuple[U8, U8 | None]:
+        """Grey (H, W), and RGB (H, W, 3) where the source has colour.
+
+        Without distortion the pixels are untouched.  Raises BrokenFrame where the frame does not
+        decode, or has another size than the calibration says.
+        """
+        pixels = decode(frame)
+        height, width = pixels.shape[:2]
+        if (width, height) != self._size:
+            raise BrokenFrame(
+                f"frame {frame.index}: {width}x{height} px, but the calibration is for "
+                f"{self._size[0]}x{self._size[1]}"
+            )
+        if self._maps is not None:
+            pixels = resample(pixels, self._maps)
+        if pixels.ndim == 2:
+            return pixels, None
+        return cast(U8, cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)), pixels
+
+
+def _decode_raw(frame: SourceFrame) -> U8:
+    size = RAW_BYTES[frame.encoding]
+    if min(frame.width, frame.height) <= 0 or len(frame.data) != frame.width * frame.height * size:
+        raise BrokenFrame(
+            f"frame {frame.index}: {len(frame.data)} bytes are no {frame.encoding} image of "
+            f"{frame.width}x{frame.height} px"
+        )
+    pixels = np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width, size)
+    match frame.encoding:
+        case "mono8":
+            return pixels[:, :, 0]
+        case "mono16":
+            return np.ascontiguousarray(pixels[:, :, 1])  # the upper byte
+        case "rgb8":
+            return pixels
+        case "bgr8":
+            return _rgb(pixels)
+        case "rgba8":
+            return np.ascontiguousarray(pixels[:, :, :3])
+        case "bgra8":
+            return np.ascontiguousarray(pixels[:, :, 2::-1])
+        case bayer:
+            return cast(U8, cv2.cvtColor(pixels[:, :, 0], _BAYER[bayer]))
+
+
+def _rgb(bgr: U8) -> U8:
+    return cast(U8, cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+
+
+def _whole(frame: SourceFrame) -> bool:
+    """Whether a file format's end marker is there.
+
+    Decoders fill what an interrupted copy lacks with grey (which of them do depends on the
+    version), and a tracker would lose its points there without anybody knowing why.
+    """
+    if frame.encoding == "jpeg":
+        # A thumbnail inside has markers of its own: the end must follow the last scan.
+        return frame.data.rfind(b"\xff\xd9") > frame.data.rfind(b"\xff\xda")
+    if frame.encoding == "png":
+        return frame.data.rfind(b"IEND") > 0
+    return True

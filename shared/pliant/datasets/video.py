@@ -1,0 +1,97 @@
+"""Video files: any that OpenCV reads, with a calibration file or a field of view.
+
+A file of the same name with the ending .yaml beside it is taken as its calibration.  Times are
+those of the container; where it has none, or they repeat, frames follow each other at its rate.
+Frames are published as they leave the decoder, as raw BGR pixels.
+"""
+
+import contextlib
+import os
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+
+from pliant.algorithms.arrays import U8
+from pliant.datasets.base import SourceFrame
+from pliant.datasets.calibration import Calibration
+from pliant.datasets.images import SourceOptions, choose_calibration
+from pliant.errors import DatasetError
+
+_DEFAULT_FPS = 30.0
+
+
+class VideoFile:
+    """The frames of a video file.  ``frame_count`` is the container's word, not a promise."""
+
+    is_live = False
+    ground_truth_path: Path | None = None
+
+    def __init__(self, file: Path, options: SourceOptions) -> None:
+        """Raises DatasetError where it holds no video, CalibrationError for its calibration."""
+        self.name = file.stem
+        self._file = file
+        with _opened(file) as capture:
+            read, first = capture.read()
+            if not read:
+                raise DatasetError(f"{file}: a video without frames")
+            count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.frame_count = count if count > 0 else None
+        height, width = cast(U8, first).shape[:2]
+        self.calibration: Calibration = choose_calibration(
+            options, (width, height), found=file.with_suffix(".yaml"), where=str(file)
+        )
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        with _opened(self._file) as capture:
+            fps = capture.get(cv2.CAP_PROP_FPS)
+            step_ns = round(1e9 / (fps if 0.1 < fps < 1e4 else _DEFAULT_FPS))
+            index, previous_ns = 0, -step_ns
+            while True:
+                read, pixels = capture.read()
+                if not read:
+                    return
+                stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+                if stamp_ns <= previous_ns:
+                    stamp_ns = previous_ns + step_ns
+                yield raw_frame(cast(U8, pixels), index, stamp_ns)
+                index, previous_ns = index + 1, stamp_ns
+
+
+def raw_frame(pixels: U8, index: int, stamp_ns: int) -> SourceFrame:
+    """A decoded frame, (H, W) grey or (H, W, 3) BGR, as raw bytes."""
+    height, width = pixels.shape[:2]
+    return SourceFrame(
+        index=index,
+        stamp_ns=stamp_ns,
+        encoding="mono8" if pixels.ndim == 2 else "bgr8",
+        data=pixels.tobytes(),
+        width=width,
+        height=height,
+    )
+
+
+@contextlib.contextmanager
+def quiet_opencv() -> Generator[None, None, None]:
+    """Keep OpenCV and FFmpeg from writing to the terminal: our own line says what is wrong."""
+    logging: Any = cv2.utils.logging
+    before = logging.getLogLevel()
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read by OpenCV at its first video
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        logging.setLogLevel(before)
+
+
+@contextlib.contextmanager
+def _opened(file: Path) -> Generator[cv2.VideoCapture, None, None]:
+    with quiet_opencv():
+        capture = cv2.VideoCapture(str(file))
+    try:
+        if not capture.isOpened():
+            raise DatasetError(f"{file}: not a video that OpenCV can read; convert it, e.g. to MP4")
+        yield capture
+    finally:
+        capture.release()

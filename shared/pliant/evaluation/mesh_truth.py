@@ -1,0 +1,172 @@
+"""A mesh against true depth maps: how much it covers, how well, and its surface and normals."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.meshing import view_mesh
+from pliant.evaluation.criteria import Similarity
+from pliant.evaluation.surface_distance import sample_surface, share_within, thin_out
+from pliant.evaluation.visible_depth import DepthView
+
+DEPTH_LIMIT = 0.05
+SURFACE_LIMIT = 0.01
+"""Share of the scene's diameter within which two surfaces are the same, for the F-score."""
+_SPACING = 0.25
+"""Samples of a surface stand so far apart, as a share of the limit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mesh:
+    """points, normals: (V, 3) in the world of the estimate.    faces: (F, 3)."""
+
+    points: F32
+    normals: F32
+    faces: I32
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshTruth:
+    """Figures of a mesh.  Pixels are those of all views together; NaN where there is nothing.
+
+    covered: share of the true depth's pixels where the mesh has depth.    median_error: of the
+    covered ones, relative.    within: share of the covered ones within 5 %.
+    fitted_scale: the scale that makes depths fit best, over that of the trajectory; 1 is best.
+    fitted_median_error, fitted_within: as above, with that scale.
+    normal_deg: median angle to the true normal, away from jumps in depth.
+    diameter_m: diagonal of the box about the true surface.    precision, recall, f_score: at 1 %
+    of it, against the true surface that the views see.
+    """
+
+    views: int
+    triangles: int
+    covered: float
+    median_error: float
+    within: float
+    fitted_scale: float
+    fitted_median_error: float
+    fitted_within: float
+    normal_deg: float
+    diameter_m: float
+    precision: float
+    recall: float
+    f_score: float
+
+
+@dataclass
+class MeshEvaluation:
+    """Compares view by view.
+
+    alignment: from the world of the estimate to the true one; depths take its scale alone, as a
+    view's own pose errors are those of the trajectory.    camera: of the true depth maps.
+    """
+
+    mesh: Mesh
+    alignment: Similarity
+    camera: PinholeCamera
+    _ratios: list[F32] = field(default_factory=list[F32])
+    _angles: list[F32] = field(default_factory=list[F32])
+    _surface: list[F64] = field(default_factory=list[F64])
+    _known: int = 0
+    _views: int = 0
+
+    def add(self, depth_m: F64, T_true: F64, T_estimate: F64) -> None:
+        """One view: true depth (H, W), 0 where unknown, and T_world_camera in both worlds."""
+        self._views += 1
+        view = DepthView.of(self.camera, T_true, depth_m)
+        seen = view_mesh(self.mesh.points, self.mesh.faces, self.camera, T_estimate)
+        known = view.inverse_depth > 0.0
+        both = known & (seen.depths > 0.0)
+        depths = seen.depths * self.alignment.scale * view.inverse_depth
+        self._ratios.append(depths[both].astype(np.float32))
+        self._known += int(known.sum())
+        normals = seen.interpolate(self.mesh.faces, self.mesh.normals) @ T_estimate[:3, :3]
+        true, smooth = _true_normals(view)
+        smooth &= both
+        cosine = (_unit(normals[smooth]) * true[smooth]).sum(axis=1)
+        angles = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        self._angles.append(angles.astype(np.float32))
+        v, u = np.nonzero(known)
+        rays = self.camera.normalise(np.stack([u, v], axis=1).astype(np.float64))
+        points = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+        points /= view.inverse_depth[v, u][:, None]
+        # Thinned at once: millions of pixels see the same surface.
+        spacing = 1e-3 * float(np.median(1.0 / view.inverse_depth[v, u])) if len(v) else 1.0
+        self._surface.append(thin_out(points @ T_true[:3, :3].T + T_true[:3, 3], spacing))
+
+    def result(self) -> MeshTruth:
+        """The figures over all views."""
+        nan = float("nan")
+        ratios = np.concatenate([np.zeros(0, np.float32), *self._ratios])
+        angles = np.concatenate([np.zeros(0, np.float32), *self._angles])
+        scale = 1.0 / float(np.median(ratios)) if len(ratios) else nan
+        errors, fitted = np.abs(ratios - 1.0), np.abs(ratios * scale - 1.0)
+        surface = np.concatenate([np.zeros((0, 3)), *self._surface])
+        diameter = float(np.linalg.norm(np.ptp(surface, axis=0))) if len(surface) else nan
+        precision, recall = self._surfaces(surface, SURFACE_LIMIT * diameter)
+        both = precision + recall
+        return MeshTruth(
+            views=self._views,
+            triangles=len(self.mesh.faces),
+            covered=len(ratios) / self._known if self._known else nan,
+            median_error=float(np.median(errors)) if len(errors) else nan,
+            within=float(np.mean(errors <= DEPTH_LIMIT)) if len(errors) else nan,
+            fitted_scale=scale,
+            fitted_median_error=float(np.median(fitted)) if len(fitted) else nan,
+            fitted_within=float(np.mean(fitted <= DEPTH_LIMIT)) if len(fitted) else nan,
+            normal_deg=float(np.median(angles)) if len(angles) else nan,
+            diameter_m=diameter,
+            precision=precision,
+            recall=recall,
+            f_score=2.0 * precision * recall / both if both > 0.0 else 0.0,
+        )
+
+    def _surfaces(self, true: F64, limit: float) -> tuple[float, float]:
+        if len(true) == 0 or len(self.mesh.faces) == 0:
+            return 0.0, 0.0
+        spacing = _SPACING * limit
+        points = self.alignment.apply(self.mesh.points.astype(np.float64))
+        samples = sample_surface(points, self.mesh.faces, spacing)
+        true = thin_out(true, spacing)
+        precision = share_within(samples, true, limit)
+        return precision, share_within(true, thin_out(samples, spacing), limit)
+
+
+def format_mesh(truth: MeshTruth) -> str:
+    """Four lines, ready to print."""
+    t = truth
+    return (
+        f"mesh in {t.views} keyframes: {100 * t.covered:.1f} % of the true depth covered, "
+        f"{t.triangles} triangles\n"
+        f"relative error of depth: median {100 * t.median_error:.2f} %, "
+        f"{100 * t.within:.1f} % within 5 %; with depths scaled by {t.fitted_scale:.4f} to fit "
+        f"best: median {100 * t.fitted_median_error:.2f} %, {100 * t.fitted_within:.1f} %\n"
+        f"normals: median angle to the truth {t.normal_deg:.1f} deg\n"
+        f"surface within 1 % of the diameter ({t.diameter_m:.2f} m): F-score {t.f_score:.3f}, "
+        f"precision {t.precision:.3f}, recall {t.recall:.3f}"
+    )
+
+
+def _unit(vectors: F32 | F64) -> F64:
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(lengths, 1e-12), np.float64)
+
+
+def _true_normals(view: DepthView) -> tuple[F64, "np.ndarray[tuple[int, ...], np.dtype[np.bool_]]"]:
+    """(H, W, 3) normals in the camera, towards it, and where they are defined.
+
+    Inverse depth is affine on a plane: w = n . ray, so its differences are n_u / fx and n_v / fy.
+    """
+    w, camera = view.inverse_depth, view.camera
+    normals = np.zeros((*w.shape, 3))
+    normals[:, 1:-1, 0] = 0.5 * (w[:, 2:] - w[:, :-2]) * camera.fx
+    normals[1:-1, :, 1] = 0.5 * (w[2:] - w[:-2]) * camera.fy
+    x = (np.arange(camera.width) - camera.cx) / camera.fx
+    y = (np.arange(camera.height) - camera.cy) / camera.fy
+    normals[..., 2] = w - normals[..., 0] * x - normals[..., 1] * y[:, None]
+    defined = ~view.broken
+    defined[[0, -1]] = False
+    defined[:, [0, -1]] = False
+    return -_unit(normals), defined

@@ -1,0 +1,250 @@
+"""Evaluate a run: its final and its causal trajectory by the criteria of VITAMIN-E section 5.2."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I64
+from pliant.errors import ResultError
+from pliant.evaluation.criteria import (
+    MIN_POSES,
+    ErrorStatistics,
+    RelativeErrors,
+    Similarity,
+    absolute_errors,
+    align,
+    frame_pairs,
+    path_length,
+    relative_errors,
+    second_pairs,
+)
+from pliant.evaluation.run_report import RunReport, read_run_report
+from pliant.export.trajectory_files import read_trajectory
+from pliant.export.tum import read_tum
+from pliant.trajectory import (
+    MAX_DIFFERENCE_NS,
+    Trajectory,
+    associate,
+)
+
+MIN_SUCCESS = 0.9
+"""Below this share of localised frames a trial is a failure and gets no accuracy (section 5.2)."""
+
+FINAL_NAME = "trajectory.txt"
+CAUSAL_NAME = "trajectory_causal.txt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrajectoryEvaluation:
+    """One trajectory against the truth.
+
+    Map segments are never joined, and aligning each by itself would flatter a run that was lost:
+    only the longest segment is evaluated (it is what trajectory.txt holds), and the frames of all
+    others count as not localised.
+
+    kind: "final" (after all corrections) or "causal" (each pose as known when its frame was done).
+    frames: of the whole sequence; None where nobody said, and then there is no success rate.
+    localised: frames with a pose in the longest segment.      other_segments: poses left out.
+    success: True, False, or None (unknown).     reason: why there is no accuracy, else "".
+    matched: localised frames that have a true pose within the time limit: the others have no error.
+    ate_m: of all matched frames, after alignment.      path_m: length of their true path.
+    rpe_frame, rpe_second: from one frame to the next, and over one second.
+    times_s, errors_m: (M,) error over time (Fig. 4), seconds since the first pose; also there for
+        a failure, as in the paper's figure, and empty where no alignment exists.
+    """
+
+    kind: str
+    frames: int | None
+    localised: int
+    other_segments: int
+    segments: int
+    success_rate: float | None
+    success: bool | None
+    matched: int
+    reason: str
+    ate_m: ErrorStatistics | None
+    path_m: float | None
+    rpe_frame: RelativeErrors | None
+    rpe_second: RelativeErrors | None
+    alignment: Similarity | None
+    times_s: F64
+    errors_m: F64
+
+    @property
+    def ate_percent_of_path(self) -> float | None:
+        """ATE RMSE in percent of the length of the true path."""
+        if self.ate_m is None or not self.path_m:
+            return None
+        return 100.0 * self.ate_m.rmse / self.path_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """One run: both trajectories, and how often its map had to start anew before it could."""
+
+    result: str
+    groundtruth: str
+    initialisation_retries: int | None
+    final: TrajectoryEvaluation
+    causal: TrajectoryEvaluation | None
+
+
+def evaluate_trajectory(
+    estimate: Trajectory,
+    truth: Trajectory,
+    *,
+    kind: str = "final",
+    frames: int | None = None,
+    other_segments: Sequence[int] = (),
+    origin_ns: int | None = None,
+    max_difference_ns: int = MAX_DIFFERENCE_NS,
+) -> TrajectoryEvaluation:
+    """Compare an estimate with the truth; see TrajectoryEvaluation for what counts.
+
+    frames: of the whole sequence.      other_segments: poses in each map segment but this one,
+    which is the longest.       origin_ns: time 0 of times_s; the first pose where None.
+    Raises ResultError when there are more poses than frames.
+    """
+    poses = len(estimate) + sum(other_segments)
+    if frames is not None and poses > frames:
+        raise ResultError(f"{poses} poses for a sequence of {frames} frames")
+    part = estimate
+    a, b = associate(part.stamps_ns, truth.stamps_ns, max_difference_ns=max_difference_ns)
+    matched, true_part = part.select(a), truth.select(b)
+
+    alignment, errors, reason = None, np.zeros(0), ""
+    try:
+        alignment = align(matched.T_world_camera, true_part.T_world_camera)
+        aligned = alignment.apply_poses(matched.T_world_camera)
+        errors = absolute_errors(aligned, true_part.T_world_camera)
+    except ValueError as error:
+        aligned = matched.T_world_camera
+        reason = _no_alignment(str(error), part, len(a), max_difference_ns)
+    rate = None if not frames else len(part) / frames
+    success = None if rate is None else rate >= MIN_SUCCESS
+    if rate is not None and not success and len(part):
+        reason = f"success rate {100.0 * rate:.1f} % is below {100.0 * MIN_SUCCESS:.0f} %"
+    accuracy = _Accuracy()
+    if not reason:
+        accuracy = _Accuracy.of(matched.stamps_ns, aligned, true_part.T_world_camera)
+    if origin_ns is None and len(estimate):
+        origin_ns = int(estimate.stamps_ns[0])
+    return TrajectoryEvaluation(
+        kind=kind,
+        frames=frames,
+        localised=len(part),
+        other_segments=sum(other_segments),
+        segments=len(other_segments) + min(len(part), 1),
+        success_rate=rate,
+        success=success,
+        matched=len(a),
+        reason=reason,
+        ate_m=accuracy.ate_m,
+        path_m=accuracy.path_m,
+        rpe_frame=accuracy.rpe_frame,
+        rpe_second=accuracy.rpe_second,
+        alignment=alignment,
+        times_s=(matched.stamps_ns - (origin_ns or 0))[: len(errors)] / 1e9,
+        errors_m=errors,
+    )
+
+
+def _no_alignment(why: str, part: Trajectory, matched: int, max_difference_ns: int) -> str:
+    if not len(part):
+        return "no frame was localised"
+    if matched < MIN_POSES:
+        limit = max_difference_ns / 1e9
+        return f"only {matched} of {len(part)} poses have a true pose within {limit:g} s"
+    return why
+
+
+@dataclass(frozen=True)
+class _Accuracy:
+    ate_m: ErrorStatistics | None = None
+    path_m: float | None = None
+    rpe_frame: RelativeErrors | None = None
+    rpe_second: RelativeErrors | None = None
+
+    @staticmethod
+    def of(stamps_ns: I64, aligned: F64, truth: F64) -> "_Accuracy":
+        return _Accuracy(
+            ErrorStatistics.of(absolute_errors(aligned, truth)),
+            path_length(truth),
+            relative_errors(aligned, truth, frame_pairs(stamps_ns), step="frame"),
+            relative_errors(aligned, truth, second_pairs(stamps_ns), step="1 s"),
+        )
+
+
+def _other_segments(trajectory: Trajectory, report: RunReport, path: Path) -> list[int]:
+    """Poses in each segment of report.json but the longest, which is the trajectory.
+
+    Raises ResultError where the trajectory is not the longest of them.
+    """
+    counts = sorted(segment.frames for segment in report.segments or () if segment.frames)
+    if report.segments is not None and len(trajectory) != (counts[-1] if counts else 0):
+        raise ResultError(
+            f"{path}: holds {len(trajectory)} poses, but the longest segment of report.json "
+            f"holds {counts[-1] if counts else 0}; the two are not of one run"
+        )
+    return counts[:-1]
+
+
+def evaluate_result(
+    result: Path,
+    *,
+    groundtruth: Path | Trajectory,
+    times: Path | None = None,
+    frames: int | None = None,
+    max_difference_ns: int = MAX_DIFFERENCE_NS,
+) -> Evaluation:
+    """Evaluate a result folder (or one trajectory file) against a ground truth.
+
+    result: a folder with trajectory.txt, and where it has them trajectory_causal.txt and
+        report.json; or a trajectory file of any known format.
+    groundtruth: a trajectory, a file of any known format, or a folder with groundtruth.txt.
+        times: the times of a KITTI ground truth.
+    frames: of the sequence, where report.json does not say.
+    Raises ResultError with one line where a file is missing or not what it should be.
+    """
+    truth = (
+        groundtruth
+        if isinstance(groundtruth, Trajectory)
+        else read_trajectory(groundtruth, times=times)
+    )
+    true_name = "given poses" if isinstance(groundtruth, Trajectory) else str(groundtruth)
+    if not result.is_dir():
+        estimate = read_trajectory(result, times=times, allow_empty=True)
+        final = evaluate_trajectory(
+            estimate, truth, frames=frames, max_difference_ns=max_difference_ns
+        )
+        return Evaluation(
+            result=str(result),
+            groundtruth=true_name,
+            initialisation_retries=None,
+            final=final,
+            causal=None,
+        )
+    report = read_run_report(result)
+    estimate = read_tum(result / FINAL_NAME, allow_empty=True)
+    others = _other_segments(estimate, report, result / FINAL_NAME)
+    evaluations: dict[str, TrajectoryEvaluation] = {}
+    for kind, path in (("final", result / FINAL_NAME), ("causal", result / CAUSAL_NAME)):
+        if path.exists():
+            evaluations[kind] = evaluate_trajectory(
+                estimate if kind == "final" else read_tum(path, allow_empty=True),
+                truth,
+                kind=kind,
+                frames=report.frames if frames is None else frames,
+                other_segments=others,
+                origin_ns=int(estimate.stamps_ns[0]) if len(estimate) else None,
+                max_difference_ns=max_difference_ns,
+            )
+    return Evaluation(
+        result=str(result),
+        groundtruth=true_name,
+        initialisation_retries=report.initialisation_retries,
+        final=evaluations["final"],
+        causal=evaluations.get("causal"),
+    )

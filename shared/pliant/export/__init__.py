@@ -1,0 +1,1 @@
+"""Open file formats and pictures: what is written for other tools and for the eye."""

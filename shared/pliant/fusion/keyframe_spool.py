@@ -1,0 +1,77 @@
+"""Keyframes on disk: their images and observations, of which memory holds the places alone."""
+
+import tempfile
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, I64
+
+_ID_BYTES = np.dtype(np.int64).itemsize
+_PIXEL_BYTES = 2 * np.dtype(np.float32).itemsize
+
+
+@dataclass(frozen=True)
+class _Place:
+    offset: int
+    size: int
+
+
+class KeyframeSpool:
+    """A temporary file; the last that was told of a keyframe counts.  A context manager."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile(prefix="pliant-keyframes-")  # noqa: SIM115
+        self._images: dict[int, _Place] = {}
+        self._observations: dict[int, _Place] = {}
+
+    def __enter__(self) -> "KeyframeSpool":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the file."""
+        return self._file.seek(0, 2)
+
+    def put_image(self, keyframe: int, jpeg: bytes) -> None:
+        """Keep the image of a keyframe."""
+        self._images[keyframe] = self._append(jpeg)
+
+    def put_observations(self, keyframe: int, point_ids: I64, points_px: F32) -> None:
+        """Keep what a keyframe observes: (N,) and (N, 2)."""
+        self._observations[keyframe] = self._append(point_ids.tobytes() + points_px.tobytes())
+
+    def keyframes(self) -> list[int]:
+        """Ids of the keyframes whose observations are here, ascending."""
+        return sorted(self._observations)
+
+    def image(self, keyframe: int) -> bytes:
+        """The image of a keyframe; empty where none was told."""
+        place = self._images.get(keyframe)
+        return self._read(place) if place is not None else b""
+
+    def observations(self, keyframe: int) -> tuple[I64, F32]:
+        """Point ids (N,) and pixels (N, 2) of a keyframe.  KeyError where none were told."""
+        raw = self._read(self._observations[keyframe])
+        count = len(raw) // (_ID_BYTES + _PIXEL_BYTES)
+        ids = np.frombuffer(raw, np.int64, count).copy()
+        pixels = np.frombuffer(raw, np.float32, 2 * count, count * _ID_BYTES)
+        return ids, pixels.reshape(-1, 2).copy()
+
+    def _append(self, data: bytes) -> _Place:
+        place = _Place(self._file.seek(0, 2), len(data))
+        self._file.write(data)
+        return place
+
+    def _read(self, place: _Place) -> bytes:
+        self._file.seek(place.offset)
+        return self._file.read(place.size)

@@ -1,0 +1,87 @@
+"""The coarse mesh of one map segment while it grows, and what of it has changed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I32, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.meshing import BlockMesh, DepthMap, MeshBlocks, TsdfParameters
+from pliant.algorithms.meshing.mesh_blocks import select_blocks
+from pliant.algorithms.stages import StageTimer
+from pliant.fusion.volume import TsdfVolume
+
+
+@dataclass(frozen=True)
+class _Preview:
+    """What was put in for a keyframe that may still move, so that it can be taken out again."""
+
+    serial: int
+    depth_map: DepthMap
+    colour: U8
+    T_world_camera: F64
+
+
+class LiveMesh:
+    """One segment.  Keyframes in the window are put in as a preview, and for good as they leave it.
+
+    voxel_size: in units of the segment's world.
+    """
+
+    def __init__(
+        self, voxel_size: float, camera: PinholeCamera, parameters: TsdfParameters, again: int
+    ) -> None:
+        self.volume = TsdfVolume(voxel_size, parameters)
+        self.held = BlockMesh()
+        self._camera = camera
+        self._again = again
+        self._previews: dict[int, _Preview] = {}
+        self._touched: list[I32] = []
+        self._next_again = 0
+
+    def put(
+        self, keyframe: int, depth_map: DepthMap, colour: U8, T_world_camera: F64, *, settled: bool
+    ) -> None:
+        """Put a keyframe in, in place of its preview where there is one.
+
+        Raises VolumeMemoryError where there is no room; the keyframe is not in the volume then.
+        """
+        self.take_out(keyframe)
+        put = self.volume.integrate(
+            depth_map.depths, depth_map.weights, colour, self._camera, T_world_camera
+        )
+        self._touched.append(put.keys)
+        if not settled:
+            self._previews[keyframe] = _Preview(put.serial, depth_map, colour, T_world_camera)
+
+    def take_out(self, keyframe: int) -> None:
+        """Take the preview of a keyframe out, exactly; nothing where there is none."""
+        old = self._previews.pop(keyframe, None)
+        if old is not None:
+            self._touched.append(
+                self.volume.remove(
+                    old.serial, old.depth_map.depths, old.depth_map.weights, old.colour,
+                    self._camera, old.T_world_camera,
+                )
+            )  # fmt: skip
+
+    def changes(self, timer: StageTimer) -> MeshBlocks | None:
+        """The blocks that differ from what was told; None where nothing was put in."""
+        if not self._touched:
+            return None
+        with timer("coarse meshing"):
+            touched = np.unique(np.concatenate(self._touched), axis=0)
+            self._touched = []
+            new = self.held.changes(self.volume.extract(self.volume.affected(touched)))
+            self.held.apply(new)
+            return new
+
+    def again(self) -> MeshBlocks:
+        """The next blocks in turn, as they were told: whoever came late has all of them in time."""
+        held = self.held.snapshot()
+        chosen = np.zeros(len(held.keys), np.bool_)
+        if len(chosen):
+            rows = (self._next_again + np.arange(min(self._again, len(chosen)))) % len(chosen)
+            chosen[rows] = True
+            self._next_again = int(self._next_again + self._again) % len(chosen)
+        return select_blocks(held, chosen)

@@ -1,0 +1,241 @@
+"""From keyframes to meshes: a live one that follows the map, and a final one from its last word.
+
+VITAMIN-E section 4, but at keyframes instead of every frame.  While the map grows, a keyframe is a
+preview until it leaves the window of bundle adjustment; then its last pose, points and observations
+take the preview's place.  The final mesh is made anew from the final poses of all keyframes, whose
+images and observations wait on disk.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.keyframe_delta import KeyframeDelta
+from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.meshing import (
+    KeyframeSurfaces,
+    MeshBlocks,
+    MeshingParameters,
+    SeenPoints,
+    Surface,
+    TriangleMesh,
+)
+from pliant.algorithms.meshing.corrected_view import CorrectedView
+from pliant.algorithms.stages import StageTimer, no_stages
+from pliant.fusion.keyframe_spool import KeyframeSpool
+from pliant.fusion.live_mesh import LiveMesh
+from pliant.fusion.volume import TsdfVolume, VolumeMemoryError
+from pliant.map_history import CurrentMap
+
+_MAX_NOTE = 200
+
+
+@dataclass(frozen=True)
+class LiveChange:
+    """Blocks of the live mesh of a segment that changed, or are told again."""
+
+    segment: int
+    voxel_size: float
+    blocks: MeshBlocks
+    again: bool = False
+
+
+@dataclass(frozen=True)
+class FinalMesh:
+    """A mesh made from final poses.  level: "fine" or "coarse"."""
+
+    segment: int
+    level: str
+    voxel_size: float
+    keyframes: int
+    mesh: TriangleMesh
+
+
+class Mesher:
+    """A function of what it is given; it holds no image but those of keyframes in the window.
+
+    counts: what has been done so far, for the report.    note: the last problem, "" without.
+    """
+
+    def __init__(
+        self, camera: PinholeCamera, parameters: MeshingParameters, spool: KeyframeSpool
+    ) -> None:
+        self._camera = camera
+        self._parameters = parameters
+        self._spool = spool
+        self._map = CurrentMap()
+        self._view = CorrectedView(camera, ())
+        self._surfaces = KeyframeSurfaces(camera, parameters.surface)
+        self._live: LiveMesh | None = None
+        self._segment = -1
+        self._pending: list[tuple[int, bool]] = []
+        self.note = ""
+        self.counts: dict[str, float] = dict.fromkeys(
+            ("fused", "settled", "passed_over", "without_surface"), 0.0
+        )
+
+    def take(self, update: MapDelta, keyframes: KeyframeDelta, jpeg: bytes, frame: int) -> None:
+        """Take in what a frame tells; cheap.  What is to be fused waits for ``fuse``."""
+        self._map.take(update, frame)
+        self._view = CorrectedView(self._camera, update.calibration_correction)
+        if keyframes.new >= 0:
+            self._spool.put_image(keyframes.new, jpeg)
+        bounds = np.concatenate([[0], np.cumsum(keyframes.counts)])
+        for row, keyframe in enumerate(keyframes.keyframe_ids.tolist()):
+            told = slice(int(bounds[row]), int(bounds[row + 1]))
+            self._spool.put_observations(
+                keyframe, keyframes.point_ids[told], keyframes.points_px[told]
+            )
+            self._pending.append((keyframe, bool(keyframes.settled[row])))
+
+    def fuse(self, *, newest_only: bool = False, timer: StageTimer = no_stages) -> list[LiveChange]:
+        """Fuse what waits; returns what changed.
+
+        newest_only: of the keyframes that are new, all but the last are passed over.
+        """
+        self.note = ""
+        pending, self._pending = self._pending, []
+        if newest_only:
+            fresh = [item for item in pending if not item[1]]
+            self.counts["passed_over"] += max(0, len(fresh) - 1)
+            pending = [item for item in pending if item[1] or item == fresh[-1]]
+        changed: list[LiveChange] = []
+        for keyframe, settled in pending:
+            segment = self._map.keyframes[keyframe].segment
+            if segment != self._segment:
+                changed += self._changes(timer)
+                self._segment, self._live = segment, None
+            self._fuse_one(keyframe, settled=settled, timer=timer)
+        return changed + self._changes(timer)
+
+    @property
+    def memory(self) -> dict[str, float]:
+        """Bytes of the live volume and of the spool on disk, and blocks of the volume."""
+        live = self._live.volume if self._live is not None else None
+        return {
+            "volume_mib": live.memory_bytes / 2**20 if live is not None else 0.0,
+            "blocks": float(live.block_count) if live is not None else 0.0,
+            "spool_mib": self._spool.size_bytes / 2**20,
+        }
+
+    def finish(self, *, timer: StageTimer = no_stages) -> Iterator[FinalMesh]:
+        """The meshes of every segment, fine and coarse, from the map as it is now."""
+        self._live = None
+        self._surfaces = KeyframeSurfaces(self._camera, self._parameters.surface)
+        by_segment: dict[int, list[int]] = {}
+        for keyframe in self._spool.keyframes():
+            by_segment.setdefault(self._map.keyframes[keyframe].segment, []).append(keyframe)
+        for segment, keyframes in sorted(by_segment.items()):
+            yield from self._finish_segment(segment, keyframes, timer)
+
+    def _fuse_one(self, keyframe: int, *, settled: bool, timer: StageTimer) -> None:
+        colour = self._colour(keyframe)
+        surface = self._surface(keyframe, timer)
+        if surface.depth_map is None or colour is None:
+            self._pass_over(keyframe, surface.problem or "it has no image")
+            if self._live is not None:
+                self._live.take_out(keyframe)
+            return
+        tsdf = self._parameters.tsdf
+        try:
+            if self._live is None:
+                voxel_size = tsdf.coarse_voxel * surface.median_depth
+                self._live = LiveMesh(voxel_size, self._camera, tsdf, self._parameters.again_blocks)
+            with timer("coarse fusion"):
+                self._live.put(
+                    keyframe, surface.depth_map, colour, self._pose(keyframe), settled=settled
+                )
+        except VolumeMemoryError as error:
+            self._pass_over(keyframe, str(error))
+            return
+        self.counts["settled" if settled else "fused"] += 1
+
+    def _finish_segment(
+        self, segment: int, keyframes: list[int], timer: StageTimer
+    ) -> Iterator[FinalMesh]:
+        unit = self._median_depth(keyframes)
+        tsdf = self._parameters.tsdf
+        sizes = {"fine": tsdf.fine_voxel * unit, "coarse": tsdf.coarse_voxel * unit}
+        volumes: dict[str, TsdfVolume] = {}
+        fused = 0
+        for keyframe in keyframes:
+            colour = self._colour(keyframe)
+            surface = self._surface(keyframe, timer)
+            if surface.depth_map is None or colour is None:
+                continue
+            volumes = volumes or {k: TsdfVolume(size, tsdf) for k, size in sizes.items()}
+            for level, volume in list(volumes.items()):
+                try:
+                    with timer(f"final {level} fusion"):
+                        volume.integrate(
+                            surface.depth_map.depths, surface.depth_map.weights, colour,
+                            self._camera, self._pose(keyframe),
+                        )  # fmt: skip
+                except VolumeMemoryError as error:
+                    self.note = f"no {level} mesh: {error}"
+                    del volumes[level]
+            fused += 1
+        for level, volume in volumes.items():
+            self.counts[f"final_{level}_mib"] = volume.memory_bytes / 2**20
+            with timer(f"final {level} meshing"):
+                mesh = volume.extract_all()
+            yield FinalMesh(segment, level, sizes[level], fused, mesh)
+
+    def _median_depth(self, keyframes: list[int]) -> float:
+        """Of the points that the keyframes see, the median of their medians."""
+        medians: list[float] = []
+        for keyframe in keyframes:
+            T = self._pose(keyframe)
+            points = self._seen(keyframe).points_world
+            depths = (points - T[:3, 3]) @ T[:3, 2]
+            depths = depths[np.isfinite(depths) & (depths > 0.0)]
+            if len(depths):
+                medians.append(float(np.median(depths)))
+        return float(np.median(medians)) if medians else 1.0
+
+    def _surface(self, keyframe: int, timer: StageTimer) -> Surface:
+        return self._surfaces.surface(self._pose(keyframe), self._seen(keyframe), timer)
+
+    def _pose(self, keyframe: int) -> F64:
+        return pose_to_matrix(self._map.keyframes[keyframe].pose_world_camera)
+
+    def _seen(self, keyframe: int) -> SeenPoints:
+        """The points that a keyframe observes, without those that are gone."""
+        ids, pixels = self._spool.observations(keyframe)
+        rows, points = self._map.points_of(ids)
+        return SeenPoints(
+            ids=points.ids,
+            points_px=self._view.pixels(pixels[rows]),
+            points_world=points.positions,
+            sigmas=np.asarray(points.sigmas, np.float32),
+            keyframes=np.asarray(points.keyframes, np.int32),
+        )
+
+    def _colour(self, keyframe: int) -> U8 | None:
+        """(H, W, 3) RGB of a keyframe; None for those from which the map started."""
+        jpeg = self._spool.image(keyframe)
+        if not jpeg:
+            return None
+        pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
+        return None if pixels is None else self._view.image(np.asarray(pixels, np.uint8))
+
+    def _pass_over(self, keyframe: int, why: str) -> None:
+        self.counts["without_surface"] += 1
+        self.note = f"keyframe {keyframe} is passed over: {why}"[:_MAX_NOTE]
+
+    def _changes(self, timer: StageTimer) -> list[LiveChange]:
+        if self._live is None:
+            return []
+        blocks = self._live.changes(timer)
+        if blocks is None:
+            return []
+        size = self._live.volume.voxel_size
+        return [
+            LiveChange(self._segment, size, blocks),
+            LiveChange(self._segment, size, self._live.again(), again=True),
+        ]

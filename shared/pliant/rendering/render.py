@@ -1,0 +1,210 @@
+"""Renders the frames of a sequence: image, exact depth, surface and pose."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import so3_exp
+from pliant.algorithms.parameters import Parameters
+from pliant.rendering.atlas import FaceTexture, make_face, pack_atlas
+from pliant.rendering.lens import NO_DISTORTION, Distortion, pixel_rays
+from pliant.rendering.paths import CameraPath, SplinePath
+from pliant.rendering.photometry import exposure_gain, sensor_image
+from pliant.rendering.raycast import Atlas, accumulate, cast, cast_depth
+from pliant.rendering.scene import Kind, Scene, Solid, SolidArrays, face_sizes, solid_arrays
+from pliant.rendering.view import Tiles, View, tile_bounds, view_of, visible_tiles
+
+# Offsets of the sub-exposures within a pixel, in sixths: no two share a row or a column.
+_SUB_PIXELS = ((-2.5, 0.5), (1.5, 2.5), (-0.5, -1.5), (2.5, -0.5), (-1.5, 1.5), (0.5, -2.5))
+# A little sharper than the footprint says: the sub-pixel offsets take care of the rest.
+_FOOTPRINT = 0.7
+
+
+class CameraOptions(Parameters):
+    """The camera that films a sequence."""
+
+    width: int = Field(default=640, ge=32, le=4096, description="Columns of the image.")
+    height: int = Field(default=480, ge=32, le=4096, description="Rows of the image.")
+    focal: float = Field(default=525.0, gt=0.0, description="Focal length at 640 columns, pixels.")
+    fps: float = Field(default=30.0, gt=0.0, description="Frames per second.")
+    noise: float = Field(
+        default=2.0, ge=0.0, description="Deviation of the image noise, grey values."
+    )
+    exposure: float = Field(
+        default=0.2, ge=0.0, lt=1.0, description="Swing of the exposure: 0.2 is 20 %."
+    )
+    blur: float = Field(
+        default=0.3, ge=0.0, le=1.0, description="Open shutter, share of the frame time."
+    )
+    distortion: Distortion = Field(default=NO_DISTORTION, description="k1, k2, p1, p2 of the lens.")
+    colour: bool = Field(default=False, description="Colour images instead of grey ones.")
+    seed: int = Field(default=0, ge=0, description="Seed of the noise.")
+
+    def pinhole(self) -> PinholeCamera:
+        """The camera of the rectified image."""
+        focal = self.focal * self.width / 640.0
+        return PinholeCamera(
+            width=self.width,
+            height=self.height,
+            fx=focal,
+            fy=focal,
+            cx=0.5 * (self.width - 1),
+            cy=0.5 * (self.height - 1),
+        )
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """One frame and the truth about it."""
+
+    time_s: float
+    T_world_camera: F64  # (4, 4), at the middle of the exposure
+    image: U8  # (H, W) grey or (H, W, 3) red, green, blue
+    depth_m: F64  # (H, W) z of the surface at the pixel centre of the rectified image, 0: none
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What an image shows at its pixel centres."""
+
+    depth_m: F64  # (H, W), 0 where nothing is seen
+    faces: I32  # (H, W) number of the face, -1 where nothing is seen
+    normals: F64  # (H, W, 3) unit normals towards the camera, world frame
+
+
+class SceneGeometry:
+    """A scene's solids, ready for rays."""
+
+    def __init__(self, scene: Scene) -> None:
+        rotations = so3_exp(np.array([solid.rotation for solid in scene.solids], np.float64))
+        self.scene = scene
+        self.solids: SolidArrays = solid_arrays(scene, rotations)
+
+    @property
+    def n_faces(self) -> int:
+        """Number of faces of all solids together."""
+        return len(face_sizes(self.scene))
+
+    def look(self, T_world_camera: F64, bounds: F64, margin: float) -> tuple[View, Tiles]:
+        """The view from a pose and what its tiles may show."""
+        view = view_of(self.solids, T_world_camera)
+        return view, visible_tiles(self.solids, view, bounds, margin)
+
+    def depth(self, T_world_camera: F64, rays: F64, bounds: F64 | None = None) -> F64:
+        """(H, W) exact depth on (H, W, 2) rays of the plane z = 1, metres; 0: nothing there.
+
+        bounds: those of the rays' tiles, where they are known already.
+        """
+        depth = np.zeros(rays.shape[:2])
+        bounds = tile_bounds(rays) if bounds is None else bounds
+        view, tiles = self.look(T_world_camera, bounds, 1e-6)
+        cast_depth(rays, self.solids, view, tiles, depth)
+        return depth
+
+    def surface(self, T_world_camera: F64, rays: F64) -> Surface:
+        """Meet (H, W, 2) rays of the plane z = 1 with the scene."""
+        shape = rays.shape[:2]
+        depth, faces = np.zeros(shape), np.zeros(shape, np.int32)
+        normals = np.zeros((*shape, 3))
+        view, tiles = self.look(T_world_camera, tile_bounds(rays), 1e-6)
+        cast(rays, self.solids, view, tiles, depth, faces, normals)
+        return Surface(depth, faces, normals)
+
+
+class Renderer:
+    """Films one scene along one path.  Frames are independent of each other and of their order."""
+
+    def __init__(
+        self,
+        geometry: SceneGeometry,
+        textures: list[FaceTexture],
+        path: CameraPath,
+        camera: CameraOptions,
+    ) -> None:
+        """textures: one for each face of the scene, from ``make_face``."""
+        self._geometry = geometry
+        self._atlas: Atlas = pack_atlas(textures)
+        self._path = path
+        self._options = camera
+        self._camera = camera.pinhole()
+        self._tints = _tints(geometry.scene, colour=camera.colour)
+        self._rays = [
+            pixel_rays(self._camera, camera.distortion, (x / 6.0, y / 6.0)).astype(np.float32)
+            for x, y in _SUB_PIXELS
+        ]
+        self._bounds = [tile_bounds(rays) for rays in self._rays]
+        self._rectified_rays = pixel_rays(self._camera, NO_DISTORTION)
+        self._rectified_bounds = tile_bounds(self._rectified_rays)
+
+    def frame(self, number: int, time_s: float) -> RenderedFrame:
+        """Film the frame whose exposure has its middle at ``time_s``."""
+        options = self._options
+        T_world_camera = self._path.T_world_camera(time_s)
+        light = self._expose(time_s)
+        rng = np.random.default_rng([options.seed, number])
+        gain = exposure_gain(time_s, options.exposure)
+        image = sensor_image(light, gain=gain, noise=options.noise, rng=rng)
+        return RenderedFrame(
+            time_s=time_s,
+            T_world_camera=T_world_camera,
+            image=image if options.colour else np.ascontiguousarray(image[:, :, 0]),
+            depth_m=self._geometry.depth(
+                T_world_camera, self._rectified_rays, self._rectified_bounds
+            ),
+        )
+
+    def _expose(self, time_s: float) -> F32:
+        """(H, W, C) light, mean of the sub-exposures while the shutter is open."""
+        camera, n = self._camera, len(_SUB_PIXELS)
+        light = np.zeros((camera.height, camera.width, self._tints.shape[1]), np.float32)
+        for i, (rays, bounds) in enumerate(zip(self._rays, self._bounds, strict=True)):
+            # Sub-exposures lie evenly about the middle, so that the blur does not shift the image.
+            delay = ((i + 0.5) / n - 0.5) * self._options.blur / self._options.fps
+            view, tiles = self._geometry.look(
+                self._path.T_world_camera(time_s + delay), bounds, 1.0 / camera.fx
+            )
+            accumulate(
+                rays,
+                self._geometry.solids,
+                view,
+                tiles,
+                self._atlas,
+                self._tints,
+                _FOOTPRINT / camera.fx,
+                1.0 / n,
+                light,
+            )
+        return light
+
+
+def paint_faces(geometry: SceneGeometry) -> list[FaceTexture]:
+    """The textures of all faces, one after the other."""
+    return [make_face(geometry.scene, geometry.solids, i) for i in range(geometry.n_faces)]
+
+
+def warm_up() -> None:
+    """Compile every kernel of the renderer, or load it from numba's cache."""
+    kinds: tuple[Kind, ...] = ("sphere", "cylinder")
+    solids = [Solid(name="room", kind="room", centre=(0, 0, 0), size=(2, 2, 2), texels_per_metre=9)]
+    solids += [
+        Solid(name=kind, kind=kind, centre=(0, 0.4, 0.8), size=(0.2, 0.2, 0.2), texels_per_metre=9)
+        for kind in kinds
+    ]
+    scene = Scene(name="warm up", solids=tuple(solids), lights=((0.0, 0.0, 0.5),))
+    geometry = SceneGeometry(scene)
+    path = SplinePath(positions=[(0, 0, 0)] * 2, targets=[(0, 1, 0)] * 2, duration_s=1.0)
+    camera = CameraOptions(width=32, height=32)
+    Renderer(geometry, paint_faces(geometry), path, camera).frame(0, 0.0)
+    geometry.surface(np.eye(4), pixel_rays(camera.pinhole(), NO_DISTORTION))
+
+
+def _tints(scene: Scene, *, colour: bool) -> F32:
+    """(F, C) factors; those of a colour have the grey image of the colour image at 1."""
+    faces = face_sizes(scene)
+    if not colour:
+        return np.ones((len(faces), 1), np.float32)
+    tints = np.array([solid.material.tint for solid, _, _ in faces], np.float64)
+    return (tints / (tints @ (0.299, 0.587, 0.114))[:, None]).astype(np.float32)

@@ -1,0 +1,66 @@
+"""What a run looks like, whatever program draws it."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.viewers.point_blocks import PointBlocks
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The frame that a drawing belongs to, and its capture time."""
+
+    frame: int
+    stamp_ns: int
+
+
+class Canvas(Protocol):
+    """Draws.  Worlds are numbered by map segment; each has a place and a scale of its own."""
+
+    def camera(self, camera: PinholeCamera) -> None:
+        """The camera of all images; comes first."""
+        ...
+
+    def image(self, at: Moment, data: bytes, encoding: str) -> None:
+        """A rectified image as the bytes of a file, "jpeg" or "png"."""
+        ...
+
+    def tracks(self, at: Moment, points_px: F32, ages: I32) -> None:
+        """(N, 2) tracks on the image, (0, 0) at the centre of the top-left pixel; (N,) ages."""
+        ...
+
+    def pose(self, at: Moment, segment: int, pose_world_camera: F64) -> None:
+        """Where the camera is: (x, y, z, qx, qy, qz, qw)."""
+        ...
+
+    def path(self, at: Moment, segment: int, positions: F64) -> None:
+        """(N, 3) positions of the keyframes in order of time."""
+        ...
+
+    def points(self, at: Moment, segment: int, points: PointBlocks, changed: list[int]) -> None:
+        """The map's points; ``changed`` names the blocks that differ from the last time."""
+        ...
+
+    def whole_map(self, at: Moment, segment: int, points: PointBlocks) -> None:
+        """The points after everything was said."""
+        ...
+
+    def mesh(
+        self, at: Moment, segment: int, name: str, vertices: F32, faces: I32, colours: U8 | None
+    ) -> None:
+        """A piece of surface, in place of what had this name: (N, 3), (F, 3), (N, 3) RGB."""
+        ...
+
+    def forget(self, at: Moment, segment: int) -> None:
+        """A world is over: the map was lost, and the next one has begun."""
+        ...
+
+    def measure(self, at: Moment, name: str, value: float) -> None:
+        """One value of a curve, such as "rate/tracking"."""
+        ...
+
+    def note(self, at: Moment, text: str) -> None:
+        """A line for the user."""
+        ...

@@ -1,0 +1,254 @@
+"""A run as Foxglove protobuf messages in an MCAP file, which opens without anything of ours.
+
+    /camera/image, /camera/calibration, /camera/tracks   every frame
+    /tf              map -> world -> camera, every frame with a pose
+    /map/points      the points that changed, every ten frames
+    /map/path        positions of the keyframes
+    /map/mesh        surface
+    /map/all_points  the whole map, once, at the end of a segment
+
+Stamps are capture times: a recording gives the same bytes each time.  Poses and points are as
+they were known at the time.  Needs its definitions: ``pip install 'pliant[foxglove]'``.
+"""
+
+import importlib
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.errors import ResultError
+from pliant.viewers.age_colours import age_buckets
+from pliant.viewers.canvas import Moment
+from pliant.viewers.point_blocks import PointBlocks
+
+_ROW = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
+_FLOAT32, _UINT8 = 7, 1  # foxglove.PackedElementField.NumericType
+_POINTS, _LINE_STRIP = 1, 0  # foxglove.PointsAnnotation.Type, foxglove.LinePrimitive.Type
+_ENTITY_FACES = 50_000
+Z_UP_XYZW = (-0.5, 0.5, -0.5, 0.5)
+"""Rotation of R_map_world: the first camera looks along x of the map, whose z is up (REP-103)."""
+
+
+def world_name(segment: int) -> str:
+    """The coordinate frame of a map segment."""
+    return "world" if segment <= 0 else f"world_{segment}"
+
+
+class FoxgloveFile:
+    """A canvas that is an MCAP file.  A context manager: leaving it closes the file."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises ResultError where the definitions are missing or the file cannot be written."""
+        self._path = path
+        self._kinds: dict[str, Any] = {}
+        self._channels: dict[str, int] = {}
+        self._sequences: dict[str, int] = {}
+        self._camera: PinholeCamera | None = None
+        self._kind("PointCloud")  # said now, before a file is there
+        try:
+            self._file = path.open("wb")
+        except OSError as error:
+            raise ResultError(f"{path}: cannot be written ({error.strerror})") from None
+        self._writer = Writer(self._file, compression=CompressionType.ZSTD)
+        self._writer.start(profile="", library="pliant")
+
+    def __enter__(self) -> "FoxgloveFile":
+        return self
+
+    def __exit__(
+        self,
+        error_type: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        try:
+            self._writer.finish()
+            self._file.close()
+        except OSError as failure:
+            raise ResultError(f"{self._path}: cannot be written ({failure.strerror})") from None
+
+    # -- the canvas ----------------------------------------------------------------------------
+
+    def camera(self, camera: PinholeCamera) -> None:
+        """Keep the camera: it is written with every image."""
+        self._camera = camera
+
+    def image(self, at: Moment, data: bytes, encoding: str) -> None:
+        """The image and its calibration."""
+        image = self._kind("CompressedImage")(frame_id="camera", data=data, format=encoding)
+        self._write("/camera/image", at, image)
+        if self._camera is not None:
+            c, K = self._camera, self._camera.K
+            P = np.concatenate([K, np.zeros((3, 1))], axis=1)
+            calibration = self._kind("CameraCalibration")(
+                frame_id="camera", width=c.width, height=c.height, distortion_model="plumb_bob",
+                D=[0.0] * 5, K=K.ravel().tolist(), R=np.eye(3).ravel().tolist(),
+                P=P.ravel().tolist(),
+            )  # fmt: skip
+            self._write("/camera/calibration", at, calibration)
+
+    def tracks(self, at: Moment, points_px: F32, ages: I32) -> None:
+        """Tracks by age, blue to orange; circles would be too many."""
+        annotations = self._kind("ImageAnnotations")()
+        for rows, (red, green, blue) in age_buckets(ages):
+            group = annotations.points.add(type=_POINTS, thickness=2.0)
+            group.timestamp.FromNanoseconds(at.stamp_ns)
+            group.outline_color.CopyFrom(self._colour(red, green, blue))
+            for u, v in points_px[rows].tolist():
+                group.points.add(x=u, y=v)
+        self._write("/camera/tracks", at, annotations, stamped=False)
+
+    def pose(self, at: Moment, segment: int, pose_world_camera: F64) -> None:
+        """The two transforms that place the camera."""
+        both = self._kind("FrameTransforms")()
+        world = world_name(segment)
+        poses = (("map", world, (0.0, 0.0, 0.0, *Z_UP_XYZW)), (world, "camera", pose_world_camera))
+        for parent, child, pose in poses:
+            transform = both.transforms.add(parent_frame_id=parent, child_frame_id=child)
+            transform.timestamp.FromNanoseconds(at.stamp_ns)
+            _fill(transform.translation, "xyz", pose[:3])
+            _fill(transform.rotation, "xyzw", pose[3:])
+        self._write("/tf", at, both, stamped=False)
+
+    def path(self, at: Moment, segment: int, positions: F64) -> None:
+        """One line through the keyframes."""
+        update, entity = self._entity(at, segment, "path")
+        line = entity.lines.add(type=_LINE_STRIP, thickness=2.0, scale_invariant=True)
+        line.pose.orientation.w = 1.0
+        line.color.CopyFrom(self._colour(255, 160, 0))
+        for position in positions.tolist():
+            _fill(line.points.add(), "xyz", position)
+        self._write("/map/path", at, update, stamped=False)
+
+    def points(self, at: Moment, segment: int, points: PointBlocks, changed: list[int]) -> None:
+        """The region that changes."""
+        self._write("/map/points", at, self._cloud(segment, *points.blocks(changed)))
+
+    def whole_map(self, at: Moment, segment: int, points: PointBlocks) -> None:
+        """Everything."""
+        self._write("/map/all_points", at, self._cloud(segment, *points.everything()))
+
+    def mesh(
+        self, at: Moment, segment: int, name: str, vertices: F32, faces: I32, colours: U8 | None
+    ) -> None:
+        """A surface, in entities of 50,000 triangles."""
+        for part, first in enumerate(range(0, len(faces), _ENTITY_FACES)):
+            chosen = faces[first : first + _ENTITY_FACES]
+            used, corners = np.unique(chosen, return_inverse=True)
+            update, entity = self._entity(at, segment, f"{name}/{part}")
+            triangles = entity.triangles.add()
+            triangles.pose.orientation.w = 1.0
+            for vertex in vertices[used].tolist():
+                _fill(triangles.points.add(), "xyz", vertex)
+            if colours is None:
+                triangles.color.CopyFrom(self._colour(200, 200, 200))
+            else:
+                for rgb in (colours[used] / 255.0).tolist():
+                    _fill(triangles.colors.add(a=1.0), "rgb", rgb)
+            triangles.indices.extend(corners.ravel().tolist())
+            self._write("/map/mesh", at, update, stamped=False)
+
+    def forget(self, at: Moment, segment: int) -> None:
+        """Take the lines and the mesh of a segment away."""
+        update = self._kind("SceneUpdate")()
+        deletion = update.deletions.add(type=1)  # everything of this topic
+        deletion.timestamp.FromNanoseconds(at.stamp_ns)
+        for topic in ("/map/path", "/map/mesh"):
+            if topic in self._channels:
+                self._write(topic, at, update, stamped=False)
+
+    def measure(self, at: Moment, name: str, value: float) -> None:
+        """Times are no part of the file: they differ from run to run."""
+
+    def note(self, at: Moment, text: str) -> None:
+        """A line in Foxglove's log panel."""
+        self._write("/notes", at, self._kind("Log")(level=2, message=text, name="pliant"))
+
+    # -- writing -------------------------------------------------------------------------------
+
+    def _cloud(self, segment: int, xyz: F32, rgb: U8) -> Any:
+        rows = np.zeros(len(xyz), _ROW)
+        rows["xyz"], rows["rgba"][:, :3], rows["rgba"][:, 3] = xyz, rgb, 255
+        cloud = self._kind("PointCloud")(
+            frame_id=world_name(segment), point_stride=_ROW.itemsize, data=rows.tobytes()
+        )
+        cloud.pose.position.SetInParent()  # zeros are there, too: some readers ask for them
+        cloud.pose.orientation.w = 1.0
+        for i, name in enumerate("xyz"):
+            cloud.fields.add(name=name, offset=4 * i, type=_FLOAT32)
+        for i, name in enumerate(("red", "green", "blue", "alpha")):
+            cloud.fields.add(name=name, offset=12 + i, type=_UINT8)
+        return cloud
+
+    def _entity(self, at: Moment, segment: int, name: str) -> tuple[Any, Any]:
+        update = self._kind("SceneUpdate")()
+        entity = update.entities.add(frame_id=world_name(segment), id=name)
+        entity.timestamp.FromNanoseconds(at.stamp_ns)
+        return update, entity
+
+    def _colour(self, red: int, green: int, blue: int) -> Any:
+        return self._kind("Color")(r=red / 255.0, g=green / 255.0, b=blue / 255.0, a=1.0)
+
+    def _kind(self, name: str) -> Any:
+        if name not in self._kinds:
+            try:
+                module: Any = importlib.import_module(f"foxglove_schemas_protobuf.{name}_pb2")
+            except ImportError:
+                raise ResultError(
+                    "--to foxglove needs the definitions of its messages: "
+                    "pip install 'pliant[foxglove]'"
+                ) from None
+            self._kinds[name] = getattr(module, name)
+        return self._kinds[name]
+
+    def _write(self, topic: str, at: Moment, message: Any, *, stamped: bool = True) -> None:
+        if stamped:
+            message.timestamp.FromNanoseconds(at.stamp_ns)
+        sequence = self._sequences[topic] = self._sequences.get(topic, -1) + 1
+        try:
+            if topic not in self._channels:
+                self._channels[topic] = self._register(topic, type(message))
+            self._writer.add_message(
+                self._channels[topic],
+                log_time=at.stamp_ns,
+                publish_time=at.stamp_ns,
+                sequence=sequence,
+                data=message.SerializeToString(deterministic=True),
+            )
+        except OSError as error:
+            raise ResultError(f"{self._path}: cannot be written ({error.strerror})") from None
+
+    def _register(self, topic: str, kind: Any) -> int:
+        schema = self._writer.register_schema(
+            kind.DESCRIPTOR.full_name, "protobuf", _definitions(kind)
+        )
+        return self._writer.register_channel(topic, "protobuf", schema)
+
+
+def _definitions(kind: Any) -> bytes:
+    """The definition of a message with those of all that it is made of: a FileDescriptorSet."""
+    descriptors: Any = importlib.import_module("google.protobuf.descriptor_pb2")
+    files = descriptors.FileDescriptorSet()
+    waiting, seen = deque([kind.DESCRIPTOR.file]), {kind.DESCRIPTOR.file.name}
+    ordered: list[Any] = []
+    while waiting:
+        ordered.append(waiting.popleft())
+        for other in ordered[-1].dependencies:
+            if other.name not in seen:
+                seen.add(other.name)
+                waiting.append(other)
+    for file in reversed(ordered):
+        file.CopyToProto(files.file.add())
+    data: bytes = files.SerializeToString(deterministic=True)
+    return data
+
+
+def _fill(record: Any, names: str, values: Any) -> None:
+    for name, value in zip(names, values, strict=True):
+        setattr(record, name, float(value))

@@ -1,0 +1,187 @@
+"""The one fold from messages to drawings: the live viewer and the exporters share it.
+
+Messages of one topic come in order; topics need not be in step.  Some may be missing: a viewer
+gives no credit, and only the newest reach it when it is slow.
+"""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.geometry import matrix_to_pose, pose_to_matrix
+from pliant.datasets.base import BrokenFrame, SourceFrame
+from pliant.datasets.calibration import calibration_from_yaml
+from pliant.datasets.own_recording import recorded_frame
+from pliant.datasets.rectifier import Rectifier
+from pliant.messages import topics
+from pliant.messages.topics import Topic
+from pliant.messages.types import (
+    CameraStream,
+    Extrema,
+    Header,
+    MapUpdate,
+    SourceImage,
+    Status,
+)
+from pliant.viewers.canvas import Canvas, Moment
+from pliant.viewers.point_blocks import PointBlocks
+
+REDRAW_FRAMES = 10
+"""Points are drawn again this often; in between they hardly move."""
+_JPEG_QUALITY = 90
+_EXIF_WITHIN = 1 << 16
+
+
+@dataclass
+class _World:
+    """The segment of the map that is being built."""
+
+    segment: int = -1
+    points: PointBlocks = field(default_factory=PointBlocks)
+    keyframes: dict[int, tuple[int, F64]] = field(default_factory=dict[int, tuple[int, F64]])
+    moved: bool = False
+
+
+class Scene:
+    """Draws a run on a canvas, message by message."""
+
+    def __init__(self, canvas: Canvas) -> None:
+        self._canvas = canvas
+        self._rectifier: Rectifier | None = None
+        self._world = _World()
+        self._expected = 0
+        self._drawn = -REDRAW_FRAMES
+        self._last = Moment(0, 0)
+        self._entered = 0
+        self.missed_updates = 0
+
+    def take(self, topic: Topic, message: Header, sequence: int) -> None:
+        """Draw a message.  sequence: its number in its topic, which tells what was missed."""
+        at = Moment(message.frame, message.stamp_ns)
+        if isinstance(message, CameraStream):
+            self._begin(message)
+        elif isinstance(message, SourceImage):
+            self._entered = max(self._entered, message.frame)
+            self._draw_image(at, recorded_frame(message))
+        elif isinstance(message, Extrema):
+            self._canvas.tracks(at, message.points_px, message.ages)
+        elif isinstance(message, MapUpdate):
+            self._take_update(at, message, sequence, final=topic.key == topics.MAP_FINAL.key)
+        elif isinstance(message, Status):
+            self._take_status(at, message)
+
+    def close(self) -> None:
+        """Draw what is left: the whole map, now that nothing more can come."""
+        if self._world.segment >= 0:
+            self._draw_map(self._last)
+            self._canvas.whole_map(self._last, self._world.segment, self._world.points)
+
+    @property
+    def last(self) -> tuple[Moment, int]:
+        """The last moment of the map, and its segment (-1 without any)."""
+        return self._last, self._world.segment
+
+    def _begin(self, stream: CameraStream) -> None:
+        if self._rectifier is None:  # told again for those who come late
+            self._rectifier = Rectifier(calibration_from_yaml(stream.calibration))
+            self._canvas.camera(stream.camera)
+
+    def _draw_image(self, at: Moment, frame: SourceFrame) -> None:
+        if self._rectifier is None or frame.dropped:
+            return
+        if self._rectifier.changes_nothing and _shows_as_it_is(frame):
+            self._canvas.image(at, frame.data, frame.encoding)
+            return
+        try:
+            grey, colour = self._rectifier.rectify(frame)
+        except BrokenFrame:
+            return
+        bgr = grey if colour is None else np.ascontiguousarray(colour[:, :, ::-1])
+        _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        self._canvas.image(at, data.tobytes(), "jpeg")
+
+    def _take_update(self, at: Moment, update: MapUpdate, sequence: int, *, final: bool) -> None:
+        if not final:
+            self._notice_gap(at, sequence)
+        self._last = at
+        world = self._world
+        if update.segment > world.segment:
+            if world.segment >= 0:
+                self._draw_map(at)
+                self._canvas.whole_map(at, world.segment, world.points)
+                self._canvas.forget(at, world.segment)
+            world = self._world = _World(segment=update.segment)
+            self._drawn = at.frame - REDRAW_FRAMES
+        mine = update.keyframe_segments == world.segment
+        for row in np.flatnonzero(mine):
+            frame, pose = int(update.keyframe_frames[row]), update.keyframe_poses[row]
+            world.keyframes[int(update.keyframe_ids[row])] = (frame, pose)
+        world.moved = world.moved or bool(mine.any())
+        here = update.point_segments == world.segment
+        world.points.tell(
+            update.point_ids[here],
+            update.points_world[here].astype(np.float32),
+            update.point_colours[here],
+            update.removed_point_ids,
+            snapshot=update.snapshot,
+        )
+        self._draw_pose(at, update)
+        if final or at.frame - self._drawn >= REDRAW_FRAMES:
+            self._draw_map(at)
+
+    def _notice_gap(self, at: Moment, sequence: int) -> None:
+        missed, self._expected = sequence - self._expected, sequence + 1
+        if missed > 0:
+            self.missed_updates += missed
+            self._world.points.miss()
+            what = "began late" if self.missed_updates == sequence else "was too slow"
+            self._canvas.note(
+                at,
+                f"the viewer {what}: {missed} updates of the map are missing before frame "
+                f"{at.frame}; points are shown once they are told again, at the latest with the "
+                "next snapshot of the window",
+            )
+
+    def _draw_pose(self, at: Moment, update: MapUpdate) -> None:
+        rows = np.flatnonzero(update.pose_frames == at.frame)
+        if not rows.size:
+            return
+        keyframe = self._world.keyframes.get(int(update.pose_keyframes[rows[0]]))
+        if keyframe is None:  # told before this viewer came
+            return
+        T_world_camera = pose_to_matrix(keyframe[1]) @ pose_to_matrix(
+            update.poses_keyframe_camera[rows[0]]
+        )
+        self._canvas.pose(at, self._world.segment, matrix_to_pose(T_world_camera))
+
+    def _draw_map(self, at: Moment) -> None:
+        world = self._world
+        if world.segment < 0:
+            return
+        self._drawn = at.frame
+        changed = world.points.take_changed()
+        if changed:
+            self._canvas.points(at, world.segment, world.points, changed)
+        if world.moved:
+            world.moved = False
+            ordered = sorted(world.keyframes.values(), key=lambda keyframe: keyframe[0])
+            positions = np.array([pose[:3] for _, pose in ordered])
+            self._canvas.path(at, world.segment, positions)
+
+    def _take_status(self, at: Moment, status: Status) -> None:
+        for stage, seconds in zip(status.stages, status.seconds.tolist(), strict=True):
+            self._canvas.measure(at, f"milliseconds/{status.service}/{stage}", 1e3 * seconds)
+        self._canvas.measure(
+            at, f"lag/{status.service}", float(max(0, self._entered - status.frame))
+        )
+        if status.note:
+            self._canvas.note(at, f"{status.service}: {status.note}")
+
+
+def _shows_as_it_is(frame: SourceFrame) -> bool:
+    """Whether every viewer shows the file as our decoder does: 8 bits, not to be turned."""
+    if frame.encoding == "png":
+        return frame.data[24:25] == b"\x08"
+    return frame.encoding == "jpeg" and b"Exif" not in frame.data[:_EXIF_WITHIN]
