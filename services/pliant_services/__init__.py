@@ -1,0 +1,1 @@
+"""Pliant's processes: one short file each, and the launcher that supervises them."""

@@ -1,0 +1,85 @@
+"""The command line: one small file per command, heavy modules imported inside the command."""
+
+import errno
+import os
+import signal
+import sys
+from contextlib import suppress
+
+import typer
+
+from pliant.errors import PliantError, SourceLostError
+
+app = typer.Typer(
+    name="pliant",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="Trajectory, dense map and deforming surfaces from the video of one camera.\n\n"
+    "[bold]Examples[/bold]\n\n"
+    "  pliant run built-in:room --output results/room\n\n"
+    "  pliant run path/to/tum_sequence\n\n"
+    "  pliant eval results/room --groundtruth path/to/groundtruth.txt\n\n"
+    "Exit codes: 0 done, 1 error or failed check, 2 wrong usage, 3 finished without a map or with "
+    "frames broken or missing, 130 interrupted.",
+)
+
+
+_FAILED, _USAGE, _INCOMPLETE, _INTERRUPTED = 1, 2, 3, 130
+# Typer carries its own copy of click, or uses click itself, depending on its version.
+_UsageError = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+
+
+def main() -> None:
+    """The command ``pliant``."""
+    # A container stops by SIGTERM and a terminal that closes sends SIGHUP: both are a Ctrl-C.
+    for kind in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(kind) == signal.SIG_DFL:  # not under nohup
+            signal.signal(kind, signal.default_int_handler)
+    try:
+        run_and_exit()
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # one more must not change the exit code
+
+
+def run_and_exit() -> None:
+    """Run the command line.  Known errors are one line on stderr and an exit code."""
+    from pliant_services.cli import commands  # noqa: F401  (registers the commands)
+
+    code = _run()
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more to flush
+        if error.errno != errno.EPIPE:  # `| head` has seen enough
+            code = _say(f"cannot write the output: {error.strerror}; free some space")
+    sys.exit(code)
+
+
+def _run() -> int:
+    try:
+        code = app(standalone_mode=False)
+    except PliantError as error:
+        return _say(str(error), _INCOMPLETE if isinstance(error, SourceLostError) else _FAILED)
+    except _UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":
+            error.show()
+            return _USAGE
+        command = getattr(getattr(error, "ctx", None), "command_path", "pliant")
+        text = error.format_message().replace("Value error, ", "").rstrip(".")
+        return _say(f"{text} (see {command} --help)", error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        return _INTERRUPTED
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        where = f"{error.filename}" if error.filename else "the output"
+        return _say(f"cannot write {where}: {error.strerror}; free some space")
+    return code if isinstance(code, int) else 0
+
+
+def _say(line: str, code: int = _FAILED) -> int:
+    with suppress(OSError):
+        print(f"pliant: {line}", file=sys.stderr)
+    return code

@@ -1,0 +1,222 @@
+"""``pliant bench``: measure, and compare within one run."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Measure speed and accuracy.  Every figure in the docs names the command that made it.",
+)
+
+Sources = Annotated[list[str], typer.Argument(help="Folders or built-in:NAME.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE; may be repeated.")]
+
+
+@app.command()
+def tracking(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(help="Frames to measure.")] = 100,
+    overrides: Overrides = None,
+) -> None:
+    """Tracking per stage, beside OpenCV's pyramidal LK for the same points.
+
+    pliant bench tracking built-in:room
+    """
+    from pliant.config import load_config
+    from pliant_services.benchmarks.tracking import measure
+
+    _print(measure(source, load_config(None, overrides or []), frames))
+
+
+@app.command()
+def codec() -> None:
+    """Packing and unpacking an image.
+
+    pliant bench codec
+    """
+    from pliant_services.benchmarks.codec import measure
+
+    _print(measure())
+
+
+@app.command()
+def recording(
+    seconds: Annotated[int, typer.Option(help="Length of the recording that is made.")] = 600,
+) -> None:
+    """Writing, reading, seeking and keeping up.  Ten minutes of recording take 12 GB for a while.
+
+    pliant bench recording
+    """
+    from pliant_services.benchmarks.recording import measure
+
+    _print(measure(seconds))
+
+
+@app.command()
+def compression(recording: Annotated[Path, typer.Argument(help="A recording.")]) -> None:
+    """What each topic of a recording gains from compression, and at which speed.
+
+    pliant bench compression results/room/recording.mcap
+    """
+    from pliant_services.benchmarks.recording import compression
+
+    _print(compression(recording))
+
+
+@app.command()
+def recorder(kills: Annotated[int, typer.Option(help="How often.")] = 50) -> None:
+    """kill -9 of the recorder at random moments, and what recovery keeps.
+
+    pliant bench recorder --kills 50
+    """
+    from pliant_services.benchmarks.recorder_kills import measure
+
+    _print(measure(kills))
+
+
+@app.command()
+def reference(
+    folder: Annotated[Path, typer.Option(help="Where it is kept.")] = Path("tests/data/reference"),
+    refresh: Annotated[
+        bool, typer.Option("--refresh", help="Keep what the services make now.")
+    ] = False,
+) -> None:
+    """Replay the reference recording and compare; exit 1 where it differs.
+
+    pliant bench reference --refresh
+    """
+    from pliant_services import reference as kept
+
+    changed = kept.refresh(folder) if refresh else kept.check(folder)
+    _print(changed or ["nothing has changed"])
+    if refresh:
+        version = kept.keep_version(folder.parent / "recordings", folder / kept.INPUT)
+        _print([f"a recording of this version: {version}"] if version else [])
+    elif changed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def bundle(
+    folder: Annotated[
+        Path | None, typer.Option("--problems", help="Folder of BAL and libmv problems.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG of the cost over time.")] = None,
+) -> None:
+    """Bundle adjustment beside Ceres (pyceres) and scipy: time to the same cost.  Ten minutes.
+
+    OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 pliant bench bundle --problems bundle_adjustment
+    """
+    from pliant_services.benchmarks.bundle import measure
+
+    _print(measure(folder, plot))
+
+
+@app.command("mesh-parts")
+def mesh_parts(
+    vertices: Annotated[int, typer.Option(min=100, help="Of the keyframe.")] = 10_000,
+    repeats: Annotated[int, typer.Option(min=1, help="Of each part; the least counts.")] = 10,
+    seeds: Annotated[int, typer.Option(min=1, help="Scenes for the errors.")] = 8,
+) -> None:
+    """The parts of meshing on a synthetic keyframe, beside the paper's, and what NLTGV gains.
+
+    OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 pliant bench mesh-parts
+    """
+    from pliant_services.benchmarks.mesh_parts import measure
+
+    _print(measure(vertices, repeats, seeds))
+
+
+@app.command()
+def accuracy(
+    sources: Sources,
+    output: Annotated[Path, typer.Option("--output", "-o")] = Path("results/bench"),
+    seeds: Annotated[int, typer.Option(help="Runs of each source, with seeds 0, 1, ...")] = 1,
+    overrides: Overrides = None,
+) -> None:
+    """The whole pipeline through its processes: accuracy, density and frames per second.
+
+    pliant bench accuracy built-in:room path/to/sequence --seeds 5
+    """
+    from pliant_services.benchmarks.accuracy import measure
+
+    _print(measure(sources, output, seeds=seeds, overrides=overrides or []))
+
+
+@app.command()
+def losses(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    runs: Annotated[int, typer.Option(min=1, help="How often.")] = 20,
+) -> None:
+    """Run again and again at full speed: messages lost by sequence number, and equal bytes.
+
+    pliant bench losses built-in:room --runs 20
+    """
+    from pliant_services.benchmarks.whole_runs import losses
+
+    _print(losses(source, runs))
+
+
+@app.command("recording-cost")
+def recording_cost(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    runs: Annotated[int, typer.Option(min=1, help="Runs with and without, in turns.")] = 3,
+) -> None:
+    """Frames a second of the pipeline with and without a recorder.
+
+    pliant bench recording-cost built-in:room
+    """
+    from pliant_services.benchmarks.whole_runs import recording_cost
+
+    _print(recording_cost(source, runs))
+
+
+@app.command()
+def kills(
+    source: Annotated[str, typer.Argument(help="Of 300 frames.")] = "built-in:room",
+    count: Annotated[int, typer.Option(min=1, help="How often each.")] = 20,
+    seed: Annotated[int, typer.Option(help="Chooses the moments.")] = 0,
+) -> None:
+    """kill -9 of each service, and of all at once, at random moments: are the results the same?
+
+    pliant bench kills built-in:room --count 20
+    """
+    from pliant_services.benchmarks.whole_runs import kills
+
+    _print(kills(source, count, seed))
+
+
+@app.command()
+def ablation(sources: Sources) -> None:
+    """What each addition to the paper is worth.
+
+    pliant bench ablation built-in:room path/to/sequence
+    """
+    from pliant_services.benchmarks.ablation import measure
+
+    _print(measure(sources))
+
+
+@app.command()
+def mesh(
+    result: Annotated[Path, typer.Argument(help="Result folder of a run.")],
+    groundtruth: Annotated[
+        str, typer.Option("--groundtruth", "-g", help="Folder with depth maps, or built-in:NAME.")
+    ],
+    overrides: Overrides = None,
+) -> None:
+    """Meshes of one run: NLTGV, Laplacian, no smoothing, Poisson, against true depth.
+
+    pliant bench mesh results/room --groundtruth built-in:room
+    """
+    from pliant_services.benchmarks.mesh import measure
+
+    _print(measure(result, groundtruth, overrides or []))
+
+
+def _print(lines: Iterable[str]) -> None:
+    for line in lines:
+        typer.echo(line)

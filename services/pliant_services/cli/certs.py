@@ -1,0 +1,26 @@
+"""``pliant certs``: an authority and a certificate for everybody in a session."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def certs(
+    folder: Annotated[Path, typer.Argument(help="Where they go; what is there is kept.")],
+    hosts: Annotated[
+        list[str] | None,
+        typer.Option("--host", help="Name or address of the router's machine; may be repeated."),
+    ] = None,
+) -> None:
+    """Make certificates for the router, every service and the operator.
+
+    pliant certs certs --host rack.local --host 10.0.0.2
+
+    Give each machine ca.pem and the two files of each service that it runs; ca.key stays here.
+    """
+    from pliant_services.access import NAMES
+    from pliant_services.certificates import make_certificates
+
+    made = make_certificates(folder, NAMES, ["localhost", "127.0.0.1", *(hosts or [])])
+    typer.echo(f"{folder}: made {', '.join(made)}" if made else f"{folder}: everything is there")

@@ -1,0 +1,40 @@
+"""Registers every command; each lives in a file of its own."""
+
+from pliant_services.cli import (
+    app,
+    bench,
+    certs,
+    config,
+    doctor,
+    export,
+    info,
+    mesh,
+    recover,
+    render,
+    replay,
+    router,
+    run,
+    service,
+    status,
+    stop,
+    view,
+)
+from pliant_services.cli import evaluate as evaluate_command
+
+app.command("run")(run.run)
+app.command("service")(service.service)
+app.command("certs")(certs.certs)
+app.command("router")(router.router)
+app.command("status")(status.status)
+app.command("stop")(stop.stop)
+app.command("eval")(evaluate_command.evaluate)
+app.command("export")(export.export)
+app.command("view")(view.view)
+app.command("mesh")(mesh.mesh)
+app.command("info")(info.info)
+app.command("recover")(recover.recover)
+app.command("replay")(replay.replay)
+app.command("render")(render.render)
+app.add_typer(bench.app, name="bench")
+app.command("config")(config.config)
+app.command("doctor")(doctor.doctor)

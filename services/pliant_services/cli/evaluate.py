@@ -1,0 +1,65 @@
+"""``pliant eval``: a result against the truth."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def evaluate(
+    results: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Result folders (or trajectory files); several give mean and deviation."
+        ),
+    ],
+    groundtruth: Annotated[
+        str, typer.Option("--groundtruth", "-g", help="Trajectory file, folder or built-in:NAME.")
+    ],
+    times: Annotated[Path | None, typer.Option(help="times.txt of a KITTI ground truth.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Frames of the sequence, where no report.json says.")
+    ] = None,
+    tracks: Annotated[
+        bool, typer.Option("--tracks", help="Tracks of the recording against true depth.")
+    ] = False,
+    points: Annotated[
+        bool, typer.Option("--map", help="The map's points against true depth.")
+    ] = False,
+    mesh: Annotated[
+        bool, typer.Option("--mesh", help="The mesh against true depth maps at the keyframes.")
+    ] = False,
+    surfels: Annotated[
+        bool, typer.Option("--surfels", help="Surfels against the source's depth of every frame.")
+    ] = False,
+    plot: Annotated[
+        Path | None, typer.Option(help="PNG of the error over time (needs matplotlib).")
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="Write every figure as JSON.")] = None,
+) -> None:
+    """ATE under Sim(3), RPE, success rate and retries, for the final and the causal trajectory.
+
+    pliant eval results/room --groundtruth built-in:room --tracks --map --mesh
+
+    pliant eval results/cloth --groundtruth path/to/cloth --surfels
+
+    pliant eval results/kitchen --groundtruth sequence/groundtruth.txt
+
+    pliant eval results/seed-* --groundtruth sequence/groundtruth.txt
+    """
+    from pliant_services.evaluate import EvaluationRequest, run_evaluation
+
+    request = EvaluationRequest(
+        results=results,
+        groundtruth=groundtruth,
+        times=times,
+        frames=frames,
+        tracks=tracks,
+        points=points,
+        mesh=mesh,
+        surfels=surfels,
+        plot=plot,
+        json=json,
+    )
+    for line in run_evaluation(request):
+        typer.echo(line)

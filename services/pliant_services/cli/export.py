@@ -1,0 +1,36 @@
+"""``pliant export``: a result as files for other programs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def export(
+    result: Annotated[Path, typer.Argument(help="A result folder or a recording.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            help="foxglove, rerun, tum, kitti, euroc, ply, colmap, images, overlay or picture.",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Where to write [in the result folder]."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
+) -> None:
+    """Write a run for other programs: viewers, trajectories, reconstructions, videos.
+
+    pliant export results/room --to overlay
+
+    pliant export results/room --to foxglove
+
+    pliant export results/room --to colmap --output models/room
+
+    pliant export recording.mcap --to kitti --output poses.txt
+    """
+    from pliant_services.export import export_result
+
+    typer.echo(str(export_result(result, to, output, force=force)))

@@ -1,0 +1,34 @@
+"""``pliant info``: what a recording holds."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def info(
+    recording: Annotated[Path, typer.Argument(help="A recording or a result folder.")],
+    config: Annotated[
+        bool, typer.Option("--config", help="Print the configuration that it was made with.")
+    ] = False,
+) -> None:
+    """Duration, topics, counts, rates, sizes, gaps, versions; whether it was closed cleanly.
+
+    pliant info results/room
+
+    pliant info results/room/recording.mcap --config
+    """
+    from pliant.recording.summary import describe, summarise
+
+    summary = summarise(recording_file(recording))
+    if config:
+        typer.echo(summary.metadata.get("config", {}).get("yaml", ""), nl=False)
+        return
+    for line in describe(summary):
+        typer.echo(line)
+
+
+def recording_file(path: Path) -> Path:
+    """The recording of a result folder, or the file or folder of parts itself."""
+    parts = path.is_dir() and any(path.glob("part_*.mcap"))
+    return path / "recording.mcap" if path.is_dir() and not parts else path

@@ -1,0 +1,32 @@
+"""``pliant mesh``: the mesh of a recording again, with other parameters."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def mesh(
+    recording: Annotated[Path, typer.Argument(help="A recording or a result folder.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Result folder [<result>_mesh].")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write into an existing folder.")] = False,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="KEY=VALUE over the recorded configuration; may be repeated."),
+    ] = None,
+) -> None:
+    """Make the mesh of a recorded run again: mesh.ply, mesh_coarse.ply and their pictures.
+
+    pliant mesh results/room --set meshing.tsdf.fine_voxel=0.005
+
+    pliant mesh results/room --set meshing.surface.smoothing=none --output results/raw
+    """
+    from pliant_services.cli.info import recording_file
+    from pliant_services.mesh_command import run_mesh
+
+    for line in run_mesh(
+        recording_file(recording), output=output, force=force, overrides=overrides or []
+    ):
+        typer.echo(line)

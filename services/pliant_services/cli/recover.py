@@ -1,0 +1,38 @@
+"""``pliant recover``: a recording that was cut off, made whole."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def recover(
+    recording: Annotated[Path, typer.Argument(help="A recording or a result folder.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File to write [<name>_recovered.mcap].")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+) -> None:
+    """Keep everything that is intact of a damaged recording, and say what is missing.
+
+    pliant recover results/room
+
+    pliant recover broken.mcap --output whole.mcap
+    """
+    from pliant.errors import RecordingError
+    from pliant.recording.recover import recover as make_whole
+    from pliant.recording.summary import describe, summarise
+    from pliant_services.cli.info import recording_file
+
+    damaged = recording_file(recording)
+    whole = output or damaged.with_name(f"{damaged.stem}_recovered{damaged.suffix}")
+    if whole.exists() and (not force or (damaged.exists() and whole.samefile(damaged))):
+        raise RecordingError(f"{whole} exists: choose another --output")
+    recovery = make_whole(damaged, whole)
+    typer.echo(f"{recovery.messages} messages kept in {whole}")
+    if recovery.unchecked:
+        typer.echo(f"{recovery.unchecked} of them from a chunk that was cut off, unchecked")
+    for damage in recovery.damage:
+        typer.echo(f"lost at byte {damage.offset}, {damage.size} bytes: {damage.what}")
+    for line in describe(summarise(whole)):
+        typer.echo(line)

@@ -1,0 +1,115 @@
+"""``pliant replay``: a recording on the bus as if live, or services again on what was recorded."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pliant.errors import PliantError
+
+
+def replay(
+    recording: Annotated[Path, typer.Argument(help="A recording or a result folder.")],
+    rate: Annotated[str, typer.Option(help="Times the pace of capture, e.g. 0.5, or max.")] = "1",
+    start: Annotated[float, typer.Option(min=0.0, help="First second that is played.")] = 0.0,
+    end: Annotated[float | None, typer.Option(min=0.0, help="Last second [the end].")] = None,
+    topics: Annotated[str, typer.Option(help="Only these, separated by commas [all].")] = "",
+    readers: Annotated[
+        str,
+        typer.Option(help="Services that are waited for and get every message, e.g. tracking."),
+    ] = "",
+    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
+    connect: Annotated[
+        list[str] | None, typer.Option("--connect", help="A router [one of our own].")
+    ] = None,
+    session: Annotated[str, typer.Option(help="Name of the session that is played.")] = "replay",
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Port of our own router [a free one].")
+    ] = None,
+    services: Annotated[
+        str, typer.Option("--services", help="Run these on it, separated by commas.")
+    ] = "",
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Result folder [<result>_replay].")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write into an existing folder.")] = False,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="KEY=VALUE over the recorded configuration; may be repeated."),
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Compare with what was recorded; exit 1 if it differs.")
+    ] = False,
+    tolerance: Annotated[
+        list[str] | None,
+        typer.Option(help="FIELD=X: numbers of the field may differ by X; may be repeated."),
+    ] = None,
+    processes: Annotated[
+        bool, typer.Option("--processes", help="Services as processes, over the bus.")
+    ] = False,
+) -> None:
+    """Play a recording on the bus as if live; or run services again on what was recorded.
+
+    pliant replay results/room --rate 0.5 --start 10
+
+    pliant replay results/room --services tracking --check
+
+    pliant replay results/room --services tracking,bundle_adjustment --set tracking.max_tracks=5000
+    """
+    from pliant_services.cli.info import recording_file
+
+    file = recording_file(recording)
+    if services or output or force or overrides or check or tolerance or processes:
+        from pliant_services.replay_command import ReplayRequest, run_replay
+
+        chosen = services or "tracking,bundle_adjustment"
+        again = ReplayRequest(
+            recording=file,
+            services=[name for name in chosen.split(",") if name],
+            output=output,
+            force=force,
+            overrides=overrides or [],
+            check=check,
+            tolerances=_tolerances(tolerance or []),
+            processes=processes,
+        )
+        raise typer.Exit(run_replay(again))
+    from pliant_services.play_command import PlayRequest, run_play
+
+    played = PlayRequest(
+        recording=file,
+        rate=_rate(rate),
+        start_s=start,
+        end_s=end,
+        topics=[key for key in topics.split(",") if key],
+        readers=[name for name in readers.split(",") if name],
+        loop=loop,
+        connect=connect or [],
+        session=session,
+        port=port,
+    )
+    raise typer.Exit(run_play(played))
+
+
+def _rate(text: str) -> float:
+    """A factor, 0 for max."""
+    try:
+        rate = 0.0 if text == "max" else float(text)
+    except ValueError:
+        rate = -1.0
+    if not (text == "max" or 1e-3 <= rate <= 1e3):
+        raise PliantError(f"--rate {text}: give a factor such as 0.5, or max")
+    return rate
+
+
+def _tolerances(texts: list[str]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for text in texts:
+        field, _, number = text.partition("=")
+        try:
+            found[field] = float(number)
+        except ValueError:
+            raise PliantError(
+                f"--tolerance {text}: expected FIELD=X, e.g. points_world=1e-9"
+            ) from None
+    return found

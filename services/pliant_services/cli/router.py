@@ -1,0 +1,43 @@
+"""``pliant router``: the meeting point of a session's services."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def router(
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(help="Endpoint to listen on; may be repeated [tcp/127.0.0.1:7447]."),
+    ] = None,
+    tls: Annotated[
+        Path | None,
+        typer.Option(help="Folder that `pliant certs` made: who may publish what, by certificate."),
+    ] = None,
+) -> None:
+    """Run a router until Ctrl-C.  Services on any machine connect to it.
+
+    pliant router
+
+    pliant router --listen tls/0.0.0.0:7447 --tls certs
+    """
+    import signal
+    import threading
+
+    from pliant.bus.session import Identity, open_router
+    from pliant_services.access import access_control
+
+    stopped = threading.Event()
+    for kind in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(kind, lambda *_: stopped.set())
+    endpoints = listen or ["tcp/127.0.0.1:7447"]
+    secure = tls is not None
+    session = open_router(
+        *endpoints,
+        identity=Identity.in_folder(tls, "router") if tls is not None else None,
+        access_control=access_control() if secure else None,
+    )
+    typer.echo(f"router on {', '.join(endpoints)}", err=True)
+    stopped.wait()
+    session.close()  # type: ignore[no-untyped-call]

@@ -1,0 +1,108 @@
+"""``pliant service``: run one service, here or on another machine."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pliant.errors import PliantError
+
+
+def service(
+    name: Annotated[str, typer.Argument(help="ingest, tracking, bundle_adjustment or recorder.")],
+    connect: Annotated[
+        list[str], typer.Option("--connect", help="Router endpoint, e.g. tcp/host:7447.")
+    ],
+    session: Annotated[str, typer.Option(help="Name of the session to join.")] = "default",
+    fleet: Annotated[
+        str, typer.Option(help="The services of this session, separated by commas.")
+    ] = "",
+    config_file: Annotated[Path | None, typer.Option("--config", help="YAML file.")] = None,
+    source: Annotated[str, typer.Option(help="ingest: where frames come from.")] = "",
+    calibration: Annotated[
+        Path | None, typer.Option(help="ingest: calibration of a video or camera.")
+    ] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="ingest: horizontal field of view in degrees.")
+    ] = None,
+    topic: Annotated[str, typer.Option(help="ingest: the images of a file with several.")] = "",
+    output: Annotated[Path | None, typer.Option(help="recorder: the MCAP file to write.")] = None,
+    metadata: Annotated[
+        Path | None, typer.Option(help="recorder: JSON of metadata records to keep.")
+    ] = None,
+    patience: Annotated[
+        float | None, typer.Option(help="Seconds that peers may be away [bus.patience_s].")
+    ] = None,
+    state: Annotated[
+        Path | None,
+        typer.Option(help="Folder of checkpoints: a service that died goes on where it was."),
+    ] = None,
+    tls: Annotated[
+        Path | None, typer.Option(help="Folder that `pliant certs` made, for tls/ endpoints.")
+    ] = None,
+    with_launcher: Annotated[
+        bool, typer.Option(hidden=True, help="End when standard input closes.")
+    ] = False,
+    delays_ms: Annotated[
+        float, typer.Option(hidden=True, help="Delay messages at random, for tests.")
+    ] = 0.0,
+) -> None:
+    """Run one service until its inputs end.
+
+    pliant service tracking --connect tcp/host:7447
+    """
+    from pliant.bus.session import Identity
+    from pliant.config import load_config
+    from pliant_services.host import ServiceOptions, end_with_launcher, run_service
+    from pliant_services.processes import BY_NAME, PROFILES, reads_depth
+
+    if with_launcher:
+        end_with_launcher()
+
+    if name not in BY_NAME:
+        raise PliantError(f"no service {name}: choose {', '.join(BY_NAME)}")
+    names = tuple(fleet.split(",")) if fleet else PROFILES["points"]
+    unknown = [other for other in (*names, name) if other not in BY_NAME or name not in names]
+    if unknown:
+        raise PliantError(f"--fleet {fleet}: choose from {', '.join(BY_NAME)}, including {name}")
+    config = load_config(config_file)
+    arguments: dict[str, Any] = {}
+    if name == "ingest":
+        from pliant.datasets import open_source
+
+        if not source:
+            raise PliantError("ingest needs --source: a folder, a video, camera:0 or built-in:room")
+        arguments["dataset"] = open_source(
+            source,
+            calibration=calibration,
+            fov_deg=fov,
+            topic=topic,
+            depth=config.ingest.depth if reads_depth(names) else "none",
+        )
+    elif name == "recorder":
+        if output is None:
+            raise PliantError("recorder needs --output: the MCAP file to write")
+        arguments["output"] = output
+        arguments["metadata"] = _read_metadata(metadata) if metadata is not None else {}
+    options = ServiceOptions(
+        endpoints=connect,
+        session=session,
+        fleet=names,
+        arguments=arguments,
+        delays_ms=delays_ms,
+        patience_s=patience,
+        state=state,
+        identity=Identity.in_folder(tls, name) if tls is not None else None,
+    )
+    run_service(name, config, options)
+
+
+def _read_metadata(file: Path) -> dict[str, dict[str, str]]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise PliantError(f"{file}: cannot read the metadata: {error}") from None
+    if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
+        raise PliantError(f"{file}: expected metadata records as JSON: name, then keys and values")
+    return content

@@ -1,0 +1,45 @@
+"""``pliant view``: look at a run, while it goes on or afterwards."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def view(
+    source: Annotated[
+        Path | None, typer.Argument(help="A result folder or a recording.", show_default=False)
+    ] = None,
+    connect: Annotated[
+        list[str] | None, typer.Option("--connect", help="Router of a session, e.g. tcp/host:7447.")
+    ] = None,
+    session: Annotated[str, typer.Option(help="Name of the session at --connect.")] = "",
+    web: Annotated[bool, typer.Option("--web", help="In a browser instead of a window.")] = False,
+    web_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of --web.")] = 9090,
+    save: Annotated[Path | None, typer.Option(help="Into an .rrd file instead.")] = None,
+    patience: Annotated[
+        float, typer.Option(hidden=True, help="Seconds to wait for a session that is to start.")
+    ] = 0.0,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+) -> None:
+    """Image with tracks, camera path, points and mesh, in Rerun.  It never slows a run.
+
+    pliant view results/room
+
+    pliant view results/room --web
+
+    pliant view --connect tcp/127.0.0.1:7447 --session run-1234
+    """
+    from pliant_services.viewing import ViewRequest, run_view
+
+    request = ViewRequest(
+        source=source,
+        endpoints=connect or [],
+        session=session,
+        web=web,
+        web_port=web_port,
+        save=save,
+        force=force,
+        patience_s=patience,
+    )
+    run_view(request)

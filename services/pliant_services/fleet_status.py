@@ -1,0 +1,127 @@
+"""Looks at a session from outside: what its services tell once a second, and their tokens."""
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import zenoh
+
+from pliant.bus.health import Health, health_key, read_health
+from pliant.bus.peers import service_of
+from pliant.bus.session import Identity, open_session
+from pliant.bus.zenoh_bus import STOP_KEY
+from pliant.errors import BusError
+
+_HEADINGS = (
+    *("session", "service", "host", "version", "frame", "frames/s", "lag", "queue"),
+    *("kept", "faults", "MiB", "clock ms", "waiting for"),
+)
+
+
+@dataclass
+class Seen:
+    """A service: its first and last health, each with our own clock when it came (ns)."""
+
+    session: str
+    first: Health
+    first_ns: int
+    last: Health
+    last_ns: int
+
+    @property
+    def rate(self) -> float:
+        """Frames a second between the two."""
+        spent_s = (self.last_ns - self.first_ns) * 1e-9
+        return (self.last.frame - self.first.frame) / spent_s if spent_s > 0.0 else 0.0
+
+
+def listen(
+    endpoints: Sequence[str], session: str, seconds: float, identity: Identity | None = None
+) -> list[Seen]:
+    """Every service that told its health in so many seconds, by session and name.
+
+    Raises BusError where no router answers.
+    """
+    seen: dict[tuple[str, str], Seen] = {}
+
+    def on_sample(sample: zenoh.Sample) -> None:
+        found = read_health(sample)
+        if found is None:
+            return
+        name, health = found
+        now = time.time_ns()
+        before = seen.get((name, health.service))
+        if before is None or before.last.incarnation != health.incarnation:
+            seen[name, health.service] = Seen(name, health, now, health, now)
+        else:
+            before.last, before.last_ns = health, now
+
+    with open_session(endpoints, identity) as connection:
+        subscriber = connection.declare_subscriber(f"pliant/{session}/{health_key('*')}", on_sample)
+        time.sleep(seconds)
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+    return [seen[key] for key in sorted(seen)]
+
+
+def table(services: Sequence[Seen]) -> Iterator[str]:
+    """The services as lines of text."""
+    newest: dict[str, int] = {}
+    for each in services:
+        newest[each.session] = max(newest.get(each.session, 0), each.last.frame)
+    rows = [_HEADINGS, *(_row(each, newest[each.session]) for each in services)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADINGS))]
+    for row in rows:
+        yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip()
+
+
+def _row(each: Seen, newest: int) -> tuple[str, ...]:
+    health = each.last
+    return (
+        each.session,
+        health.service,
+        health.host,
+        health.version,
+        str(health.frame),
+        f"{each.rate:.1f}",
+        str(newest - health.frame),
+        str(int(health.input_waiting.sum())),
+        str(int(health.output_kept.sum())),
+        str(health.faults),
+        f"{health.memory_mib:.0f}",
+        f"{(health.stamp_ns - each.last_ns) * 1e-6:+.0f}",  # with the network's delay
+        health.waiting_for or "-",
+    )
+
+
+def stop_session(
+    endpoints: Sequence[str], session: str, patience_s: float, identity: Identity | None = None
+) -> list[str]:
+    """Ask a session to end, and wait until its services are gone.
+
+    Returns those that are left.  Raises BusError where there is no such session.
+    """
+    here: dict[str, str] = {}
+    changed = threading.Condition()
+
+    def on_token(sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        with changed:
+            if sample.kind == zenoh.SampleKind.PUT:
+                here[key] = service_of(key)
+            else:
+                here.pop(key, None)
+            changed.notify_all()
+
+    with open_session(endpoints, identity) as connection:
+        tokens = f"pliant/{session}/ready/**"
+        subscriber = connection.liveliness().declare_subscriber(tokens, on_token, history=True)
+        with changed:
+            if not changed.wait_for(lambda: here, timeout=3.0):
+                raise BusError(f"no session {session} on {', '.join(endpoints)}")
+        connection.put(f"pliant/{session}/{STOP_KEY}", b"")
+        with changed:
+            changed.wait_for(lambda: not here, timeout=patience_s)
+            left = sorted(set(here.values()))
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+    return left

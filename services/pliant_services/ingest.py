@@ -1,0 +1,198 @@
+"""Ingest: frames from a source, rectified once for everybody.
+
+in   an image folder, a video, a camera, a built-in sequence
+out  camera/stream   once: the camera
+     camera/source   every frame: its bytes as they came
+     camera/image    every frame: rectified; empty where it was dropped or does not decode
+     camera/depth    every frame: the bytes of its depth map, where it has one that somebody wants
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from pliant.bus.base import Bus, resume
+from pliant.config import Config
+from pliant.datasets.base import BrokenFrame, Dataset, SourceFrame
+from pliant.datasets.calibration import calibration_yaml
+from pliant.datasets.rectifier import Rectifier
+from pliant.errors import DatasetError, SourceLostError
+from pliant.messages import topics
+from pliant.messages.types import CAMERA_FRAME_ID, CameraStream, Depth, Header, Image, SourceImage
+from pliant_services.monitor import Monitor
+
+DROPPED = "dropped"
+"""Why an image is missing that was passed over in live mode."""
+
+
+def run(
+    bus: Bus, config: Config, monitor: Monitor, dataset: Dataset, stopping: Callable[[], bool]
+) -> None:
+    """Publish until the source ends or ``stopping()``.
+
+    Raises SourceLostError where the source fails after its first frame; what came before is sent.
+    """
+    live = dataset.is_live if config.ingest.mode == "auto" else config.ingest.mode == "live"
+    rectifier = Rectifier(dataset.calibration)
+
+    def start() -> tuple[int, int, int]:
+        bus.publish(topics.STREAM, _stream(dataset, rectifier, live=live))
+        bus.end(topics.STREAM)  # its readers wait for its end before the first frame
+        return 0, 0, 0
+
+    begin, dropped, broken = resume(bus, start)
+    image: Image | None = None
+    try:
+        for source in newest(dataset, stopping) if live else every(dataset, stopping):
+            if source.index < begin:  # sent before we were started again
+                continue
+            with monitor.stage("rectify"):
+                image = rectified(source, rectifier)
+            dropped += source.dropped
+            broken += bool(image.missing) and not source.dropped
+            bus.publish(topics.SOURCE, _source_message(source))
+            bus.publish(topics.IMAGE, image)
+            bus.publish(topics.DEPTH, _depth_message(source))
+            monitor.report(image, dropped=dropped, broken=broken)
+            bus.checkpoint(image.frame, (image.frame + 1, dropped, broken))
+    except DatasetError as error:
+        if image is None:
+            raise
+        monitor.report(image, note=str(error), dropped=dropped, broken=broken)
+        raise SourceLostError(str(error)) from None
+
+
+def rectified(source: SourceFrame, rectifier: Rectifier) -> Image:
+    """The image that everybody works on: a pure function, so that a replay makes the same."""
+    if source.dropped:
+        return _without_pixels(source, DROPPED)
+    try:
+        grey, colour = rectifier.rectify(source)
+    except BrokenFrame as error:
+        return _without_pixels(source, f"broken: {error}")
+    header = _header(source)
+    return Image(
+        frame=header.frame,
+        stamp_ns=header.stamp_ns,
+        frame_id=header.frame_id,
+        grey=grey,
+        colour=colour if colour is not None else np.zeros((0, 0, 3), np.uint8),
+    )
+
+
+def every(dataset: Dataset, stopping: Callable[[], bool]) -> Iterator[SourceFrame]:
+    """Lossless: every frame, at the pace of the slowest reader."""
+    for frame in dataset:
+        if stopping():
+            return
+        yield frame
+
+
+def newest(dataset: Dataset, stopping: Callable[[], bool]) -> Iterator[SourceFrame]:
+    """Live: the newest frame wins; those passed over come out without data, to be counted.
+
+    A source that is not a camera is played at the pace of its own time stamps.
+    """
+    slot: list[SourceFrame] = []
+    failure: list[BaseException] = []
+    changed = threading.Condition()
+    finished = threading.Event()
+
+    def capture() -> None:
+        try:
+            play()
+        except BaseException as error:
+            failure.append(error)
+        finally:
+            finished.set()
+            with changed:
+                changed.notify()
+
+    def play() -> None:
+        start_s, first_ns = time.monotonic(), None
+        for frame in dataset:
+            first_ns = frame.stamp_ns if first_ns is None else first_ns
+            if not dataset.is_live:
+                due_s = start_s + (frame.stamp_ns - first_ns) * 1e-9
+                finished.wait(max(0.0, due_s - time.monotonic()))
+            if finished.is_set():
+                return
+            with changed:
+                if slot:  # passed over: only its number and time are kept
+                    slot[-1] = slot[-1].without_data()
+                slot.append(frame)
+                changed.notify()
+
+    threading.Thread(target=capture, daemon=True).start()
+    try:
+        while True:
+            with changed:
+                changed.wait_for(lambda: slot or finished.is_set(), timeout=1.0)
+                frames, slot[:] = slot[:], []
+                over = finished.is_set()
+            yield from frames
+            if stopping():
+                return
+            if over and not slot:
+                if failure:
+                    raise failure[0]
+                return
+    finally:
+        finished.set()
+
+
+def _stream(dataset: Dataset, rectifier: Rectifier, *, live: bool) -> CameraStream:
+    camera = rectifier.camera
+    return CameraStream(
+        frame=0,
+        stamp_ns=0,
+        frame_id=CAMERA_FRAME_ID,
+        source=dataset.name,
+        mode="live" if live else "lossless",
+        frames=dataset.frame_count if dataset.frame_count is not None else -1,
+        calibration=calibration_yaml(dataset.calibration),
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+    )
+
+
+def _header(source: SourceFrame) -> Header:
+    return Header(frame=source.index, stamp_ns=source.stamp_ns, frame_id=CAMERA_FRAME_ID)
+
+
+def _source_message(source: SourceFrame) -> SourceImage:
+    return SourceImage(
+        frame=source.index,
+        stamp_ns=source.stamp_ns,
+        frame_id=CAMERA_FRAME_ID,
+        encoding=source.encoding,
+        width=source.width,
+        height=source.height,
+        data=source.data,
+    )
+
+
+def _depth_message(source: SourceFrame) -> Depth:
+    return Depth(
+        frame=source.index,
+        stamp_ns=source.stamp_ns,
+        frame_id=CAMERA_FRAME_ID,
+        data=source.depth,
+    )
+
+
+def _without_pixels(source: SourceFrame, why: str) -> Image:
+    return Image(
+        frame=source.index,
+        stamp_ns=source.stamp_ns,
+        frame_id=CAMERA_FRAME_ID,
+        grey=np.zeros((0, 0), np.uint8),
+        colour=np.zeros((0, 0, 3), np.uint8),
+        missing=why,
+    )

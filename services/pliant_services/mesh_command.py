@@ -1,0 +1,114 @@
+"""Behind ``pliant mesh``: the final meshes of a recording, made again without a new recording."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pliant.algorithms.geometry import pose_to_matrix
+from pliant.bus.replay_bus import ReplayBus
+from pliant.config import Config
+from pliant.errors import RecordingError, ResultError
+from pliant.fusion.open3d_import import require_open3d
+from pliant.map_history import MapHistory
+from pliant.messages.topics import Topic
+from pliant.messages.types import Header, MeshPiece, Status
+from pliant.recording.reader import Recording
+from pliant.recording.summary import summarise
+from pliant_services import meshing
+from pliant_services.host import one_thread_each
+from pliant_services.mesh_results import mesh_report, meshes_of, write_meshes
+from pliant_services.monitor import StatusMonitor
+from pliant_services.pipeline import check_output
+from pliant_services.processes import BY_NAME
+from pliant_services.replay import recorded_config
+from pliant_services.results import folded_map
+
+REPORT_NAME = "mesh.json"
+
+
+@dataclass
+class Meshing:
+    """What meshing a recording gave.  seconds: total time of each stage."""
+
+    pieces: list[MeshPiece] = field(default_factory=list[MeshPiece])
+    seconds: dict[str, float] = field(default_factory=dict[str, float])
+    counters: dict[str, float] = field(default_factory=dict[str, float])
+    notes: list[str] = field(default_factory=list[str])
+
+    def take(self, topic: Topic, message: Header) -> None:
+        """What the service publishes; the live mesh is not kept."""
+        if isinstance(message, MeshPiece):
+            self.pieces.append(message)
+        elif isinstance(message, Status):
+            for stage, spent in zip(message.stages, message.seconds.tolist(), strict=True):
+                self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
+            self.counters.update(zip(message.counters, message.values.tolist(), strict=True))
+            if message.note:
+                self.notes.append(message.note)
+
+
+def mesh_recording(recording: Path, config: Config) -> Meshing:
+    """Run the meshing service on a recording.  Raises RecordingError where it has no keyframes."""
+    reader = Recording(recording)
+    inputs = BY_NAME["meshing"].inputs
+    known = summarise(recording).topics
+    missing = [topic.key for topic in inputs if topic.key not in known]
+    if missing:
+        raise RecordingError(f"{recording}: without {missing[0]}: `pliant replay` makes it")
+    found = Meshing()
+    bus = ReplayBus(
+        {topic: reader.decoded(topic) for topic in inputs}, through_codec=False,
+        on_publish=found.take,
+    )  # fmt: skip
+    meshing.run(bus, config, StatusMonitor(bus, "meshing"))
+    return found
+
+
+def run_mesh(
+    recording: Path, *, output: Path | None, force: bool, overrides: Sequence[str]
+) -> Iterator[str]:
+    """Mesh, write the files, and say what came of it.  Raises PliantError."""
+    one_thread_each()
+    config = recorded_config(summarise(recording), overrides)
+    require_open3d()
+    folder = recording.resolve().parent
+    output = output or folder.with_name(f"{folder.name}_mesh")
+    if output.resolve() == folder:
+        raise ResultError(f"{output} holds the recording itself: choose another --output")
+    check_output(output, force=force)
+    found = mesh_recording(recording, config)
+    yield from dict.fromkeys(found.notes)
+    history = folded_map(recording)
+    output.mkdir(parents=True, exist_ok=True)
+    write_all(output, found, history)
+    report = {
+        "mesh": mesh_report(found.pieces),
+        "seconds": found.seconds,
+        "counters": found.counters,
+        "notes": found.notes,
+        "config": config.meshing.model_dump(mode="json"),
+    }
+    (output / REPORT_NAME).write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    for mesh in mesh_report(found.pieces):
+        yield (
+            f"segment {mesh['segment']}, {mesh['level']}: {mesh['triangles']} triangles, "
+            f"{mesh['vertices']} vertices, voxel {mesh['voxel_size']:.4g}"
+        )
+    if not found.pieces:
+        raise RecordingError(
+            f"{recording}: no keyframe has a surface: {' '.join(found.notes[-1:])}"
+        )
+    yield f"results in {output}/"
+
+
+def write_all(output: Path, found: Meshing, history: MapHistory) -> None:
+    """The meshes and pictures of every segment, as the results of a run have them."""
+    longest = history.longest_segment()
+    for segment in sorted({segment for segment, _ in meshes_of(found.pieces)}):
+        poses = [pose for of, pose in history.keyframe_poses().values() if of == segment]
+        suffix = "" if segment == longest else f"_segment_{segment}"
+        T_world_camera = pose_to_matrix(np.array(poses, np.float64).reshape(-1, 7))
+        write_meshes(output, found.pieces, segment, suffix, T_world_camera)

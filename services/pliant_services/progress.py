@@ -1,0 +1,91 @@
+"""What a user sees while a run goes on: a bar on a terminal, a few lines elsewhere."""
+
+import sys
+import threading
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
+from rich.progress import Progress as RichProgress
+
+from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
+from pliant.messages.types import Status
+
+_STATES = {WAITING: "starting", TRACKING: "tracking", LOST: "lost"}
+
+
+class _Console(Console):
+    """A console that falls silent where nobody listens any more: the run goes on."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+
+
+class Progress:
+    """Follows the status messages of a run.  Everything goes to stderr."""
+
+    def __init__(self, frames: int | None) -> None:
+        self._console = _Console(stderr=True)
+        self._lock = threading.Lock()
+        self._counters: dict[str, float] = {}
+        self._note = ""
+        self._bar = RichProgress(
+            TextColumn("{task.fields[state]:>9}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]} {task.fields[detail]}"),
+            console=self._console,
+            disable=not sys.stderr.isatty(),
+            transient=True,
+        )
+        self._task = self._bar.add_task("run", total=frames, state="starting", rate="", detail="")
+
+    def say(self, line: str) -> None:
+        """One line for the user."""
+        try:
+            self._bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+        except OSError:
+            self._console.quiet = True
+
+    def on_status(self, status: Status) -> None:
+        """Take in a status; called from the bus' thread."""
+        with self._lock:
+            self._counters.update(zip(status.counters, status.values.tolist(), strict=True))
+            if status.service == "surfels":
+                self._show_surfels(status)
+            if status.service != "bundle_adjustment":
+                return
+            self._note = status.note
+            counters = self._counters
+            task = self._bar.tasks[0]
+            detail = (
+                f"{counters.get('tracks', 0):.0f} tracks, {counters.get('inliers', 0):.0f} mapped, "
+                f"{counters.get('points', 0):.0f} points"
+            )
+            dropped = counters.get("dropped", 0) + counters.get("broken", 0)
+            self._bar.update(
+                self._task,
+                completed=status.frame + 1,
+                state=_STATES.get(int(counters.get("state", WAITING)), ""),
+                rate=f"{task.speed:.1f} fps" if task.speed else "",
+                detail=detail
+                + (f", {dropped:.0f} dropped" if dropped else "")
+                + (f" ({self._note})" if self._note else ""),
+            )
+
+    def _show_surfels(self, status: Status) -> None:
+        counters, task = self._counters, self._bar.tasks[0]
+        detail = f"{counters['alive']:.0f} of {counters['surfels']:.0f} surfels alive"
+        self._bar.update(
+            self._task,
+            completed=status.frame + 1,
+            state="following",
+            rate=f"{task.speed:.1f} fps" if task.speed else "",
+            detail=detail + (f" ({status.note})" if status.note else ""),
+        )
+
+    def __enter__(self) -> "Progress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()

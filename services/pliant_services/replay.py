@@ -1,0 +1,201 @@
+"""Runs services again on what was recorded: in one process, without a bus, at full speed.
+
+Services run one after the other, and what one makes goes to the new recording, from where the next
+one reads it: so memory stays that of one message, and nothing depends on timing.
+"""
+
+import importlib
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+
+import yaml
+
+from pliant.bus.replay_bus import ReplayBus
+from pliant.config import Config, load_config
+from pliant.datasets.calibration import calibration_from_yaml
+from pliant.datasets.own_recording import recorded_frame
+from pliant.datasets.rectifier import Rectifier
+from pliant.errors import RecordingError
+from pliant.messages import codec, topics
+from pliant.messages.topics import Topic
+from pliant.messages.types import CameraStream, Header, Image, SourceImage, StreamEnd
+from pliant.recording.reader import Recorded, Recording
+from pliant.recording.summary import Summary
+from pliant.recording.writer import RecordingWriter
+from pliant_services.ingest import rectified
+from pliant_services.monitor import StatusMonitor
+from pliant_services.processes import PROCESSES, Process, outputs_of
+
+
+def replayable(names: Sequence[str]) -> tuple[Process, ...]:
+    """The services in the order in which they read each other.  Raises RecordingError."""
+    able = [p.name for p in PROCESSES if p.inputs and not p.observer]
+    wrong = [name for name in names if name not in able]
+    if wrong or not names:
+        raise RecordingError(f"--services {','.join(names)}: choose from {', '.join(able)}")
+    return tuple(process for process in PROCESSES if process.name in names)
+
+
+def recorded_config(summary: Summary, overrides: Sequence[str]) -> Config:
+    """The configuration of the recording with ``overrides`` on top."""
+    return config_of(summary.metadata, overrides)
+
+
+def config_of(metadata: Mapping[str, Mapping[str, str]], overrides: Sequence[str]) -> Config:
+    """The configuration in a recording's metadata with ``overrides`` on top."""
+    text = metadata.get("config", {}).get("yaml", "")
+    try:
+        content = yaml.safe_load(text) or {}
+    except yaml.YAMLError:
+        raise RecordingError("the configuration in the recording is damaged") from None
+    if not isinstance(content, dict):
+        raise RecordingError("the configuration in the recording is damaged")
+    return load_config(None, [*_flat(content), *overrides])
+
+
+def _flat(content: Mapping[str, object], prefix: str = "") -> Iterator[str]:
+    for key, value in content.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            flow = yaml.safe_dump(value, default_flow_style=True, width=10**9)
+            yield f"{prefix}{key}={flow.removesuffix('...' + chr(10)).strip()}"
+
+
+def require_images(summary: Summary, services: Sequence[Process]) -> None:
+    """Raise RecordingError where services need images that were left out of the recording."""
+    needing = [p.name for p in services if topics.IMAGE in p.inputs]
+    if needing and topics.SOURCE.key not in summary.topics:
+        raise RecordingError(
+            f"{' and '.join(needing)} cannot be replayed: the recording is without "
+            f"{topics.SOURCE.key} (made with --no-images?)"
+        )
+
+
+class Replay:
+    """One replay: from a recording into a new one."""
+
+    def __init__(
+        self, path: Path, summary: Summary, services: Sequence[Process], config: Config
+    ) -> None:
+        self._recorded = Recording(path)
+        self._summary = summary
+        self._services = services
+        self._config = config
+        made = [topic for process in services for topic in process.outputs]
+        self.made: tuple[Topic, ...] = tuple(made)
+        self._affected = affected(services)
+
+    def run(self, output: Path, metadata: Mapping[str, Mapping[str, str]]) -> None:
+        """Write the new recording: what came before the services as it was, and what they make.
+
+        Raises PliantError; KeyboardInterrupt leaves a recording that is closed and incomplete.
+        """
+        with RecordingWriter(output, metadata) as writer:
+            self._copy(writer)
+            for process in self._services:
+                writer.sync()  # what was made so far is the input of this one
+                self._run_service(process, writer, Recording(output))
+
+    def _run_service(self, process: Process, writer: RecordingWriter, made: Recording) -> None:
+        outputs = outputs_of(process.name)
+        sink = _Sink(writer, outputs)
+        inputs = {
+            topic: self._input(topic, made if topic in self.made else self._recorded)
+            for topic in process.inputs
+        }
+        bus = ReplayBus(inputs, through_codec=False, on_publish=sink.publish)
+        module = importlib.import_module(process.module)
+        complete = False
+        try:
+            module.run(bus, self._config, StatusMonitor(bus, process.name))
+            complete = True
+        finally:
+            sink.end(complete=complete)
+
+    def _input(self, topic: Topic, recording: Recording) -> Iterator[Header]:
+        """A topic as a service reads it; of a recording that was cut off, what all topics have."""
+        messages = self._images() if topic == topics.IMAGE else recording.decoded(topic)
+        return islice(messages, self._frames()) if topic.per_frame else messages
+
+    def _frames(self) -> int:
+        """Frames that every recorded input has."""
+        wanted = {t for process in self._services for t in process.inputs if t.per_frame}
+        keys = {topics.SOURCE.key} | {t.key for t in wanted if t.logged and t not in self.made}
+        found = self._summary.topics
+        return min((found[key].messages if key in found else 0) for key in keys)
+
+    def _images(self) -> Iterator[Image]:
+        """The rectified images, made again from their bytes."""
+        rectifier: Rectifier | None = None
+        for stream in self._recorded.decoded(topics.STREAM):
+            assert isinstance(stream, CameraStream)
+            rectifier = Rectifier(calibration_from_yaml(stream.calibration))
+        if rectifier is None:
+            raise RecordingError("the recording has no camera: it stopped before its first frame")
+        for source in self._recorded.decoded(topics.SOURCE):
+            assert isinstance(source, SourceImage)
+            yield rectified(recorded_frame(source), rectifier)
+
+    def _copy(self, writer: RecordingWriter) -> None:
+        """What the services do not touch: it makes the new recording one that can be replayed."""
+        for message in self._recorded.messages():
+            key = message.topic.key
+            if message.topic == topics.STREAM_END:
+                end = message.decode()
+                assert isinstance(end, StreamEnd)
+                key = end.topic
+            if key not in self._affected:
+                _write(writer, message)
+
+
+class _Sink:
+    """Writes what a service publishes, numbered as on the bus."""
+
+    def __init__(self, writer: RecordingWriter, outputs: Iterable[Topic]) -> None:
+        self._writer = writer
+        self._sent = dict.fromkeys(outputs, 0)
+
+    def publish(self, topic: Topic, message: Header) -> None:
+        self._write(topic, topic, message)
+
+    def end(self, *, complete: bool) -> None:
+        for topic, sent in list(self._sent.items()):
+            closing = StreamEnd(
+                frame=sent, stamp_ns=0, frame_id="",
+                topic=topic.key, messages=sent, complete=complete,
+            )  # fmt: skip
+            self._write(topic, topics.STREAM_END, closing)
+
+    def _write(self, of: Topic, topic: Topic, message: Header) -> None:
+        self._writer.write(
+            topic,
+            codec.encode(message),
+            sequence=self._sent[of],
+            log_time_ns=time.time_ns(),
+            publish_time_ns=message.stamp_ns,
+        )
+        self._sent[of] += 1
+
+
+def affected(services: Sequence[Process]) -> set[str]:
+    """Topics of the services, and of all that read what these make: they would be out of date."""
+    stale: set[Topic] = set()
+    affected: set[str] = set()
+    for process in PROCESSES:  # in the order in which they read each other
+        if process in services or stale & set(process.inputs):
+            stale |= set(process.outputs)
+            affected |= {topic.key for topic in outputs_of(process.name)}
+    return affected
+
+
+def _write(writer: RecordingWriter, message: Recorded) -> None:
+    writer.write(
+        message.topic,
+        message.data,
+        sequence=message.sequence,
+        log_time_ns=message.log_time_ns,
+        publish_time_ns=message.publish_time_ns,
+    )

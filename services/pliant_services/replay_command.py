@@ -1,0 +1,97 @@
+"""Behind ``pliant replay``: from a result folder to a new one, and whether they agree."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pliant.config import config_yaml
+from pliant.errors import RecordingError, ResultError
+from pliant.messages import topics
+from pliant.messages.topics import Topic
+from pliant.recording.compare import compare
+from pliant.recording.reader import Recording
+from pliant.recording.summary import summarise
+from pliant_services.host import one_thread_each
+from pliant_services.pipeline import (
+    check_output,
+    prepare,
+    run_metadata,
+    summary,
+    write_outputs,
+)
+from pliant_services.replay import Replay, recorded_config, replayable, require_images
+from pliant_services.replay_processes import run_as_processes
+from pliant_services.results import RECORDING_NAME
+
+SAME, DIFFERENT = 0, 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayRequest:
+    """What the user asked for."""
+
+    recording: Path
+    services: Sequence[str]
+    output: Path | None = None
+    force: bool = False
+    overrides: Sequence[str] = ()
+    check: bool = False
+    tolerances: Mapping[str, float] = field(default_factory=dict[str, float])
+    processes: bool = False
+
+
+def comparable(made: Sequence[Topic], mode: str) -> list[Topic]:
+    """What must be the same: in live mode the live mesh shows what there was time for."""
+    return [topic for topic in made if mode != "live" or topic != topics.MESH_BLOCKS]
+
+
+def run_replay(request: ReplayRequest) -> int:
+    """Replay, write the results, compare; returns the exit code.  Raises PliantError."""
+    one_thread_each()
+    services = replayable(request.services)
+    recorded = summarise(request.recording)
+    if not recorded.has_index:
+        raise RecordingError(
+            f"{request.recording}: not closed: `pliant recover` makes a recording that replays"
+        )
+    config = recorded_config(recorded, request.overrides)
+    folder = request.recording.resolve().parent
+    require_images(recorded, services)
+    output = request.output or folder.with_name(f"{folder.name}_replay")
+    check_output(output, force=request.force)
+    if output.resolve() == folder:
+        raise ResultError(f"{output} holds the recording itself: choose another --output")
+    prepare(output, config_yaml(config))
+    metadata = run_metadata(config_yaml(config))
+    metadata["replay"] = {"of": str(request.recording), "services": ",".join(request.services)}
+    made = output / RECORDING_NAME
+    replay = Replay(request.recording, recorded, services, config)
+    if request.processes:
+        run_as_processes(request.recording, services, config, output, metadata)
+    else:
+        replay.run(made, metadata)
+    report = write_outputs(output)
+    for line in summary(report):
+        print(line)
+    print(f"results in {output}/")
+    if not request.check:
+        return SAME
+    compared = comparable(replay.made, report["mode"])
+    differences = compare(
+        Recording(request.recording), Recording(made), compared, request.tolerances
+    )
+    for difference in differences:
+        print(
+            f"{difference.topic} differs in {difference.messages} messages, "
+            f"first {difference.first}"
+        )
+    if not differences:
+        keys = ", ".join(topic.key for topic in compared)
+        how = "the same within the tolerances" if request.tolerances else "the same bytes"
+        print(f"{how} as recorded: {keys}")
+        return SAME
+    before, now = recorded.metadata.get("packages", {}), metadata["packages"]
+    for name in sorted(before.keys() & now.keys()):
+        if before[name] != now[name]:
+            print(f"recorded with {name} {before[name]}, here is {now[name]}")
+    return DIFFERENT

@@ -1,0 +1,57 @@
+"""How a run lets others look on: it says where it is, and starts a viewer where asked to."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from pliant.errors import ResultError
+from pliant_services.launcher import Fleet
+from pliant_services.viewing import SESSION_NAME
+
+_START_S = 30.0  # a viewer imports Rerun, and may wait for a busy machine
+_WAIT_S = 120.0  # services compile before they are up
+_LAST_WORDS_S = 20.0
+
+
+@contextmanager
+def announced(output: Path, endpoint: str, session: str) -> Iterator[None]:
+    """Leave ``session.json`` in the result folder while the run goes on."""
+    file = output / SESSION_NAME
+    with suppress(OSError):  # a full disk has a line of its own
+        file.write_text(json.dumps({"endpoint": endpoint, "session": session}), encoding="utf-8")
+    try:
+        yield
+    finally:
+        file.unlink(missing_ok=True)
+
+
+@contextmanager
+def viewer(fleet: Fleet, *, web: bool, save: Path | None) -> Iterator[None]:
+    """A ``pliant view`` of its own that is there before the first frame.
+
+    One in a browser stays when the run is over, until Ctrl-C.  Raises ResultError where it does
+    not come up.
+    """
+    command = [
+        *(sys.executable, "-m", "pliant_services.cli", "view"),
+        *("--connect", fleet.endpoint, "--session", fleet.session, "--patience", str(_WAIT_S)),
+        *(["--web"] if web else []),
+        *(["--save", str(save), "--force"] if save is not None else []),
+    ]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    try:
+        waited = 0.0
+        while not fleet.wait_for_viewer(0.2):
+            waited += 0.2
+            if process.poll() is not None or waited > _START_S:
+                raise ResultError("the viewer did not start; what it said stands above")
+        yield
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(None if web else _LAST_WORDS_S)
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            process.wait()

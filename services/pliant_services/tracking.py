@@ -1,0 +1,32 @@
+"""Tracking: follows curvature extrema through the video.
+
+in   camera/stream    once
+     camera/image     every frame
+out  tracks/extrema   one per frame: tracks and all maxima; empty where the frame has no pixels
+"""
+
+from pliant.algorithms.tracking import ExtremaTracker
+from pliant.algorithms.tracks import FrameTracks
+from pliant.bus.base import Bus, receive, receive_one, resume
+from pliant.config import Config
+from pliant.messages import topics
+from pliant.messages.types import CameraStream, Extrema, Image
+from pliant_services.monitor import Monitor
+
+
+def run(bus: Bus, config: Config, monitor: Monitor) -> None:
+    """Track until the images end."""
+
+    def start() -> ExtremaTracker:
+        stream = receive_one(bus, topics.STREAM, CameraStream)
+        return ExtremaTracker(stream.width, stream.height, config.tracking, config.seed)
+
+    tracker = resume(bus, start)
+    for image in receive(bus, topics.IMAGE, Image):
+        if image.missing:
+            tracks = FrameTracks.empty()
+        else:
+            tracks = tracker.track(image.grey, monitor.stage)
+        bus.publish(topics.EXTREMA, Extrema.of(image, tracks, missing=image.missing))
+        monitor.report(image, tracks=len(tracks.ids), maxima=len(tracks.maxima))
+        bus.checkpoint(image.frame, tracker)
