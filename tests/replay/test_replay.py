@@ -1,0 +1,123 @@
+"""Services alone on a recorded run: the same bytes, or a readable first difference."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from pliant.config import config_yaml, load_config
+from pliant.errors import ConfigError, RecordingError
+from pliant.messages import topics
+from pliant.recording.compare import compare
+from pliant.recording.reader import Recording
+from pliant.recording.summary import summarise
+from pliant_services.replay import recorded_config, replayable
+from pliant_services.replay_command import DIFFERENT, SAME, ReplayRequest, run_replay
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "system"))
+from running import TINY, assert_one_line, pliant
+
+pytestmark = pytest.mark.system
+
+PIPELINE = ["tracking", "bundle_adjustment"]
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "tiny"
+    done = pliant("run", f"{TINY}?frames=12", "--output", folder, "--set", "seed=3")
+    assert (folder / "recording.mcap").exists(), done.stderr
+    return folder
+
+
+def replay(result: Path, output: Path, *services: str, overrides: tuple[str, ...] = ()) -> int:
+    request = ReplayRequest(
+        recording=result / "recording.mcap",
+        services=services,
+        output=output,
+        overrides=overrides,
+        check=True,
+    )
+    return run_replay(request)
+
+
+@pytest.mark.parametrize("services", [PIPELINE[:1], PIPELINE[1:], PIPELINE], ids="+".join)
+def test_the_same_bytes(
+    result: Path, tmp_path: Path, services: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert replay(result, tmp_path / "again", *services) == SAME
+    assert "the same bytes as recorded" in capsys.readouterr().out
+    made = summarise(tmp_path / "again" / "recording.mcap")
+    assert made.complete
+    assert made.missing == 0
+    assert made.metadata["replay"]["services"] == ",".join(services)
+    assert ("map/update" in made.topics) == ("bundle_adjustment" in services)  # nothing stale
+    assert made.topics["camera/source"].messages == 12
+    if "bundle_adjustment" in services:
+        before = json.loads((result / "report.json").read_text())
+        after = json.loads((tmp_path / "again" / "report.json").read_text())
+        assert after["points"] == before["points"]
+        assert after["frames"] == before["frames"] == 12
+
+
+def test_a_replay_can_be_replayed(result: Path, tmp_path: Path) -> None:
+    assert replay(result, tmp_path / "first", *PIPELINE) == SAME
+    assert replay(tmp_path / "first", tmp_path / "second", "bundle_adjustment") == SAME
+
+
+def test_a_changed_parameter_is_named_by_what_it_changes_first(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed = ("tracking.max_tracks=300",)
+    assert replay(result, tmp_path / "other", "tracking", overrides=changed) == DIFFERENT
+    said = capsys.readouterr().out
+    assert "tracks/extrema differs in 12 messages, first frame 0: ids: shape (300,), was" in said
+
+
+def test_the_recorded_configuration_is_the_default(result: Path) -> None:
+    summary = summarise(result / "recording.mcap")
+    assert recorded_config(summary, []) == load_config(None, ["seed=3"])
+    assert recorded_config(summary, ["seed=4"]).seed == 4
+    assert config_yaml(recorded_config(summary, [])) == summary.metadata["config"]["yaml"]
+    with pytest.raises(ConfigError):
+        recorded_config(summary, ["nothing.such=1"])
+
+
+def test_only_services_that_read_can_be_replayed() -> None:
+    assert [p.name for p in replayable(["bundle_adjustment", "tracking"])] == PIPELINE
+    for wrong in (["ingest"], ["recorder"], ["nothing"], []):
+        with pytest.raises(RecordingError, match="choose from tracking"):
+            replayable(wrong)
+
+
+def test_a_recording_cut_off_is_recovered_and_then_replays(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "cut"
+    folder.mkdir()
+    content = (result / "recording.mcap").read_bytes()
+    seventh = list(Recording(result / "recording.mcap").messages(topics.SOURCE))[6]
+    cut = content.index(seventh.data) + 100  # in the middle of its image
+    (folder / "recording.mcap").write_bytes(content[:cut])
+    with pytest.raises(RecordingError, match="pliant recover"):
+        replay(folder, tmp_path / "never", "tracking")
+    done = pliant("recover", folder)
+    assert done.returncode == 0, done.stderr
+    assert "messages kept" in done.stdout
+    request = ReplayRequest(
+        recording=folder / "recording_recovered.mcap",
+        services=["tracking"],
+        output=tmp_path / "made",
+    )
+    assert run_replay(request) == SAME
+    frames = len(list(Recording(tmp_path / "made" / "recording.mcap").messages(topics.EXTREMA)))
+    recorded = Recording(result / "recording.mcap")
+    assert frames == 6
+    found = compare(recorded, Recording(tmp_path / "made" / "recording.mcap"), [topics.EXTREMA])
+    assert [d.kind for d in found] == ["count"]  # as far as it goes it is the same
+
+
+def test_what_cannot_be_replayed_is_one_line(result: Path, tmp_path: Path) -> None:
+    assert_one_line(pliant("replay", tmp_path / "none.mcap"), "no such recording")
+    assert_one_line(pliant("replay", result, "--output", result), "exists")

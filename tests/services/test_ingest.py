@@ -1,0 +1,276 @@
+"""The ingest on a bus without processes: every frame has its message, whatever happens to it."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pliant.bus.replay_bus import ReplayBus
+from pliant.config import Config, IngestParameters
+from pliant.datasets.base import SourceFrame, encoding_of
+from pliant.datasets.calibration import Calibration
+from pliant.errors import DatasetError, SourceLostError
+from pliant.messages import topics
+from pliant.messages.topics import Topic
+from pliant.messages.types import CameraStream, Depth, Header, Image, SourceImage
+from pliant_services import ingest
+from pliant_services.monitor import SilentMonitor
+
+WIDTH, HEIGHT = 24, 16
+STEP_NS = 20_000_000
+CALIBRATION = Calibration(
+    model="pinhole", width=WIDTH, height=HEIGHT, fx=20.0, fy=20.0, cx=12.0, cy=8.0
+)
+
+
+def png(seed: int, width: int = WIDTH, height: int = HEIGHT) -> bytes:
+    pixels = np.random.default_rng(seed).integers(0, 256, (height, width), np.uint8)
+    return cv2.imencode(".png", pixels)[1].tobytes()
+
+
+@dataclass
+class FakeDataset:
+    """Frames from a list; ``before`` is called with the index of a frame before it comes out."""
+
+    data: Sequence[bytes]
+    is_live: bool = False
+    before: Callable[[int], None] = lambda _: None
+    fails_at: int | None = None
+    name: str = "fake"
+    ground_truth_path: Path | None = None
+    calibration: Calibration = CALIBRATION
+
+    @property
+    def frame_count(self) -> int | None:
+        return None if self.is_live else len(self.data)
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        for index, data in enumerate(self.data):
+            self.before(index)
+            if index == self.fails_at:
+                raise DatasetError("fake: delivers no more images; is it still plugged in?")
+            encoding = encoding_of(data)
+            yield SourceFrame(index=index, stamp_ns=index * STEP_NS, encoding=encoding, data=data)
+        self.before(len(self.data))
+
+
+class Counters(SilentMonitor):
+    """Keeps what was reported last."""
+
+    def __init__(self) -> None:
+        self.frames: list[int] = []
+        self.counters: dict[str, float] = {}
+        self.note = ""
+
+    def report(self, header: Header, *, note: str = "", **counters: float) -> None:
+        self.frames.append(header.frame)
+        self.counters, self.note = counters, note
+
+
+class SlowBus(ReplayBus):
+    """A bus whose readers take an image only when they are allowed to."""
+
+    def __init__(self, on_image: Callable[[int], None]) -> None:
+        super().__init__({})
+        self._on_image = on_image
+
+    def publish(self, topic: Topic, message: Header) -> None:
+        super().publish(topic, message)
+        if topic is topics.IMAGE:
+            self._on_image(message.frame)
+
+
+def run(
+    dataset: FakeDataset,
+    bus: ReplayBus | None = None,
+    *,
+    mode: str = "auto",
+    stopping: Callable[[], bool] = lambda: False,
+) -> tuple[list[Image], Counters, ReplayBus]:
+    bus = bus or ReplayBus({})
+    monitor = Counters()
+    config = Config(ingest=IngestParameters(mode=mode))  # type: ignore[arg-type]
+    ingest.run(bus, config, monitor, dataset, stopping)
+    return images_of(bus), monitor, bus
+
+
+def images_of(bus: ReplayBus) -> list[Image]:
+    """The images, after a check that both per-frame topics carry every frame exactly once."""
+    images = [m for m in bus.outputs.get(topics.IMAGE, []) if isinstance(m, Image)]
+    sources = [m for m in bus.outputs.get(topics.SOURCE, []) if isinstance(m, SourceImage)]
+    numbers = list(range(len(images)))
+    assert [m.frame for m in images] == [m.frame for m in sources] == numbers
+    assert [m.stamp_ns for m in images] == [m.stamp_ns for m in sources]
+    return images
+
+
+def test_lossless_publishes_every_frame_and_its_bytes_as_they_came() -> None:
+    data = [png(i) for i in range(5)]
+    images, monitor, bus = run(FakeDataset(data))
+    assert [image.missing for image in images] == [""] * 5
+    expected = [cv2.imdecode(np.frombuffer(d, np.uint8), cv2.IMREAD_GRAYSCALE) for d in data]
+    for image, grey in zip(images, expected, strict=True):
+        np.testing.assert_array_equal(image.grey, grey)
+    sources = bus.outputs[topics.SOURCE]
+    assert [s.data for s in sources if isinstance(s, SourceImage)] == data
+    assert monitor.counters == {"dropped": 0, "broken": 0}
+    assert monitor.frames == list(range(5))
+
+
+def test_the_camera_comes_first_and_its_topic_is_closed_before_the_first_frame() -> None:
+    order: list[str] = []
+
+    class Bus(ReplayBus):
+        def publish(self, topic: Topic, message: Header) -> None:
+            order.append(topic.key)
+            super().publish(topic, message)
+
+        def end(self, topic: Topic) -> None:
+            order.append(f"end of {topic.key}")
+            super().end(topic)
+
+    _, _, bus = run(FakeDataset([png(0)]), Bus({}))
+    assert order[:2] == [topics.STREAM.key, f"end of {topics.STREAM.key}"]
+    (stream,) = bus.outputs[topics.STREAM]
+    assert isinstance(stream, CameraStream)
+    assert (stream.mode, stream.frames, stream.width, stream.height) == ("lossless", 1, 24, 16)
+
+
+BROKEN = {
+    "an empty file": (b"", "empty"),
+    "rubbish": (b"not an image", "does not decode"),
+    "cut off": (png(1)[:-30], "cut off"),
+    "another size": (png(2, WIDTH, HEIGHT + 2), "24x18 px, but the calibration is for 24x16"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+@pytest.mark.parametrize("mode", ["lossless", "live"])
+def test_a_broken_frame_keeps_its_number_and_says_what_is_wrong(kind: str, mode: str) -> None:
+    data, text = BROKEN[kind]
+    taken = threading.Semaphore(0)
+
+    def wait_until_taken(index: int) -> None:
+        if mode == "live" and index > 0:
+            assert taken.acquire(timeout=30.0)
+
+    bus = SlowBus(lambda _: taken.release())
+    images, monitor, _ = run(
+        FakeDataset([png(0), data, png(3)], before=wait_until_taken), bus, mode=mode
+    )
+    assert [bool(image.missing) for image in images] == [False, True, False]
+    assert images[1].missing.startswith("broken: frame 1: ")
+    assert text in images[1].missing
+    assert images[1].grey.size == 0
+    assert monitor.counters == {"dropped": 0, "broken": 1}
+
+
+def test_live_passes_over_what_a_slow_reader_has_no_time_for() -> None:
+    """While the first image waits for credit, ten more come; the newest of them wins."""
+    first_is_out, all_came = threading.Event(), threading.Event()
+
+    def before(index: int) -> None:
+        if index == 1:
+            assert first_is_out.wait(30.0)
+        if index == 11:
+            all_came.set()
+
+    def on_image(frame: int) -> None:
+        if frame == 0:
+            first_is_out.set()
+            assert all_came.wait(30.0)
+
+    dataset = FakeDataset([png(i) for i in range(11)], is_live=True, before=before)
+    images, monitor, bus = run(dataset, SlowBus(on_image))
+    assert [image.missing for image in images] == ["", *["dropped"] * 9, ""]
+    assert monitor.counters == {"dropped": 9, "broken": 0}
+    sources = [s for s in bus.outputs[topics.SOURCE] if isinstance(s, SourceImage)]
+    assert [len(s.data) > 0 for s in sources] == [True, *[False] * 9, True]
+    (stream,) = bus.outputs[topics.STREAM]
+    assert isinstance(stream, CameraStream)
+    assert (stream.mode, stream.frames) == ("live", -1)
+
+
+def test_live_holds_the_pixels_of_one_frame_only() -> None:
+    """A stalled reader must not fill the memory with images that will be dropped anyway."""
+    frames = [SourceFrame(index=i, stamp_ns=i, encoding="png", data=bytes(1000)) for i in range(50)]
+    first_is_out, all_came = threading.Event(), threading.Event()
+
+    class Camera(FakeDataset):
+        def __iter__(self) -> Iterator[SourceFrame]:
+            yield frames[0]
+            assert first_is_out.wait(30.0)
+            yield from frames[1:]
+            all_came.set()
+
+    stream = ingest.newest(Camera([], is_live=True), lambda: False)
+    assert not next(stream).dropped
+    first_is_out.set()
+    assert all_came.wait(30.0)
+    rest = list(stream)
+    assert [frame.index for frame in rest] == list(range(1, 50))
+    assert [len(frame.data) for frame in rest] == [0] * 48 + [1000]
+
+
+def test_a_data_set_played_live_keeps_the_pace_of_its_stamps() -> None:
+    start = time.monotonic()
+    images, _, _ = run(FakeDataset([png(i) for i in range(4)]), mode="live")
+    assert time.monotonic() - start >= 3 * STEP_NS * 1e-9
+    assert len(images) == 4
+
+
+@pytest.mark.parametrize("is_live", [False, True])
+def test_stopping_ends_after_the_frame_at_hand(is_live: bool) -> None:
+    taken: list[int] = []
+    seen = threading.Semaphore(0)
+
+    def before(index: int) -> None:
+        if is_live and index > 0:
+            seen.acquire(timeout=30.0)
+
+    def on_image(frame: int) -> None:
+        taken.append(frame)
+        seen.release()
+
+    dataset = FakeDataset([png(i) for i in range(9)], is_live=is_live, before=before)
+    images, _, _ = run(dataset, SlowBus(on_image), stopping=lambda: len(taken) >= 3)
+    assert [image.frame for image in images] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("mode", ["lossless", "live"])
+def test_a_source_that_fails_in_mid_run_keeps_what_came_before(mode: str) -> None:
+    bus, monitor = ReplayBus({}), Counters()
+    config = Config(ingest=IngestParameters(mode=mode))  # type: ignore[arg-type]
+    dataset = FakeDataset([png(i) for i in range(5)], fails_at=3)
+    with pytest.raises(SourceLostError, match="plugged in"):
+        ingest.run(bus, config, monitor, dataset, lambda: False)
+    assert len(images_of(bus)) == 3
+    assert "plugged in" in monitor.note
+
+
+@pytest.mark.parametrize("mode", ["lossless", "live"])
+def test_a_source_without_any_frame_is_an_error(mode: str) -> None:
+    config = Config(ingest=IngestParameters(mode=mode))  # type: ignore[arg-type]
+    dataset = FakeDataset([png(0)], fails_at=0)
+    with pytest.raises(DatasetError) as raised:
+        ingest.run(ReplayBus({}), config, Counters(), dataset, lambda: False)
+    assert not isinstance(raised.value, SourceLostError)
+
+
+def test_every_frame_has_its_depth_message_also_where_it_has_no_depth() -> None:
+    class WithDepth(FakeDataset):
+        def __iter__(self) -> Iterator[SourceFrame]:
+            for frame in super().__iter__():
+                yield replace(frame, depth=b"depth of frame 1" if frame.index == 1 else b"")
+
+    _, _, bus = run(WithDepth([png(i) for i in range(3)]))
+    depths = [m for m in bus.outputs[topics.DEPTH] if isinstance(m, Depth)]
+    assert [m.frame for m in depths] == [0, 1, 2]
+    assert [m.data for m in depths] == [b"", b"depth of frame 1", b""]
+    frame = SourceFrame(index=0, stamp_ns=0, encoding="png", data=b"x", depth=b"y")
+    assert frame.without_data().depth == b""

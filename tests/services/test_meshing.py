@@ -1,0 +1,303 @@
+"""The meshing service on the in-memory bus: what it sends, that it is the same again, bad input."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import matrix_to_pose
+from pliant.algorithms.meshing import BlockMesh
+from pliant.bus.replay_bus import ReplayBus
+from pliant.config import load_config
+from pliant.fusion.keyframe_spool import KeyframeSpool
+from pliant.messages import codec, topics
+from pliant.messages.mesh_pieces import joined, split
+from pliant.messages.topics import Topic
+from pliant.messages.types import (
+    CameraStream,
+    Header,
+    Keyframe,
+    MapUpdate,
+    MeshPiece,
+    MeshUpdate,
+)
+from pliant_services import meshing
+from pliant_services.monitor import SilentMonitor
+
+pytest.importorskip("open3d", reason="meshing needs open3d: pip install 'pliant[mesh]'")
+
+CAMERA = PinholeCamera(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
+POINTS = 1500
+FRAMES = 6
+WINDOW = 2
+
+
+def stream(mode: str = "lossless") -> CameraStream:
+    return CameraStream(
+        frame=0, stamp_ns=0, frame_id="camera", source="wall", mode=mode, frames=FRAMES,
+        calibration="", width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5,
+    )  # fmt: skip
+
+
+def world() -> np.ndarray:
+    """Points on a wall at 4 and on a box before it."""
+    generator = np.random.default_rng(0)
+    x, y = generator.uniform((-3.0, -2.0), (3.0, 2.0), (POINTS, 2)).T
+    return np.stack([x, y, np.where(np.abs(x) < 0.7, 3.0, 4.0)], axis=1)
+
+
+def pose(frame: int) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = 0.15 * frame
+    return T
+
+
+def seen(frame: int) -> tuple[np.ndarray, np.ndarray]:
+    local = world() - pose(frame)[:3, 3]
+    pixels = CAMERA.project(local)
+    inside = np.all((pixels > 0) & (pixels < (159, 119)), axis=1)
+    return np.flatnonzero(inside), pixels[inside].astype(np.float32)
+
+
+def map_update(frame: int, *, last: bool = False) -> MapUpdate:
+    none = np.zeros(0, np.int64)
+    first = frame == 0
+    ids = np.arange(POINTS * first, dtype=np.int64)
+    key = np.array([] if last else [frame], np.int64)
+    return MapUpdate(
+        frame=frame, stamp_ns=frame, frame_id="world", state=1, reason="", segment=0, inliers=0,
+        pose_frames=none, pose_segments=none.astype(np.int32), pose_keyframes=none,
+        poses_keyframe_camera=np.zeros((0, 7)), pose_inliers=none.astype(np.int32),
+        keyframe_ids=key, keyframe_frames=key, keyframe_segments=np.zeros(len(key), np.int32),
+        keyframe_poses=matrix_to_pose(pose(frame)[None])[: len(key)],
+        point_ids=ids, point_segments=np.zeros(len(ids), np.int32),
+        points_world=world()[: len(ids)], point_colours=np.zeros((len(ids), 3), np.uint8),
+        point_keyframes=np.full(len(ids), 5, np.int32),
+        point_parallax_rad=np.full(len(ids), 0.1, np.float32),
+        point_sigmas=np.full(len(ids), 0.01, np.float32), removed_point_ids=none,
+    )  # fmt: skip
+
+
+def keyframe(frame: int, new: int, settled: list[int]) -> Keyframe:
+    told = [*settled, *([new] if new >= 0 else [])]
+    observed = [seen(number) for number in told]
+    image = np.full((120, 160), 40 * max(new, 0), np.uint8)
+    return Keyframe(
+        frame=frame, stamp_ns=frame, frame_id="camera", new=new,
+        keyframe_ids=np.array(told, np.int64),
+        settled=np.array([number in settled for number in told], np.bool_),
+        counts=np.array([len(ids) for ids, _ in observed], np.int32),
+        point_ids=np.concatenate([np.zeros(0, np.int64), *(ids for ids, _ in observed)]),
+        points_px=np.concatenate([np.zeros((0, 2), np.float32), *(px for _, px in observed)]),
+        jpeg=cv2.imencode(".jpg", image)[1].tobytes() if new >= 0 else b"",
+    )  # fmt: skip
+
+
+Inputs = dict[Topic, list[Header]]
+
+
+def inputs(mode: str = "lossless") -> Inputs:
+    leaving = [[frame - WINDOW] if frame >= WINDOW else [] for frame in range(FRAMES)]
+    rest = list(range(FRAMES - WINDOW, FRAMES))
+    return {
+        topics.STREAM: [stream(mode)],
+        topics.MAP_UPDATE: [map_update(frame) for frame in range(FRAMES)],
+        topics.KEYFRAME: [keyframe(frame, frame, leaving[frame]) for frame in range(FRAMES)],
+        topics.MAP_FINAL: [map_update(FRAMES - 1, last=True)],
+        topics.KEYFRAME_FINAL: [keyframe(FRAMES - 1, -1, rest)],
+    }
+
+
+class Notes(SilentMonitor):
+    """Keeps what the service says of itself."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.counters: dict[str, float] = {}
+
+    def report(self, header: Header, *, note: str = "", **counters: float) -> None:
+        self.notes += [note] if note else []
+        self.counters = counters
+
+
+def run(given: Inputs, monitor: Notes | None = None) -> dict[Topic, list[Header]]:
+    bus = ReplayBus(given)
+    meshing.run(bus, load_config(), monitor or Notes())
+    return bus.outputs
+
+
+def final(outputs: dict[Topic, list[Header]], level: str) -> MeshPiece:
+    (piece,) = [
+        m for m in outputs[topics.MESH_FINAL] if isinstance(m, MeshPiece) and m.level == level
+    ]
+    return piece
+
+
+@pytest.fixture(scope="module")
+def outputs() -> dict[Topic, list[Header]]:
+    return run(inputs())
+
+
+def test_the_final_mesh_lies_on_the_wall_and_the_box(outputs: dict[Topic, list[Header]]) -> None:
+    for level, share in (("fine", 0.8), ("coarse", 0.7)):
+        mesh = final(outputs, level)
+        assert len(mesh.triangles) > 50
+        z = mesh.positions[:, 2]
+        distance = np.minimum(np.abs(z - 3.0), np.abs(z - 4.0))
+        assert np.mean(distance < 0.02) > share
+        on_wall = distance < 0.02
+        assert np.median(mesh.normals[on_wall, 2]) < -0.99  # towards the camera
+    assert final(outputs, "fine").voxel_size < final(outputs, "coarse").voxel_size
+
+
+def test_the_same_bytes_again(outputs: dict[Topic, list[Header]]) -> None:
+    again = run(inputs())
+    for topic in (topics.MESH_BLOCKS, topics.MESH_FINAL):
+        before = [codec.encode(message) for message in outputs[topic]]
+        assert [codec.encode(message) for message in again[topic]] == before
+
+
+def test_blocks_that_changed_make_the_live_mesh_and_the_others_bring_late_viewers_up_to_date(
+    outputs: dict[Topic, list[Header]],
+) -> None:
+    viewer, late = BlockMesh(), BlockMesh()
+    updates = [m for m in outputs[topics.MESH_BLOCKS] if isinstance(m, MeshUpdate)]
+    assert [m.again for m in updates] == [False, True] * FRAMES
+    for update in updates:
+        if not update.again:
+            viewer.apply(update)
+        if update.frame >= 2:  # it came after two frames
+            late.apply(update)
+    whole = viewer.mesh()
+    assert len(whole.triangles) > 50
+    np.testing.assert_array_equal(late.mesh().positions, whole.positions)
+    # What had left the window is as in the final mesh, the rest as good.
+    assert abs(len(whole.triangles) / len(final(outputs, "coarse").triangles) - 1.0) < 0.1
+
+
+class LateBus(ReplayBus):
+    """There is always something waiting, until the last frames."""
+
+    def is_waiting(self, topic: Topic) -> bool:
+        self.asked = getattr(self, "asked", 0) + 1
+        return self.asked < FRAMES
+
+
+def test_live_passes_over_previews_when_it_is_late_and_the_final_mesh_is_the_same(
+    outputs: dict[Topic, list[Header]],
+) -> None:
+    monitor = Notes()
+    bus = LateBus(inputs("live"))
+    meshing.run(bus, load_config(), monitor)
+    assert monitor.counters["passed_over"] == FRAMES - 1
+    assert len(bus.outputs[topics.MESH_BLOCKS]) == 2
+    for message, other in zip(
+        bus.outputs[topics.MESH_FINAL], outputs[topics.MESH_FINAL], strict=True
+    ):
+        assert codec.encode(message) == codec.encode(other)
+
+
+def with_keyframes(change: Callable[[Keyframe], Keyframe]) -> Inputs:
+    given = inputs()
+    told = given[topics.KEYFRAME]
+    assert isinstance(told[3], Keyframe)
+    told[3] = change(told[3])
+    return given
+
+
+def few(message: Keyframe) -> Keyframe:
+    counts = np.array([*message.counts[:-1], 2], np.int32)
+    total = int(counts.sum())
+    return replace(
+        message, counts=counts, point_ids=message.point_ids[:total],
+        points_px=message.points_px[:total],
+    )  # fmt: skip
+
+
+def jumped(given: Inputs) -> Inputs:
+    update = given[topics.MAP_UPDATE][3]
+    assert isinstance(update, MapUpdate)
+    far = update.keyframe_poses.copy()
+    far[:, 0] += 100.0
+    given[topics.MAP_UPDATE][3] = replace(update, keyframe_poses=far)
+    return given
+
+
+def broken_points(given: Inputs) -> Inputs:
+    update = given[topics.MAP_UPDATE][0]
+    assert isinstance(update, MapUpdate)
+    points = update.points_world.copy()
+    points[::3] = np.nan
+    points[1::3, 2] *= -1.0
+    given[topics.MAP_UPDATE][0] = replace(update, points_world=points)
+    return given
+
+
+def bad_inputs() -> Iterator[tuple[str, Inputs, str]]:
+    yield "few", with_keyframes(few), "keyframe 3 is passed over: 2 points"
+    yield "jump", jumped(inputs()), "keyframe 3 is passed over: 0 points"
+    yield "image", with_keyframes(lambda k: replace(k, jpeg=b"")), "no image"
+    yield "lies", with_keyframes(lambda k: replace(k, jpeg=b"no jpeg")), "no image"
+    yield "points", broken_points(inputs()), ""
+
+
+@pytest.mark.parametrize(("name", "given", "words"), [(n, g, w) for n, g, w in bad_inputs()])
+def test_bad_input_is_reported_and_passed_over(name: str, given: Inputs, words: str) -> None:
+    monitor = Notes()
+    made = run(given, monitor)
+    assert any(words in note for note in monitor.notes) or not words
+    mesh = final(made, "fine")
+    assert len(mesh.triangles) > 1000
+    assert np.isfinite(mesh.positions).all()
+    assert np.isfinite(mesh.normals).all()
+
+
+def test_no_keyframes_no_mesh() -> None:
+    empty = inputs()
+    for topic in (topics.MAP_UPDATE, topics.KEYFRAME):
+        empty[topic] = []
+    empty[topics.KEYFRAME_FINAL] = [keyframe(0, -1, [])]
+    assert run(empty) == {}
+
+
+def test_a_volume_too_small_is_said_and_the_run_goes_on() -> None:
+    monitor = Notes()
+    bus = ReplayBus(inputs())
+    config = load_config(None, ["meshing.tsdf.max_memory_mb=1", "meshing.tsdf.fine_voxel=0.001"])
+    meshing.run(bus, config, monitor)
+    assert any("no fine mesh" in note for note in monitor.notes)
+
+
+def test_a_mesh_is_the_same_after_its_pieces(outputs: dict[Topic, list[Header]]) -> None:
+    mesh = joined([final(outputs, "fine")])
+    copies = 8
+    big = replace(
+        mesh, positions=np.tile(mesh.positions, (copies, 1)),
+        normals=np.tile(mesh.normals, (copies, 1)), colours=np.tile(mesh.colours, (copies, 1)),
+        triangles=np.concatenate([mesh.triangles + i * len(mesh.positions) for i in range(copies)]),
+    )  # fmt: skip
+    header = Header(frame=1, stamp_ns=2, frame_id="")
+    told = list(split(header, big, segment=0, level="fine", voxel_size=0.1, keyframes=3))
+    assert len(told) > 1
+    again = joined(told)
+    for name in ("positions", "normals", "colours", "triangles"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(big, name))
+
+
+def test_the_spool_gives_back_what_it_got() -> None:
+    with KeyframeSpool() as spool:
+        ids, pixels = seen(0)
+        spool.put_image(3, b"image")
+        spool.put_observations(3, ids, pixels)
+        spool.put_observations(1, ids[:5], pixels[:5])
+        spool.put_observations(3, ids[:7], pixels[:7])
+        assert spool.keyframes() == [1, 3]
+        assert spool.image(3) == b"image"
+        assert spool.image(1) == b""
+        found = spool.observations(3)
+        np.testing.assert_array_equal(found[0], ids[:7])
+        np.testing.assert_array_equal(found[1], pixels[:7])
+        assert spool.size_bytes > 0

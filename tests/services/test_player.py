@@ -1,0 +1,151 @@
+"""A recording on the bus: who reads it sees the run that was recorded."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pliant.bus.replay_bus import ReplayBus
+from pliant.bus.session import free_endpoint, open_router
+from pliant.bus.zenoh_bus import ZenohBus
+from pliant.config import Config
+from pliant.datasets import open_source
+from pliant.errors import RecordingError
+from pliant.messages import codec, topics
+from pliant.messages.types import Image
+from pliant.recording.playback import Playback
+from pliant_services import ingest, recorder
+from pliant_services.monitor import SilentMonitor
+from pliant_services.play_command import Pace, PlayRequest, run_play, take_keys
+from pliant_services.player import Played, chosen_topics, play
+
+FRAMES = 8
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def ingested() -> ReplayBus:
+    bus = ReplayBus({})
+    dataset = open_source(f"built-in:tiny?frames={FRAMES}")
+    ingest.run(bus, Config(), SilentMonitor(), dataset, stopping=lambda: False)
+    return bus
+
+
+@pytest.fixture(scope="module")
+def path(ingested: ReplayBus, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("played") / "recording.mcap"
+    logged = {t: m for t, m in ingested.outputs.items() if t.logged}
+    recorder.run(ReplayBus(logged), Config(), file, {"config": {"yaml": ""}})
+    return file
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    found = free_endpoint()
+    router = open_router(found)
+    yield found
+    router.close()
+
+
+def tracking_bus(endpoint: str) -> ZenohBus:
+    return ZenohBus(
+        endpoints=[endpoint],
+        session="replay",
+        service="tracking",
+        inputs={topics.STREAM: "ingest", topics.IMAGE: "ingest"},
+        outputs={},
+        window=4,
+    )
+
+
+def test_a_service_reads_the_images_that_were_sent_in_the_run(
+    endpoint: str, path: Path, ingested: ReplayBus
+) -> None:
+    request = PlayRequest(recording=path, rate=0.0, readers=["tracking"], connect=[endpoint])
+    player = threading.Thread(target=run_play, args=[request])
+    player.start()  # before its reader: it waits
+    with tracking_bus(endpoint) as bus:
+        streams = [codec.encode(m) for m in bus.receive(topics.STREAM)]
+        images = [codec.encode(m) for m in bus.receive(topics.IMAGE)]
+    player.join(PATIENCE_S)
+    assert streams == [codec.encode(m) for m in ingested.outputs[topics.STREAM]]
+    assert images == [codec.encode(m) for m in ingested.outputs[topics.IMAGE]]
+
+
+def test_playing_begins_and_ends_where_it_is_told(endpoint: str, path: Path) -> None:
+    playback = Playback(path)
+    times: list[int] = []
+
+    def wait_until(stamp_ns: int) -> bool:
+        times.append(stamp_ns)
+        return len(times) < 4
+
+    what = Played(start_s=0.06, readers={topics.IMAGE: ["tracking"]})
+    done: list[int] = []
+
+    def run() -> None:
+        done.append(
+            play(
+                playback, what, endpoints=[endpoint], session="replay",
+                window=4, windows={}, wait_until=wait_until,
+            )
+        )  # fmt: skip
+
+    player = threading.Thread(target=run)
+    player.start()
+    with tracking_bus(endpoint) as bus:
+        images = list(bus.receive(topics.IMAGE))
+    player.join(PATIENCE_S)
+    assert [type(image) for image in images] == [Image] * 3
+    assert [image.frame for image in images] == [2, 3, 4]
+    assert all(np.diff(times) > 0)
+    assert 0 <= times[0] < 40_000_000
+    assert done == [1 + 3 + 3]
+
+
+def test_topics_are_chosen_by_key(path: Path) -> None:
+    playback = Playback(path)
+    assert [t.key for t in chosen_topics(playback, Played(readers={}))] == [
+        "camera/depth",
+        "camera/image",
+        "camera/source",
+        "camera/stream",
+    ]
+    some = Played(readers={}, topics=["camera/stream"])
+    assert chosen_topics(playback, some) == [topics.STREAM]
+    with pytest.raises(RecordingError, match="choose from camera/depth"):
+        chosen_topics(playback, Played(readers={}, topics=["nothing"]))
+
+
+def test_a_pause_stops_time_and_q_ends() -> None:
+    pace = Pace(1.0)
+    assert pace.wait_until(0)
+    take_keys(pace, " ")
+    results: list[bool] = []
+    waiter = threading.Thread(target=lambda: results.append(pace.wait_until(1_000_000)))
+    waiter.start()
+    waiter.join(0.1)
+    assert waiter.is_alive()  # long due, and paused
+    take_keys(pace, " ")
+    waiter.join(PATIENCE_S)
+    assert results == [True]
+    take_keys(pace, "xq")
+    assert not pace.wait_until(0)
+
+
+def test_a_rate_is_a_share_of_the_pace_of_capture() -> None:
+    import time
+
+    pace = Pace(4.0)
+    start = time.monotonic()
+    assert pace.wait_until(200_000_000)
+    assert time.monotonic() - start >= 0.05
+    unbounded = Pace(0.0)
+    assert unbounded.wait_until(10**18)
+
+
+def test_an_unknown_reader_is_one_line(path: Path) -> None:
+    with pytest.raises(RecordingError, match="choose from bundle_adjustment"):
+        run_play(PlayRequest(recording=path, readers=["nobody"]))

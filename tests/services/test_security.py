@@ -1,0 +1,85 @@
+"""Certificates and access control over real TLS links on loopback."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("cryptography")
+
+from pliant.bus.session import Identity, free_endpoint, open_router, open_session
+from pliant.errors import BusError
+from pliant_services.access import NAMES, OPERATOR, access_control, may_write
+from pliant_services.certificates import make_certificates
+
+PATIENCE_S = 20.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("certs")
+    make_certificates(made, NAMES, ["localhost", "127.0.0.1"])
+    return made
+
+
+@pytest.fixture(scope="module")
+def endpoint(folder: Path) -> Iterator[str]:
+    found = free_endpoint().replace("tcp/", "tls/")
+    identity = Identity.in_folder(folder, "router")
+    router = open_router(found, identity=identity, access_control=access_control())
+    yield found
+    router.close()
+
+
+def test_made_once_and_keys_are_secret(folder: Path) -> None:
+    before = (folder / "tracking.key").read_bytes()
+    assert make_certificates(folder, NAMES, []) == []
+    assert (folder / "tracking.key").read_bytes() == before
+    assert (folder / "tracking.key").stat().st_mode & 0o077 == 0
+
+
+def test_without_a_certificate_nobody_gets_in(endpoint: str) -> None:
+    with pytest.raises(BusError, match="cannot reach"):
+        open_session([endpoint])
+
+
+def test_a_certificate_of_another_authority_is_refused(endpoint: str, tmp_path: Path) -> None:
+    make_certificates(tmp_path, ["tracking"], [])
+    with pytest.raises(BusError, match="cannot reach"):
+        open_session([endpoint], Identity.in_folder(tmp_path, "tracking"))
+
+
+def test_a_service_publishes_its_own_topics_and_no_other(endpoint: str, folder: Path) -> None:
+    came: list[str] = []
+    changed = threading.Condition()
+
+    def on_sample(sample) -> None:
+        with changed:
+            came.append(str(sample.key_expr))
+            changed.notify_all()
+
+    with (
+        open_session([endpoint], Identity.in_folder(folder, OPERATOR)) as reader,
+        open_session([endpoint], Identity.in_folder(folder, "tracking")) as tracking,
+    ):
+        reader.declare_subscriber("pliant/**", on_sample)
+        # The last one is allowed and comes over the same link, behind those that are not.
+        for key in ("camera/image", "map/update", "credit/tracks/extrema/recorder", "control/stop"):
+            tracking.put(f"pliant/s/{key}", b"forged")
+        with changed:
+            while "pliant/s/tracks/extrema" not in came:  # until the subscription has reached it
+                tracking.put("pliant/s/tracks/extrema", b"own")
+                changed.wait(0.2)
+    assert set(came) == {"pliant/s/tracks/extrema"}
+
+
+def test_everybody_in_the_list_of_processes_may_write_something() -> None:
+    assert all(may_write(name) for name in NAMES[1:])
+    assert "pliant/*/camera/image" in may_write("ingest")
+    assert "pliant/*/camera/image" not in may_write("tracking")
+
+
+def test_a_folder_without_the_certificate_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(BusError, match="pliant certs"):
+        Identity.in_folder(tmp_path, "tracking")

@@ -1,0 +1,107 @@
+"""What a user reads of a run: everything that went wrong is counted, named and said once."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pliant.algorithms.mapping import Mapper, MappingParameters
+from pliant.algorithms.tracks import FrameTracks
+from pliant.messages import codec, topics
+from pliant.messages.topics import Topic
+from pliant.messages.types import (
+    CameraStream,
+    Extrema,
+    Header,
+    MapUpdate,
+    Status,
+    StreamEnd,
+)
+from pliant.recording.writer import RecordingWriter
+from pliant_services import pipeline
+from pliant_services.pipeline import DONE, INCOMPLETE, summary
+from pliant_services.results import write_results
+
+REASON = "too few tracks: 0 of 100"
+
+
+def stream(frames: int) -> CameraStream:
+    return CameraStream(
+        frame=0, stamp_ns=0, frame_id="camera", source="fake", mode="live", frames=frames,
+        calibration="", width=24, height=16, fx=20.0, fy=20.0, cx=12.0, cy=8.0,
+    )  # fmt: skip
+
+
+def record(
+    folder: Path, missing: list[str], *, announced: int = -1, note: str = "", complete: bool = True
+) -> list[str]:
+    """The summary of a recorded run without a map, with one frame for each of ``missing``."""
+    mapper = Mapper(stream(0).camera, MappingParameters(), 0)
+    with RecordingWriter(folder / "recording.mcap", {}) as recording:
+
+        def write(topic: Topic, message: Header) -> None:
+            data = codec.encode(message)
+            recording.write(topic, data, sequence=0, log_time_ns=1, publish_time_ns=1)
+
+        write(topics.STREAM, stream(announced))
+        for frame, why in enumerate(missing):
+            header = Header(frame=frame, stamp_ns=frame, frame_id="camera")
+            write(topics.EXTREMA, Extrema.of(header, FrameTracks.empty(), missing=why))
+            delta = mapper.skip(frame)
+            delta = delta if why else replace(delta, reason=REASON)
+            write(topics.MAP_UPDATE, MapUpdate.of(header, delta, frame_id="world"))
+        status = Status(
+            frame=0, stamp_ns=0, frame_id="", service="ingest", note=note, stages=(),
+            seconds=np.zeros(0), counters=(), values=np.zeros(0),
+        )  # fmt: skip
+        write(topics.status("ingest"), status)
+        end = StreamEnd(
+            frame=0, stamp_ns=0, frame_id="", topic="camera/image", messages=0, complete=complete
+        )
+        write(topics.STREAM_END, end)
+    return summary(write_results(folder))
+
+
+@pytest.mark.parametrize("missing", [[], ["", ""], ["", "broken: frame 1: cut off"]])
+def test_no_map_has_a_reason_that_is_not_a_broken_frame(tmp_path: Path, missing: list[str]) -> None:
+    (line,) = [x for x in record(tmp_path, missing) if x.startswith("no map could start")]
+    assert line == f"no map could start: {REASON if missing else 'no frames'}"
+
+
+def test_dropped_and_broken_images_are_told_apart(tmp_path: Path) -> None:
+    why = ["", "dropped", "broken: frame 2: the png image is cut off", "dropped"]
+    lines = record(tmp_path, why)
+    assert "2 images dropped to keep up (live mode)" in lines
+    assert "1 broken image: frame 2: the png image is cut off" in lines
+
+
+@pytest.mark.parametrize(
+    ("missing", "code"),
+    [({}, DONE), ({"1": "dropped"}, DONE), ({"1": "dropped", "2": "broken: cut off"}, INCOMPLETE)],
+)
+def test_broken_images_are_a_fault_and_dropped_ones_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: dict[str, str], code: int
+) -> None:
+    record(tmp_path, [""] * 3)
+    report = json.loads((tmp_path / "report.json").read_text())
+    report |= {"segments": [{"id": 0}], "frames_without_pixels": missing}
+    monkeypatch.setattr(pipeline, "write_results", lambda _: report)
+    assert pipeline._finish(tmp_path, interrupted=False, failure=None) == code
+
+
+def test_a_source_that_failed_says_why(tmp_path: Path) -> None:
+    lines = record(tmp_path, [""] * 3, note="camera:0: delivers no more images", complete=False)
+    assert "the source ended early: camera:0: delivers no more images" in lines
+
+
+@pytest.mark.parametrize(
+    ("announced", "complete", "said"),
+    [(10, True, True), (10, False, False), (5, True, False), (-1, True, False)],
+)
+def test_a_video_that_is_cut_off_is_noticed(
+    tmp_path: Path, announced: int, complete: bool, said: bool
+) -> None:
+    lines = record(tmp_path, [""] * 4, announced=announced, complete=complete)
+    assert ("the source ended early: 4 of 10 frames came; is the file cut off?" in lines) is said

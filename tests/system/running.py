@@ -1,0 +1,135 @@
+"""Starts ``pliant`` as a process, and waits for its lines, its end and the end of its services."""
+
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+TINY = "built-in:tiny"
+TIMEOUT_S = 300
+UP = "services are up"
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "pliant_services.cli", *map(str, arguments)]
+
+
+def pliant(
+    *arguments: object, cwd: Path | None = None, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(*arguments),
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        cwd=cwd,
+        env={**os.environ, **(env or {})},
+    )
+
+
+class Running:
+    """A ``pliant run`` that goes on."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.process = process
+        self.services: dict[str, int] = {}
+
+    def wait_for(self, text: str) -> None:
+        """Block until a line on stderr has the text."""
+        assert self.process.stderr is not None
+        seen: list[str] = []
+        for line in self.process.stderr:
+            seen.append(line)
+            if text in line:
+                self.services = services_of(self.process.pid)
+                return
+        raise AssertionError(f"{text!r} did not come:\n{''.join(seen)}")
+
+    def send(self, kind: signal.Signals, service: str = "") -> None:
+        os.kill(self.services[service] if service else self.process.pid, kind)
+
+    def finish(self) -> tuple[int, str, str]:
+        """Exit code, stdout, and stderr from here on; no service may outlive its launcher."""
+        output, errors = self.process.communicate(timeout=TIMEOUT_S)
+        survivors = [name for name, pid in self.services.items() if not has_ended(pid, 0.0)]
+        assert not survivors, f"{survivors} outlived the launcher"
+        assert "Traceback" not in errors, errors
+        return self.process.returncode, output, errors
+
+
+@contextmanager
+def running(*arguments: object, env: dict[str, str] | None = None) -> Generator[Running]:
+    process = subprocess.Popen(
+        command("run", *arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **(env or {})},
+    )
+    try:
+        yield Running(process)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def services_of(pid: int) -> dict[str, int]:
+    """Process ids of a launcher's services by name."""
+    listed = subprocess.run(
+        ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(pid)], capture_output=True, text=True
+    )
+    rows = [row.split() for row in listed.stdout.splitlines()]
+    return {row[row.index("service") + 1]: int(row[0]) for row in rows if "service" in row}
+
+
+def has_ended(pid: int, timeout_s: float) -> bool:
+    """Whether a process, perhaps not a child of ours, ends within the time."""
+    try:
+        handle = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return True
+    try:
+        return bool(select.select([handle], [], [], timeout_s)[0])
+    finally:
+        os.close(handle)
+
+
+def assert_one_line(done: subprocess.CompletedProcess[str], text: str, code: int = 1) -> None:
+    assert done.returncode == code, done.stderr
+    assert text in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+
+
+def write_sequence(
+    folder: Path,
+    images: Sequence[np.ndarray | bytes],
+    *,
+    stamps: Sequence[float] | None = None,
+    **calibration: object,
+) -> Path:
+    """A folder with rgb.txt and calib.yaml; bytes are written as they are, as a file that lies."""
+    (folder / "images").mkdir(parents=True)
+    lines: list[str] = []
+    for i, image in enumerate(images):
+        name = f"images/{i:04d}.png"
+        data = image if isinstance(image, bytes) else cv2.imencode(".png", image)[1].tobytes()
+        (folder / name).write_bytes(data)
+        lines.append(f"{i / 30 if stamps is None else stamps[i]:.6f} {name}")
+    (folder / "rgb.txt").write_text("\n".join(lines) + "\n")
+    height, width = next(i for i in images if not isinstance(i, bytes)).shape[:2]
+    content: dict[str, object] = {"model": "pinhole", "width": width, "height": height}
+    focal = 0.9 * max(width, height)
+    content |= {"fx": focal, "fy": focal, "cx": width / 2, "cy": height / 2}
+    content |= calibration
+    kept = {key: value for key, value in content.items() if value is not None}
+    (folder / "calib.yaml").write_text(yaml.safe_dump(kept))
+    return folder

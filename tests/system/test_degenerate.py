@@ -1,0 +1,129 @@
+"""Videos that hold no map: every one of them runs to its end and says why, in one line."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from running import pliant, write_sequence
+
+from pliant.config import load_config
+from pliant.datasets import open_source
+from pliant.map_history import MapHistory
+from pliant_services.in_process import process
+
+pytestmark = pytest.mark.system
+
+WIDTH, HEIGHT = 160, 120
+SHAPE = (HEIGHT, WIDTH)
+
+
+def texture(width: int, height: int) -> np.ndarray:
+    """Structure at all scales, float."""
+    random = np.random.default_rng(0)
+    image = np.full((height, width), 128.0, np.float32)
+    for size in (1, 2, 4, 8, 16, 32):
+        coarse = random.normal(size=(height // size + 2, width // size + 2)).astype(np.float32)
+        layer = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+        image += 12.0 * size**0.7 * layer
+    return np.clip(image, 0.0, 255.0)
+
+
+STILL = texture(WIDTH, HEIGHT)
+
+
+def with_noise(image: np.ndarray, frames: int) -> list[np.ndarray]:
+    random = np.random.default_rng(1)
+    noisy = [image + random.normal(scale=3.0, size=image.shape) for _ in range(frames)]
+    return [np.clip(frame, 0, 255).astype(np.uint8) for frame in noisy]
+
+
+def sliding(width: int, height: int, frames: int) -> list[np.ndarray]:
+    wide = texture(width + 2 * frames, height).astype(np.uint8)
+    return [np.ascontiguousarray(wide[:, 2 * i : 2 * i + width]) for i in range(frames)]
+
+
+def turning(frames: int) -> list[np.ndarray]:
+    """What a camera sees that only turns: homographies of one picture, half a degree a frame."""
+    focal = 0.9 * WIDTH
+    K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1.0]])
+    picture = texture(3 * WIDTH, 2 * HEIGHT)
+    K_picture = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT], [0, 0, 1.0]])
+    images: list[np.ndarray] = []
+    for i in range(frames):
+        angle = np.radians(0.5 * i)
+        c, s = np.cos(angle), np.sin(angle)
+        R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        H = K @ R.T @ np.linalg.inv(K_picture)
+        images.append(cv2.warpPerspective(picture, H, (WIDTH, HEIGHT)).astype(np.uint8))
+    return images
+
+
+VIDEOS = {
+    "constant": [np.full(SHAPE, 100, np.uint8)] * 12,
+    "black": [np.zeros(SHAPE, np.uint8)] * 12,
+    "saturated": [np.full(SHAPE, 255, np.uint8)] * 12,
+    "pure noise": list(np.random.default_rng(2).integers(0, 256, (12, *SHAPE), np.uint8)),
+    "still": [STILL.astype(np.uint8)] * 30,
+    "still with noise": with_noise(STILL, 40),
+    "pure rotation": turning(30),
+    "one frame": [STILL.astype(np.uint8)],
+    "two frames": sliding(WIDTH, HEIGHT, 2),
+    "32x24": sliding(32, 24, 12),
+    "8x8": sliding(8, 8, 12),
+    "2x2": sliding(2, 2, 12),
+    "a column": sliding(8, 320, 12),
+    "a row": sliding(320, 8, 12),
+    "4k": sliding(3840, 2160, 3),
+    "16 bit": [(STILL * 256).astype(np.uint16)] * 6,
+    "transparent": [np.dstack([STILL] * 4).astype(np.uint8)] * 6,
+    "broken but for the first": [STILL.astype(np.uint8), *[b"\x89PNG\r\n\x1a\n"] * 6],
+}
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_a_video_without_a_map_says_why(name: str, tmp_path: Path) -> None:
+    """The services' algorithms in one process; what the processes add is tested below."""
+    source = write_sequence(tmp_path / "video", VIDEOS[name])
+    history = MapHistory()
+    reason = run(source, history)
+    assert history.final() == {}
+    assert reason
+    assert len(reason.splitlines()) == 1
+
+
+def test_a_camera_that_stands_still_starts_no_map(rigid_data: Path) -> None:
+    history = MapHistory()
+    reason = run(rigid_data / "euroc_v101_still30", history)
+    assert history.final() == {}
+    assert "parallax" in reason
+
+
+def run(source: Path, history: MapHistory) -> str:
+    dataset = open_source(str(source))
+    reasons = [frame.delta.reason for frame in process(dataset, load_config(), history)]
+    assert len(reasons) == dataset.frame_count
+    return reasons[-1]
+
+
+@pytest.mark.parametrize("name", ["black", "one frame"])
+def test_a_run_without_a_map_ends_with_code_3_and_the_reason(name: str, tmp_path: Path) -> None:
+    source = write_sequence(tmp_path / "video", VIDEOS[name])
+    done = pliant("run", source, "--output", tmp_path / "result")
+    assert done.returncode == 3, done.stderr
+    assert "Traceback" not in done.stderr
+    (line,) = [line for line in done.stdout.splitlines() if "no map could start" in line]
+    report = json.loads((tmp_path / "result" / "report.json").read_text())
+    assert report["last_reason"]
+    assert line.endswith(report["last_reason"])
+    assert report["frames"] == len(VIDEOS[name])
+    assert report["complete"]
+    assert (tmp_path / "result" / "trajectory.txt").read_text() == ""
+
+
+def test_an_image_too_small_for_a_camera_is_one_line(tmp_path: Path) -> None:
+    source = write_sequence(tmp_path / "video", [np.zeros((1, 1), np.uint8)], fx=1.0, fy=1.0)
+    done = pliant("run", source, cwd=tmp_path)
+    assert done.returncode == 1
+    assert "width is 1: expected 2 to" in done.stderr

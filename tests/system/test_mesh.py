@@ -1,0 +1,86 @@
+"""A run with a mesh, the mesh made again, and runs that have none and say why."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from running import TINY, assert_one_line, pliant
+
+from pliant.export.ply import read_ply
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("open3d", reason="meshing needs open3d: pip install 'pliant[mesh]'")
+    folder = tmp_path_factory.mktemp("mesh") / "tiny"
+    done = pliant("run", TINY, "--output", folder)
+    assert done.returncode == 0, done.stderr
+    assert "fine mesh:" in done.stdout
+    return folder
+
+
+def test_a_run_leaves_meshes_pictures_and_figures(result: Path) -> None:
+    report = json.loads((result / "report.json").read_text())
+    assert [mesh["level"] for mesh in report["mesh"]] == ["coarse", "fine"]
+    for mesh, name in zip(report["mesh"], ("mesh_coarse.ply", "mesh.ply"), strict=True):
+        data = read_ply(result / name)
+        assert data.faces is not None
+        assert data.normals is not None
+        assert data.colours is not None
+        assert len(data.faces) == mesh["triangles"] > 100
+        np.testing.assert_allclose(np.linalg.norm(data.normals, axis=1), 1.0, atol=1e-3)
+    for name in ("mesh.png", "mesh_shaded.png", "mesh_normals.png"):
+        assert (result / name).stat().st_size > 1000
+    stages = report["milliseconds_per_frame"]["meshing"]
+    assert {"smoothing", "coarse fusion", "final fine fusion"} <= stages.keys()
+    assert report["counters"]["meshing"]["fused"] > 0
+
+
+def test_the_mesh_against_the_truth(result: Path) -> None:
+    figures = result / "figures.json"
+    done = pliant("eval", result, "--groundtruth", TINY, "--mesh", "--json", figures)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(figures.read_text())["mesh"]
+    assert found["median_error"] < 0.01
+    assert found["within"] > 0.9
+    assert found["covered"] > 0.5
+    assert found["normal_deg"] < 8.0
+
+
+def test_the_mesh_is_made_again_with_other_parameters(result: Path, tmp_path: Path) -> None:
+    done = pliant("mesh", result, "--output", tmp_path / "same")
+    assert done.returncode == 0, done.stderr
+    for name in ("mesh.ply", "mesh_coarse.ply"):
+        assert (tmp_path / "same" / name).read_bytes() == (result / name).read_bytes()
+    sets = ("--set", "meshing.tsdf.fine_voxel=0.03")
+    done = pliant("mesh", result, "--output", tmp_path / "rough", *sets)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "rough" / "mesh.ply").stat().st_size < (
+        0.3 * (result / "mesh.ply").stat().st_size
+    )
+    assert_one_line(pliant("mesh", result, "--output", result), "holds the recording")
+
+
+def test_the_service_replays_to_the_same_bytes(result: Path, tmp_path: Path) -> None:
+    arguments = ("--services", "meshing", "--check", "--output", tmp_path / "again")
+    done = pliant("replay", result, *arguments)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "the same bytes as recorded: mesh/blocks, mesh/final" in done.stdout
+
+
+def test_without_open3d_a_run_says_so_in_one_line_and_goes_on(tmp_path: Path) -> None:
+    hidden = tmp_path / "hidden" / "open3d"
+    hidden.mkdir(parents=True)
+    (hidden / "__init__.py").write_text("raise ImportError('libGL.so.1: cannot open')")
+    environment = {"PYTHONPATH": str(hidden.parent)}
+    arguments = ("--output", tmp_path / "result", "--set", "ingest.mode=lossless")
+    done = pliant("run", f"{TINY}?frames=12", *arguments, env=environment)
+    told = [line for line in done.stderr.splitlines() if "no mesh" in line]
+    assert len(told) == 1, done.stderr
+    assert "apt-get install libegl1" in told[0]
+    assert "Traceback" not in done.stderr
+    assert (tmp_path / "result" / "trajectory.txt").exists()
+    assert not (tmp_path / "result" / "mesh.ply").exists()

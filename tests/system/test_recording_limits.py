@@ -1,0 +1,133 @@
+"""The recording at its limits: a full disk, Ctrl-C, kill -9, random delays."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from running import TINY, UP, pliant, running
+
+from pliant.config import config_yaml, load_config
+from pliant.messages import topics
+from pliant.recording.compare import compare
+from pliant.recording.reader import Recording
+from pliant.recording.summary import summarise
+from pliant_services.benchmarks.recorder_kills import measure
+from pliant_services.launcher import Fleet
+from pliant_services.pipeline import prepare
+
+pytestmark = pytest.mark.system
+
+FRAMES = 10
+DETERMINISTIC = [t for t in topics.TOPICS if t.logged and t.deterministic]
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "tiny"
+    pliant("run", f"{TINY}?frames={FRAMES}", "--output", folder)
+    assert summarise(folder).complete
+    return folder
+
+
+def assert_same(a: Path, b: Path) -> None:
+    found = compare(Recording(a), Recording(b), [t for t in DETERMINISTIC if t.per_frame])
+    assert not found, found
+    assert summarise(b).complete
+
+
+def test_the_report_proves_that_nothing_was_lost(result: Path) -> None:
+    proof = json.loads((result / "report.json").read_text())["recorder"]
+    assert (proof["lost"], proof["duplicated"]) == (0, 0)
+    for topic in (topics.SOURCE, topics.EXTREMA, topics.MAP_UPDATE):
+        assert proof["messages"][topic.key] == FRAMES
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 1, 0, 2)])
+def test_the_same_bytes_with_delays_a_busy_core_and_another_order_of_start(
+    result: Path, tmp_path: Path, order: tuple[int, ...]
+) -> None:
+    names = ("ingest", "tracking", "bundle_adjustment", "recorder")
+    prepare(tmp_path, config_yaml(load_config()))
+
+    def arguments(name: str) -> list[str]:
+        extra = ["--config", str(tmp_path / "config.yaml"), "--delays-ms", "40"]
+        if name == "ingest":
+            extra += ["--source", f"{TINY}?frames={FRAMES}"]
+        if name == "recorder":
+            extra += ["--output", str(tmp_path / "recording.mcap")]
+        return extra
+
+    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    fleet = Fleet([names[i] for i in order], log_folder=tmp_path / "logs", on_status=lambda _: None)
+    try:
+        fleet.start(arguments)
+        fleet.wait()
+    finally:
+        fleet.close()
+        busy.kill()
+        busy.wait()
+    assert_same(result, tmp_path)
+
+
+def test_a_replay_in_processes_gives_the_same_bytes(result: Path, tmp_path: Path) -> None:
+    done = pliant(
+        "replay", result, "--services", "tracking,bundle_adjustment", "--processes", "--check",
+        "--output", tmp_path / "again",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "the same bytes" in done.stdout
+    assert summarise(tmp_path / "again").complete
+
+
+def test_a_full_disk_is_one_line_and_what_was_written_is_readable(tmp_path: Path) -> None:
+    """No file may grow beyond half a recording: what a full disk looks like to its writer."""
+    code = (
+        "import resource, runpy, sys;"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20));"
+        "sys.argv = ['pliant', *sys.argv[1:]];"
+        "runpy.run_module('pliant_services.cli', run_name='__main__')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "run", f"{TINY}?frames=30", "--output", str(tmp_path / "r")],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "the disk is full; what was written stays readable" in done.stderr
+    summary = summarise(tmp_path / "r")
+    assert not summary.closed
+    assert summary.topics[topics.EXTREMA.key].messages > 2
+    assert not summary.topics[topics.EXTREMA.key].gaps
+
+
+def test_ctrl_c_in_the_middle_leaves_a_clean_file(tmp_path: Path) -> None:
+    folder = tmp_path / "stopped"
+    with running(TINY, "--output", folder, "--mode", "live") as run:
+        run.wait_for(UP)
+        run.send(signal.SIGINT)
+        code, _, errors = run.finish()
+    assert code == 130, errors
+    summary = summarise(folder)
+    assert summary.closed
+    assert not summary.missing
+    assert not summary.damage
+
+
+def test_a_recording_without_images_says_what_cannot_be_replayed(tmp_path: Path) -> None:
+    folder = tmp_path / "small"
+    pliant("run", f"{TINY}?frames=6", "--output", folder, "--no-images")
+    summary = summarise(folder)
+    assert summary.complete
+    assert topics.SOURCE.key not in summary.topics
+    done = pliant("replay", folder, "--services", "tracking")
+    assert done.returncode == 1
+    assert "tracking cannot be replayed: the recording is without camera/source" in done.stderr
+
+
+def test_kill_9_of_the_recorder_costs_a_second_at_most() -> None:
+    assert "3 of 3" in "".join(measure(3))

@@ -1,0 +1,134 @@
+"""``pliant run`` with real processes on free ports."""
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from running import TINY, UP, assert_one_line, pliant, running
+
+from pliant.bus.session import CONNECT_TIMEOUT_S, free_endpoint, open_router
+from pliant.messages import topics
+from pliant.recording.reader import Recording
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "tiny"
+    done = pliant("run", TINY, "--output", folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_a_run_leaves_everything_a_user_opens(result: Path) -> None:
+    report = json.loads((result / "report.json").read_text())
+    assert report["complete"]
+    assert report["frames"] == report["frames_with_pose"] > 10
+    assert report["points"] > 100
+    for name in ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "config.yaml"):
+        assert (result / name).stat().st_size > 0
+    assert (result / "points.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
+    assert len(np.loadtxt(result / "trajectory.txt")) == report["frames"]
+
+
+def test_nothing_is_missing_in_the_recording(result: Path) -> None:
+    report = json.loads((result / "report.json").read_text())
+    frames: dict[str, list[int]] = {}
+    for recorded in Recording(result / "recording.mcap").messages():
+        frames.setdefault(recorded.topic.key, []).append(recorded.decode().frame)
+    for topic in (topics.SOURCE, topics.EXTREMA, topics.MAP_UPDATE):
+        assert frames[topic.key] == list(range(report["frames"])), topic.key
+    assert len(frames[topics.STREAM.key]) == len(frames[topics.MAP_FINAL.key]) == 1
+    metadata = Recording(result / "recording.mcap").metadata()
+    assert metadata["config"]["yaml"] == (result / "config.yaml").read_text()
+    assert metadata["packages"]["numpy"]
+
+
+def test_two_runs_leave_the_same_bytes_also_under_load(result: Path, tmp_path: Path) -> None:
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    try:
+        done = pliant("run", TINY, "--output", tmp_path / "again")
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    assert done.returncode == 0, done.stderr
+    for name in ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply"):
+        assert (result / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+
+
+def test_an_existing_result_is_not_overwritten(result: Path) -> None:
+    done = pliant("run", TINY, "--output", result)
+    assert_one_line(done, "--force")
+
+
+def test_evaluation_of_a_run(result: Path) -> None:
+    done = pliant("eval", result, "--groundtruth", TINY, "--json", result / "evaluation.json")
+    assert done.returncode == 0, done.stderr
+    figures = json.loads((result / "evaluation.json").read_text())
+    assert figures["final"]["success"]
+
+
+def test_ctrl_c_ends_the_stream_and_keeps_what_was_done(tmp_path: Path) -> None:
+    folder = tmp_path / "stopped"
+    # Live at the pace of its stamps, so that the run is still going on when the signal comes.
+    with running(TINY, "--output", folder, "--mode", "live") as run:
+        run.wait_for(UP)
+        run.send(signal.SIGINT)
+        code, output, errors = run.finish()
+    assert code == 130, errors
+    report = json.loads((folder / "report.json").read_text())
+    recorded = [m.sequence for m in Recording(folder / "recording.mcap").messages(topics.EXTREMA)]
+    assert len(recorded) == report["frames"]
+    assert not report["complete"] or report["frames"] > 0
+    assert "frames" in output
+
+
+def test_a_service_that_dies_is_named_with_its_last_words(tmp_path: Path) -> None:
+    folder = tmp_path / "died"
+    with running(TINY, "--output", folder, "--mode", "live") as run:
+        run.wait_for(UP)
+        run.send(signal.SIGKILL, "tracking")
+        code, _, errors = run.finish()
+    assert code == 1
+    assert "tracking was killed by SIGKILL" in errors
+    assert list(Recording(folder / "recording.mcap").messages(topics.STREAM))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["run", "no/such/folder"], "no/such/folder"),
+        (["run", "built-in:nowhere"], "room"),
+        (["run", TINY, "--set", "tracking.max_trakcs=5"], "did you mean"),
+        (["run", TINY, "--set", "ingest.mode=sometimes"], "lossless"),
+        (["run", TINY, "--config", "none.yaml"], "cannot read"),
+        (["config", "--set", "a.b=1"], "unknown key"),
+        (["eval", "none", "--groundtruth", TINY], "none"),
+        (["service", "juggling", "--connect", "tcp/127.0.0.1:1"], "tracking"),
+        (["service", "ingest", "--connect", "tcp/127.0.0.1:1"], "--source"),
+    ],
+)
+def test_a_mistake_is_one_line(tmp_path: Path, arguments: Sequence[str], text: str) -> None:
+    assert_one_line(pliant(*arguments, cwd=tmp_path), text)
+
+
+def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with open_router(endpoint):
+        port = endpoint.rsplit(":", 1)[1]
+        done = pliant("run", TINY, "--output", tmp_path / "r", "--port", port)
+    assert_one_line(done, "in use")
+
+
+def test_a_service_that_cannot_reach_its_peers_says_so_within_ten_seconds(tmp_path: Path) -> None:
+    unused = free_endpoint()
+    done = pliant("service", "tracking", "--connect", unused)
+    assert_one_line(done, "cannot reach")
+    assert CONNECT_TIMEOUT_S < 8.0  # and two for Python and Zenoh to start: no clock under load

@@ -1,0 +1,102 @@
+"""The rules of the house that a machine can check."""
+
+import ast
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+LIBRARY = ROOT / "shared" / "pliant"
+SERVICES = ROOT / "services" / "pliant_services"
+
+# Who may import whom; a room that is not listed may import every room of the library.
+MAY_IMPORT: dict[str, set[str]] = {
+    "algorithms": {"algorithms"},
+    "errors": set(),
+    "cache": set(),
+    "trajectory": {"algorithms"},
+    "export": {"export", "algorithms", "errors", "trajectory"},
+    "messages": {"messages", "algorithms", "errors"},
+    "bus": {"bus", "messages", "state", "algorithms", "errors"},
+    "recording": {"recording", "messages", "algorithms", "errors"},
+    "rendering": {"rendering", "algorithms", "errors"},
+    "viewers": {"viewers", "messages", "datasets", "export", "algorithms", "errors"},
+    "datasets": {
+        *{"datasets", "rendering", "export", "cache", "algorithms", "errors"},
+        *{"messages", "recording", "trajectory"},  # our own recordings are a source, too
+    },
+    "fusion": {"fusion", "algorithms", "errors", "map_history"},
+}
+PURE_FORBIDS = {"time", "datetime", "socket", "logging", "os", "pathlib", "random", "threading"}
+# It is no algorithm: it stands beside the decorator whose cache on disk it is.
+COMPILER = LIBRARY / "algorithms" / "kernel_cache.py"
+
+
+def imports(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield node.module or ""
+
+
+def python_files(folder: Path) -> list[Path]:
+    files = sorted(folder.rglob("*.py"))
+    assert files, f"no files in {folder}"
+    return files
+
+
+@pytest.mark.parametrize("path", python_files(LIBRARY), ids=lambda p: str(p.relative_to(LIBRARY)))
+def test_imports_go_one_way(path: Path) -> None:
+    room = path.relative_to(LIBRARY).parts[0].removesuffix(".py")
+    for name in imports(path):
+        assert not name.startswith("pliant_services"), f"the library imports {name}"
+        if name.startswith("pliant.") and room in MAY_IMPORT:
+            assert name.split(".")[1] in MAY_IMPORT[room], f"{room} imports {name}"
+
+
+@pytest.mark.parametrize(
+    "path",
+    python_files(LIBRARY / "algorithms") + python_files(LIBRARY / "rendering"),
+    ids=lambda p: str(p.relative_to(LIBRARY)),
+)
+def test_algorithms_are_pure(path: Path) -> None:
+    if path == COMPILER:
+        return
+    assert not PURE_FORBIDS & {name.split(".")[0] for name in imports(path)}
+    calls = {
+        node.func.id
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    }
+    assert not calls & {"open", "print", "input"}
+
+
+@pytest.mark.parametrize(
+    "path",
+    python_files(LIBRARY) + python_files(SERVICES),
+    ids=lambda p: str(p.relative_to(ROOT)),
+)
+def test_open3d_stays_in_its_room(path: Path) -> None:
+    if "fusion" in path.relative_to(ROOT).parts:
+        return
+    assert not any(name.split(".")[0] == "open3d" for name in imports(path))
+    assert 'import_module("open3d' not in path.read_text(encoding="utf-8")
+
+
+def test_no_file_names_a_machine() -> None:
+    listed = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True
+    )
+    if listed.returncode != 0:
+        pytest.skip("not a git checkout")
+    machine_path = re.compile(r"(?<![\w.])/(root|home|work|Users)/\w")
+    for name in listed.stdout.splitlines():
+        path = ROOT / name
+        if path.suffix in {".py", ".md", ".toml", ".yaml", ".txt", ".cfg", ""} and path.is_file():
+            text = path.read_text(encoding="utf-8", errors="replace")
+            assert not machine_path.search(text), f"{name} names a path of one machine"

@@ -1,0 +1,151 @@
+"""Exactly once, in order, whatever is lost, repeated or restarted: the bus without a network."""
+
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pliant import __version__
+from pliant.bus.base import Received, Window
+from pliant.bus.checkpoints import Checkpoints, Place
+from pliant.bus.inbox import Inbox
+from pliant.bus.outbox import Numbered, Outbox
+from pliant.bus.peers import WIRE_VERSION, Peers
+from pliant.errors import BusError
+from pliant.messages import topics
+
+WINDOW = 4
+
+
+def deliver(inbox: Inbox, message: Numbered) -> None:
+    if inbox.is_next(message.sequence):
+        inbox.put(Received(topics.IMAGE, 0, message.sequence, False, message.payload))
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**32), loss=st.floats(0.0, 0.6))
+def test_every_message_is_taken_once_and_in_order(seed: int, loss: float) -> None:
+    chance = random.Random(seed)
+    outbox, inbox = Outbox("t", ["reader"], window=WINDOW), Inbox(limit=2 * WINDOW)
+    taken: list[int] = []
+    network: list[Numbered] = []
+    incarnation, kept_at, safe = 1, 0, 0  # the reader's last checkpoint
+    for _ in range(50000):
+        if len(taken) == 60:
+            break
+        step = chance.randrange(6)
+        if step == 0 and outbox.has_room() and outbox.sent < 60:
+            network.append(outbox.add(0, str(outbox.sent).encode()))
+        elif step == 1 and network:
+            message = network.pop(chance.randrange(len(network)))
+            if chance.random() >= loss:
+                deliver(inbox, message)
+        elif step == 2 and inbox.waiting:
+            taken.append(int(inbox.take().data))
+        elif step == 3:
+            kept_at = safe = len(taken)
+        elif step == 4 and chance.random() < 0.05:  # killed, and started again
+            incarnation += 1
+            del taken[kept_at:]
+            inbox = Inbox(limit=2 * WINDOW)
+            inbox.start_from(kept_at)
+        elif step == 5:  # the counts may be lost, too; asked again later
+            if chance.random() >= loss:
+                outbox.credit("reader", incarnation, inbox.taken, safe)
+            if chance.random() < 0.1:
+                network.extend(outbox.again(inbox.taken))
+        assert outbox.on_the_way() <= 60
+    assert taken == list(range(60))
+
+
+def test_nothing_is_kept_that_no_reader_can_ask_for() -> None:
+    outbox = Outbox("t", ["a", "b"], window=10)
+    for _ in range(5):
+        outbox.add(0, b"x")
+    outbox.credit("a", 1, 5, 5)
+    assert outbox.kept() == 5
+    outbox.credit("b", 1, 4, 3)
+    assert outbox.kept() == 2
+    assert [m.sequence for m in outbox.again(3)] == [3, 4]
+    with pytest.raises(BusError, match="oldest kept is 3"):
+        outbox.again(2)
+
+
+def test_counts_fall_only_with_a_new_incarnation() -> None:
+    outbox = Outbox("t", ["a"], window=10)
+    for _ in range(5):
+        outbox.add(0, b"x")
+    assert not outbox.credit("a", 7, 4, 2)
+    outbox.credit("a", 7, 1, 0)
+    assert outbox.readers["a"].taken == 4
+    outbox.credit("a", 6, 5, 5)  # what an earlier one sent comes late
+    assert outbox.readers["a"].taken == 4
+    assert outbox.credit("a", 8, 2, 2)
+    assert outbox.on_the_way() == 3
+
+
+def test_a_reader_that_makes_safe_seldom_bounds_messages_and_bytes() -> None:
+    outbox = Outbox("t", ["disk"], window=100, windows={"disk": Window(messages=3, size=25)})
+    outbox.add(0, b"0123456789")
+    assert outbox.has_room(10)
+    outbox.add(0, b"0123456789")
+    assert not outbox.has_room(10)
+    assert outbox.has_room(5)
+    outbox.add(0, b"")
+    assert not outbox.has_room(0)
+    outbox.credit("disk", 1, 3, 3)
+    assert outbox.has_room(1000)  # nothing is kept: larger than the window may pass alone
+
+
+def test_versions_that_do_not_fit_are_both_named() -> None:
+    peers = Peers("tracking", incarnation=5)
+    peers.on_token("pliant/s/ready/ingest/3/99/9.9.9", alive=True, now=0.0)
+    with pytest.raises(BusError, match=f"ingest is pliant 9.9.9 .* tracking is {__version__}"):
+        peers.raise_if_refused()
+
+
+def test_a_service_that_came_back_is_not_gone() -> None:
+    peers = Peers("tracking", incarnation=5)
+
+    def token(number: int) -> str:
+        return f"pliant/s/ready/ingest/{number}/{WIRE_VERSION}/{__version__}"
+
+    peers.on_token(token(1), alive=True, now=0.0)
+    peers.on_token(token(2), alive=True, now=1.0)
+    peers.on_token(token(1), alive=False, now=2.0)
+    assert peers.missing(["ingest"]) == []
+    peers.on_token(token(2), alive=False, now=3.0)
+    assert peers.missing(["ingest"]) == ["ingest"]
+    assert peers.lost(["ingest"], patience_s=5.0, now=7.0) == []
+    assert peers.lost(["ingest"], patience_s=5.0, now=8.0) == ["ingest"]
+
+
+def test_a_second_service_of_the_same_name_takes_over() -> None:
+    peers = Peers("tracking", incarnation=5)
+    peers.on_token(f"pliant/s/ready/tracking/4/{WIRE_VERSION}/x", alive=True, now=0.0)
+    peers.raise_if_refused()
+    peers.on_token(f"pliant/s/ready/tracking/6/{WIRE_VERSION}/x", alive=True, now=0.0)
+    with pytest.raises(BusError, match="took over"):
+        peers.raise_if_refused()
+
+
+def test_the_newest_checkpoint_that_readers_allow_is_used(tmp_path) -> None:
+    checkpoints = Checkpoints(tmp_path / "tracking", interval=10)
+    for frame in (9, 19, 29):
+        assert checkpoints.due(frame)
+        place = Place(frame, {"in": frame + 1}, {"out": frame + 1})
+        checkpoints.save(place, f"state {frame}".encode(), lambda: None)
+        checkpoints.close()
+    assert not checkpoints.due(30)
+
+    again = Checkpoints(tmp_path / "tracking", interval=10)
+    assert again.usable({"out": 5}) is None
+    place = again.usable({"out": 25})
+    assert place == Place(19, {"in": 20}, {"out": 20})
+    assert sorted(path.name for path in (tmp_path / "tracking").iterdir()) == [
+        "000000019.state",
+        "000000029.state",
+    ]
+    assert again.restart_from(place) == b"state 19"
+    assert [path.name for path in (tmp_path / "tracking").iterdir()] == ["000000019.state"]

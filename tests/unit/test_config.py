@@ -1,0 +1,60 @@
+"""Configuration: strict about names, exact in what it saves."""
+
+from pathlib import Path
+
+import pytest
+
+from pliant.config import Config, config_yaml, describe, load_config
+from pliant.errors import ConfigError
+
+
+def test_defaults_are_valid_and_survive_a_round_trip(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(config_yaml(Config()))
+    assert load_config(file) == Config()
+
+
+def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("bus:\n  window: 7\nseed: 3\n")
+    config = load_config(file, ["bus.window=9"], seed=5)
+    assert (config.bus.window, config.seed) == (9, 5)
+
+
+@pytest.mark.parametrize(
+    ("override", "complaint"),
+    [
+        ("bus.windwo=8", "did you mean bus.window"),
+        ("trakcing.x=1", "unknown key trakcing"),
+        ("bus.window=many", "bus.window"),
+        ("bus.window=0", "bus.window"),
+        ("bus.window.deeper=1", "bus.window"),
+        ("seed.deeper=1", "seed"),
+        ("no-equals-sign", "KEY=VALUE"),
+        ("recorder.sync_interval_s=.nan", "sync_interval_s"),
+        ("a=[", "not a value"),
+    ],
+)
+def test_what_is_wrong_is_one_line(override: str, complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint) as caught:
+        load_config(None, [override])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "{", "\x00", "5"])
+def test_a_file_that_is_no_configuration_is_one_line(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=r"config\.yaml") as caught:
+        load_config(file)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot read"):
+        load_config(tmp_path / "none.yaml")
+
+
+def test_every_parameter_says_what_it_means() -> None:
+    unexplained = [key for key, _, meaning in describe() if not meaning]
+    assert not unexplained

@@ -1,0 +1,165 @@
+"""Videos written here, and cameras that are simulated: there may be none on this machine."""
+
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from pliant.datasets import CameraDevice, Rectifier, SourceOptions, open_source
+from pliant.datasets.camera_device import camera_index
+from pliant.datasets.video import quiet_opencv
+from pliant.errors import CalibrationError, DatasetError
+
+WIDTH, HEIGHT = 64, 48
+CALIBRATION = {"width": WIDTH, "height": HEIGHT, "fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5}
+
+
+def video(folder: Path, frames: int = 6) -> Path:
+    file = folder / "clip.avi"
+    with quiet_opencv():  # OpenCV decides at its first video whether FFmpeg may write to stderr
+        writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (WIDTH, HEIGHT))
+    if not writer.isOpened():
+        pytest.skip("OpenCV cannot write a video here")
+    for number in range(frames):
+        writer.write(np.full((HEIGHT, WIDTH, 3), 40 * number, np.uint8))
+    writer.release()
+    return file
+
+
+def test_video(tmp_path: Path) -> None:
+    file = video(tmp_path)
+    dataset = open_source(str(file), fov_deg=60.0)
+    assert (dataset.name, dataset.frame_count, dataset.is_live) == ("clip", 6, False)
+    for _ in range(2):  # again from the start
+        frames = list(dataset)
+        assert [frame.index for frame in frames] == list(range(6))
+        assert [frame.stamp_ns for frame in frames] == [i * 40_000_000 for i in range(6)]
+    rectifier = Rectifier(dataset.calibration)
+    for number, frame in enumerate(frames):
+        assert (frame.encoding, frame.width, frame.height) == ("bgr8", WIDTH, HEIGHT)
+        grey, rgb = rectifier.rectify(frame)
+        assert abs(float(grey.mean()) - 40 * number) < 5.0
+        assert rgb is not None
+
+
+def test_calibration_of_a_video(tmp_path: Path) -> None:
+    file = video(tmp_path)
+    with pytest.raises(CalibrationError, match=r"clip.avi: no clip.yaml; give --calibration"):
+        open_source(str(file))
+    (tmp_path / "clip.yaml").write_text(yaml.safe_dump(CALIBRATION))
+    assert open_source(str(file)).calibration.fx == 60.0
+    other = tmp_path / "other.yaml"
+    other.write_text(yaml.safe_dump({**CALIBRATION, "width": 128}))
+    with pytest.raises(CalibrationError, match="128x48"):
+        open_source(str(file), calibration=other)
+
+
+def test_files_that_are_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "junk.mp4").write_bytes(b"not a video" * 100)
+    with pytest.raises(DatasetError, match=r"junk.mp4: not a video that OpenCV can read"):
+        open_source(str(tmp_path / "junk.mp4"), fov_deg=60.0)
+    (tmp_path / "image.png").write_bytes(b"")
+    with pytest.raises(DatasetError, match="give its folder"):
+        open_source(str(tmp_path / "image.png"), fov_deg=60.0)
+    assert capfd.readouterr().err == ""  # one line is enough, and that is ours
+
+
+class SimulatedCapture:
+    """A camera of 64x48 px that stops after some frames."""
+
+    def __init__(self, frames: int = 4, *, plugged_in: bool = True) -> None:
+        self.frames = frames
+        self.plugged_in = plugged_in
+        self.released = False
+        self.asked: dict[int, float] = {}
+
+    def isOpened(self) -> bool:
+        return self.plugged_in
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        self.frames -= 1
+        if self.frames < 0:
+            return False, None
+        return True, np.full((HEIGHT, WIDTH, 3), self.frames, np.uint8)
+
+    def set(self, property_id: int, value: float) -> bool:
+        self.asked[property_id] = value
+        return True
+
+    def release(self) -> None:
+        self.released = True
+
+
+def test_camera() -> None:
+    captures: list[SimulatedCapture] = []
+
+    def open_device(index: int) -> SimulatedCapture:
+        assert index == 3
+        captures.append(SimulatedCapture())
+        return captures[-1]
+
+    clock = iter([100, 100, 90, 300, 400])
+    camera = CameraDevice(
+        3, SourceOptions(fov_deg=90.0), open_device=open_device, clock_ns=lambda: next(clock)
+    )
+    assert (camera.name, camera.is_live, camera.frame_count) == ("camera:3", True, None)
+    assert captures[0].released  # so that the process that streams can open it
+    assert camera.calibration.fx == pytest.approx(32.0)
+    stream = iter(camera)
+    frames = list(islice(stream, 3))
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert [frame.stamp_ns for frame in frames] == [100, 101, 102]
+    next(stream)
+    with pytest.raises(DatasetError, match="camera:3: delivers no more images"):
+        next(stream)
+    assert captures[1].released
+
+
+def test_camera_is_released_when_nobody_reads_any_more() -> None:
+    captures: list[SimulatedCapture] = []
+
+    def open_device(_: int) -> SimulatedCapture:
+        captures.append(SimulatedCapture())
+        return captures[-1]
+
+    camera = CameraDevice(0, SourceOptions(fov_deg=90.0), open_device=open_device)
+    stream = iter(camera)
+    next(stream)
+    stream.close()  # type: ignore[attr-defined]
+    assert captures[-1].released
+
+
+def test_camera_is_asked_for_the_size_of_its_calibration(tmp_path: Path) -> None:
+    capture = SimulatedCapture()
+    file = tmp_path / "calib.yaml"
+    file.write_text(yaml.safe_dump({**CALIBRATION, "width": 128, "height": 96}))
+    with pytest.raises(CalibrationError, match="128x96 px, but they have 64x48"):
+        CameraDevice(0, SourceOptions(calibration=file), open_device=lambda _: capture)
+    assert capture.asked == {cv2.CAP_PROP_FRAME_WIDTH: 128, cv2.CAP_PROP_FRAME_HEIGHT: 96}
+
+
+def test_camera_that_is_not_there(capfd: pytest.CaptureFixture[str]) -> None:
+    missing = SimulatedCapture(plugged_in=False)
+    with pytest.raises(DatasetError, match="camera:5: no such camera"):
+        CameraDevice(5, SourceOptions(fov_deg=60.0), open_device=lambda _: missing)
+    silent = SimulatedCapture(frames=0)
+    with pytest.raises(DatasetError, match="no more images"):
+        CameraDevice(5, SourceOptions(fov_deg=60.0), open_device=lambda _: silent)
+    assert silent.released
+    with pytest.raises(DatasetError, match="camera:99: no such camera"):
+        open_source("camera:99", fov_deg=60.0)
+    assert capfd.readouterr().err == ""
+
+
+def test_names_of_cameras() -> None:
+    assert [camera_index(name) for name in ("0", "camera:12", "camera:", "a0", "-1", "0.5")] == [
+        0,
+        12,
+        None,
+        None,
+        None,
+        None,
+    ]

@@ -1,0 +1,220 @@
+"""The volume: surfaces known exactly, removal, memory, and messages that rebuild the mesh."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from fusion_scene import BALL, RADIUS, edge_uses, make_view, surface_errors
+
+from pliant.algorithms.meshing import BlockMesh, TriangleMesh, TsdfParameters
+from pliant.errors import PliantError
+from pliant.fusion import open3d_import
+from pliant.fusion.open3d_import import FusionError, require_open3d
+from pliant.fusion.volume import TsdfVolume, VolumeMemoryError
+
+VOXEL = 0.05
+PARAMETERS = TsdfParameters()
+try:
+    require_open3d()
+    MISSING = ""
+except FusionError as error:
+    MISSING = str(error)
+needs_open3d = pytest.mark.skipif(bool(MISSING), reason=MISSING)
+
+
+def fused(steps: range, parameters: TsdfParameters = PARAMETERS) -> TsdfVolume:
+    volume = TsdfVolume(VOXEL, parameters)
+    for step in steps:
+        volume.integrate(*make_view(step).arguments())
+    return volume
+
+
+def assert_same(first: Any, second: Any) -> None:
+    for field in dataclasses.fields(first):
+        np.testing.assert_array_equal(
+            getattr(first, field.name), getattr(second, field.name), err_msg=field.name
+        )
+
+
+@needs_open3d
+def test_surfaces_lie_where_they_are_with_their_normals() -> None:
+    mesh = fused(range(5)).extract_all()
+    distance, angle = surface_errors(mesh)
+    assert len(mesh.positions) > 5000
+    # The depth at a silhouette is that of one pixel: only there it is off.
+    assert np.median(distance) < 0.02 * VOXEL
+    assert np.percentile(distance, 97) < 0.2 * VOXEL
+    assert np.median(angle) < 0.5
+    assert np.percentile(angle, 90) < 5.0
+
+
+@needs_open3d
+def test_the_mesh_is_a_manifold_that_turns_outwards_with_short_triangles() -> None:
+    volume = fused(range(4))
+    mesh = volume.extract_all()
+    assert edge_uses(mesh.triangles).max() == 2
+    corners = mesh.positions[mesh.triangles].astype(np.float64)
+    sides = corners - np.roll(corners, 1, axis=1)
+    assert np.linalg.norm(sides, axis=2).max() < volume.truncation
+    turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.linalg.norm(turned, axis=1).min() > 0.0
+    agreement = np.sum(turned * mesh.normals[mesh.triangles[:, 0]], axis=1)
+    assert np.mean(agreement > 0.0) > 0.99
+
+
+@needs_open3d
+def test_what_is_taken_back_leaves_no_trace() -> None:
+    volume = fused(range(3))
+    before, blocks = volume.extract_all(), volume.block_count
+    view = make_view(12)
+    one = volume.integrate(*view.arguments())
+    between = make_view(14)
+    two = volume.integrate(*between.arguments())
+    assert volume.block_count > blocks
+    volume.remove(one.serial, *view.arguments())
+    volume.remove(two.serial, *between.arguments())
+    assert volume.block_count == blocks
+    assert_same(volume.extract_all(), before)
+
+
+@needs_open3d
+def test_everything_taken_back_leaves_nothing() -> None:
+    volume = TsdfVolume(VOXEL, PARAMETERS)
+    serials = [volume.integrate(*make_view(step).arguments()).serial for step in range(4)]
+    for step in (2, 0, 3, 1):
+        volume.remove(serials[step], *make_view(step).arguments())
+    assert volume.block_count == 0
+    assert len(volume.extract_all().triangles) == 0
+
+
+@needs_open3d
+def test_messages_rebuild_the_mesh_that_is_held() -> None:
+    volume, service, viewer = TsdfVolume(VOXEL, PARAMETERS), BlockMesh(), BlockMesh()
+    late = BlockMesh()
+    sent: list[int] = []
+    views = [make_view(step) for step in range(6)]
+    serials: list[int] = []
+    for step, view in enumerate(views):
+        done = volume.integrate(*view.arguments())
+        serials.append(done.serial)
+        keys = done.keys
+        if step == 4:  # a keyframe that has moved
+            keys = np.concatenate([keys, volume.remove(serials[1], *views[1].arguments())])
+        message = service.changes(volume.extract(volume.affected(keys)))
+        service.apply(message)
+        viewer.apply(message)
+        sent.append(len(message.triangles))
+        if step == 3:
+            late.apply(service.snapshot())
+        elif step > 3:
+            late.apply(message)
+        for held in (service, viewer, late) if step >= 3 else (service, viewer):
+            assert_same(held.mesh(), volume.extract_all())
+    assert min(sent) > 0
+
+
+@needs_open3d
+def test_neither_the_place_nor_the_order_of_blocks_changes_the_mesh() -> None:
+    volume = fused(range(4))
+    again = TsdfVolume(VOXEL, PARAMETERS.model_copy(update={"free_space": False}))
+    other = TsdfVolume(VOXEL, PARAMETERS.model_copy(update={"free_space": False}))
+    for step in range(4):
+        again.integrate(*make_view(step).arguments())
+    # Blocks are made in another order, and slots are used that were given back.
+    away = make_view(25)
+    gone = other.integrate(*away.arguments())
+    for step in (0, 1, 2, 3):
+        other.integrate(*make_view(step).arguments())
+    other.remove(gone.serial, *away.arguments())
+    assert_same(again.extract_all(), other.extract_all())
+    assert_same(volume.extract_all(), fused(range(4)).extract_all())
+
+
+@needs_open3d
+def test_what_is_seen_through_is_cleared() -> None:
+    def ghosts(parameters: TsdfParameters) -> int:
+        volume = TsdfVolume(VOXEL, parameters)
+        volume.integrate(*make_view(0, ball=True).arguments())
+        for step in range(1, 5):
+            volume.integrate(*make_view(step, ball=False).arguments())
+        distance = np.linalg.norm(volume.extract_all().positions - BALL, axis=1) - RADIUS
+        return int(np.sum(np.abs(distance) < VOXEL))
+
+    assert ghosts(PARAMETERS) == 0
+    assert ghosts(PARAMETERS.model_copy(update={"free_space": False})) > 50
+
+
+@needs_open3d
+def test_a_voxel_that_needs_too_much_memory_is_refused_with_one_that_fits() -> None:
+    view = make_view(0)
+    small = PARAMETERS.model_copy(update={"max_memory_mb": 1})
+    volume = TsdfVolume(VOXEL, small)
+    with pytest.raises(VolumeMemoryError, match="would fit") as caught:
+        volume.integrate(*view.arguments())
+    assert volume.block_count == 0
+    assert volume.memory_bytes <= 1e6
+    fits = caught.value.voxel_size_that_fits
+    assert fits > VOXEL
+    coarser = TsdfVolume(fits, small)
+    coarser.integrate(*view.arguments())
+    assert coarser.memory_bytes <= 1e6
+    with pytest.raises(VolumeMemoryError):
+        volume.check_memory(volume.blocks_needed(view.depth, view.camera, view.T_world_camera))
+
+
+@needs_open3d
+def test_memory_grows_with_the_surface_and_not_with_the_time() -> None:
+    volume = TsdfVolume(VOXEL, PARAMETERS)
+    volume.integrate(*make_view(0).arguments())
+    blocks, memory = volume.block_count, volume.memory_bytes
+    for _ in range(10):
+        volume.integrate(*make_view(0).arguments())
+    assert (volume.block_count, volume.memory_bytes) == (blocks, memory)
+    volume.integrate(*make_view(20).arguments())
+    assert volume.block_count > blocks
+
+
+@needs_open3d
+def test_depth_that_is_no_depth_is_no_surface() -> None:
+    view = make_view(0)
+    volume = TsdfVolume(VOXEL, PARAMETERS)
+    for value in (0.0, -1.0, np.nan, np.inf):
+        done = volume.integrate(np.full_like(view.depth, value), *view.arguments()[1:])
+        assert len(done.keys) == 0
+    nothing: TriangleMesh = volume.extract_all()
+    assert len(nothing.positions) == len(nothing.triangles) == volume.block_count == 0
+
+
+@needs_open3d
+def test_sizes_that_differ_are_refused() -> None:
+    view = make_view(0)
+    volume = TsdfVolume(VOXEL, PARAMETERS)
+    with pytest.raises(ValueError, match="colour"):
+        volume.integrate(
+            view.depth, view.weight, view.colour[:-1], view.camera, view.T_world_camera
+        )
+    with pytest.raises(ValueError, match="depth"):
+        volume.integrate(
+            view.depth[:-1], view.weight, view.colour, view.camera, view.T_world_camera
+        )
+
+
+@pytest.mark.parametrize(
+    ("raised", "said"),
+    [
+        (ModuleNotFoundError("no", name="open3d"), r"not installed: pip install 'pliant\[mesh\]'"),
+        (ModuleNotFoundError("no", name="dash"), "lacks dash"),
+        (OSError("libGL.so.1: cannot open shared object file"), "libGL.so.1.*libgl1"),
+    ],
+)
+def test_without_open3d_the_remedy_is_named(
+    raised: Exception, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(name: str) -> None:
+        raise raised
+
+    require_open3d.cache_clear()
+    monkeypatch.setattr(open3d_import.importlib, "import_module", fail)
+    with pytest.raises(PliantError, match=said):
+        require_open3d()

@@ -1,0 +1,226 @@
+"""The mapper from end to end on synthetic tracks: poses, map, start, loss, and bad input."""
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, Scene, looking, sideways
+
+from pliant.algorithms.arrays import check_arrays
+from pliant.algorithms.geometry import align_umeyama, pose_to_matrix
+from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
+from pliant.algorithms.mapping import Mapper, MappingParameters
+from pliant.algorithms.tracks import FrameTracks
+
+PARAMETERS = MappingParameters()
+
+
+class Told:
+    """What a reader of the deltas knows."""
+
+    def __init__(self):
+        self.keyframes, self.poses, self.points, self.states, self.reasons = {}, {}, {}, [], []
+
+    def apply(self, delta):
+        check_arrays(delta)
+        for i, pose in zip(delta.keyframe_ids.tolist(), delta.keyframe_poses, strict=True):
+            self.keyframes[i] = pose_to_matrix(pose)
+        for k, frame in enumerate(delta.pose_frames.tolist()):
+            pose = pose_to_matrix(delta.poses_keyframe_camera[k])
+            segment = int(delta.pose_segments[k])
+            self.poses[frame] = (int(delta.pose_keyframes[k]), pose, segment)
+        for point in delta.removed_point_ids.tolist():
+            del self.points[point]
+        for k, point in enumerate(delta.point_ids.tolist()):
+            self.points[point] = (delta.points_world[k], int(delta.point_keyframes[k]))
+        self.states.append(delta.state)
+        self.reasons.append(delta.reason)
+        return self
+
+    def pose(self, frame):
+        keyframe, T_keyframe_camera, _ = self.poses[frame]
+        return self.keyframes[keyframe] @ T_keyframe_camera
+
+
+def run(frames, parameters=PARAMETERS, seed=0):
+    mapper, told, deltas = Mapper(CAMERA, parameters, seed), Told(), []
+    for frame, tracks in enumerate(frames):
+        deltas.append(mapper.process(frame, tracks, None, None))
+        told.apply(deltas[-1])
+    deltas.append(mapper.finish())
+    told.apply(deltas[-1])
+    return told, deltas
+
+
+def trajectory_error(told, poses):
+    """Sim(3) RMSE as a share of the path."""
+    frames = sorted(told.poses)
+    estimated = np.array([told.pose(k)[:3, 3] for k in frames])
+    true = np.array([poses[k][:3, 3] for k in frames])
+    scale, R, t = align_umeyama(estimated, true, with_scale=True)
+    rmse = np.sqrt(((scale * estimated @ R.T + t - true) ** 2).sum(axis=1).mean())
+    return rmse / np.linalg.norm(np.diff(true, axis=0), axis=1).sum(), (scale, R, t)
+
+
+@pytest.fixture(scope="module")
+def flight():
+    poses = sideways(60)
+    scene = Scene.box(death=0.02)
+    return scene, poses, *run(scene.frames(poses))
+
+
+def test_every_frame_gets_a_pose_also_before_the_start(flight):
+    _, poses, told, _ = flight
+    assert told.states[0] == WAITING
+    assert told.states[20] == TRACKING
+    assert sorted(told.poses) == list(range(len(poses)))
+    error, _ = trajectory_error(told, poses)
+    assert error < 1e-3
+
+
+def test_the_map_is_where_the_scene_is(flight):
+    scene, poses, told, _ = flight
+    _, (scale, R, t) = trajectory_error(told, poses)
+    xyz = np.array([p[0] for p in told.points.values()])
+    keyframes = np.array([p[1] for p in told.points.values()])
+    world = scale * xyz[keyframes >= 3] @ R.T + t
+    nearest = np.array([np.linalg.norm(scene.points - x, axis=1).min() for x in world])
+    depth = np.linalg.norm(world - poses[0][:3, 3], axis=1)
+    assert len(world) > 500
+    assert np.median(nearest / depth) < 0.01
+    assert np.mean(nearest / depth < 0.05) > 0.95
+
+
+def test_lost_tracks_come_back_to_their_points(flight):
+    scene, _, told, _ = flight
+    # 2 % of the tracks die in every frame; without re-acquisition each becomes another point.
+    assert len(told.points) < 1.3 * len(scene.points)
+
+
+def test_keyframes_are_the_first_to_tell_their_own_pose(flight):
+    _, _, told, deltas = flight
+    known = set()
+    for delta in deltas:
+        known.update(delta.keyframe_ids.tolist())
+        assert set(delta.pose_keyframes.tolist()) <= known
+    assert not np.isnan([p[0] for p in told.points.values()]).any()
+
+
+def test_the_same_input_gives_the_same_bytes(flight):
+    scene, poses, _, deltas = flight
+    _, again = run(scene.frames(poses))
+    for first, second in zip(deltas, again, strict=True):
+        for name, value in vars(first).items():
+            other = getattr(second, name)
+            same = value.tobytes() == other.tobytes() if isinstance(value, np.ndarray) else None
+            assert same is not False, name
+            assert same or value == other, name
+
+
+def test_a_late_reader_catches_up_by_the_snapshots():
+    parameters = MappingParameters(snapshot_frames=20)
+    mapper, late = Mapper(CAMERA, parameters, 0), Told()
+    poses = sideways(42)
+    for frame, tracks in enumerate(Scene.box().frames(poses)):
+        delta = mapper.process(frame, tracks, None, None)
+        if frame >= 39:
+            for name in ("pose_frames", "removed_point_ids"):
+                assert getattr(delta, name).ndim == 1
+            late.apply(delta)
+    assert len(late.points) > 300
+    assert late.pose(41).shape == (4, 4)
+
+
+def test_a_still_camera_starts_no_map_and_says_why():
+    told, _ = run(Scene.box().frames([np.eye(4)] * 12))
+    assert set(told.states) == {WAITING}
+    assert "too little parallax" in told.reasons[-2]
+    assert not told.poses
+
+
+def test_a_turning_camera_starts_no_map_and_says_why():
+    turning = [looking((0.0, 0.0, 0.0), (0.0, 0.02 * k, 0.0)) for k in range(15)]
+    told, _ = run(Scene.box().frames(turning))
+    assert set(told.states) == {WAITING}
+    assert "pure rotation" in told.reasons[-2]
+
+
+def test_too_few_tracks_start_no_map_and_say_why():
+    told, _ = run(Scene.box(60).frames(sideways(8)))
+    assert set(told.states) == {WAITING}
+    assert told.reasons[0] == "too few frames: 1 of 3"
+    assert told.reasons[-2].startswith("too few tracks:")
+    assert told.reasons[-2].endswith("of 100")
+
+
+def test_a_map_starts_after_a_long_rest():
+    poses = [np.eye(4)] * 30 + sideways(30)
+    told, _ = run(Scene.box().frames(poses))
+    assert sorted(told.poses) == list(range(60))
+    error, _ = trajectory_error(told, poses)
+    assert error < 2e-3
+
+
+def noise_frames(count):
+    generator = np.random.default_rng(0)
+    for k in range(count):
+        n = 2000
+        yield FrameTracks(
+            ids=np.arange(1000 * k, 1000 * k + n),
+            points_px=generator.uniform((0, 0), (640, 480), (n, 2)).astype(np.float32),
+            ages=np.zeros(n, np.int32),
+            kappas=np.ones(n, np.float32),
+            states=np.zeros(n, np.uint8),
+            maxima=np.zeros((0, 3), np.float32),
+            dominant_flow=np.eye(2, 3),
+        )
+
+
+def test_noise_and_empty_frames_start_no_map():
+    told, _ = run(noise_frames(15))
+    assert set(told.states) == {WAITING}
+    assert all(told.reasons)
+    told, _ = run([FrameTracks.empty()] * 5)
+    assert set(told.states) == {WAITING}
+    assert "too few tracks: 0 of 100" in told.reasons
+
+
+def test_after_a_loss_a_new_segment_starts():
+    poses = sideways(40)
+    frames = list(Scene.box().frames(poses))
+    # Every track is cut at frame 20, and nothing is seen for longer than the mapper waits.
+    dark = [FrameTracks.empty()] * 12
+    offset = 1_000_000
+    after = [
+        FrameTracks(
+            ids=f.ids + offset, points_px=f.points_px, ages=f.ages, kappas=f.kappas,
+            states=f.states, maxima=np.zeros((0, 3), np.float32), dominant_flow=f.dominant_flow,
+        )
+        for f in frames[20:]
+    ]  # fmt: skip
+    told, _ = run(frames[:20] + dark + after)
+    assert LOST in told.states
+    assert {segment for _, _, segment in told.poses.values()} == {0, 1}
+    assert all(k not in told.poses for k in range(20, 31))
+    assert told.states[-2] == TRACKING
+    lost = told.reasons[told.states.index(LOST)]
+    assert lost.startswith("lost:")
+
+
+def test_a_short_gap_is_bridged():
+    poses = sideways(40)
+    frames = list(Scene.box().frames(poses))
+    frames[25] = FrameTracks.empty()
+    told, _ = run(frames)
+    assert told.states[25] == LOST
+    assert 25 not in told.poses
+    assert len({segment for _, _, segment in told.poses.values()}) <= 2
+
+
+def test_a_frame_without_pixels_leaves_the_state_as_it_was():
+    mapper = Mapper(CAMERA, PARAMETERS, 0)
+    assert mapper.skip(0).state == WAITING
+    for k, tracks in enumerate(Scene.box().frames(sideways(20))):
+        state = mapper.process(k, tracks, None, None).state
+    assert state == TRACKING
+    assert mapper.skip(20).state == TRACKING
+    assert mapper.process(21, FrameTracks.empty(), None, None).state == LOST
+    assert mapper.skip(22).state == LOST

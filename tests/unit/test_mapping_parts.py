@@ -1,0 +1,239 @@
+"""The parts of the mapper, each alone: rows, links, grid, patches, re-acquisition, errors."""
+
+import cv2
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mapping_scene import CAMERA, Scene, looking
+
+from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.mapping.links import UNLINKED, TrackLinks
+from pliant.algorithms.mapping.localisation import locate, refine
+from pliant.algorithms.mapping.map_store import CANDIDATE, FREE, MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.maxima_grid import MaximaGrid
+from pliant.algorithms.mapping.neighbours import missing_rows, near_keyframes, rows_of
+from pliant.algorithms.mapping.parameters import LocalisationParameters, ReacquisitionParameters
+from pliant.algorithms.mapping.patches import cut_patches, sample_colours
+from pliant.algorithms.mapping.reacquisition import reacquire
+from pliant.algorithms.mapping.reprojection import reprojection_errors, window_errors
+
+
+def test_rows_are_reused_and_ids_never():
+    points = PointRows()
+    first = points.allocate(3)
+    points.promote(first)
+    points.free(first[1:2])
+    assert points.state[first].tolist() == [MAPPED, FREE, MAPPED]
+    second = points.allocate(2)
+    assert second.tolist() == [1, 3]
+    assert points.state[second].tolist() == [CANDIDATE, CANDIDATE]
+    assert points.ids[second].tolist() == [-1, -1]
+    points.promote(second)
+    assert points.ids[[0, 1, 2, 3]].tolist() == [0, 3, 2, 4]
+
+
+def test_rows_grow_and_keep_what_they_hold():
+    points = PointRows()
+    rows = points.allocate(10)
+    points.xyz[rows] = np.arange(30).reshape(10, 3)
+    more = points.allocate(5000)
+    np.testing.assert_array_equal(points.xyz[:10], np.arange(30).reshape(10, 3))
+    assert not points.xyz[more].any()
+    assert np.isnan(points.told[more]).all()
+    assert (points.alias[more] == more).all()
+
+
+def test_observations_of_merged_rows_become_one():
+    points = PointRows()
+    points.allocate(6)
+    points.alias[5] = 2
+    keyframe = Keyframe(
+        id=0, frame=0, segment=0, T_world_camera=np.eye(4),
+        rows=np.array([1, 2, 5], np.int32),
+        points_px=np.array([[1, 1], [2, 2], [5, 5]], np.float32),
+    )  # fmt: skip
+    keyframe.follow_aliases(points)
+    assert keyframe.rows.tolist() == [1, 2]
+    assert keyframe.points_px.tolist() == [[1, 1], [2, 2]]
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.sets(st.integers(0, 40)), min_size=1, max_size=6))
+def test_links_follow_living_tracks_and_drop_dead_ones(frames):
+    links, expected = TrackLinks(), {}
+    for alive in frames:
+        ids = np.array(sorted(alive), np.int64)
+        links.follow(ids)
+        expected = {i: expected.get(i, UNLINKED) for i in ids.tolist()}
+        assert links.rows.tolist() == [expected[i] for i in ids.tolist()]
+        for k, i in enumerate(ids.tolist()):
+            links.rows[k] = expected[i] = 7 * i
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.floats(0.5, 8.0))
+def test_grid_finds_the_nearest_maximum(seed, radius):
+    generator = np.random.default_rng(seed)
+    maxima = np.column_stack(
+        [generator.uniform(0, 99, 200), generator.uniform(0, 59, 200), np.ones(200)]
+    ).astype(np.float32)
+    points = generator.uniform((0, 0), (99, 59), (50, 2)).astype(np.float32)
+    found = MaximaGrid.build(maxima, 100, 60).nearest(points, radius)
+    distance = np.linalg.norm(points[:, None] - maxima[None, :, :2], axis=2)
+    nearest = distance.argmin(axis=1)
+    expected = np.where(distance.min(axis=1) < radius, nearest, -1)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_grid_takes_no_maxima_at_all():
+    grid = MaximaGrid.build(np.zeros((0, 3), np.float32), 100, 60)
+    assert grid.nearest(np.array([[5.0, 5.0]], np.float32), 3.0).tolist() == [-1]
+
+
+def texture(seed=0):
+    noise = np.random.default_rng(seed).uniform(0, 255, (480, 640)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def looked_for(shift, grey, min_zncc=0.8, kappa=10.0):
+    """Re-acquire one point at the image's centre whose maximum is off by ``shift`` px."""
+    xyz = np.array([[0.0, 0.0, 4.0]])
+    patches = np.zeros((1, 8, 8), np.uint8)
+    centre = np.array([[CAMERA.cx, CAMERA.cy]], np.float32)
+    cut_patches(grey, centre, np.zeros(1, np.int32), patches)
+    maxima = np.array([[CAMERA.cx + shift, CAMERA.cy, kappa]], np.float32)
+    return reacquire(
+        np.eye(4), np.zeros(1, np.int32), xyz, np.full(1, 10.0, np.float32), patches,
+        MaximaGrid.build(maxima, 640, 480), grey, CAMERA,
+        ReacquisitionParameters(min_zncc=min_zncc),
+    )  # fmt: skip
+
+
+def test_reacquisition_refines_the_maximum_by_the_patch():
+    found = looked_for(0.7, texture())
+    assert found.rows.tolist() == [0]
+    np.testing.assert_allclose(found.points_px[0], (CAMERA.cx, CAMERA.cy), atol=0.1)
+
+
+def test_reacquisition_refuses_far_maxima_other_curvatures_and_other_patches():
+    assert len(looked_for(3.0, texture()).rows) == 0
+    assert len(looked_for(0.5, texture(), kappa=21.0).rows) == 0
+    assert len(looked_for(0.5, texture(), kappa=4.9).rows) == 0
+    assert len(looked_for(0.5, np.full((480, 640), 80, np.uint8)).rows) == 0
+    lost = looked_for(3.0, texture())
+    assert lost.visible.tolist() == [0]
+
+
+def test_reacquisition_gives_a_maximum_to_one_point_only():
+    grey = texture()
+    xyz = np.array([[0.0, 0.0, 4.0], [0.001, 0.0, 4.0], [0.0, 0.0, -4.0]])
+    patches = np.zeros((3, 8, 8), np.uint8)
+    px = CAMERA.project(np.abs(xyz)).astype(np.float32)
+    cut_patches(grey, px, np.arange(3, dtype=np.int32), patches)
+    maxima = np.array([[CAMERA.cx, CAMERA.cy, 10.0]], np.float32)
+    found = reacquire(
+        np.eye(4), np.arange(3, dtype=np.int32), xyz, np.full(3, 10.0, np.float32), patches,
+        MaximaGrid.build(maxima, 640, 480), grey, CAMERA, ReacquisitionParameters(),
+    )  # fmt: skip
+    assert found.rows.tolist() == [0]
+    assert found.visible.tolist() == [0, 1]
+
+
+def test_patches_at_the_border_stay_empty():
+    patches = np.ones((2, 8, 8), np.uint8)
+    px = np.array([[2.0, 100.0], [637.5, 100.0]], np.float32)
+    cut_patches(texture(), px, np.arange(2, dtype=np.int32), patches)
+    assert not patches.any()
+
+
+def test_colours_are_those_of_the_nearest_pixel():
+    image = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
+    px = np.array([[0.4, 0.4], [3.6, 2.2], [99.0, -7.0]], np.float32)
+    expected = [image[0, 0], image[2, 4], image[0, 4]]
+    np.testing.assert_array_equal(sample_colours(image, px), expected)
+    grey = np.ascontiguousarray(image[..., 1])
+    np.testing.assert_array_equal(sample_colours(grey, px)[:, 0], [e[1] for e in expected])
+
+
+def test_errors_are_distances_to_projections():
+    scene = Scene.box(50)
+    poses = np.array([looking((0.1, 0.0, 0.0)), looking((0.4, 0.1, 0.2), (0.0, 0.05, 0.0))])
+    px = np.array([CAMERA.project(transform(inverse(T), scene.points)) for T in poses])
+    observed = (px + np.array([3.0, 4.0])).astype(np.float32)
+    errors = reprojection_errors(poses[0], scene.points, observed[0], CAMERA)
+    np.testing.assert_allclose(errors, 5.0, atol=1e-3)
+    seen = np.ones((2, 50), np.bool_)
+    seen[1, 7] = False
+    columns = np.array([3, 7], np.int32)
+    table = window_errors(
+        poses, scene.points[columns], observed[..., 0].copy(), observed[..., 1].copy(), seen,
+        columns, CAMERA,
+    )  # fmt: skip
+    np.testing.assert_allclose(table, [[5.0, 5.0], [5.0, 0.0]], atol=1e-3)
+    behind = reprojection_errors(np.eye(4), np.array([[0.0, 0.0, -1.0]]), observed[0, :1], CAMERA)
+    assert np.isinf(behind[0])
+
+
+def localisation_case(outliers):
+    scene = Scene.box(400, seed=3)
+    T = looking((0.2, 0.1, 0.3), (0.02, -0.05, 0.1))
+    px = CAMERA.project(transform(inverse(T), scene.points))
+    ahead = transform(inverse(T), scene.points)[:, 2] > 0.5
+    points, px = scene.points[ahead], px[ahead].astype(np.float32)
+    generator = np.random.default_rng(0)
+    wrong = int(outliers * len(px))
+    px[:wrong] = generator.uniform((0, 0), (640, 480), (wrong, 2))
+    return T, points, px
+
+
+def test_a_near_prediction_suffices():
+    T, points, px = localisation_case(0.3)
+    near = T @ looking((0.03, 0.0, 0.0), (0.0, 0.01, 0.0))
+    found = refine(near, points, px, CAMERA, LocalisationParameters())
+    np.testing.assert_allclose(found.T_world_camera, T, atol=1e-4)
+    assert found.inliers.sum() >= 0.69 * len(px)
+
+
+def test_a_hopeless_prediction_is_mended_by_ransac():
+    T, points, px = localisation_case(0.4)
+    far = T @ looking((2.0, 1.0, -1.0), (0.0, 0.8, 0.0))
+    generator = np.random.default_rng(0)
+    found = locate([far], points, px, CAMERA, LocalisationParameters(), generator)
+    np.testing.assert_allclose(found.T_world_camera, T, atol=1e-3)
+
+
+def test_refined_rotations_stay_rotations():
+    T, points, px = localisation_case(0.0)
+    skewed = T.copy()
+    skewed[:3, :3] *= 1.001
+    R = refine(skewed, points, px, CAMERA, LocalisationParameters()).T_world_camera[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def keyframe_at(number, x):
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return Keyframe(
+        id=number, frame=number, segment=0, T_world_camera=pose, rows=np.array([number], np.int32),
+        points_px=np.zeros((1, 2), np.float32), focus=np.array([x, 0.0, 5.0]),
+    )  # fmt: skip
+
+
+def test_points_are_looked_for_near_the_newest_keyframe_only():
+    keyframes = [keyframe_at(k, 10.0 * k) for k in range(40)]
+    newest = keyframe_at(40, 12.0)
+    near = near_keyframes(keyframes, newest, 3)
+    assert [keyframe.id for keyframe in near] == [0, 1, 2]
+    assert rows_of(near, np.array([7], np.int32), 50).tolist() == [0, 1, 2, 7]
+    assert near_keyframes(keyframes[:2], newest, 3) == keyframes[:2]
+
+
+def test_missing_points_are_mapped_have_no_track_and_wait_after_many_misses():
+    state = np.array([MAPPED, MAPPED, CANDIDATE, MAPPED, MAPPED], np.uint8)
+    misses = np.array([0, 0, 0, 8, 0], np.uint8)
+    rows, marks = np.arange(4, dtype=np.int32), np.full(5, -1, np.int64)
+    linked = np.array([1, -1], np.int32)
+    assert missing_rows(rows, linked, state, misses, marks, 3).tolist() == [0]
+    assert missing_rows(rows, linked, state, misses, marks, 5).tolist() == [0, 3]
+    assert missing_rows(rows, linked[1:], state, misses, marks, 6).tolist() == [0, 1]

@@ -1,0 +1,102 @@
+"""What a camera sees of a mesh, against planes known exactly; surfaces within a distance."""
+
+import numpy as np
+
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import so3_exp
+from pliant.algorithms.meshing import view_mesh
+from pliant.evaluation.criteria import Similarity
+from pliant.evaluation.mesh_truth import Mesh, MeshEvaluation, format_mesh
+from pliant.evaluation.surface_distance import sample_surface, share_within, thin_out
+
+CAMERA = PinholeCamera(width=80, height=60, fx=70.0, fy=75.0, cx=38.5, cy=31.0)
+NONE = np.zeros((0, 3))
+
+
+def wall(z: float = 3.0, cells: int = 20) -> tuple[np.ndarray, np.ndarray]:
+    """A grid of triangles in the plane z, larger than what the camera sees."""
+    side = np.linspace(-4.0, 4.0, cells + 1)
+    x, y = np.meshgrid(side, side)
+    points = np.stack([x, y, np.full_like(x, z)], axis=-1).reshape(-1, 3).astype(np.float32)
+    a = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    b, c, d = a + 1, a + cells + 1, a + cells + 2
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)]).astype(np.int32)
+    return points, faces
+
+
+def test_a_slanted_wall_has_its_exact_depth_and_place_at_every_pixel() -> None:
+    points, faces = wall()
+    T = np.eye(4)
+    T[:3, :3] = so3_exp(np.array([[0.1, -0.3, 0.05]]))[0]
+    T[:3, 3] = (0.2, -0.1, 0.3)
+    view = view_mesh(points, faces, CAMERA, T)
+    assert (view.depths > 0.0).all()
+    u, v = np.meshgrid(np.arange(80.0), np.arange(60.0))
+    rays = np.stack([(u - 38.5) / 70.0, (v - 31.0) / 75.0, np.ones_like(u)], axis=-1)
+    true = (3.0 - T[2, 3]) / (rays @ T[2, :3])
+    np.testing.assert_allclose(view.depths, true, rtol=1e-5)
+    seen = view.interpolate(faces, points)
+    np.testing.assert_allclose(seen, rays * true[..., None] @ T[:3, :3].T + T[:3, 3], atol=1e-4)
+
+
+def test_the_nearest_of_two_walls_is_seen_and_what_lies_behind_is_not_drawn() -> None:
+    near, faces = wall(2.0)
+    far, _ = wall(3.0)
+    behind, _ = wall(-1.0)
+    points = np.concatenate([far, near, behind])
+    everything = np.concatenate([faces, faces + len(near), faces + 2 * len(near)])
+    view = view_mesh(points, everything, CAMERA, np.eye(4))
+    np.testing.assert_allclose(view.depths, 2.0, rtol=1e-6)
+    empty = view_mesh(behind, faces, CAMERA, np.eye(4))
+    assert not empty.depths.any()
+    assert (empty.triangles == -1).all()
+
+
+def test_samples_of_a_wall_and_what_is_within_a_distance() -> None:
+    points, faces = wall()
+    samples = sample_surface(points.astype(np.float64), faces, 0.1)
+    assert abs(len(samples) - 6400) < 80
+    np.testing.assert_allclose(samples[:, 2], 3.0)
+    thin = thin_out(samples, 0.2)
+    assert 1500 < len(thin) <= 1681
+    generator = np.random.default_rng(0)
+    others = np.array([0.0, 0.0, 3.0]) + generator.uniform(-4.0, 4.0, (500, 3))
+    near = np.linalg.norm(others[:, None] - samples, axis=-1).min(axis=1) <= 0.15
+    assert share_within(others, samples, 0.15) == near.mean()
+    assert share_within(others, NONE, 1.0) == share_within(NONE, others, 1.0) == 0.0
+
+
+def evaluate(points: np.ndarray, faces: np.ndarray, scale: float = 1.0) -> MeshEvaluation:
+    normals = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (len(points), 1))
+    mesh = Mesh(points=points, normals=normals, faces=faces)
+    alignment = Similarity(scale=scale, R=np.eye(3), t=np.zeros(3))
+    evaluation = MeshEvaluation(mesh, alignment, CAMERA)
+    evaluation.add(np.full((60, 80), 3.0), np.eye(4), np.eye(4))
+    return evaluation
+
+
+def test_the_true_wall_at_another_scale_is_perfect_but_for_what_the_view_does_not_see() -> None:
+    points, faces = wall()
+    found = evaluate(points / np.float32(2.0), faces, scale=2.0).result()
+    assert found.covered == 1.0
+    assert found.median_error < 1e-6
+    assert found.within == found.recall == 1.0
+    assert found.normal_deg < 0.1
+    seen = (80 / 70.0 * 3.0) * (60 / 75.0 * 3.0) / 64.0
+    assert abs(found.precision - seen) < 0.05
+    assert "100.0 % of the true depth" in format_mesh(found)
+
+
+def test_a_wall_ten_percent_too_far_is_so_until_its_scale_is_fitted() -> None:
+    points, faces = wall(3.3)
+    found = evaluate(points, faces).result()
+    assert abs(found.median_error - 0.1) < 1e-3
+    assert found.within == found.f_score == 0.0
+    assert abs(found.fitted_scale - 1.0 / 1.1) < 1e-3
+    assert found.fitted_median_error < 1e-3
+
+
+def test_no_mesh_covers_nothing() -> None:
+    found = evaluate(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)).result()
+    assert found.covered == found.f_score == 0.0
+    assert np.isnan(found.median_error)

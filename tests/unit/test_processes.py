@@ -1,0 +1,45 @@
+"""The table of processes describes a network that can run."""
+
+import importlib
+
+import pytest
+
+from pliant.messages import topics
+from pliant_services import processes
+from pliant_services.processes import PROCESSES, PROFILES
+
+
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+def test_every_input_has_one_sender_and_no_way_leads_back(profile: str) -> None:
+    fleet = PROFILES[profile]
+    done: set[str] = set()
+    for name in fleet:  # in the order of the table: senders come before their readers
+        senders = set(processes.inputs_of(name, fleet).values())
+        assert senders <= done, f"{name} reads {senders - done}, which come after it"
+        done.add(name)
+
+
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+def test_the_recorder_gets_everything_that_is_logged(profile: str) -> None:
+    fleet = PROFILES[profile]
+    published = {t for name in fleet for t in processes.outputs_of(name)}
+    recorded = set(processes.inputs_of("recorder", fleet))
+    assert recorded == {topic for topic in published if topic.logged}
+    for name in fleet:
+        for topic, readers in processes.readers_of(name, fleet).items():
+            assert ("recorder" in readers) == topic.logged
+
+
+def test_every_topic_of_the_table_is_published_by_one_process() -> None:
+    published = [t.key for process in PROCESSES for t in processes.outputs_of(process.name)]
+    assert len(published) == len(set(published))
+    known = {t.key for t in topics.TOPICS} - {topics.STREAM_END.key}
+    assert {key for key in published if not key.startswith("status/")} == known
+    assert [topics.by_key(key) for key in ("status/anything", "status/", "no/topic")] == [
+        topics.status("anything"), None, None,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("process", PROCESSES, ids=lambda p: p.name)
+def test_every_process_has_a_module_with_run(process: processes.Process) -> None:
+    assert callable(importlib.import_module(process.module).run)

@@ -1,0 +1,220 @@
+"""Surfels and a camera that moves: Eq. 16-22."""
+
+import numpy as np
+import pytest
+from surfel_scene import board_renderer, film, level_of, slanted_surfels, waves
+from surfel_scene import motion as rigid_motion
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse, so3_log
+from pliant.algorithms.surfels import (
+    SurfelParameters,
+    SurfelState,
+    SurfelTracker,
+    learn_equilibrium,
+    motion,
+)
+from pliant.algorithms.surfels.align import make_workspace
+from pliant.algorithms.surfels.birth import make_templates
+from pliant.algorithms.surfels.joint import se3_exp
+from pliant.algorithms.surfels.joint_kernels import evaluate_all, joint_system, rigid_system
+from pliant.algorithms.surfels.sampling import X
+from pliant.algorithms.surfels.table import move_poses
+from pliant.rendering.render import RenderedFrame
+
+SMALL = SurfelParameters(max_surfels=80, levels=2, camera="moving")
+
+
+@pytest.fixture(scope="module")
+def board() -> tuple[list[RenderedFrame], PinholeCamera, list[F64]]:
+    """A camera that moves before a rigid board, noise-free."""
+    motions = [
+        rigid_motion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        rigid_motion((0.003, -0.008, 0.01), (0.006, 0.004, -0.01)),
+        rigid_motion((0.01, -0.016, 0.02), (0.015, 0.004, -0.03)),
+        rigid_motion((0.01, -0.03, 0.03), (0.025, 0.01, -0.05)),
+    ]
+    renderer, camera = board_renderer(motions)
+    return film(renderer, 4), camera, motions
+
+
+@pytest.mark.parametrize("mode", ["moving", "static_map"])
+def test_camera_before_a_rigid_scene(
+    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]], mode: str
+) -> None:
+    frames, camera, motions = board
+    tracker = SurfelTracker(SMALL.model_copy(update={"camera": mode}))
+    first = tracker.start(frames[0].image, frames[0].depth_m, camera)
+    for frame, T in zip(frames[1:], motions[1:], strict=True):
+        result = tracker.track(frame.image)
+        off = inverse(T) @ result.T_world_camera
+        assert np.linalg.norm(off[:3, 3]) < 0.002
+        assert np.linalg.norm(so3_log(off[None, :3, :3])[0]) < 0.002
+        good = result.state == SurfelState.TRACKED
+        assert good.mean() > 0.95
+        error = np.linalg.norm(result.positions - first.positions, axis=1)[good]
+        assert np.median(error) < 0.003
+        if mode == "static_map":
+            np.testing.assert_allclose(result.positions, first.positions, atol=1e-9)
+
+
+def test_static_camera_mode_keeps_the_camera(
+    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
+) -> None:
+    frames, camera, _ = board
+    tracker = SurfelTracker(SMALL.model_copy(update={"camera": "static"}))
+    tracker.start(frames[0].image, frames[0].depth_m, camera)
+    np.testing.assert_array_equal(tracker.track(frames[1].image).T_world_camera, np.eye(4))
+
+
+def problem(seed: int = 0, count: int = 12) -> dict[str, object]:
+    """Surfels a little off their pose in a smooth image, with all sums."""
+    parameters = SurfelParameters(camera="moving")
+    tracker = SurfelTracker(parameters)
+    level, poses = level_of(waves()), slanted_surfels(count, seed)
+    templates = make_templates(poses, level, 23, 1e6, 0.5)
+    rng = np.random.default_rng(seed)
+    poses[:, X : X + 3] += 0.002 * rng.standard_normal((count, 3))
+    work, limits = make_workspace(23, by_template=False), tracker._limits(fine=True)
+    active = np.ones(count, np.uint8)
+    costs, sums, matrices = np.zeros(count), np.zeros((count, 10)), np.zeros((count, 10, 10))
+    evaluate_all(poses, active, level, templates, limits, work, costs, sums, matrices)
+    assert active.all()
+    return {
+        "poses": poses, "active": active, "level": level, "limits": limits, "work": work,
+        "sums": sums, "matrices": matrices,
+    }  # fmt: skip
+
+
+def blocks(p: dict, k: int) -> tuple[F64, F64]:
+    """The 8x8 normal equations of one surfel."""
+    mix, H, g = np.zeros((10, 11)), np.zeros((11, 11)), np.zeros(11)
+    motion.mixing(p["poses"][k], p["level"], 0, False, mix)
+    motion.normal_equations(p["matrices"][k], p["sums"][k], mix, 8, np.zeros((10, 11)), H, g)
+    return H[:8, :8], g[:8]
+
+
+def adjoint(x: F64) -> F64:
+    out = np.eye(6)
+    out[:3, 3:] = [[0.0, x[2], -x[1]], [-x[2], 0.0, x[0]], [x[1], -x[0], 0.0]]
+    return out
+
+
+def test_adjoint_by_finite_differences() -> None:
+    pose = slanted_surfels(seed=3)[:1]
+    A, out = adjoint(pose[0, X : X + 3]), np.zeros(14)
+    for k in range(6):
+        zeta = np.zeros(6)
+        zeta[k] = 1e-6
+        step = np.zeros(11)
+        step[:6] = A @ zeta
+        motion.apply_step(pose[0], step, 0, out)
+        np.testing.assert_allclose(out[:9], move_poses(pose, se3_exp(zeta))[0, :9], atol=1e-11)
+
+
+def test_eliminated_camera_system_is_the_dense_one() -> None:
+    p = problem()
+    n = len(p["poses"])
+    rng = np.random.default_rng(5)
+    equilibrium = p["poses"][:, X : X + 3] + 0.01 * rng.standard_normal((n, 3))
+    roots = 300.0 * rng.standard_normal((n, 3, 3))
+    weights = roots @ roots.transpose(0, 2, 1)
+    own, follow, M, v = np.zeros((n, 11)), np.zeros((n, 11, 6)), np.zeros((6, 6)), np.zeros(6)
+    joint_system(
+        p["poses"], p["active"], p["level"], p["limits"], p["work"], p["sums"], p["matrices"],
+        equilibrium, weights, np.zeros(n), own, follow, M, v,
+    )  # fmt: skip
+    zeta = np.linalg.solve(M, v)
+    dense, right = np.zeros((8 * n + 6, 8 * n + 6)), np.zeros(8 * n + 6)
+    for k in range(n):
+        H, g = blocks(p, k)
+        at = slice(8 * k, 8 * k + 8)
+        dense[at, at] += H
+        right[at] -= g
+        rows = np.zeros((3, 8 * n + 6))
+        rows[:, 8 * k : 8 * k + 3] = np.eye(3)
+        rows[:, -6:] = -adjoint(equilibrium[k])[:3]
+        e = p["poses"][k, X : X + 3] - equilibrium[k]
+        dense += rows.T @ weights[k] @ rows
+        right -= rows.T @ weights[k] @ e
+    scale = 1.0 / np.sqrt(np.diag(dense))
+    x = scale * np.linalg.solve(dense * np.outer(scale, scale), scale * right)
+    np.testing.assert_allclose(zeta, x[-6:], rtol=1e-3, atol=1e-3 * np.abs(x[-6:]).max())
+    steps = own + follow @ zeta
+    for k in range(n):
+        np.testing.assert_allclose(steps[k, :3], x[8 * k : 8 * k + 3], atol=1e-6)
+
+
+def test_rigid_camera_system_is_the_dense_one() -> None:
+    p = problem()
+    n = len(p["poses"])
+    light, M, v = np.zeros((n, 2, 7)), np.zeros((6, 6)), np.zeros(6)
+    rigid_system(
+        p["poses"], p["active"], p["level"], p["limits"], p["work"], p["sums"], p["matrices"],
+        light, M, v,
+    )  # fmt: skip
+    zeta = np.linalg.solve(M, v)
+    dense, right = np.zeros((6 + 2 * n, 6 + 2 * n)), np.zeros(6 + 2 * n)
+    for k in range(n):
+        H, g = blocks(p, k)
+        J = np.zeros((8, 6 + 2 * n))
+        J[:6, :6] = adjoint(p["poses"][k, X : X + 3])
+        J[6:, 6 + 2 * k : 8 + 2 * k] = np.eye(2)
+        dense += J.T @ H @ J
+        right -= J.T @ g
+    x = np.linalg.solve(dense, right)
+    np.testing.assert_allclose(zeta, x[:6], rtol=1e-4, atol=1e-6 * np.abs(x[:6]).max())
+    np.testing.assert_allclose(light @ np.r_[1.0, zeta], x[6:].reshape(n, 2), rtol=1e-3, atol=1e-5)
+
+
+def test_floating_map_ambiguity() -> None:
+    """Eq. 16-19: without the regulariser the image says nothing of the camera."""
+    p = problem()
+    n = len(p["poses"])
+    own, follow, M, v = np.zeros((n, 11)), np.zeros((n, 11, 6)), np.zeros((6, 6)), np.zeros(6)
+    equilibrium = p["poses"][:, X : X + 3].copy()
+    arguments = (
+        p["poses"], p["active"], p["level"], p["limits"], p["work"], p["sums"], p["matrices"],
+        equilibrium,
+    )  # fmt: skip
+    joint_system(*arguments, np.zeros((n, 3, 3)), np.zeros(n), own, follow, M, v)
+    assert not M.any()
+    assert not v.any()
+    assert not follow.any()
+    weights = np.broadcast_to(1e5 * np.eye(3), (n, 3, 3)).copy()
+    joint_system(*arguments, weights, np.zeros(n), own, follow, M, v)
+    assert np.linalg.eigvalsh(M)[0] > 1.0
+    # A camera step and the same step of every surfel leave each image as it is.
+    poses = p["poses"]
+    T = se3_exp(np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.03]))
+    T_cw = np.eye(4)
+    floated = move_poses(move_poses(poses, inverse(T)), T @ T_cw)
+    np.testing.assert_allclose(floated, poses, atol=1e-12)
+
+
+def test_learned_equilibrium() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.standard_normal((5, 3))
+    spread = np.array([0.01, 0.02, 0.05])
+    trajectory = points + spread * rng.standard_normal((4000, 5, 3))
+    trajectory[7, 2] = np.nan
+    mean, covariance = learn_equilibrium(trajectory, 1e-3)
+    np.testing.assert_allclose(mean, points, atol=0.005)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    np.testing.assert_allclose(sigma, np.broadcast_to(spread, (5, 3)), rtol=0.1)
+    trajectory[:, 1] = np.nan
+    with pytest.raises(ValueError, match="point 1"):
+        learn_equilibrium(trajectory, 1e-3)
+
+
+def test_equilibrium_is_set_by_id(
+    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
+) -> None:
+    frames, camera, _ = board
+    tracker = SurfelTracker(SMALL)
+    first = tracker.start(frames[0].image, frames[0].depth_m, camera)
+    some = first.ids[3:6]
+    tracker.set_equilibrium(some, first.positions[3:6], np.broadcast_to(np.eye(3), (3, 3, 3)))
+    with pytest.raises(ValueError, match="not in the map"):
+        tracker.set_equilibrium(np.array([10_000]), np.zeros((1, 3)), np.eye(3)[None])

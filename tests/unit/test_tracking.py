@@ -1,0 +1,141 @@
+"""The tracker as a whole: correct on known motion, deterministic, and unharmed by bad frames."""
+
+import numpy as np
+import pytest
+
+from pliant.algorithms.arrays import F64, U8, check_arrays
+from pliant.algorithms.tracking import ExtremaTracker, TrackingParameters
+from pliant.algorithms.tracks import FrameTracks
+
+HEIGHT, WIDTH = 240, 320
+
+
+def smooth_texture(points_px: F64, seed: int = 3) -> F64:
+    """Grey levels of an endless texture with structure at all scales, at (..., 2) positions."""
+    rng = np.random.default_rng(seed)
+    grey = np.full(points_px.shape[:-1], 120.0)
+    for wavelength in np.geomspace(6.0, 120.0, 60):
+        angle, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+        k = 2.0 * np.pi / wavelength * np.array([np.cos(angle), np.sin(angle)])
+        grey += 1.2 * wavelength**0.5 * np.sin(points_px @ k + phase)
+    return grey
+
+
+def motion(frame: int) -> F64:
+    """(2, 3) affine that maps pixels of frame 0 to this frame: shift, rotation and zoom."""
+    angle, zoom = 0.004 * frame, 1.0 + 0.003 * frame
+    A = zoom * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    centre = np.array([WIDTH, HEIGHT]) / 2.0
+    shift = np.array([3.3 * frame, -1.7 * frame])
+    return np.column_stack([A, centre + shift - A @ centre])
+
+
+def render(frame: int, *, gain: float = 1.0, noise: float = 2.0) -> U8:
+    """The texture as seen in a frame of the known motion."""
+    M = motion(frame)
+    v, u = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
+    inverse = np.linalg.inv(M[:, :2])
+    source = (np.stack([u, v], axis=-1) - M[:, 2]) @ inverse.T
+    rng = np.random.default_rng(frame)
+    grey = gain * smooth_texture(source) + rng.normal(0.0, noise, (HEIGHT, WIDTH))
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def follow(images: list[U8], parameters: TrackingParameters, seed: int = 0) -> list[FrameTracks]:
+    """Track a list of images."""
+    tracker = ExtremaTracker(images[0].shape[1], images[0].shape[0], parameters, seed)
+    return [tracker.track(image) for image in images]
+
+
+@pytest.fixture(scope="module")
+def sequence() -> list[U8]:
+    """Twelve frames of the known motion, with noise and a gain that wobbles by 10 %."""
+    return [render(f, gain=1.0 + 0.1 * np.sin(f)) for f in range(12)]
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        TrackingParameters(max_tracks=3000),
+        TrackingParameters(max_tracks=3000, patch_refinement=False),
+        TrackingParameters(
+            max_tracks=3000, patch_refinement=False, local_flow=False, affine_refit=True
+        ),
+    ],
+)
+def test_tracks_follow_the_known_motion(sequence: list[U8], parameters: TrackingParameters) -> None:
+    results = follow(sequence, parameters)
+    last = results[-1]
+    old = last.ages >= 10
+    assert old.sum() > 100
+    start = results[1]
+    at = np.searchsorted(start.ids, last.ids[old])
+    known = start.ids[np.minimum(at, len(start.ids) - 1)] == last.ids[old]
+    M0, M1 = motion(1), motion(11)
+    origin = (start.points_px[at[known]] - M0[:, 2]) @ np.linalg.inv(M0[:, :2]).T
+    truth = origin @ M1[:, :2].T + M1[:, 2]
+    error = np.linalg.norm(last.points_px[old][known] - truth, axis=1)
+    assert (error < 2.0).mean() > 0.97
+
+
+def test_the_literal_paper_runs(sequence: list[U8]) -> None:
+    literal = TrackingParameters(
+        both_signs=False,
+        mutual_check=False,
+        local_flow=False,
+        deduplicate=False,
+        subpixel=False,
+        patch_refinement=False,
+    )
+    last = follow(sequence, literal)[-1]
+    assert np.all(last.points_px == np.rint(last.points_px))
+    assert (last.ages >= 10).sum() > 50
+
+
+def test_every_frame_keeps_the_contract(sequence: list[U8]) -> None:
+    for result in follow(sequence[:4], TrackingParameters(max_tracks=1000)):
+        check_arrays(result)
+        assert np.all(np.diff(result.ids) > 0)
+        assert len(result.ids) <= 1000
+        assert np.all((result.points_px >= 0) & (result.points_px < [WIDTH, HEIGHT]))
+
+
+def test_same_input_gives_the_same_bytes(sequence: list[U8]) -> None:
+    first = follow(sequence[:5], TrackingParameters(), seed=4)
+    second = follow(sequence[:5], TrackingParameters(), seed=4)
+    for a, b in zip(first, second, strict=True):
+        for name in vars(a):
+            assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
+
+
+@pytest.mark.parametrize("kind", ["black", "saturated", "noise", "bars", "dot", "switching"])
+def test_hopeless_frames_do_no_harm(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    images = []
+    for frame in range(4):
+        image = np.zeros((HEIGHT, WIDTH), np.uint8)
+        if kind == "saturated" or (kind == "switching" and frame % 2):
+            image[:] = 255
+        elif kind == "noise":
+            image = rng.integers(0, 256, image.shape, np.uint8)
+        elif kind == "bars":
+            image[:, ::7] = 200
+        elif kind == "dot":
+            image[100 + frame, 100] = 255
+        images.append(image)
+    for result in follow(images, TrackingParameters()):
+        check_arrays(result)
+        assert np.all(np.isfinite(result.points_px))
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (20, 30), (64, 17), (370, 1226)])
+def test_any_size_of_image_will_do(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(1).integers(0, 256, shape, np.uint8)
+    for result in follow([image, image], TrackingParameters()):
+        check_arrays(result)
+
+
+def test_an_image_of_another_size_is_refused() -> None:
+    tracker = ExtremaTracker(WIDTH, HEIGHT, TrackingParameters())
+    with pytest.raises(ValueError, match="uint8 image of shape"):
+        tracker.track(np.zeros((HEIGHT, WIDTH + 1), np.uint8))

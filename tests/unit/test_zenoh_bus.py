@@ -1,0 +1,224 @@
+"""Flow control over real Zenoh sessions: nothing lost, memory bounded, nobody waits for ever."""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pliant.bus.base import Window
+from pliant.bus.session import free_endpoint, open_router
+from pliant.bus.zenoh_bus import ZenohBus
+from pliant.errors import BusError, MessageError
+from pliant.messages import codec, topics
+from pliant.messages.types import Image
+
+WINDOW = 4
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    found = free_endpoint()
+    router = open_router(found)
+    yield found
+    router.close()
+
+
+def image(frame: int) -> Image:
+    return Image(
+        frame=frame,
+        stamp_ns=frame,
+        frame_id="camera",
+        grey=np.full((48, 64), frame % 256, np.uint8),
+        colour=np.zeros((0, 0, 3), np.uint8),
+    )
+
+
+def reader(endpoint: str, name: str = "tracking") -> ZenohBus:
+    return ZenohBus(
+        endpoints=[endpoint],
+        session="test",
+        service=name,
+        inputs={topics.IMAGE: "ingest"},
+        outputs={},
+        window=WINDOW,
+    )
+
+
+def writer(endpoint: str, *readers: str) -> ZenohBus:
+    return ZenohBus(
+        endpoints=[endpoint],
+        session="test",
+        service="ingest",
+        inputs={},
+        outputs={topics.IMAGE: readers or ("tracking",)},
+        window=WINDOW,
+    )
+
+
+def die(bus: ZenohBus) -> None:
+    """End as a killed process does: without a word."""
+    bus._closing = True
+    bus._wake.set()
+    bus._keeper.join()
+    bus._session.close()
+
+
+def in_thread(function) -> tuple[threading.Thread, list[object]]:
+    result: list[object] = []
+
+    def run() -> None:
+        try:
+            result.append(function())
+        except Exception as error:
+            result.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread, result
+
+
+def test_a_late_reader_gets_every_message_in_order(endpoint: str) -> None:
+    def write() -> None:
+        with writer(endpoint) as bus:
+            for frame in range(50):
+                bus.publish(topics.IMAGE, image(frame))
+            bus.end_all()
+
+    thread, result = in_thread(write)  # waits for the reader's token
+    with reader(endpoint) as bus:
+        frames = [message.frame for message in bus.receive(topics.IMAGE)]
+    thread.join(PATIENCE_S)
+    assert result == [None]
+    assert frames == list(range(50))
+
+
+def test_a_sender_is_never_more_than_a_window_ahead_of_its_slowest_reader(endpoint: str) -> None:
+    sent: list[int] = []
+    window_full = threading.Event()
+
+    def write() -> None:
+        with writer(endpoint, "tracking", "recorder") as bus:
+            for frame in range(20):
+                if frame == WINDOW:
+                    window_full.set()
+                bus.publish(topics.IMAGE, image(frame))
+                sent.append(frame)
+            bus.end_all()
+
+    with reader(endpoint) as fast, reader(endpoint, "recorder") as slow:
+        thread, result = in_thread(write)
+        drained, frames = in_thread(lambda: [m.frame for m in fast.receive(topics.IMAGE)])
+        assert window_full.wait(PATIENCE_S)
+        for taken, message in enumerate(slow.receive(topics.IMAGE)):
+            assert message.frame == taken
+            # The slow reader holds `taken + 1`; the sender may be a window beyond, and no more.
+            assert len(sent) <= taken + 1 + WINDOW
+        thread.join(PATIENCE_S)
+        drained.join(PATIENCE_S)
+    assert result == [None]
+    assert frames == [list(range(20))]
+
+
+def test_a_window_is_bounded_in_bytes_and_opens_when_its_reader_acknowledges(
+    endpoint: str,
+) -> None:
+    size = len(codec.encode(image(0)))
+    sent: list[int] = []
+
+    def write() -> None:
+        with ZenohBus(
+            endpoints=[endpoint],
+            session="test",
+            service="ingest",
+            inputs={},
+            outputs={topics.IMAGE: ["recorder"]},
+            window=WINDOW,
+            windows={"recorder": Window(messages=100, size=3 * size + 10)},
+        ) as bus:
+            for frame in range(9):
+                bus.publish(topics.IMAGE, image(frame))
+                sent.append(frame)
+            bus.end_all()
+
+    with reader(endpoint, "recorder") as bus:
+        thread, result = in_thread(write)
+        taken: list[int] = []
+        for received in bus.receive_any(timeout_s=0.2):
+            entry = bus._inputs[topics.IMAGE.key]
+            assert entry.box.taken - entry.safe <= 3
+            if received is None:  # nothing more comes without credit
+                bus.acknowledge()
+            else:
+                taken.append(received.sequence)
+        bus.acknowledge()
+        thread.join(PATIENCE_S)
+    assert result == [None]
+    assert taken == list(range(10))
+
+
+def test_a_reader_that_dies_is_named(endpoint: str) -> None:
+    bus = reader(endpoint)
+    thread, result = in_thread(lambda: _write_many(endpoint))
+    next(bus.receive(topics.IMAGE))
+    die(bus)
+    thread.join(PATIENCE_S)
+    assert isinstance(result[0], BusError)
+    assert "tracking went away" in str(result[0])
+
+
+def _write_many(endpoint: str) -> None:
+    with writer(endpoint) as bus:
+        for frame in range(1000):
+            bus.publish(topics.IMAGE, image(frame))
+
+
+def test_a_reader_that_died_before_another_came_does_not_stop_the_other(endpoint: str) -> None:
+    with writer(endpoint, "tracking", "recorder") as bus:
+        die(reader(endpoint))
+        with bus._changed:
+            assert bus._changed.wait_for(lambda: "tracking" in bus._peers.gone_since, PATIENCE_S)
+        thread, result = in_thread(lambda: bus.publish(topics.IMAGE, image(0)))
+        with reader(endpoint, "recorder") as late:
+            assert next(late.receive(topics.IMAGE)).frame == 0
+            thread.join(PATIENCE_S)
+            assert result == [None]
+            with pytest.raises(BusError, match="tracking went away"):
+                bus.flush()
+            bus._outputs.clear()  # nothing more to wait for
+
+
+def test_a_sender_that_ignores_credit_fills_no_memory(endpoint: str) -> None:
+    with reader(endpoint) as bus:
+        rude = bus._session.declare_publisher(f"pliant/test/{topics.IMAGE.key}")
+        box = bus._inputs[topics.IMAGE.key].box
+        for sequence in range(10 * WINDOW):
+            rude.put(b"no message", attachment=sequence.to_bytes(8, "little") + b"\x00")
+        with bus._changed:
+            assert bus._changed.wait_for(lambda: len(box.waiting) == box.limit, PATIENCE_S)
+        assert box.limit == 2 * WINDOW
+
+
+def test_a_message_that_readers_would_refuse_is_not_sent(endpoint: str) -> None:
+    small = replace(topics.IMAGE, max_bytes=1000)
+    with writer(endpoint) as bus, pytest.raises(MessageError, match="frame 0 takes"):
+        bus.publish(small, image(0))
+
+
+def test_a_sender_that_dies_is_named(endpoint: str) -> None:
+    with reader(endpoint) as bus:
+        sender = writer(endpoint)
+        sender.publish(topics.IMAGE, image(0))
+        messages = bus.receive(topics.IMAGE)
+        assert next(messages).frame == 0
+        die(sender)
+        with pytest.raises(BusError, match="ingest went away"):
+            next(messages)
+
+
+def test_a_port_in_use_is_one_line(endpoint: str) -> None:
+    with pytest.raises(BusError, match="in use") as caught:
+        open_router(endpoint)
+    assert "\n" not in str(caught.value)
