@@ -123,10 +123,8 @@ class Fleet:
         Raises ServiceDiedError when one fails, or, where services are started again, when one dies
         three times of the same frame.
         """
-        while any(child.process.poll() is None for child in self._children):
-            self._restart_or_raise()
+        while not self._all_left():
             time.sleep(_POLL_S)
-        self._restart_or_raise()
 
     def give_up(self) -> None:
         """Start nobody again from now on."""
@@ -179,28 +177,36 @@ class Fleet:
         )
         return Child(name, process, self._log_folder / f"{name}.log")
 
-    def _restart_or_raise(self) -> None:
-        """Start those that crashed again, if we may; else raise ServiceDiedError."""
+    def _all_left(self) -> bool:
+        """Whether every service has left by itself; those that crashed start again, if they may.
+
+        Raises ServiceDiedError.
+        """
+        over = all(child.process.poll() is not None for child in self._children)
         if self._state is None or self._gave_up:
             self._raise_if_died()
-            return
+            return over
         if all(c.process.poll() == 0 for c in self._children if BY_NAME[c.name].observer):
-            return  # all is on the disk: whoever dies now is not missed
+            return over  # all is on the disk: whoever dies now is not missed
         for index, child in enumerate(self._children):
-            if not child.failed:
-                continue
-            if not child.crashed:
-                raise ServiceDiedError(child.obituary())
-            frame = self._frames.get(child.name, max(self._frames.values(), default=-1)) + 1
-            last, times = self._deaths.get(child.name, (-1, 0))
-            times = times + 1 if frame == last else 1
-            self._deaths[child.name] = (frame, times)
-            if times >= _MOST_DEATHS:
-                raise ServiceDiedError(
-                    f"frame {frame} killed {child.name} {times} times: {child.obituary()}"
-                )
-            child.close()
-            self._children[index] = self._spawn(child.name)
+            if child.failed:
+                self._restart_or_raise(index, child)
+                over = False  # also where all had died at once
+        return over
+
+    def _restart_or_raise(self, index: int, child: Child) -> None:
+        if not child.crashed:
+            raise ServiceDiedError(child.obituary())
+        frame = self._frames.get(child.name, max(self._frames.values(), default=-1)) + 1
+        last, times = self._deaths.get(child.name, (-1, 0))
+        times = times + 1 if frame == last else 1
+        self._deaths[child.name] = (frame, times)
+        if times >= _MOST_DEATHS:
+            raise ServiceDiedError(
+                f"frame {frame} killed {child.name} {times} times: {child.obituary()}"
+            )
+        child.close()
+        self._children[index] = self._spawn(child.name)
 
     def _raise_if_died(self) -> None:
         if not any(child.failed for child in self._children):
