@@ -5,13 +5,14 @@ in   camera/stream    once
      tracks/extrema   every frame
 out  map/update       one per frame: pose, points, keyframes, corrections of earlier poses
      map/final        one, after the last frame: the last corrections
-     map/keyframe     one per frame: a new keyframe with its image, observations of those that leave
+     map/keyframe     one per frame: a new keyframe with its image, observations of those that leave;
+                      as a map starts, the images of the keyframes that it starts from, too
      map/keyframe_final   one, after the last frame: observations of those still in the window
 """
 
 import cv2
 
-from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.map_delta import WAITING, MapDelta
 from pliant.algorithms.mapping import Mapper
 from pliant.bus.base import Bus, join, receive, receive_one, resume
 from pliant.config import Config
@@ -34,11 +35,12 @@ _JPEG_QUALITY = 95
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     """Map until the tracks end."""
 
-    def start() -> tuple[Header, Mapper]:
+    def start() -> tuple[Header, Mapper, dict[int, bytes]]:
         stream = receive_one(bus, topics.STREAM, CameraStream)
-        return stream, Mapper(stream.camera, config.bundle_adjustment, config.seed)
+        return stream, Mapper(stream.camera, config.bundle_adjustment, config.seed), {}
 
-    last, mapper = resume(bus, start)
+    # waiting: images of the frames from which a map may yet start, by frame number.
+    last, mapper, waiting = resume(bus, start)
     images, extrema = receive(bus, topics.IMAGE, Image), receive(bus, topics.EXTREMA, Extrema)
     for image, tracks in join(images, extrema):
         if tracks.missing:
@@ -47,7 +49,11 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
             colour = image.colour if image.colour.size else None
             delta = mapper.process(tracks.frame, tracks, image.grey, colour, monitor.stage)
         bus.publish(topics.MAP_UPDATE, _update(tracks, delta))
-        bus.publish(topics.KEYFRAME, _keyframe(image, mapper))
+        bus.publish(topics.KEYFRAME, _keyframe(image, mapper, delta, waiting))
+        if delta.state == WAITING and not tracks.missing:
+            waiting[tracks.frame] = _jpeg(image)
+            if len(waiting) > config.bundle_adjustment.start.max_frames:
+                del waiting[min(waiting)]
         monitor.report(
             tracks,
             note=delta.reason,
@@ -56,7 +62,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
             points=mapper.point_count,
         )
         last = Header(frame=tracks.frame, stamp_ns=tracks.stamp_ns, frame_id=tracks.frame_id)
-        bus.checkpoint(tracks.frame, (last, mapper))
+        bus.checkpoint(tracks.frame, (last, mapper, waiting))
     with monitor.stage("finish"):
         final = mapper.finish()
     bus.publish(topics.MAP_FINAL, _update(last, final))
@@ -64,9 +70,23 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     monitor.report(last, points=mapper.point_count)
 
 
-def _keyframe(image: Image, mapper: Mapper) -> Keyframe:
+def _keyframe(
+    image: Image, mapper: Mapper, update: MapDelta, waiting: dict[int, bytes]
+) -> Keyframe:
+    """What the frame tells of keyframes.  The images that wait are done with once a map starts."""
     delta = mapper.tell_keyframes()
-    return Keyframe.of(image, delta, jpeg=_jpeg(image) if delta.new >= 0 else b"")
+    if delta.new < 0:
+        return Keyframe.of(image, delta)
+    told = zip(update.keyframe_ids.tolist(), update.keyframe_frames.tolist(), strict=True)
+    earlier = [(keyframe, waiting[frame]) for keyframe, frame in told if frame in waiting]
+    waiting.clear()
+    return Keyframe.of(
+        image,
+        delta,
+        jpeg=_jpeg(image),
+        earlier_ids=tuple(keyframe for keyframe, _ in earlier),
+        earlier_jpegs=tuple(jpeg for _, jpeg in earlier),
+    )
 
 
 def _jpeg(image: Image) -> bytes:

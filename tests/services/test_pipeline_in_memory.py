@@ -137,6 +137,7 @@ def test_every_keyframe_is_told_when_new_and_once_more_when_it_is_settled(
     assert [m.frame for m in told] == [*range(FRAMES), FRAMES - 1]
     history = MapHistory()
     settled: list[int] = []
+    pictured: list[int] = []  # also those from which the map started
     for update, keyframe in zip(
         [*outputs[topics.MAP_UPDATE], *outputs[topics.MAP_FINAL]], told, strict=True
     ):
@@ -148,14 +149,16 @@ def test_every_keyframe_is_told_when_new_and_once_more_when_it_is_settled(
         rows, points = history.points_of(keyframe.point_ids)
         assert len(rows) == len(keyframe.point_ids)  # all of them are points of the map now
         settled += keyframe.keyframe_ids[keyframe.settled].tolist()
+        for number, jpeg in keyframe.images().items():
+            pictured.append(number)
+            pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_UNCHANGED)
+            image = ingested[topics.IMAGE][history.keyframes[number].frame]
+            assert isinstance(image, Image)
+            assert pixels.shape == image.grey.shape  # this sequence has no colours
+            assert np.abs(pixels.astype(int) - image.grey).mean() < 4.0
         if keyframe.new < 0:
             continue
         assert history.keyframes[keyframe.new].frame == keyframe.frame
-        pixels = cv2.imdecode(np.frombuffer(keyframe.jpeg, np.uint8), cv2.IMREAD_UNCHANGED)
-        image = ingested[topics.IMAGE][keyframe.frame]
-        assert isinstance(image, Image)
-        assert pixels.shape == image.grey.shape  # this sequence has no colours
-        assert np.abs(pixels.astype(int) - image.grey).mean() < 4.0
         # Where the points are seen is where they project to.
         T = np.linalg.inv(pose_to_matrix(history.keyframes[keyframe.new].pose_world_camera))
         stream = ingested[topics.STREAM][0]
@@ -163,7 +166,9 @@ def test_every_keyframe_is_told_when_new_and_once_more_when_it_is_settled(
         last = slice(-int(keyframe.counts[-1]), None)
         projected = stream.camera.project(transform(T, points.positions[last]))
         assert np.median(np.abs(projected - keyframe.points_px[last])) < 0.5
-    assert settled == sorted(history.keyframes)
+    assert settled == pictured == sorted(history.keyframes)
+    assert len(told[0].images()) == 0  # type: ignore[attr-defined]
+    assert max(len(m.images()) for m in told) > 2  # type: ignore[attr-defined]
     assert len(settled) > 3
     assert any(m.settled.any() for m in outputs[topics.KEYFRAME])  # type: ignore[attr-defined]
 

@@ -6,7 +6,7 @@ take the preview's place.  The final mesh is made anew from the final poses of a
 images and observations wait on disk.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -79,12 +79,17 @@ class Mesher:
             ("fused", "settled", "passed_over", "without_surface"), 0.0
         )
 
-    def take(self, update: MapDelta, keyframes: KeyframeDelta, jpeg: bytes, frame: int) -> None:
-        """Take in what a frame tells; cheap.  What is to be fused waits for ``fuse``."""
+    def take(
+        self, update: MapDelta, keyframes: KeyframeDelta, images: Mapping[int, bytes], frame: int
+    ) -> None:
+        """Take in what a frame tells; cheap.  What is to be fused waits for ``fuse``.
+
+        images: JPEG files of keyframes by their ids, each told once.
+        """
         self._map.take(update, frame)
         self._view = CorrectedView(self._camera, update.calibration_correction)
-        if keyframes.new >= 0:
-            self._spool.put_image(keyframes.new, jpeg)
+        for keyframe, jpeg in images.items():
+            self._spool.put_image(keyframe, jpeg)
         bounds = np.concatenate([[0], np.cumsum(keyframes.counts)])
         for row, keyframe in enumerate(keyframes.keyframe_ids.tolist()):
             told = slice(int(bounds[row]), int(bounds[row + 1]))
@@ -217,7 +222,7 @@ class Mesher:
         )
 
     def _colour(self, keyframe: int) -> U8 | None:
-        """(H, W, 3) RGB of a keyframe; None for those from which the map started."""
+        """(H, W, 3) RGB of a keyframe; None where its image is missing or broken."""
         jpeg = self._spool.image(keyframe)
         if not jpeg:
             return None

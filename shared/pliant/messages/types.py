@@ -125,9 +125,18 @@ class Keyframe(Header, KeyframeDelta):
     """What a frame tells of keyframes.
 
     jpeg: the rectified image of the new keyframe, colour where the source has it; empty without.
+    earlier_ids, earlier_jpegs: keyframes that earlier frames became now that a map starts from
+    them, and their images.
     """
 
     jpeg: bytes = b""
+    earlier_ids: tuple[int, ...] = ()
+    earlier_jpegs: tuple[bytes, ...] = ()
+
+    def images(self) -> dict[int, bytes]:
+        """All images of this message by the id of the keyframe."""
+        found = dict(zip(self.earlier_ids, self.earlier_jpegs, strict=False))
+        return {**found, self.new: self.jpeg} if self.new >= 0 else found
 
 
 @dataclass(frozen=True, kw_only=True)
