@@ -5,8 +5,8 @@ in   camera/stream    once
      tracks/extrema   every frame
 out  map/update       one per frame: pose, points, keyframes, corrections of earlier poses
      map/final        one, after the last frame: the last corrections
-     map/keyframe     one per frame: a new keyframe with its image, observations of those that leave;
-                      as a map starts, the images of the keyframes that it starts from, too
+     map/keyframe     one per frame: a new keyframe with its image, observations of those that leave
+                      (as a map starts: the images of all keyframes that it starts from)
      map/keyframe_final   one, after the last frame: observations of those still in the window
 """
 
