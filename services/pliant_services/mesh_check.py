@@ -5,6 +5,8 @@ import sys
 
 from pliant.config import Config
 
+WITH_MESH = "rigid"
+"""The profile that makes a mesh."""
 _TIMEOUT_S = 180.0
 _IMPORT = """
 from pliant.errors import PliantError
@@ -25,7 +27,7 @@ def choose_profile(config: Config, *, restartable: bool) -> tuple[str, str]:
             "no mesh while services may be started again: afterwards `pliant mesh` makes it"
         )
     problem = why_no_mesh()
-    return ("points", f"no mesh: {problem}") if problem else ("rigid", "")
+    return ("points", f"no mesh: {problem}") if problem else (WITH_MESH, "")
 
 
 def why_no_mesh() -> str:

@@ -11,10 +11,12 @@ from pliant.algorithms.geometry import pose_to_matrix
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config
 from pliant.errors import RecordingError, ResultError
+from pliant.fusion.memory import check_voxel_sizes
 from pliant.fusion.open3d_import import require_open3d
 from pliant.map_history import MapHistory
+from pliant.messages import topics
 from pliant.messages.topics import Topic
-from pliant.messages.types import Header, MeshPiece, Status
+from pliant.messages.types import CameraStream, Header, MeshPiece, Status
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
 from pliant_services import meshing
@@ -51,13 +53,19 @@ class Meshing:
 
 
 def mesh_recording(recording: Path, config: Config) -> Meshing:
-    """Run the meshing service on a recording.  Raises RecordingError where it has no keyframes."""
+    """Run the meshing service on a recording.
+
+    Raises RecordingError where it has no keyframes; VoxelSizeError before the work starts.
+    """
     reader = Recording(recording)
     inputs = BY_NAME["meshing"].inputs
     known = summarise(recording).topics
     missing = [topic.key for topic in inputs if topic.key not in known]
     if missing:
         raise RecordingError(f"{recording}: without {missing[0]}: `pliant replay` makes it")
+    for stream in reader.decoded(topics.STREAM):
+        assert isinstance(stream, CameraStream)
+        check_voxel_sizes(stream.camera, config.meshing.tsdf)
     found = Meshing()
     bus = ReplayBus(
         {topic: reader.decoded(topic) for topic in inputs}, through_codec=False,

@@ -19,12 +19,14 @@ from pliant import __version__
 from pliant.config import Config, config_yaml, load_config
 from pliant.datasets import open_source
 from pliant.datasets.builtin import builtin_folder, is_builtin
+from pliant.datasets.rectifier import Rectifier
 from pliant.errors import PliantError, ResultError
+from pliant.fusion.memory import check_voxel_sizes
 from pliant.recording import parts
 from pliant_services import warm_up
 from pliant_services.ingest import DROPPED
 from pliant_services.launcher import Fleet
-from pliant_services.mesh_check import choose_profile
+from pliant_services.mesh_check import WITH_MESH, choose_profile
 from pliant_services.mesh_results import FILES as MESH_FILES
 from pliant_services.processes import PROFILES, reads_depth
 from pliant_services.progress import Progress
@@ -104,6 +106,8 @@ def run_pipeline(request: RunRequest) -> int:
         profile, without_mesh = choose_profile(config, restartable=state is not None)
         if without_mesh:
             progress.say(without_mesh)
+        if profile == WITH_MESH:
+            check_voxel_sizes(Rectifier(dataset.calibration).camera, config.meshing.tsdf)
     fleet = Fleet(
         PROFILES[profile],
         log_folder=output / "logs",

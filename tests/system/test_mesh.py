@@ -64,6 +64,17 @@ def test_the_mesh_is_made_again_with_other_parameters(result: Path, tmp_path: Pa
     assert_one_line(pliant("mesh", result, "--output", result), "holds the recording")
 
 
+def test_a_voxel_too_small_for_the_memory_is_refused_before_the_work(
+    result: Path, tmp_path: Path
+) -> None:
+    sets = ("--output", tmp_path / "small", "--set", "meshing.tsdf.fine_voxel=0.0001")
+    for command in (("run", TINY), ("mesh", result)):
+        done = pliant(*command, *sets)
+        assert_one_line(done, "fine_voxel=0.0001 needs")
+        assert "would fit" in done.stderr
+        assert not (tmp_path / "small").exists()
+
+
 def test_the_service_replays_to_the_same_bytes(result: Path, tmp_path: Path) -> None:
     arguments = ("--services", "meshing", "--check", "--output", tmp_path / "again")
     done = pliant("replay", result, *arguments)

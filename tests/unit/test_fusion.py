@@ -5,11 +5,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fusion_scene import BALL, RADIUS, edge_uses, make_view, surface_errors
+from fusion_scene import BALL, CAMERA, RADIUS, edge_uses, make_view, surface_errors
 
 from pliant.algorithms.meshing import BlockMesh, TriangleMesh, TsdfParameters
 from pliant.errors import PliantError
 from pliant.fusion import open3d_import
+from pliant.fusion.memory import (
+    BLOCK_BYTES,
+    SCENE_VIEWS,
+    VoxelSizeError,
+    check_voxel_sizes,
+    view_bytes,
+)
 from pliant.fusion.open3d_import import FusionError, require_open3d
 from pliant.fusion.volume import TsdfVolume, VolumeMemoryError
 
@@ -164,6 +171,32 @@ def test_a_voxel_that_needs_too_much_memory_is_refused_with_one_that_fits() -> N
 
 
 @needs_open3d
+@needs_open3d
+def test_what_a_view_needs_is_known_before() -> None:
+    depth = np.ones((CAMERA.height, CAMERA.width), np.float32)
+    for voxel in (1 / 40, 1 / 120, 1 / 400):
+        volume = TsdfVolume(voxel, PARAMETERS)
+        # Wherever the wall stands in the grid, on average.
+        counts = [
+            len(volume.blocks_needed(depth + np.float32(0.21 * k * voxel), CAMERA, np.eye(4)))
+            for k in range(8)
+        ]
+        known = view_bytes(voxel, CAMERA, PARAMETERS) / BLOCK_BYTES
+        assert 0.6 < known / np.mean(counts) < 1.1
+
+
+def test_a_voxel_that_one_view_cannot_have_is_refused_before_the_work() -> None:
+    small = TsdfParameters(max_memory_mb=20)
+    check_voxel_sizes(CAMERA, small)
+    with pytest.raises(VoxelSizeError, match=r"fine_voxel=0\.001 needs .* MB ") as refused:
+        check_voxel_sizes(CAMERA, small.model_copy(update={"fine_voxel": 0.001}))
+    fitting = float(str(refused.value).split("): ")[1].split()[0])
+    taken = SCENE_VIEWS * view_bytes(fitting, CAMERA, small)
+    assert 0.8 * 20e6 < taken <= 20e6
+    with pytest.raises(VoxelSizeError, match=r"coarse_voxel=0\.0001 "):
+        check_voxel_sizes(CAMERA, small.model_copy(update={"coarse_voxel": 0.0001}))
+
+
 def test_memory_grows_with_the_surface_and_not_with_the_time() -> None:
     volume = TsdfVolume(VOXEL, PARAMETERS)
     volume.integrate(*make_view(0).arguments())

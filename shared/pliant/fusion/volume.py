@@ -33,10 +33,9 @@ from pliant.algorithms.meshing.tsdf_pixels import (
     intrinsics_of,
     pixel_planes,
 )
+from pliant.fusion.memory import BLOCK_BYTES
 from pliant.fusion.open3d_import import FusionError, require_open3d
 
-BLOCK_BYTES = SIDE**3 * 4 * 6
-"""Six int32 a voxel: see ``tsdf_integrate``."""
 _FIRST_BLOCKS = 512
 _GROWTH = 0.6
 """Of surface, blocks grow with one over the voxel squared; at its borders more slowly."""
