@@ -100,8 +100,6 @@ def run_pipeline(request: RunRequest) -> int:
         depth=config.ingest.depth if reads_depth(PROFILES[profile]) else "none",
     )
     progress = Progress(dataset.frame_count)
-    interrupted = False
-    failure: PliantError | None = None
     if profile != _DEFORMABLE:
         profile, without_mesh = choose_profile(config, restartable=state is not None)
         if without_mesh:
@@ -115,6 +113,16 @@ def run_pipeline(request: RunRequest) -> int:
         port=request.port,
         state=state,
     )
+    interrupted, failure = _go_through(request, config, output, fleet, progress)
+    if failure is None and not interrupted:
+        shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
+    return _finish(output, interrupted=interrupted, failure=failure)
+
+
+def _go_through(
+    request: RunRequest, config: Config, output: Path, fleet: Fleet, progress: Progress
+) -> tuple[bool, PliantError | None]:
+    """Start the services and wait for their end: whether it was Ctrl-C, and what went wrong."""
     try:
         warm_up.compile_kernels(progress.say)
         if not request.resume:
@@ -127,16 +135,13 @@ def run_pipeline(request: RunRequest) -> int:
         with announced(output, fleet.endpoint, fleet.session), looking_on, progress:
             fleet.start(lambda name: service_arguments(name, request, output))
             progress.say(f"services are up; look on: pliant view {output}")
-            interrupted = _wait(fleet, progress)
+            return _wait(fleet, progress), None
     except KeyboardInterrupt:
-        interrupted = True
+        return True, None
     except PliantError as error:
-        failure = error
+        return False, error
     finally:
         fleet.close()
-    if failure is None and not interrupted:
-        shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
-    return _finish(output, interrupted=interrupted, failure=failure)
 
 
 def resumed_config(output: Path, request: RunRequest) -> Config:

@@ -38,6 +38,13 @@ def replayable(names: Sequence[str]) -> tuple[Process, ...]:
     return tuple(process for process in PROCESSES if process.name in names)
 
 
+def recorded_services(summary: Summary) -> list[str]:
+    """Names of the services whose outputs the recording holds, but for the source."""
+    return [
+        p.name for p in PROCESSES if p.inputs and any(t.key in summary.topics for t in p.outputs)
+    ]
+
+
 def recorded_config(summary: Summary, overrides: Sequence[str]) -> Config:
     """The configuration of the recording with ``overrides`` on top."""
     return config_of(summary.metadata, overrides)

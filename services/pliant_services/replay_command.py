@@ -19,7 +19,13 @@ from pliant_services.pipeline import (
     summary,
     write_outputs,
 )
-from pliant_services.replay import Replay, recorded_config, replayable, require_images
+from pliant_services.replay import (
+    Replay,
+    recorded_config,
+    recorded_services,
+    replayable,
+    require_images,
+)
 from pliant_services.replay_processes import run_as_processes
 from pliant_services.results import RECORDING_NAME
 
@@ -31,7 +37,7 @@ class ReplayRequest:
     """What the user asked for."""
 
     recording: Path
-    services: Sequence[str]
+    services: Sequence[str]  # without any, all that were recorded
     output: Path | None = None
     force: bool = False
     overrides: Sequence[str] = ()
@@ -48,8 +54,8 @@ def comparable(made: Sequence[Topic], mode: str) -> list[Topic]:
 def run_replay(request: ReplayRequest) -> int:
     """Replay, write the results, compare; returns the exit code.  Raises PliantError."""
     one_thread_each()
-    services = replayable(request.services)
     recorded = summarise(request.recording)
+    services = replayable(request.services or recorded_services(recorded))
     if not recorded.has_index:
         raise RecordingError(
             f"{request.recording}: not closed: `pliant recover` makes a recording that replays"
@@ -63,7 +69,10 @@ def run_replay(request: ReplayRequest) -> int:
         raise ResultError(f"{output} holds the recording itself: choose another --output")
     prepare(output, config_yaml(config))
     metadata = run_metadata(config_yaml(config))
-    metadata["replay"] = {"of": str(request.recording), "services": ",".join(request.services)}
+    metadata["replay"] = {
+        "of": str(request.recording),
+        "services": ",".join(s.name for s in services),
+    }
     made = output / RECORDING_NAME
     replay = Replay(request.recording, recorded, services, config)
     if request.processes:

@@ -45,8 +45,6 @@ def main() -> None:
 
 def run_and_exit() -> None:
     """Run the command line.  Known errors are one line on stderr and an exit code."""
-    from pliant_services.cli import commands  # noqa: F401  (registers the commands)
-
     code = _run()
     try:
         sys.stdout.flush()
@@ -59,6 +57,8 @@ def run_and_exit() -> None:
 
 def _run() -> int:
     try:
+        from pliant_services.cli import commands  # noqa: F401  (registers the commands)
+
         code = app(standalone_mode=False)
     except PliantError as error:
         return _say(str(error), _INCOMPLETE if isinstance(error, SourceLostError) else _FAILED)

@@ -27,7 +27,7 @@ def replay(
         int | None, typer.Option(min=1, max=65535, help="Port of our own router [a free one].")
     ] = None,
     services: Annotated[
-        str, typer.Option("--services", help="Run these on it, separated by commas.")
+        str, typer.Option("--services", help="Run these on it, separated by commas [all recorded].")
     ] = "",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Result folder [<result>_replay].")
@@ -62,10 +62,9 @@ def replay(
     if services or output or force or overrides or check or tolerance or processes:
         from pliant_services.replay_command import ReplayRequest, run_replay
 
-        chosen = services or "tracking,bundle_adjustment"
         again = ReplayRequest(
             recording=file,
-            services=[name for name in chosen.split(",") if name],
+            services=[name for name in services.split(",") if name],
             output=output,
             force=force,
             overrides=overrides or [],

@@ -7,13 +7,14 @@ from typing import Annotated, Any
 import typer
 
 from pliant.errors import PliantError
+from pliant_services.cli.options import Connect, TlsFolder, identity_in
+
+NAMES = "ingest, tracking, bundle_adjustment, meshing, surfels, recorder"
 
 
 def service(
-    name: Annotated[str, typer.Argument(help="ingest, tracking, bundle_adjustment or recorder.")],
-    connect: Annotated[
-        list[str], typer.Option("--connect", help="Router endpoint, e.g. tcp/host:7447.")
-    ],
+    name: Annotated[str, typer.Argument(help=f"One of {NAMES}.")],
+    connect: Connect,
     session: Annotated[str, typer.Option(help="Name of the session to join.")] = "default",
     fleet: Annotated[
         str, typer.Option(help="The services of this session, separated by commas.")
@@ -38,9 +39,7 @@ def service(
         Path | None,
         typer.Option(help="Folder of checkpoints: a service that died goes on where it was."),
     ] = None,
-    tls: Annotated[
-        Path | None, typer.Option(help="Folder that `pliant certs` made, for tls/ endpoints.")
-    ] = None,
+    tls: TlsFolder = None,
     with_launcher: Annotated[
         bool, typer.Option(hidden=True, help="End when standard input closes.")
     ] = False,
@@ -52,7 +51,6 @@ def service(
 
     pliant service tracking --connect tcp/host:7447
     """
-    from pliant.bus.session import Identity
     from pliant.config import load_config
     from pliant_services.host import ServiceOptions, end_with_launcher, run_service
     from pliant_services.processes import BY_NAME, PROFILES, reads_depth
@@ -93,7 +91,7 @@ def service(
         delays_ms=delays_ms,
         patience_s=patience,
         state=state,
-        identity=Identity.in_folder(tls, name) if tls is not None else None,
+        identity=identity_in(tls, name),
     )
     run_service(name, config, options)
 

@@ -10,7 +10,6 @@ that checkpoint; the recorder says what is on its disk.  A state machine: no soc
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 from pliant.bus.base import Window
 from pliant.errors import BusError
@@ -27,11 +26,12 @@ class Reader:
 
 @dataclass(frozen=True)
 class Numbered:
-    """A message with its sequence number."""
+    """A message with its sequence number.  before: bytes of all messages that came before it."""
 
     sequence: int
     kind: int
     payload: bytes
+    before: int = 0
 
 
 class Outbox:
@@ -51,14 +51,16 @@ class Outbox:
         self.topic = topic
         self.readers = {name: Reader() for name in readers}
         self.sent = 0
+        self._bytes = 0  # of all messages so far
         self._window = window
         self._windows = {name: w for name, w in (windows or {}).items() if name in self.readers}
         self._kept: deque[Numbered] = deque()
 
     def add(self, kind: int, payload: bytes) -> Numbered:
         """Number a message and keep it."""
-        message = Numbered(self.sent, kind, payload)
+        message = Numbered(self.sent, kind, payload, self._bytes)
         self.sent += 1
+        self._bytes += len(payload)
         if self.readers:
             self._kept.append(message)
         return message
@@ -106,11 +108,15 @@ class Outbox:
             waiting = self.sent - self.readers[name].safe
             if waiting >= window.messages:
                 return False
-            newest = islice(reversed(self._kept), max(0, waiting))
-            kept = sum(len(message.payload) for message in newest)
-            if waiting > 0 and kept + size > window.size:
+            if waiting > 0 and self._bytes_from(self.readers[name].safe) + size > window.size:
                 return False
         return True
+
+    def _bytes_from(self, sequence: int) -> int:
+        """Bytes kept of the messages from a number on: in every send, so no sum over them."""
+        if not self._kept:
+            return 0
+        return self._bytes - self._kept[max(0, sequence - self._kept[0].sequence)].before
 
     def on_the_way(self) -> int:
         """Messages that the slowest required reader has not taken."""
