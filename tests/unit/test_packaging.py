@@ -1,10 +1,9 @@
 """The wheel holds the two packages and nothing else, and works where it is installed."""
 
 import json
-import math
+import os
 import subprocess
 import sys
-import time
 import tomllib
 import zipfile
 from pathlib import Path
@@ -13,7 +12,6 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 HEAVY = {"cv2", "matplotlib", "numba", "open3d", "scipy", "zenoh"}
-HELP_SECONDS = 2.0
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +38,10 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*command: object, cwd: Path | None = None) -> str:
-    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, cwd=cwd)
+    env = {name: text for name, text in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [str(part) for part in command], capture_output=True, text=True, cwd=cwd, env=env
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -71,17 +72,9 @@ def test_the_wheel_is_any_python_3_and_carries_its_licence(wheel: Path) -> None:
     assert f"Version: {project['version']}" in text
 
 
-def test_help_of_the_installed_wheel_comes_at_once_and_loads_nothing_heavy(
-    installed: Path, tmp_path: Path
-) -> None:
-    command = installed.with_name("pliant")
-    seconds = math.inf
-    for _ in range(3):  # the first start compiles bytecode; the machine may be busy
-        start = time.perf_counter()
-        text = run(command, "--help", cwd=tmp_path)
-        seconds = min(seconds, time.perf_counter() - start)
-    assert "pliant run" in text
-    assert seconds < HELP_SECONDS
+def test_help_of_the_installed_wheel_loads_nothing_heavy(installed: Path, tmp_path: Path) -> None:
+    """So it comes at once; how soon is not for a test to say on a busy machine."""
+    assert "pliant run" in run(installed.with_name("pliant"), "--help", cwd=tmp_path)
     loaded = run(
         installed,
         "-c",
