@@ -20,6 +20,9 @@ from pliant.rendering.scene import Material, Scene, Solid
 
 WIDTH, HEIGHT = 320, 240
 
+EVERYWHERE = np.ones((120, 160))
+"""Depth for the templates of ``waves``, with a bound that is infinite."""
+
 
 def board_renderer(
     motions: list[F64], *, noise: float = 0.0, tilt_rad: float = 0.3, exposure: float = 0.0

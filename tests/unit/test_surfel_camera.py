@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from surfel_scene import board_renderer, film, level_of, slanted_surfels, waves
+from surfel_scene import EVERYWHERE, board_renderer, film, level_of, slanted_surfels, waves
 from surfel_scene import motion as rigid_motion
 
 from pliant.algorithms.arrays import F64
@@ -73,7 +73,7 @@ def problem(seed: int = 0, count: int = 12) -> dict[str, object]:
     parameters = SurfelParameters(camera="moving")
     tracker = SurfelTracker(parameters)
     level, poses = level_of(waves()), slanted_surfels(count, seed)
-    templates = make_templates(poses, level, 23, 1e6, 0.5)
+    templates = make_templates(poses, level, 23, 1e6, 0.5, EVERYWHERE, np.inf)
     rng = np.random.default_rng(seed)
     poses[:, X : X + 3] += 0.002 * rng.standard_normal((count, 3))
     work, limits = make_workspace(23, by_template=False), tracker._limits(fine=True)

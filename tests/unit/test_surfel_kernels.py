@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from surfel_scene import level_of, slanted_surfels, waves
+from surfel_scene import EVERYWHERE, level_of, slanted_surfels, waves
 
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.surfels import motion
@@ -140,7 +140,7 @@ def test_jacobians_by_finite_differences(model: int, seed: int) -> None:
 def test_template_jacobian_is_the_frame_jacobian_where_they_agree() -> None:
     image, poses = waves(), slanted_surfels(seed=2)
     level = level_of(image)
-    templates = make_templates(poses, level, SIDE, HIGH, 0.5)
+    templates = make_templates(poses, level, SIDE, HIGH, 0.5, EVERYWHERE, np.inf)
     pose = poses[0].copy()
     pose[GAIN], pose[BIAS] = 0.5, 7.0
     darker = (2.0 * (image - templates.means[0] - 7.0) + templates.means[0]).astype(np.float32)
@@ -176,7 +176,7 @@ def test_template_jacobian_is_the_frame_jacobian_where_they_agree() -> None:
 def test_template_sums_against_numpy() -> None:
     image, poses = waves(), slanted_surfels(seed=5)
     level = level_of(image)
-    templates = make_templates(poses, level, SIDE, HIGH, 0.5)
+    templates = make_templates(poses, level, SIDE, HIGH, 0.5, EVERYWHERE, np.inf)
     moved = poses[0].copy()
     moved[X] += 0.02
     grid, h, out, tau = make_grid(SIDE), np.zeros(9), np.zeros(FEATURES), 8.0
@@ -199,7 +199,7 @@ def test_template_sums_against_numpy() -> None:
 def normal_matrix(model: int, omega: float) -> tuple[F64, F64]:
     image, poses = waves(), slanted_surfels(seed=6)
     level, n = level_of(image), motion.parameter_count(model)
-    templates = make_templates(poses, level, 23, HIGH, 0.5)
+    templates = make_templates(poses, level, 23, HIGH, 0.5, EVERYWHERE, np.inf)
     mix = np.zeros((FEATURES, motion.MOST_PARAMETERS))
     motion.mixing(poses[0], level, model, True, mix)
     H, g = np.zeros((motion.MOST_PARAMETERS,) * 2), np.zeros(motion.MOST_PARAMETERS)

@@ -49,7 +49,7 @@ def test_recovery_without_noise(
         result = tracker.track(frame.image)
         truth = transform(inverse(T), first.positions)
         good = result.state == SurfelState.TRACKED
-        assert good.mean() >= (0.95 if jacobian == "frame" else 0.75)
+        assert good.mean() >= (0.95 if jacobian == "frame" else 0.7)
         error = np.linalg.norm(result.positions - truth, axis=1)[good]
         assert np.median(error) < 0.003
         lateral = np.linalg.norm(camera.project(truth) - result.points_px, axis=1)[good]
@@ -177,6 +177,40 @@ def test_births_fill_what_is_free(
     assert len(result.ids) == 60
     np.testing.assert_array_equal(result.ids[: len(first.ids)], first.ids)
     assert (result.born[len(first.ids) :] == 1).all()
+
+
+def test_a_background_without_depth_is_no_part_of_the_texture(
+    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
+) -> None:
+    """A surface that moves before one that does not: the still part must not hold the patch."""
+    frames, camera, motions = board
+    depth = frames[0].depth_m.copy()
+    depth[:, 150:] = 0.0
+    shown = frames[1].image.copy()
+    edge = camera.project(transform(inverse(motions[1]), camera_points(camera, depth, 150)))
+    right = np.arange(WIDTH)[None, :] >= np.median(edge[:, 0])
+    shown[right.repeat(HEIGHT, 0)] = 20
+    frozen = frames[0].image.copy()
+    frozen[:, 150:] = 20
+    tracker = SurfelTracker(SMALL.model_copy(update={"levels": 1}))
+    first = tracker.start(frozen, depth, camera)
+    near = np.flatnonzero(first.points_px[:, 0] > 150 - 11)
+    assert len(near)
+    background = tracker._table.templates[0].images[near, 0] > 1e6
+    assert (background.sum(axis=1) > 0).all()
+    result = tracker.track(shown)
+    truth = transform(inverse(motions[1]), first.positions)
+    error = np.linalg.norm(result.positions - truth, axis=1)[near]
+    assert np.median(error) < 0.004
+    assert result.visible[near].min() > 0.8
+
+
+def camera_points(camera: PinholeCamera, depth: F64, column: int) -> F64:
+    """(H, 3) points of the column left of ``column``."""
+    rows = np.arange(camera.height)
+    pixels = np.stack([np.full(len(rows), column - 1.0), rows], axis=1)
+    rays = np.concatenate([camera.normalise(pixels), np.ones((len(rows), 1))], axis=1)
+    return rays * depth[rows, column - 1][:, None]
 
 
 def test_no_texture_and_no_depth_give_no_surfels() -> None:

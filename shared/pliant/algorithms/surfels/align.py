@@ -29,6 +29,7 @@ class Templates(NamedTuple):
 
     images: F32  # (N, 3, n) grey levels without their mean, derivatives along i and j
     means: F64  # (N,) grey levels
+    counts: F64  # (N,) samples that the template has
     matrices: F64  # (N, FEATURES, FEATURES) sums of products of the template's features
     usable: U8  # (N,) 1 where enough of the patch lay in the image at birth
 
@@ -119,8 +120,8 @@ def patch_step_px(before: F64, after: F64, half: float) -> float:
 
 @fast_kernel
 def align(
-    pose: F64, level: Level, images: F32, mean: float, template_matrix: F64, limits: Limits,
-    work: Workspace,
+    pose: F64, level: Level, images: F32, mean: float, count: float, template_matrix: F64,
+    limits: Limits, work: Workspace,
 ) -> tuple[float, int]:  # fmt: skip
     """Minimise Eq. 11 (hard) or Eq. 13 (soft) from ``pose``, which is overwritten.
 
@@ -137,6 +138,8 @@ def align(
         return cost, 1
     before[:] = work.h
     cost += limits.omega_i * motion.deformation_energy(pose)
+    # Samples that the template lacks cost the same everywhere; slack is a share of the others.
+    lacking = limits.tau * limits.tau * (images.shape[1] - count)
     damping, accepted, fresh = limits.start_lambda, 0, True
     for iteration in range(limits.iterations):
         if fresh:
@@ -156,7 +159,7 @@ def align(
         front = next_cost >= 0.0
         next_cost += limits.omega_i * motion.deformation_energy(candidate)
         moved = patch_step_px(before, work.h, half) if front else 1e9
-        if front and next_cost < cost * (1.0 + limits.slack):
+        if front and next_cost < cost + limits.slack * (cost - lacking):
             pose[:POSE_FLOATS] = candidate
             before[:] = work.h
             cost, fresh, accepted = next_cost, True, accepted + 1
@@ -187,7 +190,7 @@ def align_all(
     for k in range(len(poses)):
         if active[k] and templates.usable[k]:
             _, used = align(
-                poses[k], level, templates.images[k], templates.means[k],
+                poses[k], level, templates.images[k], templates.means[k], templates.counts[k],
                 templates.matrices[k], limits, work,
             )  # fmt: skip
             evaluations += used

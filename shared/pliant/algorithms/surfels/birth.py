@@ -1,5 +1,6 @@
 """New surfels from an image and its depth (DSDT, section III)."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,7 +64,8 @@ def find_births(
     )
     poses = place(corners[:, :2], depth, camera, p)
     templates = [
-        make_templates(poses, each, p.patch_px, p.highlight, p.min_template) for each in pyramid
+        make_templates(poses, each, p.patch_px, p.highlight, p.min_template, depth, p.max_off_plane)
+        for each in pyramid
     ]
     rows = np.flatnonzero(templates[0].usable)[: max(count, 0)]
     return Births(poses[rows], [select(each, rows) for each in templates])
@@ -104,31 +106,61 @@ def place(points_px: F64, depth: F64, camera: PinholeCamera, p: SurfelParameters
 
 
 def make_templates(
-    poses: F64, level: Level, side: int, highlight: float, min_share: float
-) -> Templates:
-    """Textures on the surfels' own grids at one level, and their derivatives along the grid."""
+    poses: F64, level: Level, side: int, highlight: float, min_share: float, depth: F64,
+    max_off_plane: float,
+) -> Templates:  # fmt: skip
+    """Textures on the surfels' own grids at one level, and their derivatives along the grid.
+
+    depth: (H, W) metres of the full-size image.  What is not of the surfel's own plane takes no
+    part: a background that stays where it is would hold the patch, or tear it along the ray.
+    """
     n = len(poses)
     templates = Templates(
         np.zeros((n, TEMPLATE_IMAGES, side * side), np.float32),
+        np.zeros(n),
         np.zeros(n),
         np.zeros((n, FEATURES, FEATURES)),
         np.zeros(n, np.uint8),
     )
     scratch = make_features(side)
-    _fill(poses, level, make_grid(side + 2), highlight, min_share, templates, scratch)
+    wide = make_grid(side + 2)
+    _fill(poses, level, wide, highlight, min_share, depth, max_off_plane, templates, scratch)
     return templates
 
 
 @fast_kernel
+def _leave_out_other_surfaces(h: F64, level: Level, wide: Grid, depth: F64, bound: float) -> None:
+    """Make invalid what has no depth, or one off the plane by more than a share of ``bound``.
+
+    A pixel of a coarse level covers several of the depth map: its middle and corners are looked at.
+    """
+    height, width = depth.shape
+    scale = width // level.width
+    for k in range(len(wide.i)):
+        z = h[6] * wide.i[k] + h[7] * wide.j[k] + h[8]
+        u = (h[0] * wide.i[k] + h[1] * wide.j[k] + h[2]) / z
+        v = (h[3] * wide.i[k] + h[4] * wide.j[k] + h[5]) / z
+        for corner in range(5):
+            du = 0.0 if corner == 4 else (0.5 if corner & 1 else -0.5)
+            dv = 0.0 if corner == 4 else (0.5 if corner & 2 else -0.5)
+            column = math.floor((u + du + 0.5) * scale)
+            row = math.floor((v + dv + 0.5) * scale)
+            column, row = min(max(column, 0), width - 1), min(max(row, 0), height - 1)
+            if not abs(depth[row, column] - z) <= bound * z:
+                wide.values[k] = np.float32(INVALID)
+
+
+@fast_kernel
 def _fill(
-    poses: F64, level: Level, wide: Grid, highlight: float, min_share: float,
-    templates: Templates, scratch: F32,
+    poses: F64, level: Level, wide: Grid, highlight: float, min_share: float, depth: F64,
+    max_off_plane: float, templates: Templates, scratch: F32,
 ) -> None:  # fmt: skip
     h, sums = np.empty(9), np.empty(FEATURES)
     side = wide.side - 2
     for s in range(len(poses)):
         if not homography(poses[s], level, h) or not sample_patch(h, level, wide, highlight):
             continue
+        _leave_out_other_surfaces(h, level, wide, depth, max_off_plane)
         images = templates.images[s]
         count, total, squares = 0, 0.0, 0.0
         for row in range(side):
@@ -146,7 +178,7 @@ def _fill(
         if count < min_share * side * side:
             continue
         mean = total / count
-        templates.means[s] = mean
+        templates.means[s], templates.counts[s] = mean, count
         # A sample that the template lacks is saturated in every frame.
         for n in range(side * side):
             if images[0, n] < _FAR:
@@ -158,7 +190,9 @@ def _fill(
 def select(templates: Templates, rows: I64) -> Templates:
     """The templates of some surfels, copied."""
     t = templates
-    return Templates(t.images[rows], t.means[rows], t.matrices[rows], t.usable[rows])
+    return Templates(
+        t.images[rows], t.means[rows], t.counts[rows], t.matrices[rows], t.usable[rows]
+    )
 
 
 def join(first: Templates, second: Templates) -> Templates:
@@ -166,6 +200,7 @@ def join(first: Templates, second: Templates) -> Templates:
     return Templates(
         np.concatenate([first.images, second.images]),
         np.concatenate([first.means, second.means]),
+        np.concatenate([first.counts, second.counts]),
         np.concatenate([first.matrices, second.matrices]),
         np.concatenate([first.usable, second.usable]),
     )

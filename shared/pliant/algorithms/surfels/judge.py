@@ -13,11 +13,12 @@ from pliant.algorithms.surfels.sampling import BIAS, GAIN, Grid, Level, homograp
 from pliant.algorithms.surfels.sums import correlation
 
 FRONT, INSIDE, SEEN, CORRELATION, SIGMA, U, V, VERDICTS = 0, 1, 2, 3, 4, 5, 6, 7
-"""Columns of a verdict: in front of the camera (0 or 1), shares of the patch inside of the image
+"""Columns of a verdict: in front of the camera (0 or 1), shares of the texture inside of the image
 and seen, ZNCC, standard deviation of the position (metres), pixel of the centre."""
 
 _MIN_NOISE = 0.5  # DN: quantisation alone makes this much of a difference of two images
 _MAX_SIGMA = 1e3
+_FAR = 1e6
 
 
 @fast_kernel
@@ -30,7 +31,6 @@ def judge_all(
     grid: of the side of the templates.  The pixel is left alone where a surfel is not in front.
     """
     parameters = motion.parameter_count(limits.model)
-    n = len(grid.i)
     for s in range(len(poses)):
         if not active[s]:
             continue
@@ -45,13 +45,14 @@ def judge_all(
         images, m = templates.images[s], templates.means[s]
         gain, bias = pose[GAIN], pose[BIAS]
         inside = seen = squares = 0.0
-        for k in range(n):
+        count = templates.counts[s]
+        for k in range(len(grid.i)):
             r = gain * (grid.values[k] - m) + bias - images[0, k]
             good = abs(r) < limits.tau
-            inside += grid.valid[k]
+            inside += grid.valid[k] if images[0, k] < _FAR else 0.0
             seen += 1.0 if good else 0.0
             squares += r * r if good else 0.0
-        verdict[INSIDE], verdict[SEEN] = inside / n, seen / n
+        verdict[INSIDE], verdict[SEEN] = inside / count, seen / count
         verdict[CORRELATION], _ = correlation(images[0], grid.values)
         if seen < parameters:
             continue

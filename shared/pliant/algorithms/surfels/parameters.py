@@ -82,8 +82,17 @@ class SurfelParameters(Parameters):
         description="Steepest surface at birth: relative change of depth per unit of normalised "
         "coordinate.",
     )
+    max_off_plane: float = Field(
+        default=0.03,
+        gt=0.0,
+        description="Pixels whose depth is missing, or off a new surfel's plane by more than this "
+        "share, are no part of its texture.",
+    )
     min_template: float = Field(
-        default=0.6, gt=0.0, le=1.0, description="Least share of a patch inside of the image."
+        default=0.6,
+        gt=0.0,
+        le=1.0,
+        description="Least share of a patch inside of the image and on the surfel's plane.",
     )
 
     jacobian: Literal["template", "frame"] = Field(
