@@ -4,8 +4,8 @@ processes."""
 from typing import Any
 
 from pliant.bus.health import health_key
-from pliant.bus.zenoh_bus import STOP_KEY
-from pliant_services.processes import PROCESSES, outputs_of
+from pliant.bus.zenoh_bus import OVER_KEY, STOP_KEY
+from pliant_services.processes import BY_NAME, PROCESSES, outputs_of
 
 OPERATOR = "operator"
 """May look at every session and end it; also the name of viewers' certificates."""
@@ -38,9 +38,10 @@ def access_control() -> dict[str, Any]:
 def may_write(name: str) -> tuple[str, ...]:
     """The keys that a holder of this certificate may publish."""
     if name == OPERATOR:
-        return (f"pliant/*/{STOP_KEY}",)
+        return (f"pliant/*/{STOP_KEY}", "pliant/*/viewer/*")
     own = [topic.key for topic in outputs_of(name)]
     keys = [*own, health_key(name), f"credit/**/{name}", f"ready/{name}/**"]
+    keys += [OVER_KEY] if BY_NAME[name].observer else []
     return tuple(f"pliant/*/{key}" for key in keys)
 
 

@@ -37,6 +37,7 @@ class ServiceOptions:
     patience_s: how long peers may be away; the configuration's if None.
     state: folder of the session's checkpoints, where services are started again; else None.
     identity: the service's certificate, for endpoints such as tls/host:7447.
+    alive: file that is touched once a second as long as the service is well.
     """
 
     endpoints: Sequence[str]
@@ -47,6 +48,7 @@ class ServiceOptions:
     patience_s: float | None = None
     state: Path | None = None
     identity: Identity | None = None
+    alive: Path | None = None
 
 
 def run_service(name: str, config: Config, options: ServiceOptions) -> None:
@@ -91,6 +93,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
         windows=observer_windows(config, options.fleet),
         disturb=random_delays(options.delays_ms),
         identity=options.identity,
+        on_tick=options.alive.touch if options.alive is not None else None,
     ) as bus:
         if interrupted is not None:
             arguments["stopping"] = lambda: interrupted() or bus.stop_requested

@@ -83,7 +83,7 @@ def run_mesh(
     config = recorded_config(summarise(recording), overrides)
     require_open3d()
     folder = recording.resolve().parent
-    output = output or folder.with_name(f"{folder.name}_mesh")
+    output = output or _beside(folder)
     if output.resolve() == folder:
         raise ResultError(f"{output} holds the recording itself: choose another --output")
     check_output(output, force=force)
@@ -110,6 +110,15 @@ def run_mesh(
             f"{recording}: no keyframe has a surface: {' '.join(found.notes[-1:])}"
         )
     yield f"results in {output}/"
+
+
+def is_meshed(result: Path, output: Path | None) -> bool:
+    """Whether the mesh of a result folder is there, whole: its report is written last."""
+    return ((output or _beside(result.resolve())) / REPORT_NAME).exists()
+
+
+def _beside(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}_mesh")
 
 
 def write_all(output: Path, found: Meshing, history: MapHistory) -> None:

@@ -202,8 +202,11 @@ def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> 
         print(f"results in {output}/: {', '.join(files)}")
     if failure is not None:
         raise failure
-    if interrupted:
-        return INTERRUPTED
+    return INTERRUPTED if interrupted else grade(report)
+
+
+def grade(report: dict[str, Any]) -> int:
+    """The exit code of a run with this report."""
     whole = report["complete"] and not (_broken(report) or report["ended_early"])
     return DONE if report["segments"] and whole else INCOMPLETE
 

@@ -29,6 +29,10 @@ class BusError(PliantError):
     """A peer cannot be reached, or a port is in use."""
 
 
+class SessionOverError(BusError):
+    """Nothing is left to do: everything of the session is on the recorder's disk."""
+
+
 class RecordingError(PliantError):
     """A recording cannot be written or read."""
 

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
@@ -71,3 +72,40 @@ def test_an_empty_router_has_no_services_and_no_session(endpoint: str) -> None:
     assert (shown.returncode, "no services" in shown.stderr) == (1, True)
     stopped = call("stop", "--connect", endpoint, "--session", "none")
     assert (stopped.returncode, "no session none" in stopped.stderr) == (1, True)
+
+
+def test_a_session_without_a_launcher_writes_its_results_and_ends_its_router(
+    tmp_path: Path,
+) -> None:
+    """Started again when it is over, as by what starts services again: nothing is done twice."""
+    output = tmp_path / "recording.mcap"
+    extra = {
+        "ingest": ["--source", "built-in:tiny"],
+        "recorder": ["--output", str(output), "--results"],
+    }
+    written: list[bytes] = []
+    for _ in range(2):
+        found = free_endpoint()
+        common = ["--connect", found, "--session", "lab", "--state", str(tmp_path / "state")]
+        with ExitStack() as running:
+            parts = [running.enter_context(start("router", "--listen", found, "--once"))]
+            for name in PROFILES["points"]:
+                arguments = ["service", name, *common, *extra.get(name, [])]
+                parts.append(running.enter_context(start(*arguments)))
+            said = [part.communicate(timeout=300)[0] for part in parts]
+            assert [part.returncode for part in parts] == [0] * len(parts), said
+        assert {path.name for path in tmp_path.iterdir()} == {
+            *("recording.mcap", "config.yaml", "report.json", "points.ply", "keyframes.txt"),
+            *("trajectory.txt", "trajectory_causal.txt", "state"),
+        }
+        written.append((tmp_path / "trajectory.txt").read_bytes() + output.read_bytes())
+    assert "40 frames" not in "".join(said)
+    assert written[0] == written[1]
+
+
+def test_results_go_to_no_folder_with_another_recording(endpoint: str, tmp_path: Path) -> None:
+    (tmp_path / "recording.mcap").write_bytes(b"of another session")
+    output, state = str(tmp_path / "recording.mcap"), str(tmp_path / "state")
+    arguments = ["--connect", endpoint, "--output", output, "--results", "--state", state]
+    done = call("service", "recorder", *arguments)
+    assert (done.returncode, "choose another folder" in done.stderr) == (1, True)

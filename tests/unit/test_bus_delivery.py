@@ -12,7 +12,7 @@ from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.bus.inbox import Inbox
 from pliant.bus.outbox import Numbered, Outbox
 from pliant.bus.peers import WIRE_VERSION, Peers
-from pliant.errors import BusError
+from pliant.errors import BusError, SessionOverError
 from pliant.messages import topics
 
 WINDOW = 4
@@ -149,3 +149,19 @@ def test_the_newest_checkpoint_that_readers_allow_is_used(tmp_path) -> None:
     ]
     assert again.restart_from(place) == b"state 19"
     assert [path.name for path in (tmp_path / "tracking").iterdir()] == ["000000019.state"]
+
+
+def test_who_was_here_before_us_is_not_awaited_for_ever() -> None:
+    peers = Peers("ingest", incarnation=5)
+    peers.on_token(f"pliant/s/ready/tracking/1/{WIRE_VERSION}/0.1.0", alive=True, now=0.0)
+    peers.expect(["tracking", "recorder"], now=1.0)
+    assert peers.lost(["tracking", "recorder"], patience_s=60.0, now=60.0) == []
+    assert peers.lost(["tracking", "recorder"], patience_s=60.0, now=61.0) == ["recorder"]
+
+
+def test_nobody_waits_once_the_session_is_over() -> None:
+    peers = Peers("ingest", incarnation=5)
+    peers.raise_if_refused()
+    peers.over = True
+    with pytest.raises(SessionOverError, match="ingest"):
+        peers.raise_if_refused()

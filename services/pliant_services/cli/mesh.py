@@ -12,6 +12,12 @@ def mesh(
         Path | None, typer.Option("--output", "-o", help="Result folder [<result>_mesh].")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Write into an existing folder.")] = False,
+    when_over: Annotated[
+        bool,
+        typer.Option(
+            "--when-over", help="Wait for the end of the session that writes there; once only."
+        ),
+    ] = False,
     overrides: Annotated[
         list[str] | None,
         typer.Option("--set", help="KEY=VALUE over the recorded configuration; may be repeated."),
@@ -24,9 +30,19 @@ def mesh(
     pliant mesh results/room --set meshing.surface.smoothing=none --output results/raw
     """
     from pliant_services.cli.info import recording_file
-    from pliant_services.mesh_command import run_mesh
+    from pliant_services.mesh_command import is_meshed, run_mesh
 
+    if when_over:
+        from pliant_services.pipeline import STATE_FOLDER
+        from pliant_services.session_end import wait_until_over
+
+        wait_until_over(recording / STATE_FOLDER)
+        if is_meshed(recording, output):
+            return
     for line in run_mesh(
-        recording_file(recording), output=output, force=force, overrides=overrides or []
+        recording_file(recording),
+        output=output,
+        force=force or when_over,
+        overrides=overrides or [],
     ):
         typer.echo(line)

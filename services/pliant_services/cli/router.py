@@ -15,6 +15,9 @@ def router(
         Path | None,
         typer.Option(help="Folder that `pliant certs` made: who may publish what, by certificate."),
     ] = None,
+    once: Annotated[
+        bool, typer.Option("--once", help="Leave when the first session is over.")
+    ] = False,
 ) -> None:
     """Run a router until Ctrl-C.  Services on any machine connect to it.
 
@@ -26,6 +29,7 @@ def router(
     import threading
 
     from pliant.bus.session import Identity, open_router
+    from pliant.bus.zenoh_bus import OVER_KEY
     from pliant_services.access import access_control
 
     stopped = threading.Event()
@@ -38,6 +42,8 @@ def router(
         identity=Identity.in_folder(tls, "router") if tls is not None else None,
         access_control=access_control() if secure else None,
     )
+    if once:
+        session.declare_subscriber(f"pliant/*/{OVER_KEY}", lambda _: stopped.set())
     typer.echo(f"router on {', '.join(endpoints)}", err=True)
     stopped.wait()
     session.close()  # type: ignore[no-untyped-call]

@@ -2,12 +2,15 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pliant.errors import PliantError
 from pliant_services.cli.options import Connect, TlsFolder, identity_in
+
+if TYPE_CHECKING:
+    from pliant.config import Config
 
 NAMES = "ingest, tracking, bundle_adjustment, meshing, surfels, recorder"
 
@@ -32,6 +35,9 @@ def service(
     metadata: Annotated[
         Path | None, typer.Option(help="recorder: JSON of metadata records to keep.")
     ] = None,
+    results: Annotated[
+        bool, typer.Option("--results", help="recorder: at the end write the results beside it.")
+    ] = False,
     patience: Annotated[
         float | None, typer.Option(help="Seconds that peers may be away [bus.patience_s].")
     ] = None,
@@ -40,6 +46,9 @@ def service(
         typer.Option(help="Folder of checkpoints: a service that died goes on where it was."),
     ] = None,
     tls: TlsFolder = None,
+    alive: Annotated[
+        Path | None, typer.Option(help="File to touch once a second, for health checks.")
+    ] = None,
     with_launcher: Annotated[
         bool, typer.Option(hidden=True, help="End when standard input closes.")
     ] = False,
@@ -54,6 +63,7 @@ def service(
     from pliant.config import load_config
     from pliant_services.host import ServiceOptions, end_with_launcher, run_service
     from pliant_services.processes import BY_NAME, PROFILES, reads_depth
+    from pliant_services.session_end import run_alone
 
     if with_launcher:
         end_with_launcher()
@@ -82,7 +92,7 @@ def service(
         if output is None:
             raise PliantError("recorder needs --output: the MCAP file to write")
         arguments["output"] = output
-        arguments["metadata"] = _read_metadata(metadata) if metadata is not None else {}
+        arguments["metadata"] = _metadata(metadata, config)
     options = ServiceOptions(
         endpoints=connect,
         session=session,
@@ -92,11 +102,20 @@ def service(
         patience_s=patience,
         state=state,
         identity=identity_in(tls, name),
+        alive=alive,
     )
-    run_service(name, config, options)
+    if with_launcher:
+        run_service(name, config, options)
+    else:
+        raise typer.Exit(run_alone(name, config, options, results=results))
 
 
-def _read_metadata(file: Path) -> dict[str, dict[str, str]]:
+def _metadata(file: Path | None, config: "Config") -> dict[str, dict[str, str]]:
+    if file is None:
+        from pliant.config import config_yaml
+        from pliant_services.pipeline import run_metadata
+
+        return run_metadata(config_yaml(config))
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

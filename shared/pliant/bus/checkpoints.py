@@ -54,6 +54,11 @@ class Checkpoints:
             place.frame: place for place in (_read_place(p) for p in folder.glob("*.state"))
         }
 
+    def has_any(self) -> bool:
+        """Whether there is one, from an earlier start."""
+        with self._lock:
+            return bool(self._places)
+
     def due(self, frame: int) -> bool:
         """Whether this frame closes an interval and the one before is on the disk."""
         busy = self._writer is not None and self._writer.is_alive()

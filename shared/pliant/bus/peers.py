@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from pliant import __version__
-from pliant.errors import BusError
+from pliant.errors import BusError, SessionOverError
 
 WIRE_VERSION = 2
 """Of envelopes and credits; services of different ones refuse each other."""
@@ -35,6 +35,8 @@ class Peers:
     gone_since: dict[str, float] = field(default_factory=dict[str, float])
     refusal: str = ""
     """Why this service cannot take part; "" while it can."""
+    over: bool = False
+    """Whether the recorder has said that everything is on its disk."""
 
     def on_token(self, key: str, *, alive: bool, now: float) -> str:
         """Take note of a token that appeared or vanished; returns the service it is of."""
@@ -60,6 +62,12 @@ class Peers:
         """Whether all of them are here, or have been."""
         return all(self.here.get(name) or name in self.gone_since for name in names)
 
+    def expect(self, names: Iterable[str], now: float) -> None:
+        """Those that were here before we came count as gone from now on, until they are seen."""
+        for name in names:
+            if not self.here.get(name):
+                self.gone_since.setdefault(name, now)
+
     def missing(self, names: Iterable[str]) -> list[str]:
         """Those that are not here now, sorted."""
         return sorted(name for name in names if not self.here.get(name))
@@ -70,6 +78,9 @@ class Peers:
         return sorted(name for name in names if name in gone and now - gone[name] >= patience_s)
 
     def raise_if_refused(self) -> None:
-        """Raise BusError where versions do not fit or a newer one of us is there."""
+        """Raise BusError where versions do not fit or a newer one of us is there, SessionOverError
+        where there is nothing to wait for any more."""
+        if self.over:
+            raise SessionOverError(f"{self.service}: the session is over")
         if self.refusal:
             raise BusError(self.refusal)

@@ -39,6 +39,7 @@ from pliant.messages.types import Header, StreamEnd
 from pliant.state import load_state, save_state
 
 STOP_KEY = "control/stop"
+OVER_KEY = "control/over"
 _TICK_S = 1.0
 _LAST_CREDITS_S = 2.0
 
@@ -61,6 +62,7 @@ class ZenohBus:
         windows: Mapping[str, Window] | None = None,
         disturb: Callable[[], None] | None = None,
         identity: Identity | None = None,
+        on_tick: Callable[[], None] | None = None,
     ) -> None:
         """Connect, subscribe to the inputs, and announce that we are ready.
 
@@ -74,11 +76,13 @@ class ZenohBus:
         windows: what is kept for readers that acknowledge seldom, by name.
         disturb: called before each message goes out or is taken; for tests, which delay there.
         identity: our certificate, for endpoints such as tls/host:7447.
+        on_tick: called once a second, as long as we are well.
         Raises BusError when no endpoint answers.
         """
         self._patience_s = patience_s
         self._checkpoints = checkpoints
         self._disturb = disturb or (lambda: None)
+        self._on_tick = on_tick or (lambda: None)
         self._changed = threading.Condition()
         self._wake = threading.Event()
         self._closing = False
@@ -109,6 +113,7 @@ class ZenohBus:
             liveliness.declare_subscriber(tokens, self._on_token, history=True),
             liveliness.declare_token(f"{shared.prefix}/{own}"),
             self._session.declare_subscriber(f"{shared.prefix}/{STOP_KEY}", self._on_stop),
+            self._session.declare_subscriber(f"{shared.prefix}/{OVER_KEY}", self._on_over),
         ]
         self._keeper = threading.Thread(target=self._keep, daemon=True)
         self._keeper.start()
@@ -286,6 +291,9 @@ class ZenohBus:
         if self._checkpoints is None:
             return None
         outputs = self._outputs.values()
+        if self._checkpoints.has_any():  # our readers have been here: they are not awaited for ever
+            with self._changed:
+                self._peers.expect((r for o in outputs for r in o.box.readers), time.monotonic())
         for output in outputs:
             self._wait_for_readers(output, output.box.heard_from_all)
         with self._changed:
@@ -344,12 +352,15 @@ class ZenohBus:
             self._wake.clear()
             tick = time.monotonic() - last_tick >= _TICK_S
             last_tick = time.monotonic() if tick else last_tick
-            if self._closing or not self._restored:
+            if self._closing:
+                return
+            if tick:
+                self._tell_health()
+                self._on_tick()
+            if not self._restored:
                 continue
             greeting, self._greeting = self._greeting, False
             try:
-                if tick:
-                    self._tell_health()
                 self._advance_safe()
                 for entry in self._inputs.values():
                     self._keep_input(entry, tick=tick, greeting=greeting)
@@ -405,6 +416,11 @@ class ZenohBus:
 
     def _on_stop(self, _: zenoh.Sample) -> None:
         self.stop_requested = True
+
+    def _on_over(self, _: zenoh.Sample) -> None:
+        with self._changed:
+            self._peers.over = True
+            self._changed.notify_all()
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT

@@ -1,0 +1,141 @@
+"""The files in deploy/: what users start sessions with, in containers."""
+
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from containers import (
+    ROOT,
+    SOURCE,
+    Session,
+    build_image,
+    call,
+    compose_commands,
+    session,
+    skip_without_engine,
+)
+from running import pliant
+
+from pliant.bus.session import open_session
+from pliant.messages import codec, topics
+from pliant.messages.types import Status
+from pliant_services.processes import PROFILES
+
+pytestmark = pytest.mark.system
+
+DEPLOY = ROOT / "deploy"
+FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
+
+
+def results_of(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in FILES}
+
+
+@pytest.fixture(scope="module")
+def on_the_host(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The results of the same run without containers."""
+    output = tmp_path_factory.mktemp("host")
+    done = pliant("run", SOURCE, "--output", output, "--force", "--set", "meshing.enabled=false")
+    assert done.returncode == 0, done.stderr
+    return results_of(output)
+
+
+@pytest.fixture(scope="module")
+def image() -> None:
+    skip_without_engine()
+    build_image()
+
+
+@pytest.mark.parametrize("profile", ["rigid", "deformable", "replay"])
+def test_every_compose_on_this_machine_reads_the_file(profile: str) -> None:
+    if not compose_commands():
+        pytest.skip("neither docker-compose nor docker compose is installed")
+    for command in compose_commands():
+        done = call(
+            *command, "--file", DEPLOY / "compose.yaml", "--profile", profile, "config",
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("profile", ["rigid", "deformable"])
+def test_a_profile_starts_its_services_and_each_is_told_of_the_others(profile: str) -> None:
+    content = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    mine = [s for s in content["services"].values() if profile in s.get("profiles", [])]
+    fleets = {part for s in mine for part in s["command"] if part.startswith("--fleet=")}
+    assert len(fleets) == 1
+    fleet = fleets.pop().removeprefix("--fleet=").split(",")
+    assert set(fleet) == {s["command"][1] for s in mine if s["command"][0] == "service"}
+    # The mesh is made when the session is over: a mesher cannot go on where it was.
+    assert tuple(fleet) == PROFILES["points" if profile == "rigid" else profile]
+
+
+def test_nothing_runs_as_root_or_writes_into_its_image() -> None:
+    content = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    for name, service in content["services"].items():
+        assert service["read_only"], name
+        assert service["cap_drop"] == ["ALL"], name
+        assert not str(service["user"]).startswith("0"), name
+        assert all(port.startswith("127.0.0.1:") for port in service.get("ports", [])), name
+
+
+class Followed:
+    """Listens to a session's status from outside, as a viewer would."""
+
+    def __init__(self, port: int, name: str) -> None:
+        self._changed = threading.Condition()
+        self._frames: dict[str, int] = {}
+        self._session = open_session([f"tcp/127.0.0.1:{port}"])
+        self._held = self._session.declare_subscriber(
+            f"pliant/{name}/{topics.status('*').key}", self._on_sample
+        )
+
+    def _on_sample(self, sample) -> None:
+        envelope = sample.attachment.to_bytes()
+        if envelope[-1:] == b"\0":
+            status = codec.decode(Status, sample.payload.to_bytes())
+            with self._changed:
+                self._frames[status.service] = status.frame
+                self._changed.notify_all()
+
+    def wait_for(self, service: str, frame: int) -> None:
+        with self._changed:
+            assert self._changed.wait_for(lambda: self._frames.get(service, -1) >= frame, 300)
+
+    def close(self) -> None:
+        self._session.close()
+
+
+@pytest.fixture
+def workstation(image: None, tmp_path: Path) -> Iterator[Session]:
+    config = tmp_path / "config.yaml"
+    config.write_text("bus: {checkpoint_frames: 6}\n")
+    with session(
+        f"pliant-test-{os.getpid()}",
+        tmp_path / "results",
+        DEPLOY / "compose.yaml",
+        PLIANT_CONFIG=str(config),
+    ) as one:
+        yield one
+
+
+@pytest.mark.docker
+@pytest.mark.slow
+def test_killed_containers_come_back_and_the_results_are_those_of_the_host(
+    workstation: Session, on_the_host: dict[str, bytes]
+) -> None:
+    workstation.compose("up", "--detach", "router", *PROFILES["points"])
+    followed = Followed(workstation.port, "session")
+    followed.wait_for("bundle_adjustment", 8)
+    workstation.kill("tracking", "recorder")
+    followed.wait_for("bundle_adjustment", 25)
+    workstation.kill("bundle_adjustment")
+    workstation.wait("router")
+    followed.close()
+    for service in PROFILES["points"]:
+        workstation.wait(service)
+    folder = workstation.results / "session"
+    assert results_of(folder) == on_the_host
+    assert pliant("info", folder).returncode == 0
