@@ -200,6 +200,31 @@ def test_live_passes_over_previews_when_it_is_late_and_the_final_mesh_is_the_sam
         assert codec.encode(message) == codec.encode(other)
 
 
+def test_a_preview_that_moved_can_be_put_in_again() -> None:
+    given = inputs()
+    update = given[topics.MAP_UPDATE][4]
+    assert isinstance(update, MapUpdate)
+    # Keyframe 3 moves by more than a coarse voxel (0.2), and keyframe 2 by less.
+    told = np.array([2, 3, 4], np.int64)
+    moved = np.stack([pose(2), pose(3), pose(4)])
+    moved[:2, 1, 3] += (0.02, 0.3)
+    given[topics.MAP_UPDATE][4] = replace(
+        update, keyframe_ids=told, keyframe_frames=told,
+        keyframe_segments=np.zeros(3, np.int32), keyframe_poses=matrix_to_pose(moved),
+    )  # fmt: skip
+    made: list[list[bytes]] = []
+    for way, again in (("settled", None), ("moved", 1.0)):
+        monitor = Notes()
+        bus = ReplayBus(given)
+        config = load_config(
+            None, [f"meshing.corrections={way}", "meshing.surface.max_error_px=50"]
+        )
+        meshing.run(bus, config, monitor)
+        assert monitor.counters.get("again") == again
+        made.append([codec.encode(message) for message in bus.outputs[topics.MESH_FINAL]])
+    assert made[0] == made[1]
+
+
 def with_keyframes(change: Callable[[Keyframe], Keyframe]) -> Inputs:
     given = inputs()
     told = given[topics.KEYFRAME]

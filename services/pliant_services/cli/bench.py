@@ -217,6 +217,23 @@ def mesh(
     _print(measure(result, groundtruth, overrides or []))
 
 
+@app.command("mesh-live")
+def mesh_live(
+    result: Annotated[Path, typer.Argument(help="Result folder of a run.")],
+    groundtruth: Annotated[
+        str, typer.Option("--groundtruth", "-g", help="Folder with depth maps, or built-in:NAME.")
+    ],
+    overrides: Overrides = None,
+) -> None:
+    """Two ways in which the live mesh can follow the corrections of the map, against true depth.
+
+    pliant bench mesh-live results/room --groundtruth built-in:room
+    """
+    from pliant_services.benchmarks.mesh import measure_live
+
+    _print(measure_live(result, groundtruth, overrides or []))
+
+
 def _print(lines: Iterable[str]) -> None:
     for line in lines:
         typer.echo(line)

@@ -1,15 +1,21 @@
 """The coarse mesh of one map segment while it grows, and what of it has changed."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse
 from pliant.algorithms.meshing import BlockMesh, DepthMap, MeshBlocks, TsdfParameters
 from pliant.algorithms.meshing.mesh_blocks import select_blocks
 from pliant.algorithms.stages import StageTimer
 from pliant.fusion.volume import TsdfVolume
+
+_SPARSE = 8
+"""Every so many pixels give a keyframe's median depth."""
 
 
 @dataclass(frozen=True)
@@ -20,6 +26,7 @@ class _Preview:
     depth_map: DepthMap
     colour: U8
     T_world_camera: F64
+    median_depth: float
 
 
 class LiveMesh:
@@ -52,7 +59,11 @@ class LiveMesh:
         )
         self._touched.append(put.keys)
         if not settled:
-            self._previews[keyframe] = _Preview(put.serial, depth_map, colour, T_world_camera)
+            some = depth_map.depths[::_SPARSE, ::_SPARSE]
+            depth = float(np.median(some[some > 0.0])) if some.any() else 0.0
+            self._previews[keyframe] = _Preview(
+                put.serial, depth_map, colour, T_world_camera, depth
+            )
 
     def take_out(self, keyframe: int) -> None:
         """Take the preview of a keyframe out, exactly; nothing where there is none."""
@@ -64,6 +75,18 @@ class LiveMesh:
                     self._camera, old.T_world_camera,
                 )
             )  # fmt: skip
+
+    def moved(self, pose_of: Callable[[int], F64]) -> list[int]:
+        """Keyframes whose preview lies a voxel or more off where their poses now put it."""
+        found: list[int] = []
+        for keyframe, preview in self._previews.items():
+            T_old_new = inverse(preview.T_world_camera) @ pose_of(keyframe)
+            # A turn by an angle moves what lies at that depth by the chord.
+            chord = math.sqrt(max(0.0, 3.0 - float(np.trace(T_old_new[:3, :3]))))
+            off = float(np.linalg.norm(T_old_new[:3, 3])) + preview.median_depth * chord
+            if off >= self.volume.voxel_size:
+                found.append(keyframe)
+        return found
 
     def changes(self, timer: StageTimer) -> MeshBlocks | None:
         """The blocks that differ from what was told; None where nothing was put in."""

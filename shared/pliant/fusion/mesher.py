@@ -109,6 +109,11 @@ class Mesher:
             fresh = [item for item in pending if not item[1]]
             self.counts["passed_over"] += max(0, len(fresh) - 1)
             pending = [item for item in pending if item[1] or item == fresh[-1]]
+        if self._live is not None and self._parameters.corrections == "moved":
+            told = [keyframe for keyframe, _ in pending]
+            moved = [k for k in self._live.moved(self._pose) if k not in told]
+            self.counts["again"] = self.counts.get("again", 0.0) + len(moved)
+            pending = [*((k, False) for k in moved), *pending]
         changed: list[LiveChange] = []
         for keyframe, settled in pending:
             segment = self._map.keyframes[keyframe].segment

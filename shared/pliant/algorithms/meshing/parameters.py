@@ -1,5 +1,7 @@
 """Everything that a user may change about meshing."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from pliant.algorithms.meshing.keyframe_surface import SurfaceParameters
@@ -16,6 +18,11 @@ class MeshingParameters(Parameters):
         ge=0,
         description="Blocks that have not changed and are told again with each change, in turn, "
         "for viewers that came late.",
+    )
+    corrections: Literal["settled", "moved"] = Field(
+        default="settled",
+        description="When a keyframe in the live mesh is put in again: once, as it leaves the "
+        "window, or also whenever it has moved by a voxel (to compare).",
     )
     surface: SurfaceParameters = SurfaceParameters()
     tsdf: TsdfParameters = TsdfParameters()
