@@ -71,8 +71,8 @@ def test_outliers_vanish_as_they_do_not_without_smoothing() -> None:
         covered[kind] = float(np.mean(surface.depth_map.depths > 0.0))
         rms[kind] = float(np.sqrt(np.mean(errors(surface.depth_map.depths) ** 2)))
     assert rms["nltgv"] < 0.3 * rms["laplacian"]
-    # Without smoothing, needles are no surface, and leave holes.
-    assert rms["nltgv"] < 0.6 * rms["none"]
+    # Without smoothing, needles are no surface: most are dropped, and leave holes.
+    assert rms["nltgv"] < 0.7 * rms["none"]
     assert covered["nltgv"] > covered["none"] + 0.2
 
 

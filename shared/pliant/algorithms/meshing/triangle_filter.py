@@ -23,7 +23,7 @@ class TriangleFilterParameters(Parameters):
         description="Largest over smallest depth of a triangle's corners: more is a jump.",
     )
     max_slant_deg: float = Field(
-        default=85.0,
+        default=75.0,
         gt=0.0,
         le=90.0,
         description="Largest angle between a triangle's normal and the ray to its centre, degrees.",

@@ -30,9 +30,10 @@ class TsdfParameters(Parameters):
         description="Distances to the surface are kept up to so many voxels.",
     )
     min_weight: float = Field(
-        default=0.5,
+        default=0.1,
         ge=0.0,
-        description="Voxels whose weights sum to less are not meshed (one sight weighs up to 1).",
+        description="Voxels whose weights sum to less are not meshed: one sight, face on, weighs 1 "
+        "where its depth is certain, 0.5 where it may be 1 % off, 0.1 where it may be 3 % off.",
     )
     free_space: bool = Field(
         default=True, description="What a keyframe sees through counts against surface there."
