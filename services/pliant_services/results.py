@@ -262,10 +262,11 @@ def _well_observed(run: Run, final: dict[int, Any]) -> int:
 
 def _correction(correction: tuple[float, ...]) -> dict[str, float] | None:
     """What the final adjustment found wrong with the calibration; None if it was not asked."""
-    if len(correction) != 3:
+    if len(correction) < 3:
         return None
-    s, k1, k2 = correction
-    return {"focal_factor": round(float(np.exp(s)), 6), "k1": round(k1, 6), "k2": round(k2, 6)}
+    s, k1, k2, readout = (*correction, 0.0)[:4]  # recordings from before the readout have three
+    found = {"focal_factor": float(np.exp(s)), "k1": k1, "k2": k2, "readout": readout}
+    return {name: round(value, 6) for name, value in found.items()}
 
 
 def _median(values: Any) -> float:

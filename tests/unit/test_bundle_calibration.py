@@ -13,14 +13,14 @@ from pliant.algorithms.bundle import (
     solve_calibrating,
     solve_schur,
 )
-from pliant.algorithms.bundle.calibration_kernels import calibrated_system
+from pliant.algorithms.bundle.calibration_kernels import PAIRS, UNKNOWNS, calibrated_system
 from pliant.algorithms.bundle.cost import limits_of
 from pliant.algorithms.bundle.layout import build_layout
 from pliant.algorithms.camera import PinholeCamera
 
 EXACT = BundleParameters(kernel_sigma_px=0.0, max_iterations=60, min_relative_decrease=1e-10)
 ROBUST = BundleParameters(kernel_sigma_px=1.0, max_iterations=60, min_relative_decrease=1e-7)
-FREE = CalibrationUncertainty(focal=1.0, k1=1.0, k2=1.0, prior_px=1e-3)
+FREE = CalibrationUncertainty(focal=1.0, k1=1.0, k2=1.0, readout=1.0, prior_px=1e-3)
 
 
 def with_lens(problem, s=0.0, k1=0.0, k2=0.0):
@@ -36,37 +36,53 @@ def undistorted(problem):
     return with_lens(problem)
 
 
-@pytest.mark.parametrize("calibration", [(0.0, 0.0, 0.0), (0.03, -0.2, 0.08)])
+def random_flow(problem):
+    """What a rolling shutter would do, here at random: (2, M, N) px."""
+    shape = (2, len(problem.T_world_camera), len(problem.points_world))
+    return np.random.default_rng(1).normal(0.0, 3.0, shape).astype(np.float32)
+
+
+@pytest.mark.parametrize("calibration", [(0.0, 0.0, 0.0, 0.0), (0.03, -0.2, 0.08, 0.4)])
 def test_the_blocks_are_those_of_finite_differences(calibration):
     scene = make_scene(cameras=4, points=20, noise_px=1.0)
-    problem = with_lens(scene.problem, *calibration)
+    problem = with_lens(scene.problem, *calibration[:3])
     layout = build_layout(problem)
+    flow = random_flow(scene.problem)
+    padded = np.zeros((2, *layout.u.shape), np.float32)
+    padded[:, :, layout.column] = flow
+    moved = np.float32(calibration[3]) * padded
     lenses = np.ascontiguousarray(problem.intrinsics[:, 4:])
     M, F = len(layout.cameras), int((layout.free >= 0).sum())
     fixed = np.zeros_like(layout.movable)  # no point is eliminated: the plain blocks stand in b
     S, b = np.zeros((6 * F + 6, 6 * F + 6)), np.zeros(6 * F + 6)
-    normal, cross, shared = np.zeros((M, 27)), np.zeros((M, 18)), np.zeros(9)
+    normal, cross = np.zeros((M, 27)), np.zeros((M, 6 * UNKNOWNS))
+    shared = np.zeros(PAIRS + UNKNOWNS)
     w = np.concatenate([layout.w, layout.w.max(axis=0, keepdims=True)])
     calibrated_system(
-        layout.cameras, layout.pinholes, lenses, layout.free, layout.points, fixed, layout.u,
-        layout.v, w, layout.seen, limits_of(EXACT), 0.0, S, b, normal, cross, shared,
+        layout.cameras, layout.pinholes, lenses, layout.free, layout.points, fixed,
+        layout.u - moved[0], layout.v - moved[1], padded, w, layout.seen, limits_of(EXACT), 0.0,
+        S, b, normal, cross, shared,
     )  # fmt: skip
 
     def predicted(q):
-        lens = with_lens(scene.problem, *q).intrinsics
-        return project(problem.T_world_camera, problem.points_world, lens).reshape(-1)
+        lens = with_lens(scene.problem, *q[:3]).intrinsics
+        px = project(problem.T_world_camera, problem.points_world, lens)
+        return (px + q[3] * flow.transpose(1, 2, 0)).reshape(-1)
 
     step = 1e-6
     q = np.array(calibration)
     J = np.stack(
-        [(predicted(q + d) - predicted(q - d)) / (2.0 * step) for d in step * np.eye(3)], axis=1
+        [(predicted(q + d) - predicted(q - d)) / (2.0 * step) for d in step * np.eye(UNKNOWNS)],
+        axis=1,
     )
     observed = problem.points_px.astype(np.float64).reshape(-1)
     H = J.T @ J
-    np.testing.assert_allclose(shared[:6], H[np.tril_indices(3)], rtol=1e-6)
-    np.testing.assert_allclose(shared[6:], J.T @ (observed - predicted(q)), rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(shared[:PAIRS], H[np.tril_indices(UNKNOWNS)], rtol=1e-6)
+    np.testing.assert_allclose(
+        shared[PAIRS:], J.T @ (observed - predicted(q)), rtol=1e-5, atol=1e-3
+    )
     B = -numeric_jacobian(problem)[:, : 6 * M]
-    expected = (J.T @ B).reshape(3, M, 6).transpose(1, 0, 2).reshape(M, 18)
+    expected = (J.T @ B).reshape(UNKNOWNS, M, 6).transpose(1, 0, 2).reshape(M, 6 * UNKNOWNS)
     np.testing.assert_allclose(cross, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
 
 
@@ -79,7 +95,7 @@ def test_a_wrong_calibration_is_recovered_with_the_poses(truth):
     # One who believes in a focal length that is too short by e^-s, and in no distortion.
     problem = with_lens(scene.problem, s=-s)
     result, found = solve_calibrating(problem, EXACT, FREE)
-    np.testing.assert_allclose(found, truth, atol=2e-3)
+    np.testing.assert_allclose(found[:3], truth, atol=2e-3)
     np.testing.assert_allclose(result.T_world_camera, scene.T_world_camera, atol=2e-3)
     blind = solve_schur(problem, EXACT)
     wrong = np.abs(blind.T_world_camera - scene.T_world_camera).max()
@@ -90,13 +106,26 @@ def test_the_cost_is_that_of_the_answer_with_its_lens():
     problem = undistorted(make_scene(cameras=6, points=200, distortion=(-0.05, 0.0)).problem)
     result, found = solve_calibrating(problem, EXACT, FREE)
     corrected = dataclasses.replace(
-        with_lens(problem, *found),
+        with_lens(problem, *found[:3]),
         T_world_camera=result.T_world_camera,
         points_world=result.points_world,
     )
     again = solve_schur(corrected, EXACT.model_copy(update={"max_iterations": 1}))
     assert (np.diff(result.costs) <= 0.0).all()
     assert again.initial_cost == pytest.approx(result.final_cost, rel=1e-3, abs=1e-4)
+
+
+def test_the_readout_of_a_rolling_shutter_is_found():
+    scene = make_scene(cameras=6, points=200)
+    flow = random_flow(scene.problem)
+    camera, point = scene.problem.camera_index, scene.problem.point_index
+    px = scene.problem.points_px + np.float32(0.7) * flow[:, camera, point].T
+    problem = dataclasses.replace(scene.problem, points_px=px)
+    result, found = solve_calibrating(problem, EXACT, FREE, flow=flow)
+    np.testing.assert_allclose(found, (0.0, 0.0, 0.0, 0.7), atol=2e-3)
+    np.testing.assert_allclose(result.T_world_camera, scene.T_world_camera, atol=2e-3)
+    _, without = solve_calibrating(problem, EXACT, FREE)
+    assert without[3] == 0.0
 
 
 def test_a_right_calibration_is_left_alone():
@@ -121,14 +150,14 @@ def test_the_prior_holds_what_the_motion_cannot_tell():
     )
     _, found = solve_calibrating(problem, EXACT, CalibrationUncertainty(focal=0.01, k1=0.0))
     assert abs(found[0]) < 2e-3
-    assert found[1:].tolist() == [0.0, 0.0]
+    assert found[1:].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_sigmas_of_zero_give_what_is_found_without():
     problem = make_scene(noise_px=0.5).problem
     held = CalibrationUncertainty(focal=0.0, k1=0.0, k2=0.0)
     result, found = solve_calibrating(problem, EXACT, held)
-    assert found.tolist() == [0.0, 0.0, 0.0]
+    assert found.tolist() == [0.0, 0.0, 0.0, 0.0]
     plain = solve_schur(problem, EXACT)
     assert result.final_cost == pytest.approx(plain.final_cost, rel=1e-6)
     np.testing.assert_allclose(result.T_world_camera, plain.T_world_camera, atol=1e-4)

@@ -34,9 +34,10 @@ class MapDelta:
     point_parallax_rad: largest angle between two of the rays that observe it.
     point_sigmas: standard deviation along the ray, as a share of the depth.
     removed_point_ids: points that no longer exist (wrong, or merged into another).
-    calibration_correction: (s, k1, k2), what the last adjustment found wrong with the calibration:
-        a point of the map at (x, y) on the plane z = 1 is seen in the rectified image at
-        ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx``, likewise v.   () where nothing was estimated.
+    calibration_correction: (s, k1, k2, readout), what the last adjustment found wrong with the
+        calibration: a point of the map at (x, y) on the plane z = 1 is seen in the rectified image
+        at ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx``, likewise v, and a rolling shutter takes the
+        rows of a frame in this share of the frame interval.   () where nothing was estimated.
     snapshot: every keyframe and point of the active window is told, changed or not.
     """
 

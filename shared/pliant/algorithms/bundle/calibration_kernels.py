@@ -10,11 +10,13 @@ The Jacobian of the lens is ``F = K D`` with ``D = d I + e (x, y)^T (x, y)``, wh
 e = 2 k1 + 4 k2 r^2.  (x, y) is an eigenvector of D: ``D (x, y)^T = (d + e r^2) (x, y)^T``.
 So a calibration unknown moves the point on the plane z = 1 as if by
 
-    A_q = (x, y)^T rho_q,     rho_q = h_q / (1 + 3 k1 r^2 + 5 k2 r^4),     F A_q = d(u, v) / dq,
+    A_q = (x, y)^T rho_q,     rho_q = h_q / (1 + 3 k1 r^2 + 5 k2 r^4),     F A_q = d(u, v) / dq.
 
-and enters the Hessian like a column of B (see ``projection``): with M and e of that module the
-blocks are ``A^T M A``, ``A^T M B``, ``A^T M P`` and the negative gradient ``A^T e``.  So the
-calibration is one more camera, which sees every point and whose last three unknowns are void.
+A fourth unknown is the readout of a rolling shutter, as a share of the frame interval: it moves an
+observation by the readout times its flow (see ``solve_calibrating``), so that ``A = F^-1 flow``.
+An unknown enters the Hessian like a column of B (see ``projection``): with M and e of that module
+the blocks are ``A^T M A``, ``A^T M B``, ``A^T M P`` and the negative gradient ``A^T e``.  So the
+calibration is one more camera, which sees every point and whose last two unknowns are void.
 """
 
 from typing import Any
@@ -32,7 +34,7 @@ from pliant.algorithms.bundle.products import (
     multiply_points,
     multiply_vector,
 )
-from pliant.algorithms.bundle.projection import motion_of, point_rows
+from pliant.algorithms.bundle.projection import motion_of, pinhole_of, point_rows
 from pliant.algorithms.bundle.schur_kernels import (
     camera_block,
     carry_step,
@@ -43,6 +45,11 @@ from pliant.algorithms.bundle.schur_kernels import (
     whiten,
 )
 from pliant.algorithms.kernel import fast_kernel, inline_kernel, kernel
+
+UNKNOWNS = 4
+"""Logarithm of the focal length's factor, k1, k2, readout."""
+
+PAIRS = UNKNOWNS * (UNKNOWNS + 1) // 2
 
 
 @inline_kernel
@@ -62,6 +69,7 @@ def calibrated_system(
     movable: U8,
     u: F32,
     v: F32,
+    flow: F32,
     w: F32,
     seen: U8,
     limits: Limits,
@@ -74,16 +82,17 @@ def calibrated_system(
 ) -> None:
     """``schur_kernels.reduced_system`` with the calibration in the last six rows.
 
-    w: (M + 1, P), the last row positive where any camera sees the point.
+    flow: (2, M, P) px.     w: (M + 1, P), the last row positive where any camera sees the point.
     S: (6F + 6, 6F + 6).     b: (6F + 6,).     normal: (M, 27) as there.
-    cross: (M, 18) ``A^T M B`` of each camera, shared: (9,) lower triangle of ``A^T M A`` by rows,
-    then ``A^T e``: added to.
+    cross: (M, 6 UNKNOWNS) ``A^T M B`` of each camera, shared: (PAIRS + UNKNOWNS,) lower triangle of
+    ``A^T M A`` by rows, then ``A^T e``: added to.
     """
     M = cameras.shape[0]
     F = S.shape[0] // 6 - 1
     U = np.empty((M + 1, 6 * DEPTH))
     common = np.empty(6 * DEPTH)
     local = np.empty(8 * BLOCK)
+    A = np.empty(2 * UNKNOWNS * BLOCK)
     V = np.empty(9 * BLOCK)
     L = np.empty(6 * BLOCK)
     y = np.empty(DEPTH)
@@ -104,8 +113,9 @@ def calibrated_system(
             linearise_block(
                 cameras, pinholes, lenses, m, lo, points, u, v, w, limits, local, V
             )  # fmt: skip
-            calibration_points(motion_of(cameras, m), lenses[m], local, common)
-            calibration_cameras(lenses[m], local, cross[m], shared)
+            calibration_moves(pinholes, lenses[m], m, lo, flow, local, A)
+            calibration_points(motion_of(cameras, m), local, A, common)
+            calibration_cameras(local, A, cross[m], shared)
             if free[m] >= 0:
                 rows[count], slots[count] = free[m], m
                 couple_block(motion_of(cameras, m), local, U[count])
@@ -126,58 +136,68 @@ def calibrated_system(
 
 
 @fast_kernel
-def calibration_points(T: Any, lens: F64, local: F64, W: F64) -> None:
-    """Add ``A^T M P`` of one camera and block to W (6 x 3 x BLOCK); rows 3 to 5 stay."""
-    k1, k2 = lens[0], lens[1]
+def calibration_moves(
+    pinholes: F64, lens: F64, m: int, lo: int, flow: F32, local: F64, A: F64
+) -> None:
+    """Write A (UNKNOWNS x 2 x BLOCK) of one camera and block."""
+    K, k1, k2 = pinhole_of(pinholes, m), lens[0], lens[1]
+    fu, fv = flow[0, m, lo : lo + BLOCK], flow[1, m, lo : lo + BLOCK]
     for i in range(BLOCK):
-        x, y, iz = local[i], local[BLOCK + i], local[2 * BLOCK + i]
-        m00, m01, m11 = local[3 * BLOCK + i], local[4 * BLOCK + i], local[5 * BLOCK + i]
-        a, c = m00 * x + m01 * y, m01 * x + m11 * y
-        p0, p1, p2, q0, q1, q2 = point_rows(T, x, y, iz)
-        h0, h1, h2 = a * p0 + c * q0, a * p1 + c * q1, a * p2 + c * q2
-        s0, s1, s2 = radial_shares(x * x + y * y, k1, k2)
-        W[i] += s0 * h0
-        W[BLOCK + i] += s0 * h1
-        W[2 * BLOCK + i] += s0 * h2
-        W[DEPTH + i] += s1 * h0
-        W[DEPTH + BLOCK + i] += s1 * h1
-        W[DEPTH + 2 * BLOCK + i] += s1 * h2
-        W[2 * DEPTH + i] += s2 * h0
-        W[2 * DEPTH + BLOCK + i] += s2 * h1
-        W[2 * DEPTH + 2 * BLOCK + i] += s2 * h2
+        x, y = local[i], local[BLOCK + i]
+        n2 = x * x + y * y
+        s0, s1, s2 = radial_shares(n2, k1, k2)
+        A[i] = s0 * x
+        A[BLOCK + i] = s0 * y
+        A[2 * BLOCK + i] = s1 * x
+        A[3 * BLOCK + i] = s1 * y
+        A[4 * BLOCK + i] = s2 * x
+        A[5 * BLOCK + i] = s2 * y
+        # D^-1 by Sherman and Morrison.
+        a, c = fu[i] / K[0], fv[i] / K[1]
+        d, e = 1.0 + n2 * (k1 + k2 * n2), 2.0 * k1 + 4.0 * k2 * n2
+        t = e * (x * a + y * c) / (d + e * n2)
+        A[6 * BLOCK + i] = (a - t * x) / d
+        A[7 * BLOCK + i] = (c - t * y) / d
 
 
 @fast_kernel
-def calibration_cameras(lens: F64, local: F64, cross: F64, shared: F64) -> None:
-    """Add ``A^T M B`` (3 x 6 by rows) to cross, ``A^T M A`` and ``A^T e`` to shared (9,)."""
-    k1, k2 = lens[0], lens[1]
-    h00 = h10 = h11 = h20 = h21 = h22 = g0 = g1 = g2 = 0.0
-    for i in range(BLOCK):
-        x, y = local[i], local[BLOCK + i]
-        m00, m01, m11 = local[3 * BLOCK + i], local[4 * BLOCK + i], local[5 * BLOCK + i]
-        e = x * local[6 * BLOCK + i] + y * local[7 * BLOCK + i]
-        r = m00 * x * x + 2.0 * m01 * x * y + m11 * y * y
-        s0, s1, s2 = radial_shares(x * x + y * y, k1, k2)
-        h00 += s0 * s0 * r
-        h10 += s1 * s0 * r
-        h11 += s1 * s1 * r
-        h20 += s2 * s0 * r
-        h21 += s2 * s1 * r
-        h22 += s2 * s2 * r
-        g0 += s0 * e
-        g1 += s1 * e
-        g2 += s2 * e
-    sums = (h00, h10, h11, h20, h21, h22, g0, g1, g2)
-    for k in range(9):
-        shared[k] += sums[k]
-    for q in range(3):
-        t0 = t1 = t2 = t3 = t4 = t5 = 0.0
+def calibration_points(T: Any, local: F64, A: F64, W: F64) -> None:
+    """Add ``A^T M P`` of one camera and block to W (6 x 3 x BLOCK); the last rows stay."""
+    for q in range(UNKNOWNS):
+        Aq, Wq = A[2 * q * BLOCK :], W[q * DEPTH :]
         for i in range(BLOCK):
             x, y, iz = local[i], local[BLOCK + i], local[2 * BLOCK + i]
             m00, m01, m11 = local[3 * BLOCK + i], local[4 * BLOCK + i], local[5 * BLOCK + i]
-            s0, s1, s2 = radial_shares(x * x + y * y, k1, k2)
-            share = s0 if q == 0 else (s1 if q == 1 else s2)
-            a, c = share * (m00 * x + m01 * y), share * (m01 * x + m11 * y)
+            a = m00 * Aq[i] + m01 * Aq[BLOCK + i]
+            c = m01 * Aq[i] + m11 * Aq[BLOCK + i]
+            p0, p1, p2, q0, q1, q2 = point_rows(T, x, y, iz)
+            Wq[i] += a * p0 + c * q0
+            Wq[BLOCK + i] += a * p1 + c * q1
+            Wq[2 * BLOCK + i] += a * p2 + c * q2
+
+
+@fast_kernel
+def calibration_cameras(local: F64, A: F64, cross: F64, shared: F64) -> None:
+    """Add ``A^T M B`` (UNKNOWNS x 6 by rows) to cross, ``A^T M A`` and ``A^T e`` to shared."""
+    at = 0
+    for q in range(UNKNOWNS):
+        Aq = A[2 * q * BLOCK :]
+        for p in range(q + 1):
+            Ap = A[2 * p * BLOCK :]
+            h = 0.0
+            for i in range(BLOCK):
+                m00, m01, m11 = local[3 * BLOCK + i], local[4 * BLOCK + i], local[5 * BLOCK + i]
+                a, c = Ap[i], Ap[BLOCK + i]
+                h += Aq[i] * (m00 * a + m01 * c) + Aq[BLOCK + i] * (m01 * a + m11 * c)
+            shared[at] += h
+            at += 1
+        g = t0 = t1 = t2 = t3 = t4 = t5 = 0.0
+        for i in range(BLOCK):
+            x, y, iz = local[i], local[BLOCK + i], local[2 * BLOCK + i]
+            m00, m01, m11 = local[3 * BLOCK + i], local[4 * BLOCK + i], local[5 * BLOCK + i]
+            g += Aq[i] * local[6 * BLOCK + i] + Aq[BLOCK + i] * local[7 * BLOCK + i]
+            a = m00 * Aq[i] + m01 * Aq[BLOCK + i]
+            c = m01 * Aq[i] + m11 * Aq[BLOCK + i]
             r = x * a + y * c
             t0 += iz * a
             t1 += iz * c
@@ -185,12 +205,10 @@ def calibration_cameras(lens: F64, local: F64, cross: F64, shared: F64) -> None:
             t3 -= c + y * r
             t4 += a + x * r
             t5 += x * c - y * a
-        cross[6 * q] += t0
-        cross[6 * q + 1] += t1
-        cross[6 * q + 2] += t2
-        cross[6 * q + 3] += t3
-        cross[6 * q + 4] += t4
-        cross[6 * q + 5] += t5
+        shared[PAIRS + q] += g
+        sums = (t0, t1, t2, t3, t4, t5)
+        for k in range(6):
+            cross[6 * q + k] += sums[k]
 
 
 @kernel
@@ -202,6 +220,7 @@ def calibrated_substitution(
     movable: U8,
     u: F32,
     v: F32,
+    flow: F32,
     w: F32,
     seen: U8,
     limits: Limits,
@@ -210,8 +229,9 @@ def calibrated_substitution(
     change: F64,
     out: F64,
 ) -> None:
-    """``schur_kernels.back_substitute`` after a step ``change`` (3,) of the calibration too."""
+    """``schur_kernels.back_substitute`` after a ``change`` (UNKNOWNS,) of the calibration too."""
     local = np.empty(8 * BLOCK)
+    A = np.empty(2 * UNKNOWNS * BLOCK)
     V = np.empty(9 * BLOCK)
     L = np.empty(6 * BLOCK)
     y = np.empty(DEPTH)
@@ -226,22 +246,23 @@ def calibrated_substitution(
             )  # fmt: skip
             if np.any(steps[m] != 0.0):
                 carry_step(motion_of(cameras, m), local, steps[m], V)
-            carry_change(motion_of(cameras, m), lenses[m], local, change, V)
+            calibration_moves(pinholes, lenses[m], m, lo, flow, local, A)
+            carry_change(motion_of(cameras, m), local, A, change, V)
         factor_points(V, movable[lo : lo + BLOCK], damping, L, y)
         substitute_points(points, lo, L, y, out)
 
 
 @fast_kernel
-def carry_change(T: Any, lens: F64, local: F64, change: F64, V: F64) -> None:
+def carry_change(T: Any, local: F64, A: F64, change: F64, V: F64) -> None:
     """Subtract ``P^T M A dq`` from the negative gradients in V."""
-    k1, k2 = lens[0], lens[1]
-    c0, c1, c2 = change[0], change[1], change[2]
     for i in range(BLOCK):
         x, y, iz = local[i], local[BLOCK + i], local[2 * BLOCK + i]
         m00, m01, m11 = local[3 * BLOCK + i], local[4 * BLOCK + i], local[5 * BLOCK + i]
-        s0, s1, s2 = radial_shares(x * x + y * y, k1, k2)
-        share = s0 * c0 + s1 * c1 + s2 * c2
-        a, c = share * (m00 * x + m01 * y), share * (m01 * x + m11 * y)
+        dx = dy = 0.0
+        for q in range(UNKNOWNS):
+            dx += change[q] * A[2 * q * BLOCK + i]
+            dy += change[q] * A[(2 * q + 1) * BLOCK + i]
+        a, c = m00 * dx + m01 * dy, m01 * dx + m11 * dy
         p0, p1, p2, q0, q1, q2 = point_rows(T, x, y, iz)
         V[6 * BLOCK + i] -= a * p0 + c * q0
         V[7 * BLOCK + i] -= a * p1 + c * q1

@@ -25,6 +25,12 @@ class CalibrationUncertainty(Parameters):
         ge=0.0,
         description="Standard deviation of the radial distortion k2 after rectification; 0: held",
     )
+    readout: float = Field(
+        default=0.1,
+        ge=0.0,
+        description="Standard deviation of the readout of a rolling shutter, as a share of the "
+        "frame interval; 0: every row is taken at once",
+    )
     prior_px: float = Field(
         default=1.0,
         gt=0.0,
@@ -34,5 +40,5 @@ class CalibrationUncertainty(Parameters):
 
     @property
     def sigmas(self) -> F64:
-        """(3,) of the focal factor's logarithm, k1 and k2."""
-        return np.array([self.focal, self.k1, self.k2])
+        """(4,) of the focal factor's logarithm, k1, k2 and the readout."""
+        return np.array([self.focal, self.k1, self.k2, self.readout])

@@ -20,6 +20,7 @@ from pliant.algorithms.mapping.neighbours import (
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.patches import cut_patches, sample_colours
 from pliant.algorithms.mapping.reacquisition import Reacquired
+from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.tables import (
     columns_in_state,
@@ -362,7 +363,7 @@ class ActiveMap:
         self.window = self._window(chosen, fixed=held, outside=len(fixed))
         self._nearby = rows_of(older, self.window.rows, len(self.points.state))
 
-    def adjust_all(self) -> F64:
+    def adjust_all(self, path: Path) -> F64:
         """Adjust all but the first keyframe; returns ``Window.adjust``'s correction."""
         sizes = self.parameters.window
         self.window = self._window(self.keyframes, fixed=1, outside=0)
@@ -371,6 +372,7 @@ class ActiveMap:
             iterations=sizes.final_iterations,
             points_per_keyframe=sizes.final_points_per_keyframe,
             uncertainty=self.parameters.calibration,
+            motions=path.motions(self.keyframes),
         )  # fmt: skip
         self.points.base_keyframes[self.window.rows] = 0
         self.points.base_parallax_rad[self.window.rows] = 0.0

@@ -23,6 +23,7 @@ from pliant.algorithms.mapping.maxima_grid import MaximaGrid
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import reacquire
 from pliant.algorithms.mapping.reprojection import reprojection_errors
+from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.start import Start, WaitingFrame, find_start
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracks import FrameTracks
@@ -46,6 +47,7 @@ class Mapper:
         self._timer: StageTimer = no_stages
         self._points = PointRows()
         self._changes = Changes()
+        self._path = Path()
         self._report = KeyframeReport(self._points)
         self._waiting: list[WaitingFrame] = []
         self._map: ActiveMap | None = None
@@ -90,7 +92,7 @@ class Mapper:
         self._since_keyframe += 1
         self._lost_frames = 0
         self._recent_poses = [*self._recent_poses[-1:], T_world_camera]
-        self._changes.add_pose(frame, hanging, T_world_camera, inliers)
+        self._add_pose(self._map, frame, hanging, T_world_camera, inliers)
         return self._tell(TRACKING, "", inliers)
 
     def skip(self, frame: int) -> MapDelta:
@@ -113,16 +115,28 @@ class Mapper:
         """What is still to be corrected at the end of the stream."""
         if self._map is None:
             return self._tell(WAITING, "the stream has ended", 0, repeat=True)
-        limits = self._parameters.window
         correction: tuple[float, ...] = ()
-        if limits.final_adjustment and len(self._map.keyframes) <= limits.final_max_keyframes:
+        if self._finishes(self._map):
             self._map.collect_garbage()
-            found = self._map.adjust_all()
+            found = self._map.adjust_all(self._path)
             if self._parameters.calibration.sigmas.any():
                 correction = tuple(found.tolist())
         self._report.leave(self._map.keyframes)
         delta = self._tell(TRACKING, "", 0, repeat=True)
         return dataclasses.replace(delta, calibration_correction=correction)
+
+    def _finishes(self, active: ActiveMap) -> bool:
+        limits = self._parameters.window
+        return limits.final_adjustment and len(active.keyframes) <= limits.final_max_keyframes
+
+    def _add_pose(
+        self, active: ActiveMap, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int
+    ) -> None:
+        self._changes.add_pose(frame, keyframe, T_world_camera, inliers)
+        if self._finishes(active):
+            self._path.add(frame, keyframe, T_world_camera)
+        else:
+            self._path.forget()
 
     def tell_keyframes(self) -> KeyframeDelta:
         """What the last frame, or ``finish``, tells of keyframes."""
@@ -152,6 +166,7 @@ class Mapper:
             self._segments, self._points, self._keyframes, self._camera, self._parameters
         )
         self._segments += 1
+        self._path.forget()
         self._map.begin(start, self._waiting, grey, colour)
         keyframes = {keyframe.frame: keyframe for keyframe in self._map.keyframes}
         T_world_camera = self._map.keyframes[-1].T_world_camera
@@ -179,7 +194,7 @@ class Mapper:
                 continue
             if waiting.frame not in keyframes:
                 T_world_camera = located.T_world_camera
-            self._changes.add_pose(waiting.frame, hanging, T_world_camera, count)
+            self._add_pose(self._map, waiting.frame, hanging, T_world_camera, count)
             poses.append(T_world_camera)
             inliers = inliers or count
         self._recent_poses = poses[1::-1]

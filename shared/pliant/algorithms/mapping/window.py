@@ -18,6 +18,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reprojection import window_errors
+from pliant.algorithms.mapping.rolling_shutter import readout_flow
 from pliant.algorithms.mapping.tables import (
     choose,
     columns_in_state,
@@ -113,11 +114,13 @@ class Window:
         iterations: int,
         points_per_keyframe: int,
         uncertainty: CalibrationUncertainty | None = None,
+        motions: F64 | None = None,
     ) -> F64:
         """Schur LM over the keyframes and the best observed points, then the other points alone.
 
         uncertainty: of the calibration, which is corrected with them; None or zeros: it is right.
-        Returns the correction (3,), see ``solve_calibrating``.  The window's u and v become those
+        motions: (M, 6) of the keyframes, see ``Path``; None: no rolling shutter is looked for.
+        Returns the correction (4,), see ``solve_calibrating``.  The window's u and v become those
         of ``camera``, so that all that follows goes on with a pinhole camera.
         """
         columns = self.mapped_columns()
@@ -126,11 +129,16 @@ class Window:
         best = self._best_observed(columns, count, points_per_keyframe)
         bundle = parameters.bundle.model_copy(update={"max_iterations": iterations})
         chosen = columns[best]
-        problem, correction = self._problem(chosen, camera), np.zeros(3)
+        problem, correction = self._problem(chosen, camera), np.zeros(4)
         if uncertainty is None or not uncertainty.sigmas.any():
             result = solve_schur(problem, bundle)
         else:
-            result, correction = solve_calibrating(problem, bundle, uncertainty)
+            flow = None if motions is None else self._readout_flow(columns, motions, camera)
+            part = None if flow is None else flow[:, :, best]
+            result, correction = solve_calibrating(problem, bundle, uncertainty, flow=part)
+            if flow is not None:
+                self.u[:, columns] -= np.float32(correction[3]) * flow[0]
+                self.v[:, columns] -= np.float32(correction[3]) * flow[1]
         self._take(chosen, result)
         if correction.any():
             seen = self.seen
@@ -141,6 +149,18 @@ class Window:
         found = refine_points(self._problem(others, camera), bundle, iterations=_POINT_STEPS)
         self._take(others, found)
         return correction
+
+    def _readout_flow(self, columns: I32, motions: F64, camera: PinholeCamera) -> F32:
+        still = np.zeros((1, 6))  # the current frame's slot
+        return readout_flow(
+            self.T_world_camera,
+            np.concatenate([motions, still]),
+            self.points.xyz[self.rows[columns]],
+            self.v,
+            self.seen,
+            columns,
+            camera,
+        )
 
     def _best_observed(self, columns: I32, observations: I32, wanted: int) -> BoolArray:
         """Mask of ``columns`` that gives every keyframe its ``wanted`` most observed points."""

@@ -11,12 +11,13 @@ from pliant.algorithms.camera import PinholeCamera
 class CorrectedView:
     """Moves what was seen to where the ideal camera would have seen it.
 
-    correction: (s, k1, k2) as MapDelta.calibration_correction, or () for none.
+    correction: (s, k1, k2, ...) as MapDelta.calibration_correction, or () for none.  What a rolling
+    shutter does is left: it moves pixels along the image, which depth hardly feels.
     """
 
     def __init__(self, camera: PinholeCamera, correction: tuple[float, ...]) -> None:
         self._camera = camera
-        self._correction = np.array(correction if len(correction) == 3 else (0.0, 0.0, 0.0))
+        self._correction = np.array(correction[:3] if len(correction) >= 3 else (0.0, 0.0, 0.0))
 
     def pixels(self, points_px: F32) -> F32:
         """(N, 2) pixels of the rectified image in the ideal one."""

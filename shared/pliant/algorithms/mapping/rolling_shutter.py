@@ -1,0 +1,107 @@
+"""How a rolling shutter moves observations: the rows of a frame are taken one after the other.
+
+The pose of a frame is that of its middle row.  With the readout as a share of the frame interval,
+row v is taken ``readout (v - middle) / height`` frame intervals later, when the camera has moved on
+by as much of its motion.  A map that is built without regard to this bends and drifts in scale, at
+residuals that hardly grow.
+"""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, BoolArray
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse, so3_log
+from pliant.algorithms.kernel import kernel
+from pliant.algorithms.mapping.map_store import Keyframe
+
+_SPAN = 2
+"""Frames before and after a keyframe over which its motion is measured: poses have noise."""
+
+_MIN_DEPTH = 1e-6
+
+
+class Path:
+    """Poses of the frames of a segment, each relative to its keyframe, which may still move."""
+
+    def __init__(self) -> None:
+        self._poses: dict[int, tuple[int, F64]] = {}
+
+    def add(self, frame: int, keyframe: Keyframe, T_world_camera: F64) -> None:
+        """A frame whose pose hangs on a keyframe."""
+        self._poses[frame] = (keyframe.id, inverse(keyframe.T_world_camera) @ T_world_camera)
+
+    def forget(self) -> None:
+        """Nobody will ask any more."""
+        self._poses = {}
+
+    def motions(self, keyframes: list[Keyframe]) -> F64:
+        """(M, 6) (omega, nu) of each keyframe: in its camera, points X become
+        ``exp(t omega) X + t nu`` after t frame intervals.  0 where no frame is near.
+        """
+        T_world_keyframe = {keyframe.id: keyframe.T_world_camera for keyframe in keyframes}
+        motions = np.zeros((len(keyframes), 6))
+        for row, keyframe in enumerate(keyframes):
+            near = range(keyframe.frame - _SPAN, keyframe.frame + _SPAN + 1)
+            known = [f for f in near if self._poses.get(f, (-1,))[0] in T_world_keyframe]
+            if len(known) < 2:
+                continue
+            first, last = (
+                inverse(T_world_keyframe[hanging] @ T_keyframe_camera) @ keyframe.T_world_camera
+                for hanging, T_keyframe_camera in (self._poses[known[0]], self._poses[known[-1]])
+            )
+            turn = so3_log(last[:3, :3] @ first[:3, :3].T)
+            both = np.concatenate([turn, last[:3, 3] - first[:3, 3]])
+            motions[row] = both / (known[-1] - known[0])
+        return motions
+
+
+def readout_flow(
+    T_world_camera: F64,
+    motions: F64,
+    points_world: F64,
+    v: F32,
+    seen: BoolArray,
+    columns: I32,
+    camera: PinholeCamera,
+) -> F32:
+    """(2, M, C) px by which a readout of one frame interval moves each observation.
+
+    T_world_camera: (M, 4, 4) and motions (M, 6) of the cameras.   points_world: (C, 3), those in
+    ``columns`` of the table v, seen (M, N).   0 where nothing is seen, or behind the camera.
+    """
+    flow = np.zeros((2, len(motions), len(columns)), np.float32)
+    T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:, :3])
+    K = np.array([camera.fx, camera.fy, camera.height])
+    _flow(T_camera_world, motions, points_world, v, seen, columns, K, flow)
+    return flow
+
+
+@kernel
+def _flow(
+    T_camera_world: F64,
+    motions: F64,
+    points_world: F64,
+    v: F32,
+    seen: BoolArray,
+    columns: I32,
+    K: F64,
+    flow: F32,
+) -> None:
+    middle = 0.5 * (K[2] - 1.0)
+    for m in range(motions.shape[0]):
+        T, motion = T_camera_world[m], motions[m]
+        for i in range(columns.size):
+            n = columns[i]
+            X = points_world[i]
+            z = T[2, 0] * X[0] + T[2, 1] * X[1] + T[2, 2] * X[2] + T[2, 3]
+            if not seen[m, n] or z < _MIN_DEPTH:
+                continue
+            x = (T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2] + T[0, 3]) / z
+            y = (T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2] + T[1, 3]) / z
+            # The velocity of the point over its depth.
+            a = motion[1] - motion[2] * y + motion[3] / z
+            b = motion[2] * x - motion[0] + motion[4] / z
+            c = motion[0] * y - motion[1] * x + motion[5] / z
+            share = (v[m, n] - middle) / K[2]
+            flow[0, m, i] = share * K[0] * (a - x * c)
+            flow[1, m, i] = share * K[1] * (b - y * c)
