@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from pliant.bus.session import free_endpoint, open_router
+from pliant.bus.session import Identity, free_endpoint, open_router
 from pliant.errors import RecordingError
 from pliant.messages.topics import Topic
 from pliant.recording.playback import Playback
@@ -36,6 +36,7 @@ class PlayRequest:
     readers: Sequence[str] = ()
     loop: bool = False
     connect: Sequence[str] = ()
+    tls: Path | None = None
     session: str = "replay"
     port: int | None = None
 
@@ -71,6 +72,7 @@ def run_play(request: PlayRequest) -> int:
                 what,
                 endpoints=endpoints,
                 session=request.session,
+                identity=lambda name: _identity(request.tls, name),
                 window=config.bus.window,
                 windows=observer_windows(config, fleet),
                 wait_until=pace.wait_until,
@@ -78,6 +80,10 @@ def run_play(request: PlayRequest) -> int:
             _say(f"{count} messages played")
             if pace.stopped or not request.loop:
                 return 0
+
+
+def _identity(tls: Path | None, name: str) -> Identity | None:
+    return Identity.in_folder(tls, name) if tls is not None else None
 
 
 def _required(

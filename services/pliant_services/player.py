@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 from pliant.bus.base import Window
+from pliant.bus.session import Identity
 from pliant.bus.zenoh_bus import ZenohBus
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.own_recording import recorded_frame
@@ -73,8 +74,11 @@ def play(
     window: int,
     windows: Mapping[str, Window],
     wait_until: Callable[[int], bool],
+    identity: Callable[[str], Identity | None] = lambda name: None,
 ) -> int:
     """Publish the recording once, ends included; returns the number of messages.
+
+    identity: the certificate of a service that is impersonated, for tls/ endpoints.
 
     ``wait_until``: is given each message's capture time in nanoseconds from the start, returns when
     it is due, and False where playing shall end.  Raises RecordingError and BusError.
@@ -97,6 +101,7 @@ def play(
                 outputs={topic: what.readers.get(topic, ()) for topic in outputs},
                 window=window,
                 windows=windows,
+                identity=identity(sender),
             )
             stack.enter_context(bus)
             buses |= dict.fromkeys((topic.key for topic in outputs), bus)

@@ -24,15 +24,20 @@ _PAUSE_S = 0.005
 class Relay:
     """The viewers' side of a launcher."""
 
-    def __init__(self, router: zenoh.Session, session: str) -> None:
-        """Watch for viewers of a session.  Nothing else happens until one comes."""
+    def __init__(
+        self, router: zenoh.Session, session: str, camera: tuple[bytes, bytes] | None = None
+    ) -> None:
+        """Watch for viewers of a session.  Nothing else happens until one comes.
+
+        camera: what the session has told of its camera before, as it came.
+        """
         self._router = router
         self._prefix = f"pliant/{session}"
         self._viewers: set[str] = set()
         self._arrived = threading.Event()
         self._seen = threading.Event()
         self._stopping = threading.Event()
-        self._camera: tuple[bytes, bytes] | None = None
+        self._camera = camera
         self._held: list[Any] = [
             router.declare_subscriber(f"{self._prefix}/{topics.STREAM.key}", self._on_camera),
             router.liveliness().declare_subscriber(
@@ -51,11 +56,13 @@ class Relay:
         self._stopping.set()
         self._arrived.set()
         self._thread.join()
+        for declared in self._held:
+            declared.undeclare()
 
     def _on_camera(self, sample: zenoh.Sample) -> None:
-        envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
-        if envelope[-1:] == b"\x00" and len(sample.payload) <= topics.STREAM.max_bytes:
-            self._camera = (sample.payload.to_bytes(), envelope)
+        camera = _camera_in(sample)
+        if camera is not None:
+            self._camera = camera
             self._arrived.set()
 
     def _on_viewer(self, sample: zenoh.Sample) -> None:
@@ -115,3 +122,81 @@ class Relay:
         return self._router.declare_publisher(
             f"{self._prefix}/view/{topic.key}", congestion_control=zenoh.CongestionControl.DROP
         )
+
+
+class Relays:
+    """The viewers' side of a router: a relay for each session, from its first service to its last.
+
+    Zenoh is called by a thread of its own, never in a callback.
+    """
+
+    def __init__(self, router: zenoh.Session) -> None:
+        self._router = router
+        self._changed = threading.Condition()
+        self._tokens: dict[str, set[str]] = {}
+        self._cameras: dict[str, tuple[bytes, bytes]] = {}
+        self._relays: dict[str, Relay] = {}
+        self._stopping = False
+        self._held: list[Any] = [
+            router.declare_subscriber(f"pliant/*/{topics.STREAM.key}", self._on_camera),
+            router.liveliness().declare_subscriber(
+                "pliant/*/ready/**", self._on_token, history=True
+            ),
+        ]
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop; to be called before the router is closed."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _on_camera(self, sample: zenoh.Sample) -> None:
+        camera = _camera_in(sample)
+        if camera is not None:
+            with self._changed:
+                self._cameras[_session_of(sample)] = camera
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        with self._changed:
+            tokens = self._tokens.setdefault(_session_of(sample), set())
+            if sample.kind == zenoh.SampleKind.PUT:
+                tokens.add(str(sample.key_expr))
+            else:
+                tokens.discard(str(sample.key_expr))
+            self._changed.notify_all()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._stopping or self._here() != set(self._relays))
+                here = set[str]() if self._stopping else self._here()
+                over = {name: self._relays.pop(name) for name in set(self._relays) - here}
+                new = sorted(here - set(self._relays))
+                cameras = dict(self._cameras)
+                for name in over:
+                    self._tokens.pop(name, None)
+                    self._cameras.pop(name, None)
+            for relay in over.values():
+                relay.close()
+            if self._stopping:
+                return
+            for name in new:
+                self._relays[name] = Relay(self._router, name, cameras.get(name))
+
+    def _here(self) -> set[str]:
+        return {name for name, tokens in self._tokens.items() if tokens}
+
+
+def _camera_in(sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
+    """A camera as a session tells it, with its envelope; None for anything else."""
+    envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
+    if envelope[-1:] == b"\x00" and len(sample.payload) <= topics.STREAM.max_bytes:
+        return sample.payload.to_bytes(), envelope
+    return None
+
+
+def _session_of(sample: zenoh.Sample) -> str:
+    return str(sample.key_expr).split("/")[1]

@@ -12,7 +12,7 @@ from typing import Any
 
 import zenoh
 
-from pliant.bus.session import open_session
+from pliant.bus.session import Identity, open_session
 from pliant.errors import MessageError, ResultError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic, by_key
@@ -38,6 +38,7 @@ class ViewRequest:
     source: Path | None
     endpoints: list[str]
     session: str
+    identity: Identity | None = None
     web: bool = False
     save: Path | None = None
     force: bool = False
@@ -62,7 +63,7 @@ def run_view(request: ViewRequest) -> None:
         print(f"open {canvas.address} in a browser", flush=True)
     try:
         if endpoints:
-            follow(endpoints, session, canvas, request.patience_s)
+            follow(endpoints, session, canvas, request.patience_s, request.identity)
         elif recording is not None and request.source is not None:
             draw(recording, canvas, request.source / MESH_NAME)
     finally:
@@ -83,11 +84,15 @@ def running_session(result: Path) -> tuple[list[str], str]:
 
 
 def follow(
-    endpoints: list[str], session: str, canvas: RerunCanvas, patience_s: float = 0.0
+    endpoints: list[str],
+    session: str,
+    canvas: RerunCanvas,
+    patience_s: float = 0.0,
+    identity: Identity | None = None,
 ) -> None:
     """Draw a running session until it ends.  Never asks it to wait.
 
-    patience_s: for a session that is about to start.
+    patience_s: for a session that is about to start.     identity: for tls/ endpoints.
 
     Raises BusError where nothing listens, ResultError where the session does not run.
     """
@@ -106,7 +111,7 @@ def follow(
         kind = topics.STREAM_END if envelope[-1] else topic
         waiting.append((kind, int.from_bytes(envelope[:8], "little"), sample.payload.to_bytes()))
 
-    with open_session(endpoints) as connection:
+    with open_session(endpoints, identity) as connection:
         held: list[Any] = [
             connection.declare_subscriber(f"{prefix}**", on_sample),
             connection.liveliness().declare_token(f"pliant/{session}/viewer/{os.getpid()}"),

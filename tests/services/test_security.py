@@ -12,6 +12,7 @@ from pliant.bus.session import Identity, free_endpoint, open_router, open_sessio
 from pliant.errors import BusError
 from pliant_services.access import NAMES, OPERATOR, access_control, may_write
 from pliant_services.certificates import make_certificates
+from pliant_services.relay import Relays
 
 PATIENCE_S = 20.0
 
@@ -83,3 +84,37 @@ def test_everybody_in_the_list_of_processes_may_write_something() -> None:
 def test_a_folder_without_the_certificate_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(BusError, match="pliant certs"):
         Identity.in_folder(tmp_path, "tracking")
+
+
+def test_a_viewer_sees_a_session_through_the_router_and_a_late_one_its_camera(folder: Path) -> None:
+    found = free_endpoint().replace("tcp/", "tls/")
+    router = open_router(
+        found,
+        identity=Identity.in_folder(folder, "router"),
+        access_control=access_control(),
+    )
+    relays = Relays(router)
+    came: list[bytes] = []
+    changed = threading.Condition()
+
+    def on_sample(sample) -> None:
+        with changed:
+            came.append(sample.payload.to_bytes())
+            changed.notify_all()
+
+    with (
+        open_session([found], Identity.in_folder(folder, "ingest")) as ingest,
+        open_session([found], Identity.in_folder(folder, OPERATOR)) as viewer,
+    ):
+        token = ingest.liveliness().declare_token("pliant/s/ready/ingest/1/2/0.1.0")
+        ingest.put("pliant/s/camera/stream", b"the camera", attachment=bytes(9))
+        held = [
+            viewer.declare_subscriber("pliant/s/view/**", on_sample),
+            viewer.liveliness().declare_token("pliant/s/viewer/1"),
+        ]
+        with changed:
+            assert changed.wait_for(lambda: b"the camera" in came, PATIENCE_S)
+        held.clear()
+        token.undeclare()
+    relays.close()
+    router.close()

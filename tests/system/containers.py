@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+import yaml
 
 from pliant.bus.session import free_endpoint
 from pliant.datasets.builtin import builtin_folder
@@ -184,3 +185,24 @@ def session(
             env=project.environment,
         )  # fmt: skip
         call("docker", "volume", "rm", "--force", f"{name}_{cache or 'cache'}")
+
+
+@contextmanager
+def network(name: str, folder: Path) -> Iterator[dict[str, Path]]:
+    """A network without a way out that joins machines; yields a compose file for each of them.
+
+    In it the rack's router has the name by which the other machines reach it.
+    """
+    docker("network", "create", "--internal", name)
+    joined: dict[str, Path] = {}
+    for machine in ("camera", "edge", "robot", "rack"):
+        content: dict[str, object] = {"networks": {"default": {"external": True, "name": name}}}
+        if machine == "rack":
+            router = {"networks": {"default": {"aliases": ["rack.local"]}}}
+            content["services"] = {"router": router}
+        joined[machine] = folder / f"{machine}-joined.yaml"
+        joined[machine].write_text(yaml.safe_dump(content))
+    try:
+        yield joined
+    finally:
+        call("docker", "network", "rm", name)

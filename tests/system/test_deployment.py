@@ -1,8 +1,10 @@
 """The files in deploy/: what users start sessions with, in containers."""
 
-import os
+import shutil
 import threading
+import uuid
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from containers import (
     build_image,
     call,
     compose_commands,
+    network,
     session,
     skip_without_engine,
 )
@@ -22,12 +25,21 @@ from running import pliant
 from pliant.bus.session import open_session
 from pliant.messages import codec, topics
 from pliant.messages.types import Status
+from pliant_services.access import NAMES
+from pliant_services.certificates import make_certificates
 from pliant_services.processes import PROFILES
 
 pytestmark = pytest.mark.system
 
 DEPLOY = ROOT / "deploy"
 FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
+
+SERVICES_OF = {
+    "camera": ["ingest"],
+    "edge": ["tracking"],
+    "robot": ["ingest", "tracking"],
+    "rack": ["router", "bundle_adjustment", "recorder"],
+}
 
 
 def results_of(folder: Path) -> dict[str, bytes]:
@@ -81,6 +93,29 @@ def test_nothing_runs_as_root_or_writes_into_its_image() -> None:
         assert all(port.startswith("127.0.0.1:") for port in service.get("ports", [])), name
 
 
+@pytest.mark.parametrize("unit", ["pliant-router.service", "pliant@.service"])
+def test_systemd_takes_the_units(unit: str, tmp_path: Path) -> None:
+    if not shutil.which("systemd-analyze"):
+        pytest.skip("systemd-analyze is not installed")
+    text = (DEPLOY / "systemd" / unit).read_text()
+    assert "/opt/pliant/bin/pliant " in text
+    copy = tmp_path / unit.replace("@", "@tracking")
+    copy.write_text(text.replace("/opt/pliant/bin/pliant ", "/bin/true "))
+    done = call("systemd-analyze", "verify", copy)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("command", ["service", "router"])
+def test_what_the_units_are_told_are_options_of_their_commands(command: str) -> None:
+    known = pliant(command, "--help", env={"COLUMNS": "200"}).stdout
+    files = ["router.env"] if command == "router" else ["session.env", "ingest.env", "recorder.env"]
+    for file in files:
+        words = (DEPLOY / "systemd" / file).read_text().split()
+        options = [w.rpartition("=")[2] for w in words if "--" in w and w != "--connect"]
+        assert options, file
+        assert [option for option in options if f"{option} " not in known] == [], file
+
+
 class Followed:
     """Listens to a session's status from outside, as a viewer would."""
 
@@ -108,12 +143,25 @@ class Followed:
         self._session.close()
 
 
+@pytest.mark.parametrize("machine", ["camera", "edge", "robot", "rack"])
+def test_every_compose_reads_the_files_of_the_machines(machine: str) -> None:
+    if not compose_commands():
+        pytest.skip("neither docker-compose nor docker compose is installed")
+    for command in compose_commands():
+        done = call(*command, "--file", DEPLOY / "machines" / f"{machine}.yaml", "config")
+        assert done.returncode == 0, done.stderr
+        content = yaml.safe_load(done.stdout)
+        for name, service in content["services"].items():
+            assert service["read_only"], name
+            assert name == "mesher" or any(part.startswith("--tls") for part in service["command"])
+
+
 @pytest.fixture
 def workstation(image: None, tmp_path: Path) -> Iterator[Session]:
     config = tmp_path / "config.yaml"
     config.write_text("bus: {checkpoint_frames: 6}\n")
     with session(
-        f"pliant-test-{os.getpid()}",
+        f"pliant-test-{uuid.uuid4().hex[:8]}",
         tmp_path / "results",
         DEPLOY / "compose.yaml",
         PLIANT_CONFIG=str(config),
@@ -139,3 +187,34 @@ def test_killed_containers_come_back_and_the_results_are_those_of_the_host(
     folder = workstation.results / "session"
     assert results_of(folder) == on_the_host
     assert pliant("info", folder).returncode == 0
+
+
+@pytest.mark.docker
+@pytest.mark.slow
+@pytest.mark.parametrize("machines", [("robot", "rack"), ("camera", "edge", "rack")])
+def test_several_machines_over_tls_give_the_results_of_one(
+    image: None, machines: tuple[str, ...], tmp_path: Path, on_the_host: dict[str, bytes]
+) -> None:
+    pytest.importorskip("cryptography")
+    make_certificates(tmp_path / "certs", NAMES, ["rack.local"])
+    for key in (tmp_path / "certs").glob("*.key"):
+        key.chmod(0o644)  # the tests run as one user, the containers as another
+    name = f"pliant-test-{uuid.uuid4().hex[:8]}"
+    with network(name, tmp_path) as joined, ExitStack() as running:
+        sessions: dict[str, Session] = {}
+        for machine in reversed(machines):  # in any order; results are the last machine's
+            sessions[machine] = running.enter_context(
+                session(
+                    f"{name}-{machine}",
+                    tmp_path / "results",
+                    DEPLOY / "machines" / f"{machine}.yaml",
+                    joined[machine],
+                    PLIANT_CERTS=str(tmp_path / "certs"),
+                )
+            )
+            sessions[machine].compose("up", "--detach", *SERVICES_OF[machine])
+        sessions["rack"].wait("router")
+        for machine, started in sessions.items():
+            for service in SERVICES_OF[machine]:
+                started.wait(service)
+    assert results_of(tmp_path / "results" / "session") == on_the_host

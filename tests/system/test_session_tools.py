@@ -13,6 +13,7 @@ from pliant_services.processes import PROFILES
 
 pytestmark = pytest.mark.system
 
+REFERENCE = Path(__file__).parents[1] / "data" / "reference" / "reference.mcap"
 PLIANT = [sys.executable, "-m", "pliant_services.cli"]
 
 
@@ -109,3 +110,16 @@ def test_results_go_to_no_folder_with_another_recording(endpoint: str, tmp_path:
     arguments = ["--connect", endpoint, "--output", output, "--results", "--state", state]
     done = call("service", "recorder", *arguments)
     assert (done.returncode, "choose another folder" in done.stderr) == (1, True)
+
+
+def test_a_recording_is_replayed_to_a_viewer_elsewhere(endpoint: str, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    to = ["--connect", endpoint, "--session", "replay"]
+    with start("replay", str(REFERENCE), *to, "--rate", "max", "--loop") as player:
+        try:
+            seen = call("view", *to, "--save", str(tmp_path / "seen.rrd"), "--patience", "60")
+            assert seen.returncode == 0, seen.stderr
+        finally:
+            player.terminate()
+            player.communicate()
+    assert (tmp_path / "seen.rrd").stat().st_size > 10_000

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from pliant.errors import PliantError
+from pliant_services.cli.options import TlsFolder
 
 
 def replay(
@@ -22,6 +23,7 @@ def replay(
     connect: Annotated[
         list[str] | None, typer.Option("--connect", help="A router [one of our own].")
     ] = None,
+    tls: TlsFolder = None,
     session: Annotated[str, typer.Option(help="Name of the session that is played.")] = "replay",
     port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Port of our own router [a free one].")
@@ -84,6 +86,7 @@ def replay(
         readers=[name for name in readers.split(",") if name],
         loop=loop,
         connect=connect or [],
+        tls=tls,
         session=session,
         port=port,
     )

@@ -31,6 +31,7 @@ def router(
     from pliant.bus.session import Identity, open_router
     from pliant.bus.zenoh_bus import OVER_KEY
     from pliant_services.access import access_control
+    from pliant_services.relay import Relays
 
     stopped = threading.Event()
     for kind in (signal.SIGINT, signal.SIGTERM):
@@ -42,8 +43,12 @@ def router(
         identity=Identity.in_folder(tls, "router") if tls is not None else None,
         access_control=access_control() if secure else None,
     )
-    if once:
-        session.declare_subscriber(f"pliant/*/{OVER_KEY}", lambda _: stopped.set())
+    held = session.declare_subscriber(
+        f"pliant/*/{OVER_KEY}", lambda _: stopped.set() if once else None
+    )
     typer.echo(f"router on {', '.join(endpoints)}", err=True)
+    relays = Relays(session)
     stopped.wait()
+    relays.close()
+    held.undeclare()
     session.close()  # type: ignore[no-untyped-call]

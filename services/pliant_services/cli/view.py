@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from pliant_services.cli.options import TlsFolder, identity_in
+
 
 def view(
     source: Annotated[
@@ -14,6 +16,7 @@ def view(
         list[str] | None, typer.Option("--connect", help="Router of a session, e.g. tcp/host:7447.")
     ] = None,
     session: Annotated[str, typer.Option(help="Name of the session at --connect.")] = "",
+    tls: TlsFolder = None,
     web: Annotated[bool, typer.Option("--web", help="In a browser instead of a window.")] = False,
     web_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of --web.")] = 9090,
     save: Annotated[Path | None, typer.Option(help="Into an .rrd file instead.")] = None,
@@ -30,12 +33,14 @@ def view(
 
     pliant view --connect tcp/127.0.0.1:7447 --session run-1234
     """
+    from pliant_services.access import OPERATOR
     from pliant_services.viewing import ViewRequest, run_view
 
     request = ViewRequest(
         source=source,
         endpoints=connect or [],
         session=session,
+        identity=identity_in(tls, OPERATOR),
         web=web,
         web_port=web_port,
         save=save,
