@@ -210,6 +210,8 @@ def test_several_machines_over_tls_give_the_results_of_one(
                     DEPLOY / "machines" / f"{machine}.yaml",
                     joined[machine],
                     PLIANT_CERTS=str(tmp_path / "certs"),
+                    PLIANT_PORT="7447",  # what the router listens on in there
+                    PLIANT_LISTEN="127.0.0.1",
                 )
             )
             sessions[machine].compose("up", "--detach", *SERVICES_OF[machine])
