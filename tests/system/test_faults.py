@@ -68,25 +68,33 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return run(tmp_path_factory.mktemp("undisturbed"))
 
 
-def once_at(frame: int, *names: str) -> Callable[[Status, Fleet], Sequence[str]]:
-    """Kill these when bundle adjustment has told of a frame."""
-    done: list[int] = []
+def once_at(*when: tuple[int, Sequence[str]]) -> Callable[[Status, Fleet], Sequence[str]]:
+    """Kill these when bundle adjustment has told of a frame; frames rise."""
+    waiting = list(when)
 
     def victims(status: Status, _: Fleet) -> Sequence[str]:
-        if status.service != "bundle_adjustment" or status.frame < frame or done:
+        if not waiting or status.service != "bundle_adjustment" or status.frame < waiting[0][0]:
             return ()
-        done.append(status.frame)
-        return names
+        return waiting.pop(0)[1]
 
     return victims
 
 
-@pytest.mark.parametrize("name", SERVICES)
-@pytest.mark.parametrize("frame", [3, 20])
-def test_a_killed_service_goes_on_where_it_was(
-    name: str, frame: int, tmp_path: Path, undisturbed: dict[str, str]
+@pytest.mark.parametrize("first", [2, 16])
+def test_killed_services_go_on_where_they_were(
+    first: int, tmp_path: Path, undisturbed: dict[str, str]
 ) -> None:
-    assert run(tmp_path, once_at(frame, name)) == undisturbed
+    """Each in its turn, early, before there is a checkpoint, and late."""
+    killed: list[str] = []
+    kills = once_at(*((first + 3 * i, (name,)) for i, name in enumerate(SERVICES)))
+
+    def victims(status: Status, fleet: Fleet) -> Sequence[str]:
+        chosen = kills(status, fleet)
+        killed.extend(chosen)
+        return chosen
+
+    assert run(tmp_path, victims) == undisturbed
+    assert killed == list(SERVICES)
 
 
 @pytest.mark.parametrize("look_s", [0.01, 1.0])
@@ -95,7 +103,7 @@ def test_all_at_once(
 ) -> None:
     """Whether the launcher sees one dead and others alive, or, looking seldom, all dead."""
     monkeypatch.setattr(launcher, "_POLL_S", look_s)
-    assert run(tmp_path, once_at(18, *SERVICES)) == undisturbed
+    assert run(tmp_path, once_at((18, SERVICES))) == undisturbed
 
 
 def test_a_power_cut_and_resume(tmp_path: Path, undisturbed: dict[str, str]) -> None:

@@ -12,14 +12,11 @@ from pliant.export.ply import read_ply
 pytestmark = pytest.mark.system
 
 
-@pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def result(tiny_run: Path) -> Path:
     pytest.importorskip("open3d", reason="meshing needs open3d: pip install 'pliant[mesh]'")
-    folder = tmp_path_factory.mktemp("mesh") / "tiny"
-    done = pliant("run", TINY, "--output", folder)
-    assert done.returncode == 0, done.stderr
-    assert "fine mesh:" in done.stdout
-    return folder
+    assert "fine mesh:" in (tiny_run / "logs" / "stdout").read_text()
+    return tiny_run
 
 
 def test_a_run_leaves_meshes_pictures_and_figures(result: Path) -> None:
@@ -39,8 +36,8 @@ def test_a_run_leaves_meshes_pictures_and_figures(result: Path) -> None:
     assert report["counters"]["meshing"]["fused"] > 0
 
 
-def test_the_mesh_against_the_truth(result: Path) -> None:
-    figures = result / "figures.json"
+def test_the_mesh_against_the_truth(result: Path, tmp_path: Path) -> None:
+    figures = tmp_path / "figures.json"
     done = pliant("eval", result, "--groundtruth", TINY, "--mesh", "--json", figures)
     assert done.returncode == 0, done.stderr
     found = json.loads(figures.read_text())["mesh"]

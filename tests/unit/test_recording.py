@@ -104,3 +104,15 @@ def test_a_record_that_claims_an_impossible_length_ends_the_reading(
     claim = b"\x06" + length.to_bytes(8, "little")  # a chunk
     path.write_bytes(whole[:header_ends] + claim + whole[header_ends:])
     assert list(Recording(path).messages()) == []
+
+
+def test_the_final_map_comes_after_the_updates_that_it_corrects(tmp_path: Path) -> None:
+    """A recorder that was started again gets what waited for it topic by topic."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, {"pliant": {"version": "1"}}) as recording:
+        for count, topic in enumerate(
+            (topics.MAP_UPDATE, topics.MAP_FINAL, topics.MAP_UPDATE, topics.EXTREMA)
+        ):
+            recording.write(topic, b"x", sequence=count, log_time_ns=count, publish_time_ns=count)
+    assert [r.sequence for r in Recording(path).messages()] == [0, 2, 3, 1]
+    assert [r.sequence for r in Recording(path).messages(topics.MAP_FINAL)] == [1]

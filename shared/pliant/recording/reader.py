@@ -8,7 +8,7 @@ from mcap.records import Attachment, Channel, Metadata
 
 from pliant.errors import RecordingError
 from pliant.messages import codec
-from pliant.messages.topics import Topic, by_key
+from pliant.messages.topics import MAP_FINAL, Topic, by_key
 from pliant.messages.types import Header
 from pliant.recording.parts import parts_of
 from pliant.recording.scan import Closed, Damage, Item, StoredMessage, scan
@@ -56,12 +56,21 @@ class Recording:
         return sum(file.stat().st_size for file in self.files)
 
     def messages(self, *topics: Topic) -> Iterator[Recorded]:
-        """Messages in file order up to the first damage; of all known topics if none is named."""
+        """Messages in file order up to the first damage; of all known topics if none is named.
+
+        The final map comes last, as it was told: a recorder that was started again gets what
+        waited for it topic by topic, and so may have it before the updates that it corrects.
+        """
+        final: list[Recorded] = []
         for item in self.everything(*topics):
             if isinstance(item, Damage) or (isinstance(item, Recorded) and not item.checked):
-                return  # what came before is all that is certain
+                break  # what came before is all that is certain
             if isinstance(item, Recorded):
-                yield item
+                if item.topic == MAP_FINAL:
+                    final.append(item)
+                else:
+                    yield item
+        yield from final
 
     def decoded(self, topic: Topic) -> Iterator[Header]:
         """The decoded messages of one topic, in order."""
