@@ -35,8 +35,8 @@ _CORRECTIONS = {
     "live, in the end: put in again whenever it moves": "moved",
 }
 _FIGURES = (
-    "covered", "median error", "within 5 %", "with the scale that fits", "normals", "F-score",
-    "triangles",
+    "covered", "median error", "within 5 %", "with the scale that fits", "normals",
+    "F-score (precision, recall)", "triangles",
 )  # fmt: skip
 
 
@@ -104,7 +104,7 @@ class _Compared:
             f"{100 * found.within:.1f} %",
             f"{100 * found.fitted_median_error:.2f} %, {100 * found.fitted_within:.1f} %",
             f"{found.normal_deg:.1f} deg",
-            f"{found.f_score:.3f}",
+            f"{found.f_score:.3f} ({found.precision:.3f}, {found.recall:.3f})",
             str(found.triangles),
         ]
 
