@@ -1,5 +1,6 @@
 """The files in deploy/: what users start sessions with, in containers."""
 
+import os
 import shutil
 import threading
 import uuid
@@ -34,6 +35,9 @@ pytestmark = pytest.mark.system
 DEPLOY = ROOT / "deploy"
 FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
 
+only_in_soak = pytest.mark.skipif(
+    "PLIANT_SOAK" not in os.environ, reason="takes minutes: scripts/soak runs it"
+)
 SERVICES_OF = {
     "camera": ["ingest"],
     "edge": ["tracking"],
@@ -191,7 +195,13 @@ def test_killed_containers_come_back_and_the_results_are_those_of_the_host(
 
 @pytest.mark.docker
 @pytest.mark.slow
-@pytest.mark.parametrize("machines", [("robot", "rack"), ("camera", "edge", "rack")])
+@pytest.mark.parametrize(
+    "machines",
+    [
+        pytest.param(("robot", "rack"), marks=only_in_soak, id="two"),
+        pytest.param(("camera", "edge", "rack"), id="three"),
+    ],
+)
 def test_several_machines_over_tls_give_the_results_of_one(
     image: None, machines: tuple[str, ...], tmp_path: Path, on_the_host: dict[str, bytes]
 ) -> None:
