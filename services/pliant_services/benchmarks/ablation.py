@@ -27,6 +27,7 @@ _OFF = {
     "minima beside maxima": ["tracking.both_signs=false"],
     "re-acquisition": ["bundle_adjustment.reacquisition.enabled=false"],
     "final adjustment": ["bundle_adjustment.window.final_adjustment=false"],
+    "readout of a rolling shutter": ["bundle_adjustment.calibration.readout=0"],
 }
 _TRACKER = ("mutual check", "local flow", "de-duplication", "sub-pixel extrema")
 _LITERAL = [s for name in (*_TRACKER, "patch refinement and coasting") for s in _OFF[name]]
