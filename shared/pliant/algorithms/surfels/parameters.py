@@ -42,6 +42,36 @@ class SurfelParameters(Parameters):
         "depth at birth.  Less is a more rigid scene.",
     )
 
+    neighbours: int = Field(
+        default=8,
+        ge=0,
+        le=32,
+        description="Neighbours on the same surface that a surfel holds on to (not in the paper); "
+        "0: the paper's surfels, each on its own.",
+    )
+    strain: float = Field(
+        default=0.02,
+        gt=0.0,
+        description="Relative change of the distance of neighbours that is as likely as a residual "
+        "of root omega_E.  Less is a stiffer surface.",
+    )
+    bend: float = Field(
+        default=0.3, gt=0.0, description="The same for the angle between neighbours, rad."
+    )
+    tear: float = Field(
+        default=0.3,
+        gt=0.0,
+        description="Strain at which neighbours hold on by a quarter only: what tears or slides.",
+    )
+    off_plane: float = Field(
+        default=0.3,
+        gt=0.0,
+        description="Neighbours are off each other's plane by at most this share of the distance.",
+    )
+    together_steps: int = Field(
+        default=4, ge=1, description="Steps of all surfels together at each level."
+    )
+
     max_surfels: int = Field(default=500, ge=1, le=20_000, description="Most surfels at a time.")
     patch_px: int = Field(
         default=23,

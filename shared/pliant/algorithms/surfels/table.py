@@ -8,6 +8,13 @@ from pliant.algorithms.arrays import F64, I32, I64, U8, BoolArray
 from pliant.algorithms.surfels.align import Templates
 from pliant.algorithms.surfels.birth import Births, join, select
 from pliant.algorithms.surfels.judge import CORRELATION, FRONT, INSIDE, SEEN, new_verdicts
+from pliant.algorithms.surfels.neighbours import (
+    Edges,
+    find_edges,
+    join_edges,
+    keep_rows,
+    no_edges,
+)
 from pliant.algorithms.surfels.sampling import POSE_FLOATS, A, B, X
 from pliant.algorithms.surfels.states import SurfelState
 
@@ -29,6 +36,8 @@ class SurfelTable:
     born: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
     missing: I32 = field(default_factory=lambda: np.zeros(0, np.int32))  # frames since last good
     verdicts: F64 = field(default_factory=lambda: new_verdicts(0))
+    guesses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # where to look next
+    edges: Edges = field(default_factory=no_edges)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -47,6 +56,7 @@ class SurfelTable:
             else births.templates
         )
         self.poses = np.concatenate([self.poses, poses])
+        self.guesses = np.concatenate([self.guesses, poses])
         self.rest = np.concatenate([self.rest, poses[:, X : X + 3]])
         self.information = np.concatenate([self.information, information])
         self.ids = np.concatenate([self.ids, np.arange(first_id, first_id + n)])
@@ -57,9 +67,26 @@ class SurfelTable:
 
     def keep(self, rows: I64) -> None:
         """Drop all but some rows."""
+        self.edges = keep_rows(self.edges, rows, len(self))
         self.templates = [select(each, rows) for each in self.templates]
-        for name in ("poses", "rest", "information", "ids", "state", "born", "missing", "verdicts"):
+        for name in (
+            "poses",
+            "rest",
+            "information",
+            "ids",
+            "state",
+            "born",
+            "missing",
+            "verdicts",
+            "guesses",
+        ):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[rows]))
+
+    def connect(self, first_new: int, count: int, off_plane: float) -> None:
+        """Give the rows from ``first_new`` on their neighbours."""
+        known = self.tracked.astype(np.int64)
+        new = find_edges(self.guesses, known, first_new, count, off_plane)
+        self.edges = join_edges(self.edges, new)
 
     @property
     def tracked(self) -> BoolArray:

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I64, U8
+from pliant.algorithms.arrays import F32, F64, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.surfels import judge
-from pliant.algorithms.surfels.align import Limits, align_all, make_workspace
+from pliant.algorithms.surfels.align import Limits, Templates, align_all, make_workspace
 from pliant.algorithms.surfels.birth import find_births
 from pliant.algorithms.surfels.joint import Equilibrium, align_jointly, align_rigid
 from pliant.algorithms.surfels.motion import MODELS
@@ -16,6 +16,7 @@ from pliant.algorithms.surfels.pyramid import make_pyramid, usable_levels
 from pliant.algorithms.surfels.sampling import BIAS, GAIN, A, B, F, Level, X, make_grid
 from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.table import SurfelTable, move_poses
+from pliant.algorithms.surfels.together import Hold, align_together
 
 _FOUND_AGAIN_ZNCC = 0.9
 """A surfel that was missing must fit better than one that was followed: chance has had tries."""
@@ -69,14 +70,15 @@ class SurfelTracker:
         pyramid = self._pyramid(image)
         goals = self._goals(prediction, len(pyramid))
         self._frame += 1
-        poses = move_poses(self._table.poses, inverse(self._T_world_camera))
+        torn: BoolArray = np.zeros(len(self._table), np.bool_)
+        poses = move_poses(self._table.guesses, inverse(self._T_world_camera))
         active = np.ones(len(poses), np.uint8)
         if self._parameters.camera == "static":
             self._start_at(goals, pyramid[-1], poses, active)
-            self._align(pyramid, poses, active)
+            torn = self._align(pyramid, poses, active)
         else:
             self._align_with_camera(pyramid, poses, goals)
-        self._judge(pyramid[0], poses, active)
+        self._judge(pyramid[0], poses, active, torn)
         if depth is not None:
             self._give_birth(pyramid, _checked_depth(depth, self._camera))
         return self._result()
@@ -122,13 +124,38 @@ class SurfelTracker:
             if templates:
                 start_at(poses, active, goals, level, templates[-1], limits, self._work)
 
-    def _align(self, pyramid: list[Level], poses: F64, active: U8) -> None:
+    def _align(self, pyramid: list[Level], poses: F64, active: U8) -> BoolArray:
         """Coarse to fine: the solution of a scale is the guess of the next (section VI-A2)."""
+        # With a moving camera the equilibrium of section V is what holds the surfels.
+        together = self._parameters.camera == "static" and len(self._table.edges.ends) > 0
+        start, torn = poses.copy(), np.zeros(len(poses), np.bool_)
         for number in range(len(pyramid) - 1, -1, -1):
-            align_all(
-                poses, active, pyramid[number], self._table.templates[number],
-                self._limits(fine=number == 0), self._work,
-            )  # fmt: skip
+            level, templates = pyramid[number], self._table.templates[number]
+            limits = self._limits(fine=number == 0)
+            # Alone each finds its place in the image; at full size depth would go astray.
+            if number > 0 or not together or len(pyramid) == 1:
+                align_all(poses, active, level, templates, limits, self._work)
+            if together:
+                torn = self._hold_together(level, poses, start, active, templates, limits)
+        return torn
+
+    def _hold_together(
+        self,
+        level: Level,
+        poses: F64,
+        start: F64,
+        active: U8,
+        templates: Templates,
+        limits: Limits,
+    ) -> BoolArray:
+        p = self._parameters
+        hold = Hold(
+            p.omega_e, p.strain, p.bend, p.tear, p.together_steps, p.min_zncc, p.min_visible
+        )
+        return align_together(
+            poses, start, active, self._table.edges, level, templates, limits, self._work,
+            self._grid, hold,
+        )  # fmt: skip
 
     def _align_with_camera(self, pyramid: list[Level], poses: F64, goals: F64 | None) -> None:
         """Section V: rigid at the coarsest level first, then Eq. 21 from coarse to fine."""
@@ -160,7 +187,7 @@ class SurfelTracker:
             poses[missing > 0] = rest[missing > 0]
             self._align(pyramid, poses, missing)
 
-    def _judge(self, level: Level, poses: F64, active: U8) -> None:
+    def _judge(self, level: Level, poses: F64, active: U8, torn: BoolArray) -> None:
         """Keep what was found; what was not stays where it was last good."""
         table, p = self._table, self._parameters
         judge.judge_all(
@@ -174,12 +201,19 @@ class SurfelTracker:
         state[verdicts[:, judge.SEEN] < p.min_visible] = SurfelState.OCCLUDED
         state[verdicts[:, judge.INSIDE] < p.min_visible] = SurfelState.OUTSIDE
         state[verdicts[:, judge.FRONT] == 0.0] = SurfelState.OUTSIDE
+        state[torn & (state == SurfelState.TRACKED)] = SurfelState.OUTLIER
         good = (state == SurfelState.TRACKED) & np.isfinite(poses).all(axis=1)
         table.missing = np.where(good, 0, table.missing + 1).astype(np.int32)
         state[~good & (table.missing > p.lost_after)] = SurfelState.LOST
         table.state = state
-        table.poses[good] = move_poses(poses[good], self._T_world_camera)
         self._lost = int(good.sum()) < p.min_alive
+        world = move_poses(poses, self._T_world_camera)
+        table.poses[good] = world[good]
+        # With neighbours, what is not seen is looked for where they have carried it.
+        table.guesses = table.poses.copy()
+        if p.neighbours and p.camera == "static" and not self._lost:
+            carried = ~good & np.isfinite(world).all(axis=1)
+            table.guesses[carried] = world[carried]
 
     def _give_birth(self, pyramid: list[Level], depth: F64) -> None:
         table, p, camera = self._table, self._parameters, self._camera
@@ -197,6 +231,7 @@ class SurfelTracker:
         sigma = p.expected_motion * births.poses[:, X + 2]
         information = np.eye(3) / np.maximum(sigma, 1e-9)[:, None, None] ** 2
         table.add(births, self._T_world_camera, self._next_id, self._frame, information)
+        table.connect(len(table) - n, p.neighbours, p.off_plane)
         self._next_id += n
         self._lost = int(table.tracked.sum()) < p.min_alive
         rows = (table.born == self._frame).astype(np.uint8)

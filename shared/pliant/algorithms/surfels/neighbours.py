@@ -1,0 +1,130 @@
+"""Surfels that were born side by side on one surface.
+
+Not in the paper, whose surfels know nothing of each other; ``together`` says what for.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.surfels.sampling import A, B, X
+
+
+class Edges(NamedTuple):
+    """E pairs of neighbours, d metres apart when the younger was born."""
+
+    ends: I64  # (E, 2) rows of the two surfels
+    first: F64  # (E, 3) d in A, B, A x B of the first
+    second: F64  # (E, 3) d in A, B, A x B of the second
+    lengths: F64  # (E,) |d|, metres
+
+
+def no_edges() -> Edges:
+    """No pairs."""
+    return Edges(np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
+
+@fast_kernel
+def own_coordinates(pose: F64, d: F64, out: F64) -> None:
+    """Coefficients of a vector in A, B and A x B of a surfel."""
+    a0, a1, a2 = pose[A], pose[A + 1], pose[A + 2]
+    b0, b1, b2 = pose[B], pose[B + 1], pose[B + 2]
+    n0, n1, n2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    dn = (d[0] * n0 + d[1] * n1 + d[2] * n2) / (n0 * n0 + n1 * n1 + n2 * n2)
+    aa, ab, bb = (
+        a0 * a0 + a1 * a1 + a2 * a2,
+        a0 * b0 + a1 * b1 + a2 * b2,
+        b0 * b0 + b1 * b1 + b2 * b2,
+    )
+    da, db = a0 * d[0] + a1 * d[1] + a2 * d[2], b0 * d[0] + b1 * d[1] + b2 * d[2]
+    det = aa * bb - ab * ab
+    out[0], out[1], out[2] = (da * bb - db * ab) / det, (db * aa - da * ab) / det, dn
+
+
+@fast_kernel
+def own_vector(pose: F64, c: F64, out: F64) -> None:
+    """The vector of such coefficients."""
+    a0, a1, a2 = pose[A], pose[A + 1], pose[A + 2]
+    b0, b1, b2 = pose[B], pose[B + 1], pose[B + 2]
+    out[0] = c[0] * a0 + c[1] * b0 + c[2] * (a1 * b2 - a2 * b1)
+    out[1] = c[0] * a1 + c[1] * b1 + c[2] * (a2 * b0 - a0 * b2)
+    out[2] = c[0] * a2 + c[1] * b2 + c[2] * (a0 * b1 - a1 * b0)
+
+
+@fast_kernel
+def _nearest(
+    points: F64, normals: F64, rows: I64, first_new: int, off_plane: float, out: I64
+) -> None:
+    """Fill ``out`` (N, K) with the nearest rows on the same surface, -1 where there are none.
+
+    rows: (N,) 1 where a surfel may be a neighbour.  Of each pair one is at least ``first_new``.
+    """
+    n, wanted = len(points), out.shape[1]
+    best = np.empty(wanted)
+    for i in range(n):
+        out[i] = -1
+        best[:] = np.inf
+        for j in range(n):
+            if j == i or not rows[i] or not rows[j] or (i < first_new and j < first_new):
+                continue
+            squares = off_i = off_j = 0.0
+            for k in range(3):
+                d = points[j, k] - points[i, k]
+                squares += d * d
+                off_i += d * normals[i, k]
+                off_j += d * normals[j, k]
+            bound = off_plane * off_plane * squares
+            if squares >= best[wanted - 1] or off_i * off_i > bound or off_j * off_j > bound:
+                continue
+            at = wanted - 1
+            while at > 0 and best[at - 1] > squares:
+                best[at], out[i, at] = best[at - 1], out[i, at - 1]
+                at -= 1
+            best[at], out[i, at] = squares, j
+
+
+def find_edges(poses: F64, known: I64, first_new: int, count: int, off_plane: float) -> Edges:
+    """The ``count`` nearest neighbours of each surfel that lie on the same surface.
+
+    poses: (N, POSE_FLOATS).  known: (N,) 1 where the pose is trusted.  first_new: pairs of earlier
+    rows are left out.  off_plane: neighbours are off each other's plane by at most this share of
+    their distance.
+    """
+    n = len(poses)
+    if n < 2 or count == 0:
+        return no_edges()
+    points = np.ascontiguousarray(poses[:, X : X + 3])
+    normals = np.cross(poses[:, A : A + 3], poses[:, B : B + 3])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    nearest = np.empty((n, count), np.int64)
+    _nearest(points, normals, known, first_new, off_plane, nearest)
+    rows, columns = np.repeat(np.arange(n), count), nearest.ravel()
+    pairs = np.stack([rows, columns], axis=1)[columns >= 0]
+    ends = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64).reshape(-1, 2)
+    d = points[ends[:, 1]] - points[ends[:, 0]]
+    first, second = np.zeros((len(ends), 3)), np.zeros((len(ends), 3))
+    for e, (i, j) in enumerate(ends):
+        own_coordinates(poses[i], d[e], first[e])
+        own_coordinates(poses[j], d[e], second[e])
+    return Edges(ends, first, second, np.maximum(np.linalg.norm(d, axis=1), 1e-9))
+
+
+def keep_rows(edges: Edges, rows: I64, count: int) -> Edges:
+    """The pairs whose surfels are both kept.  rows: those kept, of ``count``."""
+    new = np.full(count, -1, np.int64)
+    new[rows] = np.arange(len(rows))
+    ends = new[edges.ends]
+    kept = (ends >= 0).all(axis=1)
+    return Edges(ends[kept], edges.first[kept], edges.second[kept], edges.lengths[kept])
+
+
+def join_edges(a: Edges, b: Edges) -> Edges:
+    """All pairs of both."""
+    return Edges(
+        np.concatenate([a.ends, b.ends]),
+        np.concatenate([a.first, b.first]),
+        np.concatenate([a.second, b.second]),
+        np.concatenate([a.lengths, b.lengths]),
+    )

@@ -1,0 +1,118 @@
+"""Neighbouring surfels that hold on to each other."""
+
+import numpy as np
+from surfel_scene import slanted_surfels
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.surfels import motion
+from pliant.algorithms.surfels import together_kernels as kernels
+from pliant.algorithms.surfels.neighbours import Edges, find_edges, join_edges, keep_rows
+from pliant.algorithms.surfels.sampling import A, B, X
+from pliant.algorithms.surfels.together import torn_off
+
+N = 12
+
+
+def plane(count: int = N, seed: int = 0) -> F64:
+    """Surfels of one plane, z = 1 m."""
+    poses = slanted_surfels(count, seed)
+    poses[:, X + 2] = 1.0
+    poses[:, A : A + 3], poses[:, B : B + 3] = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    return poses
+
+
+def pairs_of(poses: F64, count: int = 3) -> Edges:
+    return find_edges(poses, np.ones(len(poses), np.int64), 0, count, 0.3)
+
+
+def rows_of(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
+    e = len(edges.ends)
+    w, residuals, arms = np.zeros(e), np.zeros((e, 2, 3)), np.zeros((e, 2, 3))
+    kernels.edge_rows(poses, edges, 0.3, w, residuals, arms)
+    return w, residuals, arms
+
+
+def stepped(poses: F64, x: F64) -> F64:
+    out = poses.copy()
+    step = np.zeros(motion.MOST_PARAMETERS)
+    for s in range(len(poses)):
+        step[:6] = x[s]
+        motion.apply_step(poses[s], step, motion.ISOMETRIC, out[s])
+    return out
+
+
+def test_neighbours_are_the_nearest_of_the_same_surface() -> None:
+    poses = plane()
+    poses[N // 2 :, X + 2] = 1.5
+    edges = pairs_of(poses)
+    assert ((edges.ends < N // 2).sum(axis=1) != 1).all()
+    d = poses[edges.ends[:, 1], X : X + 3] - poses[edges.ends[:, 0], X : X + 3]
+    np.testing.assert_allclose(edges.lengths, np.linalg.norm(d, axis=1))
+    points = poses[: N // 2, X : X + 3]
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    nearest = {tuple(sorted((i, int(j)))) for i in range(6) for j in np.argsort(distance[i])[1:4]}
+    assert nearest == {(int(i), int(j)) for i, j in edges.ends if i < N // 2}
+
+
+def test_pairs_follow_their_rows() -> None:
+    poses = plane()
+    old = pairs_of(poses)
+    rows = np.arange(2, N)
+    kept = keep_rows(old, rows, N)
+    assert 0 < len(kept.ends) < len(old.ends)
+    w, residuals, _ = rows_of(poses[rows], kept)
+    np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
+    np.testing.assert_allclose(w, 1.0)
+    new = find_edges(poses, np.ones(N, np.int64), N - 2, 3, 0.3)
+    assert (new.ends.max(axis=1) >= N - 2).all()
+    assert len(join_edges(old, new).ends) == len(old.ends) + len(new.ends)
+
+
+def test_a_rigid_motion_costs_nothing() -> None:
+    poses = plane()
+    edges = pairs_of(poses)
+    turn, shift = np.array([0.02, -0.03, 0.01]), np.array([0.1, 0.0, 0.05])
+    x = np.zeros((N, 6))
+    x[:, 3:] = turn
+    moved = stepped(poses, x)
+    c = np.cross(moved[0, A : A + 3], moved[0, B : B + 3])
+    rotation = np.stack([moved[0, A : A + 3], moved[0, B : B + 3], c], axis=1)
+    moved[:, X : X + 3] = poses[:, X : X + 3] @ rotation.T + shift
+    _, residuals, _ = rows_of(moved, edges)
+    np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
+
+
+def test_solution_against_dense_least_squares() -> None:
+    """Finite differences of the residuals, solved densely, give the same steps."""
+    rng = np.random.default_rng(1)
+    poses = plane()
+    edges = pairs_of(poses)
+    moved = stepped(poses, 0.003 * rng.standard_normal((N, 6)))
+    w, residuals, arms = rows_of(moved, edges)
+    pull, bend = w * 40.0 / edges.lengths**2, w * 3.0 / edges.lengths**2
+    roots = np.linalg.cholesky(np.eye(6) + 0.1)
+    S = np.broadcast_to(roots @ roots.T, (N, 6, 6)).copy()
+    b = rng.standard_normal((N, 6)) * 1e-3
+    x = np.zeros((N, 6))
+    kernels.solve_together(S, b, edges, arms, residuals, pull, bend, 500, 1e-24, x)
+    J = np.zeros((residuals.size, 6 * N))
+    for k in range(6 * N):
+        step = np.zeros(6 * N)
+        step[k] = 1e-6
+        ahead = rows_of(stepped(moved, step.reshape(N, 6)), edges)[1]
+        behind = rows_of(stepped(moved, -step.reshape(N, 6)), edges)[1]
+        J[:, k] = (ahead - behind).ravel() / 2e-6
+    W = np.repeat(np.stack([pull, bend], axis=1).ravel(), 3)
+    H = J.T @ (W[:, None] * J) + np.kron(np.eye(N), roots @ roots.T)
+    expected = -np.linalg.solve(H, J.T @ (W * residuals.ravel()) + b.ravel())
+    np.testing.assert_allclose(x.ravel(), expected, atol=1e-6 * np.abs(expected).max() + 1e-9)
+
+
+def test_who_leaves_all_neighbours_is_torn_off() -> None:
+    poses = plane()
+    edges = pairs_of(poses, 4)
+    assert not torn_off(edges, rows_of(poses, edges)[0], N).any()
+    poses[3, X : X + 3] *= 1.3
+    torn = torn_off(edges, rows_of(poses, edges)[0], N)
+    assert torn[3]
+    assert torn.sum() == 1
