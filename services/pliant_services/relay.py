@@ -24,20 +24,15 @@ _PAUSE_S = 0.005
 class Relay:
     """The viewers' side of a launcher."""
 
-    def __init__(
-        self, router: zenoh.Session, session: str, camera: tuple[bytes, bytes] | None = None
-    ) -> None:
-        """Watch for viewers of a session.  Nothing else happens until one comes.
-
-        camera: what the session has told of its camera before, as it came.
-        """
+    def __init__(self, router: zenoh.Session, session: str) -> None:
+        """Watch for viewers of a session.  Nothing else happens until one comes."""
         self._router = router
         self._prefix = f"pliant/{session}"
         self._viewers: set[str] = set()
         self._arrived = threading.Event()
         self._seen = threading.Event()
         self._stopping = threading.Event()
-        self._camera = camera
+        self._camera: tuple[bytes, bytes] | None = None
         self._held: list[Any] = [
             router.declare_subscriber(f"{self._prefix}/{topics.STREAM.key}", self._on_camera),
             router.liveliness().declare_subscriber(
@@ -51,6 +46,11 @@ class Relay:
         """Wait until the first viewer has come; False where none does in time."""
         return self._seen.wait(timeout_s)
 
+    def know_camera(self, camera: tuple[bytes, bytes]) -> None:
+        """What the session has told of its camera, as it came."""
+        self._camera = camera
+        self._arrived.set()
+
     def close(self) -> None:
         """Stop; to be called before the router is closed."""
         self._stopping.set()
@@ -62,8 +62,7 @@ class Relay:
     def _on_camera(self, sample: zenoh.Sample) -> None:
         camera = _camera_in(sample)
         if camera is not None:
-            self._camera = camera
-            self._arrived.set()
+            self.know_camera(camera)
 
     def _on_viewer(self, sample: zenoh.Sample) -> None:
         name = str(sample.key_expr)
@@ -156,8 +155,11 @@ class Relays:
     def _on_camera(self, sample: zenoh.Sample) -> None:
         camera = _camera_in(sample)
         if camera is not None:
+            name = _session_of(sample)
             with self._changed:
-                self._cameras[_session_of(sample)] = camera
+                self._cameras[name] = camera
+                if name in self._relays:
+                    self._relays[name].know_camera(camera)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         with self._changed:
@@ -175,7 +177,6 @@ class Relays:
                 here = set[str]() if self._stopping else self._here()
                 over = {name: self._relays.pop(name) for name in set(self._relays) - here}
                 new = sorted(here - set(self._relays))
-                cameras = dict(self._cameras)
                 for name in over:
                     self._tokens.pop(name, None)
                     self._cameras.pop(name, None)
@@ -184,7 +185,11 @@ class Relays:
             if self._stopping:
                 return
             for name in new:
-                self._relays[name] = Relay(self._router, name, cameras.get(name))
+                relay = Relay(self._router, name)
+                with self._changed:  # the camera may have been told in the meantime
+                    self._relays[name] = relay
+                    if name in self._cameras:
+                        relay.know_camera(self._cameras[name])
 
     def _here(self) -> set[str]:
         return {name for name, tokens in self._tokens.items() if tokens}
