@@ -52,12 +52,12 @@ class Relay:
         self._arrived.set()
 
     def close(self) -> None:
-        """Stop; to be called before the router is closed."""
+        """Stop; to be called before the router is closed.  Twice does no harm."""
         self._stopping.set()
         self._arrived.set()
         self._thread.join()
-        for declared in self._held:
-            declared.undeclare()
+        while self._held:
+            self._held.pop().undeclare()
 
     def _on_camera(self, sample: zenoh.Sample) -> None:
         camera = _camera_in(sample)
