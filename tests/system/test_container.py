@@ -1,5 +1,6 @@
 """The README's commands on a bare machine: plain Debian, Python, git, a user without rights."""
 
+import os
 import shutil
 import subprocess
 import uuid
@@ -62,7 +63,9 @@ def machine(image: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ma
     if bundled.returncode != 0:
         pytest.skip(f"not a whole git checkout: {bundled.stderr.strip()}")
     machine = Machine(f"pliant-test-{uuid.uuid4().hex[:12]}")
-    started = run("docker", "run", "-d", "--name", machine.name, image, "sleep", "infinity")
+    # Its home is a volume: installing into the engine's layers takes half as long again.
+    options = ["-d", "--name", machine.name, "-v", "/home/plain"]
+    started = run("docker", "run", *options, image, "sleep", "infinity")
     assert started.returncode == 0, started.stderr
     try:
         cloned = machine.shell(
@@ -72,7 +75,7 @@ def machine(image: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ma
         give_kernels(machine)
         yield machine
     finally:
-        run("docker", "rm", "--force", machine.name)
+        run("docker", "rm", "--force", "--volumes", machine.name)
 
 
 def give_kernels(machine: Machine) -> None:
@@ -112,6 +115,9 @@ def test_the_demo_sets_itself_up_and_leaves_what_it_names(machine_with_venv: Mac
         assert machine_with_venv.shell(f"test -s ~/pliant/{name}").returncode == 0, name
 
 
+@pytest.mark.skipif(
+    "PLIANT_SOAK" not in os.environ, reason="takes minutes, and CI does the same: scripts/soak"
+)
 def test_the_tests_set_themselves_up(machine_with_venv: Machine) -> None:
     done = machine_with_venv.shell(
         "cd ~/pliant && scripts/test tests/unit -k 'packaging or codec or config'"
