@@ -81,7 +81,7 @@ def rows(kills: int, seed: int) -> Iterator[tuple[str, int, int]]:
                 found = with_router_killed(Path(folder), frame)
             else:
                 names = SERVICES if victim == "all at once" else (victim,)
-                found = run(Path(folder), once_at(frame, *names))
+                found = run(Path(folder), once_at((frame, names)))
         print(f"{victim} killed at frame {frame}: {found == undisturbed}", file=sys.stderr)
         return found == undisturbed
 
