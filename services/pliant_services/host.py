@@ -106,6 +106,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
             lost = error
         stopping: Callable[[], bool] | None = arguments.get("stopping")
         bus.end_all(complete=lost is None and (stopping is None or not stopping()))
+        bus.see_off()
     if lost is not None:
         raise lost
 

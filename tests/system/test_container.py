@@ -17,7 +17,7 @@ IMAGE = "pliant-test-bare"
 DOCKERFILE = """
 FROM debian:bookworm-slim
 RUN apt-get update && apt-get install --yes --no-install-recommends python3 git
-RUN useradd --create-home plain
+RUN useradd --create-home --home-dir /srv/plain plain
 USER plain
 """
 
@@ -64,7 +64,7 @@ def machine(image: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ma
         pytest.skip(f"not a whole git checkout: {bundled.stderr.strip()}")
     machine = Machine(f"pliant-test-{uuid.uuid4().hex[:12]}")
     # Its home is a volume: installing into the engine's layers takes half as long again.
-    options = ["-d", "--name", machine.name, "-v", "/home/plain"]
+    options = ["-d", "--name", machine.name, "-v", "/srv/plain"]
     started = run("docker", "run", *options, image, "sleep", "infinity")
     assert started.returncode == 0, started.stderr
     try:

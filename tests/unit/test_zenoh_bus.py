@@ -222,3 +222,18 @@ def test_a_port_in_use_is_one_line(endpoint: str) -> None:
     with pytest.raises(BusError, match="in use") as caught:
         open_router(endpoint)
     assert "\n" not in str(caught.value)
+
+
+def test_a_reader_stays_until_its_sender_has_its_last_credits(endpoint: str) -> None:
+    def write() -> None:
+        with writer(endpoint) as bus:
+            bus.publish(topics.IMAGE, image(0))
+            bus.end_all()
+
+    thread, result = in_thread(write)
+    with reader(endpoint) as bus:
+        assert len(list(bus.receive(topics.IMAGE))) == 1
+        bus.see_off()
+        assert bus._peers.missing(["ingest"]) == ["ingest"]
+    thread.join(PATIENCE_S)
+    assert result == [None]

@@ -42,6 +42,7 @@ STOP_KEY = "control/stop"
 OVER_KEY = "control/over"
 _TICK_S = 1.0
 _LAST_CREDITS_S = 2.0
+_SEEING_OFF_S = 5.0
 
 
 class ZenohBus:
@@ -179,6 +180,22 @@ class ZenohBus:
         for output in self._outputs.values():
             if output.box.sent:
                 self._wait_for_readers(output, lambda box=output.box: box.all_safe())
+
+    def see_off(self) -> None:
+        """Once all that we sent is safe, stay until our senders have left, some seconds at most.
+
+        They leave when they have our last credits.  A session that is closed drops what has not
+        gone out yet: who leaves at once on a busy machine is taken for dead.
+        """
+        self.flush()
+        self._all_is_safe()
+        deadline = time.monotonic() + _SEEING_OFF_S
+        senders = {entry.sender for entry in self._inputs.values()}
+        with self._changed:
+            while len(self._peers.missing(senders)) < len(senders):
+                if time.monotonic() >= deadline:
+                    return
+                self._changed.wait(_TICK_S)  # the keeper tells our counts again meanwhile
 
     def _send(self, output: OutLink, kind: int, payload: bytes) -> None:
         if output.ended:
