@@ -6,19 +6,22 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
-from hashlib import sha256
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent / "system"))
 
-from running import TINY, command
-from test_faults import FILES, SERVICES, once_at, run
+from running import TINY, command, digests
+from soak_network import hostile_rows, latency_rows, network_rows
+from test_faults import SERVICES, once_at, run
 
 from pliant.bus.session import free_endpoint, open_session
 from pliant.messages import codec, topics
 from pliant.messages.types import Status
+from pliant_services.benchmarks import latency
+from pliant_services.benchmarks.table import markdown
 from pliant_services.warm_up import compile_kernels
 
 FRAMES = 40  # of the source
@@ -58,7 +61,7 @@ def with_router_killed(folder: Path, frame: int) -> dict[str, str]:
             held.undeclare()
         running.enter_context(_router(endpoint))
         assert [service.wait(TIMEOUT_S) for service in services] == [0] * len(services)
-    return {name: sha256((folder / name).read_bytes()).hexdigest() for name in FILES}
+    return digests(folder)
 
 
 def _router(endpoint: str) -> subprocess.Popen[str]:
@@ -70,7 +73,7 @@ def _router(endpoint: str) -> subprocess.Popen[str]:
     return process
 
 
-def rows(kills: int, seed: int) -> Iterator[tuple[str, int, int]]:
+def rows(kills: int, seed: int, undisturbed: dict[str, str]) -> Iterator[tuple[str, int, int]]:
     """What was killed, how often, and after how many of them the results were the same bytes."""
     random = np.random.default_rng(seed)
 
@@ -85,8 +88,6 @@ def rows(kills: int, seed: int) -> Iterator[tuple[str, int, int]]:
         print(f"{victim} killed at frame {frame}: {found == undisturbed}", file=sys.stderr)
         return found == undisturbed
 
-    with tempfile.TemporaryDirectory(prefix="pliant-soak-") as folder:
-        undisturbed = run(Path(folder))
     for victim in (*SERVICES, "all at once", "router"):
         yield victim, kills, sum(same(victim) for _ in range(kills))
 
@@ -96,9 +97,16 @@ def main() -> int:
     compile_kernels(print)
     print("| killed | times | same bytes |\n|---|---|---|")
     whole = True
-    for victim, times, same in rows(kills, seed):
+    with tempfile.TemporaryDirectory(prefix="pliant-soak-") as folder:
+        undisturbed = run(Path(folder))
+    for victim, times, same in rows(kills, seed, undisturbed):
         print(f"| {victim} | {times} | {same} |", flush=True)
         whole = whole and times == same
+    print("\n| fault | same bytes | told meanwhile |\n|---|---|---|")
+    for fault, same, told in chain(network_rows(undisturbed), hostile_rows(undisturbed)):
+        print(f"| {fault} | {same} | {told} |", flush=True)
+        whole = whole and same
+    print("\n" + markdown(latency.HEADING, latency_rows()), flush=True)
     return 0 if whole else 1
 
 

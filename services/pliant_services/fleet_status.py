@@ -19,6 +19,9 @@ _HEADINGS = (
 )
 
 
+_SILENT = "told nothing: stopped, or its host cut off"
+
+
 @dataclass
 class Seen:
     """A service: its first and last health, each with our own clock when it came (ns)."""
@@ -38,18 +41,29 @@ class Seen:
 
 def listen(
     endpoints: Sequence[str], session: str, seconds: float, identity: Identity | None = None
-) -> list[Seen]:
-    """Every service that told its health in so many seconds, by session and name.
+) -> tuple[list[Seen], list[tuple[str, str]]]:
+    """Every service that told its health in so many seconds, by session and name; and the session
+    and name of those that are announced and told nothing.
 
     Raises BusError where no router answers.
     """
     seen: dict[tuple[str, str], Seen] = {}
+    announced: dict[str, tuple[str, str]] = {}
+
+    def on_token(sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        if sample.kind == zenoh.SampleKind.PUT:
+            announced[key] = key.split("/")[1], service_of(key)
+        else:
+            announced.pop(key, None)
 
     def on_sample(sample: zenoh.Sample) -> None:
         found = read_health(sample)
         if found is None:
             return
         name, health = found
+        if str(sample.key_expr) != f"pliant/{name}/{health_key(health.service)}":
+            return
         now = time.time_ns()
         before = seen.get((name, health.service))
         if before is None or before.last.incarnation != health.incarnation:
@@ -58,18 +72,27 @@ def listen(
             before.last, before.last_ns = health, now
 
     with open_session(endpoints, identity) as connection:
-        subscriber = connection.declare_subscriber(f"pliant/{session}/{health_key('*')}", on_sample)
+        tokens = f"pliant/{session}/ready/**"
+        liveliness = connection.liveliness()
+        subscribers = (
+            connection.declare_subscriber(f"pliant/{session}/{health_key('*')}", on_sample),
+            liveliness.declare_subscriber(tokens, on_token, history=True),
+        )
         time.sleep(seconds)
-        subscriber.undeclare()  # type: ignore[no-untyped-call]
-    return [seen[key] for key in sorted(seen)]
+        for subscriber in subscribers:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+    silent = set(announced.values()) - set(seen)
+    return [seen[key] for key in sorted(seen)], sorted(silent)
 
 
-def table(services: Sequence[Seen]) -> Iterator[str]:
-    """The services as lines of text."""
+def table(services: Sequence[Seen], silent: Sequence[tuple[str, str]] = ()) -> Iterator[str]:
+    """The services as lines of text.  silent: session and name of those that told nothing."""
     newest: dict[str, int] = {}
     for each in services:
         newest[each.session] = max(newest.get(each.session, 0), each.last.frame)
     rows = [_HEADINGS, *(_row(each, newest[each.session]) for each in services)]
+    unknown = ("-",) * (len(_HEADINGS) - 3)
+    rows += [(*which, *unknown, _SILENT) for which in silent]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADINGS))]
     for row in rows:
         yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip()

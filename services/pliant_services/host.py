@@ -4,6 +4,7 @@ import contextlib
 import importlib
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +26,7 @@ from pliant_services.warm_up import load_kernels
 
 ENDED_EARLY = 3  # exit code of a source that failed after its first frame
 _GRACE_S = 3.0
+_TOLD_MESSAGES = 128  # two seconds at 60 frames/s, and a few
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,9 +92,13 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
         patience_s=config.bus.patience_s if options.patience_s is None else options.patience_s,
         checkpoints=checkpoints,
         keeps_books=process.observer and restartable,
-        windows=observer_windows(config, options.fleet),
+        windows={
+            **observer_windows(config, options.fleet),
+            **(checkpoint_windows(config, options.fleet) if restartable else {}),
+        },
         disturb=random_delays(options.delays_ms),
         identity=options.identity,
+        on_fault=lambda line: print(line, file=sys.stderr, flush=True),
         on_tick=options.alive.touch if options.alive is not None else None,
     ) as bus:
         if interrupted is not None:
@@ -116,6 +122,34 @@ def observer_windows(config: Config, fleet: Sequence[str]) -> dict[str, Window]:
     limits = config.recorder
     window = Window(limits.window_messages, limits.window_mib << 20)
     return {name: window for name in fleet if processes.BY_NAME[name].observer}
+
+
+def checkpoint_windows(config: Config, fleet: Sequence[str]) -> dict[str, Window]:
+    """The windows of those services that may ask for all since their last usable checkpoint.
+
+    What is on the way, two intervals for each stage down to the disk (one checkpoint may be passed
+    over while another is written), and what comes while each stage tells the one before it: the
+    rate of 60 frames/s for two of its ticks of a second.  With less the others would wait for
+    checkpoints that need more frames.
+    """
+
+    def stages(name: str) -> int:
+        if processes.BY_NAME[name].observer:
+            return 0
+        readers = processes.readers_of(name, fleet).values()
+        return 1 + max((stages(reader) for those in readers for reader in those), default=0)
+
+    bus = config.bus
+
+    def window(depth: int) -> Window:
+        kept = 2 * bus.window + 2 * bus.checkpoint_frames * depth + _TOLD_MESSAGES * (depth + 1)
+        return Window(kept, sys.maxsize)
+
+    return {
+        name: window(stages(name))
+        for name in fleet
+        if processes.BY_NAME[name].inputs and not processes.BY_NAME[name].observer
+    }
 
 
 def random_delays(largest_ms: float) -> Callable[[], None] | None:

@@ -80,8 +80,9 @@ class Fleet:
                 return
             with suppress(MessageError):  # not from a service of ours
                 message = codec.decode(Status, sample.payload.to_bytes())
-                self._frames[message.service] = message.frame
-                on_status(message)
+                if message.service in self._session_services:
+                    self._frames[message.service] = message.frame
+                    on_status(message)
 
         self._held = [
             self._router.liveliness().declare_subscriber(

@@ -28,7 +28,7 @@ from pliant_services.ingest import DROPPED
 from pliant_services.launcher import Fleet
 from pliant_services.mesh_check import WITH_MESH, choose_profile
 from pliant_services.mesh_results import FILES as MESH_FILES
-from pliant_services.processes import PROFILES, reads_depth
+from pliant_services.processes import PROFILES, deformable_fleet, reads_depth
 from pliant_services.progress import Progress
 from pliant_services.results import CONFIG_NAME, RECORDING_NAME, write_results
 from pliant_services.spectators import announced, viewer
@@ -97,10 +97,12 @@ def run_pipeline(request: RunRequest) -> int:
         calibration=request.calibration,
         fov_deg=request.fov_deg,
         topic=request.topic,
-        depth=config.ingest.depth if reads_depth(PROFILES[profile]) else "none",
+        depth=config.ingest.depth if reads_depth(PROFILES[profile], config) else "none",
     )
     progress = Progress(dataset.frame_count)
-    if profile != _DEFORMABLE:
+    if profile == _DEFORMABLE:
+        profile = deformable_fleet(config)
+    else:
         profile, without_mesh = choose_profile(config, restartable=state is not None)
         if without_mesh:
             progress.say(without_mesh)

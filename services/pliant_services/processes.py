@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from pliant.config import Config
 from pliant.messages import topics
 from pliant.messages.topics import Topic
 
@@ -11,6 +12,7 @@ from pliant.messages.topics import Topic
 class Process:
     """A service: its module has ``run(bus, ...)``.
 
+    optional: topics that it reads besides where a service of the fleet publishes them.
     observer: it reads every logged topic of the others, and nobody reads it.
     niceness: how much it gives way where processors are few; others do not wait for what it makes.
     """
@@ -19,6 +21,7 @@ class Process:
     module: str
     inputs: tuple[Topic, ...] = ()
     outputs: tuple[Topic, ...] = field(default=())
+    optional: tuple[Topic, ...] = ()
     observer: bool = False
     niceness: int = 0
 
@@ -58,6 +61,7 @@ PROCESSES: tuple[Process, ...] = (
         "surfels",
         "pliant_services.surfels",
         inputs=(topics.STREAM, topics.IMAGE, topics.DEPTH),
+        optional=(topics.EXTREMA, topics.MAP_UPDATE, topics.KEYFRAME),
         outputs=(topics.SURFELS,),
     ),
     Process("recorder", "pliant_services.recorder", observer=True),
@@ -69,12 +73,24 @@ PROFILES: dict[str, tuple[str, ...]] = {
     "rigid": ("ingest", "tracking", "bundle_adjustment", "meshing", "recorder"),
     "points": ("ingest", "tracking", "bundle_adjustment", "recorder"),
     "deformable": ("ingest", "surfels", "recorder"),
+    "deformable-tracks": ("ingest", "tracking", "surfels", "recorder"),
+    "deformable-map": ("ingest", "tracking", "bundle_adjustment", "surfels", "recorder"),
 }
+"""``deformable`` becomes one of the others where surfels are configured to use what those make."""
 
 
-def reads_depth(fleet: Sequence[str]) -> bool:
-    """Whether a service of the fleet works with depth maps."""
-    return any(topics.DEPTH in BY_NAME[name].inputs for name in fleet)
+def reads_depth(fleet: Sequence[str], config: Config) -> bool:
+    """Whether a service of the fleet works with the source's depth maps."""
+    return config.surfels.depth_from == "sensor" and any(
+        topics.DEPTH in BY_NAME[name].inputs for name in fleet
+    )
+
+
+def deformable_fleet(config: Config) -> str:
+    """The profile that makes what surfels are configured to use."""
+    if config.surfels.depth_from == "map":
+        return "deformable-map"
+    return "deformable-tracks" if config.surfels.prediction == "tracks" else "deformable"
 
 
 def inputs_of(name: str, fleet: Sequence[str], *, images: bool = True) -> dict[Topic, str]:
@@ -87,7 +103,8 @@ def inputs_of(name: str, fleet: Sequence[str], *, images: bool = True) -> dict[T
     if process.observer:
         left_out = () if images else (topics.SOURCE, topics.DEPTH)
         return {t: s for t, s in senders.items() if t.logged and t not in left_out}
-    return {topic: senders[topic] for topic in process.inputs}
+    optional = (topic for topic in process.optional if topic in senders)
+    return {topic: senders[topic] for topic in (*process.inputs, *optional)}
 
 
 def outputs_of(name: str) -> tuple[Topic, ...]:

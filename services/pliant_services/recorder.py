@@ -56,7 +56,7 @@ def run(
 
 def _record(recording: RollingWriter, received: Received, now_ns: int) -> None:
     topic = topics.STREAM_END if received.is_end else received.topic
-    message = codec.decode(topic.message, received.data, max_bytes=topic.max_bytes)
+    message = received.message or codec.decode(topic.message, received.data)
     if isinstance(message, CameraStream):
         recording.attach("calibration.yaml", "application/yaml", message.calibration.encode())
     recording.write(

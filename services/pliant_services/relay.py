@@ -7,18 +7,28 @@ while a viewer is there; the camera, which is told once, is kept for those who c
 """
 
 import threading
+import time
 from typing import Any
 
 import zenoh
 
-from pliant.messages import topics
+from pliant.errors import MessageError
+from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 
-VIEWED = (topics.SOURCE, topics.EXTREMA, topics.MAP_UPDATE, topics.MAP_FINAL)
-"""What viewers draw; mesh topics join here."""
-_RING = {topics.SOURCE.key: 2, topics.EXTREMA.key: 2}
+VIEWED = (
+    topics.SOURCE, topics.EXTREMA, topics.MAP_UPDATE, topics.MAP_FINAL,
+    topics.MESH_BLOCKS, topics.MESH_FINAL, topics.SURFELS,
+)  # fmt: skip
+"""What viewers draw."""
+_MESH_RING = 64  # changed blocks of 32 keyframes, or a final mesh of 8 million triangles
+_RING = {
+    topics.SOURCE.key: 2, topics.EXTREMA.key: 2, topics.SURFELS.key: 2,
+    topics.MESH_BLOCKS.key: _MESH_RING, topics.MESH_FINAL.key: _MESH_RING,
+}  # fmt: skip
 _MAP_RING = 256  # updates are deltas: lost ones are waited for until the next snapshot
 _PAUSE_S = 0.005
+_LAST_WORDS_S = 2.0
 
 
 class Relay:
@@ -81,12 +91,17 @@ class Relay:
                 self._serve()
 
     def _serve(self) -> None:
-        """Hand on until the last viewer is gone."""
+        """Hand on until the last viewer is gone; of a session that is over, what is there."""
         outputs = {topic: self._publisher(topic) for topic in (*VIEWED, topics.STREAM)}
         inputs = {topic: self._ring(topic.key, _RING.get(topic.key, _MAP_RING)) for topic in VIEWED}
         told = self._ring(topics.status("*").key, _MAP_RING)
         greeted: set[str] = set()
-        while self._viewers and not self._stopping.is_set():
+        idle, last_word = False, time.monotonic() + _LAST_WORDS_S
+        while self._viewers:
+            if not self._stopping.is_set():
+                last_word = time.monotonic() + _LAST_WORDS_S
+            elif idle or time.monotonic() > last_word:
+                break
             if self._camera is not None and not self._viewers <= greeted:
                 greeted = set(self._viewers)
                 data, envelope = self._camera
@@ -198,9 +213,14 @@ class Relays:
 def _camera_in(sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
     """A camera as a session tells it, with its envelope; None for anything else."""
     envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
-    if envelope[-1:] == b"\x00" and len(sample.payload) <= topics.STREAM.max_bytes:
-        return sample.payload.to_bytes(), envelope
-    return None
+    if envelope[-1:] != b"\x00" or len(sample.payload) > topics.STREAM.max_bytes:
+        return None
+    data = sample.payload.to_bytes()
+    try:
+        codec.decode(topics.STREAM.message, data)
+    except MessageError:
+        return None
+    return data, envelope
 
 
 def _session_of(sample: zenoh.Sample) -> str:

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ pytest.importorskip("cryptography")
 
 from pliant.bus.session import Identity, free_endpoint, open_router, open_session
 from pliant.errors import BusError
+from pliant.messages import topics
+from pliant.recording.reader import Recording
 from pliant_services.access import NAMES, OPERATOR, access_control, may_write
 from pliant_services.certificates import make_certificates
 from pliant_services.relay import Relays
@@ -94,6 +97,8 @@ def test_a_viewer_sees_a_session_through_the_router_and_a_late_one_its_camera(fo
         access_control=access_control(),
     )
     relays = Relays(router)
+    recording = Path(__file__).parents[1] / "data" / "reference" / "reference.mcap"
+    camera = next(Recording(recording).messages(topics.STREAM)).data
     came: list[bytes] = []
     changed = threading.Condition()
 
@@ -103,18 +108,20 @@ def test_a_viewer_sees_a_session_through_the_router_and_a_late_one_its_camera(fo
             changed.notify_all()
 
     with (
+        closing(router),
+        closing(relays),
         open_session([found], Identity.in_folder(folder, "ingest")) as ingest,
         open_session([found], Identity.in_folder(folder, OPERATOR)) as viewer,
     ):
         token = ingest.liveliness().declare_token("pliant/s/ready/ingest/1/2/0.1.0")
-        ingest.put("pliant/s/camera/stream", b"the camera", attachment=bytes(9))
+        for payload in (b"no camera", camera):
+            ingest.put("pliant/s/camera/stream", payload, attachment=bytes(9))
         held = [
             viewer.declare_subscriber("pliant/s/view/**", on_sample),
             viewer.liveliness().declare_token("pliant/s/viewer/1"),
         ]
         with changed:
-            assert changed.wait_for(lambda: b"the camera" in came, PATIENCE_S)
+            assert changed.wait_for(lambda: camera in came, PATIENCE_S)
         held.clear()
         token.undeclare()
-    relays.close()
-    router.close()
+    assert b"no camera" not in came

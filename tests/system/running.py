@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from hashlib import sha256
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,13 @@ import yaml
 TINY = "built-in:tiny"
 TIMEOUT_S = 300
 UP = "services are up"
+FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
+"""Of a run's results, those that depend on nothing but its input."""
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Of the result files: thousands of differing bytes tell a reader nothing."""
+    return {name: sha256((folder / name).read_bytes()).hexdigest() for name in FILES}
 
 
 def command(*arguments: object) -> list[str]:

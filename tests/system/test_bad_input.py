@@ -81,6 +81,8 @@ MISTAKES: list[tuple[Sequence[str], int, Sequence[str]]] = [
     (["run", "file"], 1, ["file: not a video"]),
     (["run", "camera:77"], 1, ["no such camera"]),
     (["run", "built-in:nowhere"], 1, ["built-in:room"]),
+    (["run", "built-in:kinect-paper", "--profile", "deformable"], 1, ["?tracks=PATH"]),
+    (["render", "built-in:kinect-paper?tracks=no.npz"], 1, ["no.npz: no such file"]),
     (["run", TINY + "?frames=many"], 1, ["frames=many"]),
     (["run", TINY, "--fov", "nan"], 1, ["1 to 170 degrees"]),
     (["run", TINY, "--fov", "60", "--calibration", "file"], 1, ["contradict"]),

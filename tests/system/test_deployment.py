@@ -21,7 +21,7 @@ from containers import (
     session,
     skip_without_engine,
 )
-from running import pliant
+from running import FILES, pliant
 
 from pliant.bus.session import open_session
 from pliant.messages import codec, topics
@@ -33,7 +33,6 @@ from pliant_services.processes import PROFILES
 pytestmark = pytest.mark.system
 
 DEPLOY = ROOT / "deploy"
-FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
 
 only_in_soak = pytest.mark.skipif(
     "PLIANT_SOAK" not in os.environ, reason="takes minutes: scripts/soak runs it"

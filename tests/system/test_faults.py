@@ -2,11 +2,13 @@
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
-from hashlib import sha256
 from pathlib import Path
 
 import pytest
+from hostile import attack, samples
+from running import TINY, digests
 
 from pliant.config import config_yaml, load_config
 from pliant.messages.types import Status
@@ -25,8 +27,7 @@ from pliant_services.results import write_results
 pytestmark = pytest.mark.system
 
 SERVICES = PROFILES["points"]
-FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
-REQUEST = RunRequest(source="built-in:tiny")
+REQUEST = RunRequest(source=TINY)
 
 
 def run(
@@ -34,8 +35,12 @@ def run(
     victims: Callable[[Status, Fleet], Sequence[str]] = lambda status, fleet: (),
     *,
     resume: bool = False,
+    slowed_ms: int = 0,
 ) -> dict[str, str]:
-    """One run in which the victims of each status are killed; returns the result files."""
+    """One run in which the victims of each status are killed; returns the result files.
+
+    slowed_ms: of every tenth message of the tracker, the longest delay.
+    """
     config = load_config(overrides=["bus.checkpoint_frames=6"])
     if not resume:
         prepare(output, config_yaml(config))
@@ -53,13 +58,13 @@ def run(
         state=output / STATE_FOLDER,
     )
     try:
-        fleet.start(lambda name: service_arguments(name, REQUEST, output))
+        slowed = {"tracking": ["--delays-ms", str(slowed_ms)]} if slowed_ms else {}
+        fleet.start(lambda name: [*service_arguments(name, REQUEST, output), *slowed.get(name, [])])
         fleet.wait()
     finally:
         fleet.close()
     write_results(output)
-    # Digests: thousands of differing bytes tell a reader nothing.
-    return {name: sha256((output / name).read_bytes()).hexdigest() for name in FILES}
+    return digests(output)
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +122,52 @@ def test_a_power_cut_and_resume(tmp_path: Path, undisturbed: dict[str, str]) -> 
         run(tmp_path, cut)
     resumed_config(tmp_path, REQUEST)
     assert run(tmp_path, resume=True) == undisturbed
+
+
+def test_messages_that_no_service_sends_are_counted_told_and_change_nothing(
+    tmp_path: Path, undisturbed: dict[str, str], tiny_run: Path
+) -> None:
+    """To every key, also under the numbers of the true ones, while the source is held up."""
+    assert run_attacked(tmp_path, tiny_run / "recording.mcap", each=300) == undisturbed
+    for name in ("tracking", "bundle_adjustment", "recorder"):
+        said = (tmp_path / "logs" / f"{name}.log").read_text()
+        assert "messages passed over" in said, name
+        assert "refused" in said, name
+    assert "credit of camera/image" in (tmp_path / "logs" / "ingest.log").read_text()
+
+
+def run_attacked(output: Path, recording: Path, each: int, *, slowed_ms: int = 0) -> dict[str, str]:
+    """A run that meets so many hostile messages on every key; returns the result files.
+
+    slowed_ms: slow the run down instead of stopping its source: nobody can be stopped for long.
+    """
+    attackers: list[threading.Thread] = []
+    failures: list[Exception] = []
+
+    def hold_and_attack(status: Status, fleet: Fleet) -> Sequence[str]:
+        if not attackers and status.service == "bundle_adjustment" and status.frame >= 10:
+            source = fleet.pids["ingest"]
+
+            def work() -> None:
+                if not slowed_ms:
+                    os.kill(source, signal.SIGSTOP)
+                try:
+                    attack(fleet.endpoint, fleet.session, SERVICES, samples(recording), each)
+                except Exception as error:
+                    failures.append(error)
+                finally:
+                    if not slowed_ms:
+                        os.kill(source, signal.SIGCONT)
+
+            attackers.append(threading.Thread(target=work))
+            attackers[0].start()  # no Zenoh call in a callback
+        return ()
+
+    found = run(output, hold_and_attack, slowed_ms=slowed_ms)
+    assert attackers
+    attackers[0].join()
+    assert not failures, failures
+    return found
 
 
 def test_a_frame_that_kills_again_and_again_ends_the_run_with_its_number(tmp_path: Path) -> None:

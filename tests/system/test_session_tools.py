@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from pliant.bus.session import free_endpoint
+from pliant_services.benchmarks.latency import hop
 from pliant_services.processes import PROFILES
 
 pytestmark = pytest.mark.system
@@ -123,3 +124,9 @@ def test_a_recording_is_replayed_to_a_viewer_elsewhere(endpoint: str, tmp_path: 
             player.terminate()
             player.communicate()
     assert (tmp_path / "seen.rrd").stat().st_size > 10_000
+
+
+def test_a_hop_is_measured() -> None:
+    images, p50, p99 = hop(free_endpoint(), images=60)
+    assert images == "60"
+    assert 0.0 < float(p50) <= float(p99)

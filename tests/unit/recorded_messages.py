@@ -115,20 +115,23 @@ def _fill(writer: Any, ros: Ros, messages: Messages, serialise: Callable[..., An
             writer.write(connection, START_NS + i * STEP_NS, serialise(value, kind))
 
 
-def write_ros2_mcap(path: Path, ros: Ros, messages: Messages) -> None:
-    """As ``ros2 bag record --storage mcap`` and Foxglove's bridge do."""
+def write_ros_mcap(path: Path, ros: Ros, messages: Messages) -> None:
+    """As ``ros2 bag record --storage mcap`` and Foxglove's bridge do, or ``mcap convert`` of a
+    ROS 1 bag."""
+    release = 1 if ros.one else 2
+    serialise = ros.store.serialize_ros1 if ros.one else ros.store.serialize_cdr
     with path.open("wb") as file:
         writer = Writer(file)
-        writer.start(profile="ros2", library="test")
+        writer.start(profile=f"ros{release}", library="test")
         for topic, values in messages.items():
             kind = values[0].__msgtype__
-            text, _ = ros.store.generate_msgdef(kind, ros_version=2)
-            schema = writer.register_schema(kind, "ros2msg", text.encode())
-            channel = writer.register_channel(topic, "cdr", schema)
+            text, _ = ros.store.generate_msgdef(kind, ros_version=release)
+            name = kind.replace("/msg/", "/") if ros.one else kind
+            schema = writer.register_schema(name, f"ros{release}msg", text.encode())
+            channel = writer.register_channel(topic, "ros1" if ros.one else "cdr", schema)
             for i, value in enumerate(values):
                 time_ns = START_NS + i * STEP_NS
-                data = bytes(ros.store.serialize_cdr(value, kind))
-                writer.add_message(channel, time_ns, data, time_ns)
+                writer.add_message(channel, time_ns, bytes(serialise(value, kind)), time_ns)
         writer.finish()
 
 

@@ -12,6 +12,7 @@ from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.bus.inbox import Inbox
 from pliant.bus.outbox import Numbered, Outbox
 from pliant.bus.peers import WIRE_VERSION, Peers
+from pliant.bus.waiting import Waiting
 from pliant.errors import BusError, SessionOverError
 from pliant.messages import topics
 
@@ -72,6 +73,42 @@ def test_nothing_is_kept_that_no_reader_can_ask_for() -> None:
         outbox.again(2)
 
 
+def test_what_was_asked_for_and_has_come_since_is_not_sent_again() -> None:
+    """After a cut the words of a reader come in one go: the first asks, the last has it all."""
+    outbox = Outbox("t", ["a", "b"], window=10)
+    for _ in range(6):
+        outbox.add(0, b"x")
+    outbox.credit("a", 1, 2, 2)
+    outbox.credit("b", 1, 6, 6)
+    outbox.asking.add("a")
+    outbox.credit("a", 1, 5, 5)
+    assert [m.sequence for m in outbox.asked_for()] == [5]
+    assert outbox.asked_for() == ()
+    outbox.asking.add("a")
+    outbox.credit("a", 1, 6, 6)
+    assert outbox.asked_for() == ()
+
+
+def test_a_wait_is_told_with_its_length_once_it_is_long() -> None:
+    waiting = Waiting()
+    assert waiting.told(now=100.0) == ""
+    waiting.begin("an image", now=100.0)
+    assert waiting.told(now=101.0) == "an image"
+    waiting.begin("an image from afar", now=103.0)  # the same wait
+    assert waiting.told(now=105.0) == "an image from afar, for 5 s"
+    waiting.end()
+    waiting.begin("an image", now=106.0)
+    assert waiting.told(now=107.0) == "an image"
+
+
+def test_all_who_are_furthest_behind_are_named() -> None:
+    outbox = Outbox("t", ["a", "c", "b"], window=10)
+    outbox.add(0, b"x")
+    assert outbox.slowest() == "a, b, c"
+    outbox.credit("b", 1, 1, 1)
+    assert outbox.slowest() == "a, c"
+
+
 def test_counts_fall_only_with_a_new_incarnation() -> None:
     outbox = Outbox("t", ["a"], window=10)
     for _ in range(5):
@@ -117,6 +154,7 @@ def test_a_service_that_came_back_is_not_gone() -> None:
     assert peers.missing(["ingest"]) == []
     peers.on_token(token(2), alive=False, now=3.0)
     assert peers.missing(["ingest"]) == ["ingest"]
+    assert peers.absent(["ingest", "tracking"]) == "ingest (away), tracking (not here yet)"
     assert peers.lost(["ingest"], patience_s=5.0, now=7.0) == []
     assert peers.lost(["ingest"], patience_s=5.0, now=8.0) == ["ingest"]
 

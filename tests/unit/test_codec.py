@@ -30,7 +30,7 @@ _SCALARS = {
 def messages(draw: st.DrawFn, message: type[Header]) -> Header:
     sizes: dict[str, int] = {}
     values = {}
-    for name, kind in codec._scalars(message).items():
+    for name, kind in codec.scalars(message).items():
         if get_origin(kind) is tuple:
             element = _SCALARS[get_args(kind)[0].__name__]
             values[name] = tuple(draw(st.lists(element, max_size=4)))
@@ -56,7 +56,7 @@ def test_round_trip_of_every_message(message: type[Header], data: st.DataObject)
         assert after.dtype == before.dtype
         assert after.shape == before.shape
         assert after.tobytes() == before.tobytes()
-    for name in codec._scalars(message):
+    for name in codec.scalars(message):
         assert getattr(received, name) == getattr(sent, name)
     assert codec.encode(received) == wire
 

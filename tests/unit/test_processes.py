@@ -1,12 +1,15 @@
 """The table of processes describes a network that can run."""
 
 import importlib
+from pathlib import Path
 
 import pytest
 
+from pliant.config import Config
 from pliant.messages import topics
 from pliant_services import processes
 from pliant_services.cli import service as cli_service
+from pliant_services.host import checkpoint_windows
 from pliant_services.processes import PROCESSES, PROFILES
 
 
@@ -48,3 +51,13 @@ def test_every_process_has_a_module_with_run(process: processes.Process) -> None
 
 def test_the_help_names_every_service() -> None:
     assert cli_service.NAMES.split(", ") == list(processes.BY_NAME)
+
+
+def test_what_is_kept_for_checkpoints_is_what_the_docs_say() -> None:
+    windows = checkpoint_windows(Config(), PROFILES["points"])
+    assert {name: window.messages for name, window in windows.items()} == {
+        "tracking": 656,
+        "bundle_adjustment": 408,
+    }
+    docs = (Path(__file__).parents[2] / "docs" / "faults.md").read_text(encoding="utf-8")
+    assert all(f"| {window.messages} |" in docs for window in windows.values())

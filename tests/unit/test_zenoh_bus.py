@@ -1,5 +1,6 @@
 """Flow control over real Zenoh sessions: nothing lost, memory bounded, nobody waits for ever."""
 
+import struct
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 
 from pliant.bus.base import Window
+from pliant.bus.checkpoints import Checkpoints
 from pliant.bus.session import free_endpoint, open_router
 from pliant.bus.zenoh_bus import ZenohBus
 from pliant.errors import BusError, MessageError
 from pliant.messages import codec, topics
-from pliant.messages.types import Image
+from pliant.messages.types import Image, StreamEnd
 
 WINDOW = 4
 PATIENCE_S = 20.0
@@ -159,6 +161,47 @@ def test_a_window_is_bounded_in_bytes_and_opens_when_its_reader_acknowledges(
     assert taken == list(range(10))
 
 
+def test_what_is_kept_for_checkpoints_is_bounded_and_nobody_waits_for_ever(
+    endpoint: str, tmp_path
+) -> None:
+    """A sender waits for a checkpoint of its reader, which has what it needs to make one."""
+    most, interval, frames = 2 * WINDOW + 2 * 3, 3, 40
+    kept: list[int] = []
+
+    def write() -> None:
+        with ZenohBus(
+            endpoints=[endpoint],
+            session="test",
+            service="ingest",
+            inputs={},
+            outputs={topics.IMAGE: ["tracking"]},
+            window=WINDOW,
+            windows={"tracking": Window(messages=most, size=1 << 30)},
+        ) as bus:
+            for frame in range(frames):
+                bus.publish(topics.IMAGE, image(frame))
+                kept.append(bus._outputs[topics.IMAGE.key].box.kept())
+            bus.end_all()
+
+    thread, result = in_thread(write)
+    with ZenohBus(
+        endpoints=[endpoint],
+        session="test",
+        service="tracking",
+        inputs={topics.IMAGE: "ingest"},
+        outputs={},
+        window=WINDOW,
+        checkpoints=Checkpoints(tmp_path, interval=interval),
+    ) as bus:
+        assert bus.restore() is None
+        for message in bus.receive(topics.IMAGE):
+            bus.checkpoint(message.frame, message.frame)
+    thread.join(PATIENCE_S)
+    assert result == [None]
+    assert len(kept) == frames
+    assert max(kept) <= most
+
+
 def test_a_reader_that_dies_is_named(endpoint: str) -> None:
     bus = reader(endpoint)
     thread, result = in_thread(lambda: _write_many(endpoint))
@@ -199,6 +242,73 @@ def test_a_sender_that_ignores_credit_fills_no_memory(endpoint: str) -> None:
         with bus._changed:
             assert bus._changed.wait_for(lambda: len(box.waiting) == box.limit, PATIENCE_S)
         assert box.limit == 2 * WINDOW
+
+
+def test_what_is_no_message_is_counted_told_and_asked_for_again(endpoint: str) -> None:
+    """Also where it comes first under the number of a true one, and where it looks like an end."""
+    said: list[str] = []
+    told = threading.Event()
+
+    def on_fault(line: str) -> None:
+        said.append(line)
+        told.set()
+
+    with ZenohBus(
+        endpoints=[endpoint],
+        session="test",
+        service="tracking",
+        inputs={topics.IMAGE: "ingest"},
+        outputs={},
+        window=WINDOW,
+        on_fault=on_fault,
+    ) as bus:
+        rude = bus._session.declare_publisher(f"pliant/test/{topics.IMAGE.key}")
+        box = bus._inputs[topics.IMAGE.key].box
+        end = codec.encode(
+            StreamEnd(frame=0, stamp_ns=0, frame_id="", topic="x", messages=0, complete=True)
+        )
+        for payload, envelope in (
+            (end, bytes(8) + b"\x01"),
+            (b"no image", bytes(9)),
+            (codec.encode(image(0)), bytes(8) + b"\x07"),
+            (codec.encode(image(0)), b"short"),
+            (codec.encode(image(9)), (9).to_bytes(8, "little") + b"\x00"),
+        ):
+            rude.put(payload, attachment=envelope)
+        with bus._changed:
+            assert bus._changed.wait_for(lambda: box.early, PATIENCE_S)
+        thread, result = in_thread(lambda: _write(endpoint, 3 * WINDOW))
+        frames = [message.frame for message in bus.receive(topics.IMAGE)]
+        bus.see_off()
+        thread.join(PATIENCE_S)
+        assert told.wait(PATIENCE_S)
+    assert result == [None]
+    assert frames == list(range(3 * WINDOW))
+    assert (box.refused, box.early) == (3, 1)
+    assert "tracking: messages passed over: camera/image" in said[0]
+
+
+def _write(endpoint: str, frames: int) -> None:
+    with writer(endpoint) as bus:
+        for frame in range(frames):
+            bus.publish(topics.IMAGE, image(frame))
+        bus.end_all()
+
+
+def test_a_credit_of_nobody_is_refused(endpoint: str) -> None:
+    with writer(endpoint) as bus:
+        other = bus._session.declare_publisher(f"pliant/test/credit/{topics.IMAGE.key}/tracking")
+        box = bus._outputs[topics.IMAGE.key].box
+        with reader(endpoint) as true:
+            with bus._changed:
+                assert bus._changed.wait_for(box.heard_from_all, PATIENCE_S)
+            bus.publish(topics.IMAGE, image(0))
+            assert next(true.receive(topics.IMAGE)).frame == 0
+            for credit in (b"short", struct.pack("<QQQB", 2**63, 0, 0, 2), bytes(24) + b"\x07"):
+                other.put(credit)
+            with bus._changed:
+                assert bus._changed.wait_for(lambda: box.refused == 3, PATIENCE_S)
+            assert box.readers["tracking"].incarnation == true._peers.incarnation
 
 
 def test_a_message_that_readers_would_refuse_is_not_sent(endpoint: str) -> None:

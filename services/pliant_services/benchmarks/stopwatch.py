@@ -2,7 +2,7 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -11,18 +11,19 @@ import numpy as np
 class Stopwatch:
     """A StageTimer that adds up each stage's time per frame; ``lap`` closes a frame."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
         self._frame: dict[str, float] = defaultdict(float)
         self.laps: list[dict[str, float]] = []
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
         """Time a stage of the current frame."""
-        start = time.perf_counter()
+        start = self._clock()
         try:
             yield
         finally:
-            self._frame[stage] += time.perf_counter() - start
+            self._frame[stage] += self._clock() - start
 
     def lap(self) -> None:
         """Close the frame."""

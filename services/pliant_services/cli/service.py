@@ -86,7 +86,7 @@ def service(
             calibration=calibration,
             fov_deg=fov,
             topic=topic,
-            depth=config.ingest.depth if reads_depth(names) else "none",
+            depth=config.ingest.depth if reads_depth(names, config) else "none",
         )
     elif name == "recorder":
         if output is None:

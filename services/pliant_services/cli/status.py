@@ -20,9 +20,9 @@ def status(
     from pliant_services.access import OPERATOR
     from pliant_services.fleet_status import listen, table
 
-    services = listen(connect, session, seconds, identity_in(tls, OPERATOR))
-    if not services:
+    services, silent = listen(connect, session, seconds, identity_in(tls, OPERATOR))
+    if not services and not silent:
         typer.echo(f"no services on {', '.join(connect)}", err=True)
         raise typer.Exit(1)
-    for line in table(services):
+    for line in table(services, silent):
         typer.echo(line)

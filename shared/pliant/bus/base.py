@@ -12,13 +12,28 @@ from pliant.errors import BusError
 from pliant.messages.topics import Topic
 from pliant.messages.types import Header
 
-_A = TypeVar("_A", bound=Header)
-_B = TypeVar("_B", bound=Header)
+
+class OfFrame(Protocol):
+    """Something that belongs to a frame."""
+
+    @property
+    def frame(self) -> int:
+        """Its number."""
+        ...
+
+
+_M = TypeVar("_M", bound=Header)
+_A = TypeVar("_A", bound=OfFrame)
+_B = TypeVar("_B", bound=OfFrame)
 _S = TypeVar("_S")
 
 
 class Bus(Protocol):
     """Messages in and out of one service."""
+
+    def reads(self, topic: Topic) -> bool:
+        """Whether somebody in this session publishes the topic for this service."""
+        ...
 
     def receive(self, topic: Topic) -> Iterator[Header]:
         """Every message of a topic in order, until its end.  Blocks while there is none.
@@ -57,13 +72,17 @@ class Bus(Protocol):
 
 @dataclass(frozen=True)
 class Received:
-    """A message as it came off the wire.  ``arrival`` counts over all inputs."""
+    """A message as it came off the wire.  ``arrival`` counts over all inputs.
+
+    message: what is in it (a StreamEnd for an end), once somebody has looked.
+    """
 
     topic: Topic
     arrival: int
     sequence: int
     is_end: bool
     data: bytes
+    message: Header | None = None
 
 
 @dataclass(frozen=True)
@@ -103,7 +122,7 @@ def resume(bus: Bus, start: Callable[[], _S]) -> _S:
     return start() if state is None else state
 
 
-def receive_one(bus: Bus, topic: Topic, message: type[_A]) -> _A:
+def receive_one(bus: Bus, topic: Topic, message: type[_M]) -> _M:
     """The single message of a topic that carries just one, read to the topic's end.
 
     Raises BusError where the topic carried none or several.
@@ -114,7 +133,7 @@ def receive_one(bus: Bus, topic: Topic, message: type[_A]) -> _A:
     return everything[0]
 
 
-def receive(bus: Bus, topic: Topic, message: type[_A]) -> Iterator[_A]:
+def receive(bus: Bus, topic: Topic, message: type[_M]) -> Iterator[_M]:
     """``bus.receive`` with the message's type known to the reader."""
     for received in bus.receive(topic):
         assert isinstance(received, message)

@@ -30,7 +30,8 @@ class Health(Header):
     """How a service stands.  frame: messages taken of its busiest input; sent, for a source.
 
     stamp_ns: its clock.     waiting_for: what holds it up, "" while it works.
-    input_taken, input_waiting: messages by input.     faults: repeated, early and refused ones.
+    input_taken, input_waiting: messages by input.     faults: repeated, early and refused ones,
+    and refused credits.
     output_sent, output_behind, output_kept: messages by output: sent, on the way to the slowest
     reader, kept to be sent again.
     """
@@ -92,7 +93,8 @@ def health_of(
         inputs=tuple(inputs),
         input_taken=np.array(taken, np.int64),
         input_waiting=np.array([len(box.waiting) for box in inputs.values()], np.int64),
-        faults=sum(box.repeated + box.early + box.refused for box in inputs.values()),
+        faults=sum(box.repeated + box.early + box.refused for box in inputs.values())
+        + sum(box.refused for box in outputs.values()),
         outputs=tuple(outputs),
         output_sent=np.array(sent, np.int64),
         output_behind=np.array([box.on_the_way() for box in outputs.values()], np.int64),

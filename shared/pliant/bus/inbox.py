@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 
 from pliant.bus.base import Received
 
+_WHY_CHARACTERS = 120
+
 
 @dataclass
 class Inbox:
@@ -17,7 +19,8 @@ class Inbox:
 
     taken: messages taken so far, and so the number of the next.     limit: of messages that wait;
     a sender never has more than its window on the way, so more are not from one of ours.
-    repeated, early, refused: counts of messages passed over.
+    repeated, early, refused: counts of messages passed over.     why: the last was refused.
+    gap: something is missing, to be asked for.
     """
 
     limit: int
@@ -25,6 +28,7 @@ class Inbox:
     repeated: int = 0
     early: int = 0
     refused: int = 0
+    why: str = ""
     gap: bool = False
     waiting: deque[Received] = field(default_factory=deque[Received])
 
@@ -41,10 +45,21 @@ class Inbox:
             self.early += 1
             self.gap = True
         elif len(self.waiting) >= self.limit:
-            self.refused += 1
+            self.refuse("beyond its credit")
         else:
             return True
         return False
+
+    def refuse(self, why: str) -> None:
+        """Count a message that is not from a bus of ours."""
+        self.refused += 1
+        self.why = why[:_WHY_CHARACTERS]
+
+    def refuse_first(self, why: str) -> None:
+        """The first that waits is not what it must be: what really has its number comes again."""
+        self.refuse(why)
+        self.waiting.clear()
+        self.gap = True
 
     def put(self, received: Received) -> None:
         """Append the next message."""

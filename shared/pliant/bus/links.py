@@ -5,15 +5,18 @@ Callbacks run in Zenoh's threads: under the bus's lock they append and notify, a
 
 import struct
 import threading
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import zenoh
 
 from pliant.bus.base import Received, Window
 from pliant.bus.inbox import Inbox
 from pliant.bus.outbox import Numbered, Outbox
+from pliant.errors import MessageError
+from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
+from pliant.messages.types import StreamEnd
 
 DATA, END = 0, 1
 NOTHING, IF_OLD, NOW = 0, 1, 2
@@ -28,6 +31,7 @@ class Shared:
     """What the links of one bus share.
 
     changed: the lock, and who waits for something to change.     wake: rouses the keeper.
+    is_known: whether a service has been announced with this incarnation.
     arrivals: messages that have come, over all topics.
     """
 
@@ -35,6 +39,7 @@ class Shared:
     prefix: str
     changed: threading.Condition
     wake: threading.Event
+    is_known: Callable[[str, int], bool]
     arrivals: int = 0
 
 
@@ -43,6 +48,7 @@ class InLink:
 
     safe: messages that we will never ask for again.     wanted: the service waits for this topic.
     arrived: whether one came since the last tick.     ended: its end was kept before we started.
+    asked_at: when we asked for what is missing.
     """
 
     def __init__(self, shared: Shared, topic: Topic, sender: str, *, reader: str, limit: int):
@@ -50,6 +56,7 @@ class InLink:
         self.sender = sender
         self.box = Inbox(limit)
         self.safe = 0
+        self.asked_at = float("-inf")
         self.wanted = self.arrived = self.ended = False
         self._shared = shared
         self._credit = _publisher(shared, f"credit/{topic.key}/{reader}")
@@ -66,15 +73,18 @@ class InLink:
         self.safe = taken
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
-        envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
-        if len(envelope) != _ENVELOPE.size or len(sample.payload) > self.topic.max_bytes:
-            self.box.refused += 1  # not from a bus of ours
+        attachment, size, shared = sample.attachment, len(sample.payload), self._shared
+        if attachment is None or len(attachment) != _ENVELOPE.size:
+            self._refuse("no envelope")
             return
-        sequence, kind = _ENVELOPE.unpack(envelope)
-        shared = self._shared
+        sequence, kind = _ENVELOPE.unpack(attachment.to_bytes())
+        if kind not in (DATA, END) or size > self.topic.max_bytes:
+            self._refuse(f"kind {kind}, {size} bytes")
+            return
         with shared.changed:
+            known_gap = self.box.gap
             if not self.box.is_next(sequence):
-                if self.box.gap:
+                if self.box.gap and not known_gap:
                     shared.wake.set()
                 return
             data = sample.payload.to_bytes()
@@ -82,6 +92,20 @@ class InLink:
             self.arrived = True
             shared.arrivals += 1
             shared.changed.notify_all()
+
+    def _refuse(self, why: str) -> None:
+        with self._shared.changed:
+            self.box.refuse(why)
+
+    def look_into(self, received: Received) -> Received:
+        """The message with what is in it.  Raises MessageError where it does not fit the topic."""
+        topic = topics.STREAM_END if received.is_end else self.topic
+        message = codec.decode(topic.message, received.data, max_bytes=topic.max_bytes)
+        if isinstance(message, StreamEnd) and received.is_end:
+            found, expected = (message.topic, message.messages), (self.topic.key, received.sequence)
+            if found != expected:
+                raise MessageError(f"an end of {found} came as one of {expected}")
+        return replace(received, message=message)
 
 
 class OutLink:
@@ -100,7 +124,6 @@ class OutLink:
         self.box = Outbox(topic.key, readers, window=window, windows=windows)
         self.ended = False
         self.sent_at_tick = 0
-        self._again_from: int | None = None  # what a reader has asked for
         self._sending = threading.Lock()
         self._shared = shared
         self._publisher = _publisher(shared, topic.key)
@@ -116,13 +139,11 @@ class OutLink:
 
     def send_again(self) -> None:
         """Send what a reader has asked for.  Raises BusError where it is not kept any more."""
-        with self._shared.changed:
-            sequence, self._again_from = self._again_from, None
-        if sequence is None:
+        if not self.box.asking:  # who is sending may be held up: do not wait for nothing
             return
         with self._sending:
             with self._shared.changed:
-                messages = self.box.again(sequence)
+                messages = self.box.asked_for()
             for message in messages:
                 self._put(message)
 
@@ -132,17 +153,21 @@ class OutLink:
 
     def _on_credit(self, sample: zenoh.Sample) -> None:
         reader = str(sample.key_expr).rsplit("/", 1)[1]
-        payload = sample.payload.to_bytes()
-        if reader not in self.box.readers or len(payload) != _CREDIT.size:
-            return
-        incarnation, taken, safe, ask = _CREDIT.unpack(payload)
         shared = self._shared
+        fits = reader in self.box.readers and len(sample.payload) == _CREDIT.size
+        payload = sample.payload.to_bytes() if fits else b""
         with shared.changed:
+            if not fits:
+                self.box.refused += 1
+                return
+            incarnation, taken, safe, ask = _CREDIT.unpack(payload)
+            if ask > NOW or not shared.is_known(reader, incarnation):
+                self.box.refused += 1
+                return
             came_back = self.box.credit(reader, incarnation, taken, safe)
             asked = came_back or ask == NOW or (ask == IF_OLD and taken < self.sent_at_tick)
             if asked and taken < self.box.sent:
-                before = self._again_from
-                self._again_from = taken if before is None else min(before, taken)
+                self.box.asking.add(reader)
                 shared.wake.set()
             shared.changed.notify_all()
 

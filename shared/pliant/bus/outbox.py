@@ -51,10 +51,14 @@ class Outbox:
         self.topic = topic
         self.readers = {name: Reader() for name in readers}
         self.sent = 0
+        self.refused = 0
+        """Credits that no reader of ours can have given."""
         self._bytes = 0  # of all messages so far
         self._window = window
         self._windows = {name: w for name, w in (windows or {}).items() if name in self.readers}
         self._kept: deque[Numbered] = deque()
+        self.asking: set[str] = set()
+        """Readers that want something sent again."""
 
     def add(self, kind: int, payload: bytes) -> Numbered:
         """Number a message and keep it."""
@@ -124,12 +128,23 @@ class Outbox:
         return max(0, self.sent - slowest)
 
     def slowest(self) -> str:
-        """The name of the reader that is furthest behind; "" where there is none."""
-        return min(self.readers, key=lambda name: (self.readers[name].taken, name), default="")
+        """The names of all readers that are furthest behind; "" where there is none."""
+        least = min((reader.taken for reader in self.readers.values()), default=0)
+        return ", ".join(sorted(n for n, reader in self.readers.items() if reader.taken == least))
 
     def kept(self) -> int:
         """Messages held here: at most a window and what the slowest checkpoint lies behind."""
         return len(self._kept)
+
+    def asked_for(self) -> tuple[Numbered, ...]:
+        """What readers have asked for and still lack, once.
+
+        By what they have told since: words that were held up on the way come in one go, and with
+        the last of them the first may ask for what is not kept any more.  Raises BusError.
+        """
+        taken = [self.readers[name].taken for name in self.asking]
+        self.asking.clear()
+        return self.again(min(taken)) if taken else ()
 
     def again(self, sequence: int) -> tuple[Numbered, ...]:
         """Everything from a number on.  Raises BusError where it is not kept any more."""

@@ -5,6 +5,7 @@ start of a service from the next, so that the late end of an old token is not ta
 of the service that has come back.  A state machine: no socket, the time is handed in.
 """
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -13,6 +14,8 @@ from pliant.errors import BusError, SessionOverError
 
 WIRE_VERSION = 2
 """Of envelopes and credits; services of different ones refuse each other."""
+
+_TOKEN = re.compile(r"/ready/([^/]+)/(\d{1,20})/(\d{1,9})/([^/]{1,40})$")
 
 
 def token_key(service: str, incarnation: int) -> str:
@@ -33,14 +36,20 @@ class Peers:
     incarnation: int
     here: dict[str, set[int]] = field(default_factory=dict[str, set[int]])
     gone_since: dict[str, float] = field(default_factory=dict[str, float])
+    met: dict[str, set[int]] = field(default_factory=dict[str, set[int]])
+    """Every incarnation that was here, of each service."""
     refusal: str = ""
     """Why this service cannot take part; "" while it can."""
     over: bool = False
     """Whether the recorder has said that everything is on its disk."""
 
     def on_token(self, key: str, *, alive: bool, now: float) -> str:
-        """Take note of a token that appeared or vanished; returns the service it is of."""
-        name, number, wire, version = key.split("/ready/", 1)[1].split("/")
+        """Take note of a token that appeared or vanished; returns the service it is of, "" where
+        it is none of ours."""
+        match = _TOKEN.search(key)
+        if match is None:
+            return ""
+        name, number, wire, version = match.groups()
         incarnations = self.here.setdefault(name, set())
         if not alive:
             incarnations.discard(int(number))
@@ -48,6 +57,7 @@ class Peers:
                 self.gone_since.setdefault(name, now)
             return name
         incarnations.add(int(number))
+        self.met.setdefault(name, set()).add(int(number))
         self.gone_since.pop(name, None)
         if int(wire) != WIRE_VERSION:
             self.refusal = (
@@ -57,6 +67,10 @@ class Peers:
         if name == self.service and int(number) > self.incarnation:
             self.refusal = f"another {name} took over in this session"
         return name
+
+    def is_known(self, name: str, incarnation: int) -> bool:
+        """Whether a service may speak as this incarnation: none was announced before, or this."""
+        return incarnation in self.met.get(name, {incarnation})
 
     def seen(self, names: Iterable[str]) -> bool:
         """Whether all of them are here, or have been."""
@@ -71,6 +85,13 @@ class Peers:
     def missing(self, names: Iterable[str]) -> list[str]:
         """Those that are not here now, sorted."""
         return sorted(name for name in names if not self.here.get(name))
+
+    def absent(self, names: Iterable[str]) -> str:
+        """Those that are not here now in words: "tracking (away)"; "" while all are."""
+        missing = dict.fromkeys(self.missing(names))
+        return ", ".join(
+            f"{name} ({'away' if name in self.gone_since else 'not here yet'})" for name in missing
+        )
 
     def lost(self, names: Iterable[str], *, patience_s: float, now: float) -> list[str]:
         """Those that have been gone for longer than we wait, sorted."""

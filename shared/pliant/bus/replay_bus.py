@@ -34,6 +34,10 @@ class ReplayBus:
         self._inputs = {topic: iter(messages) for topic, messages in inputs.items()}
         self._through_codec = through_codec
 
+    def reads(self, topic: Topic) -> bool:
+        """Whether the topic was given."""
+        return topic in self._inputs
+
     def receive(self, topic: Topic) -> Iterator[Header]:
         """Every message given for the topic; KeyError for a topic that was not given."""
         for message in self._inputs[topic]:

@@ -10,9 +10,12 @@ from typing import Any
 import zenoh
 
 from pliant.errors import BusError
+from pliant.messages.topics import TOPICS
 
 CONNECT_TIMEOUT_S = 7.0  # with the start of Python, a user waits ten seconds at most
 _PATIENCE_MS = 60_000  # Zenoh's defaults lose messages after a stall of 5 to 10 s (its second line)
+_MAX_BYTES = max(topic.max_bytes for topic in TOPICS) + (1 << 20)
+"""Whoever announces more than our largest topic takes is cut off, before memory is taken for it."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ def _config(mode: str, identity: Identity | None) -> zenoh.Config:
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("scouting/gossip/enabled", "false")
+    config.insert_json5("transport/link/rx/max_message_size", str(_MAX_BYTES))
     config.insert_json5("transport/link/tx/lease", str(_PATIENCE_MS))
     config.insert_json5(
         "transport/link/tx/queue/congestion_control/block/wait_before_close",

@@ -28,10 +28,12 @@ import zenoh
 
 from pliant.bus.base import Received, Window
 from pliant.bus.checkpoints import Checkpoints, Place
+from pliant.bus.faults import FaultLog
 from pliant.bus.health import health_key, health_of
 from pliant.bus.links import DATA, END, IF_OLD, NOTHING, NOW, InLink, OutLink, Shared, first_arrived
 from pliant.bus.peers import Peers, token_key
 from pliant.bus.session import Identity, open_session
+from pliant.bus.waiting import Waiting
 from pliant.errors import BusError, MessageError
 from pliant.messages import codec
 from pliant.messages.topics import Topic
@@ -41,6 +43,7 @@ from pliant.state import load_state, save_state
 STOP_KEY = "control/stop"
 OVER_KEY = "control/over"
 _TICK_S = 1.0
+_ASK_AGAIN_S = 0.1  # what was asked for takes a while, and whoever sends nonsense asks for nothing
 _LAST_CREDITS_S = 2.0
 _SEEING_OFF_S = 5.0
 
@@ -64,6 +67,7 @@ class ZenohBus:
         disturb: Callable[[], None] | None = None,
         identity: Identity | None = None,
         on_tick: Callable[[], None] | None = None,
+        on_fault: Callable[[str], None] | None = None,
     ) -> None:
         """Connect, subscribe to the inputs, and announce that we are ready.
 
@@ -78,12 +82,15 @@ class ZenohBus:
         disturb: called before each message goes out or is taken; for tests, which delay there.
         identity: our certificate, for endpoints such as tls/host:7447.
         on_tick: called once a second, as long as we are well.
+        on_fault: told what was passed over, in a line a second at most.
         Raises BusError when no endpoint answers.
         """
         self._patience_s = patience_s
         self._checkpoints = checkpoints
         self._disturb = disturb or (lambda: None)
         self._on_tick = on_tick or (lambda: None)
+        self._on_fault = on_fault
+        self._fault_log = FaultLog(service)
         self._changed = threading.Condition()
         self._wake = threading.Event()
         self._closing = False
@@ -91,14 +98,15 @@ class ZenohBus:
         self._restored = checkpoints is None and not keeps_books
         self._done = False
         self._place = Place(-1, {}, {})
-        self.waiting_for = ""
-        """What the service is waiting for now; for people."""
+        self._waiting = Waiting()
         self._peers = Peers(service, time.time_ns())
         self._session = open_session(endpoints, identity)
         self._prefix = f"pliant/{session}"
         self.stop_requested = False
         """Whether somebody has asked the session to end (``pliant stop``)."""
-        shared = Shared(self._session, self._prefix, self._changed, self._wake)
+        shared = Shared(
+            self._session, self._prefix, self._changed, self._wake, self._peers.is_known
+        )
         self._outputs = {
             topic.key: OutLink(shared, topic, readers, window=window, windows=windows or {})
             for topic, readers in outputs.items()
@@ -131,6 +139,7 @@ class ZenohBus:
             self._closing = True
             self._wake.set()
             self._keeper.join()
+            self._tell_faults()  # of the last second
             if self._checkpoints is not None:
                 self._checkpoints.close()
             self._session.close()  # type: ignore[no-untyped-call]
@@ -211,7 +220,7 @@ class ZenohBus:
                 self._peers.raise_if_refused()
                 here = self._peers.seen(readers)
                 if here and enough():
-                    self.waiting_for = ""
+                    self._waiting.end()
                     return
                 patience_s = max(self._patience_s, _LAST_CREDITS_S)  # credits may be on the way
                 lost = self._peers.lost(readers, patience_s=patience_s, now=time.monotonic())
@@ -220,9 +229,8 @@ class ZenohBus:
                         f"{lost[0]} went away with {output.box.on_the_way()} messages of "
                         f"{output.topic.key} unread"
                     )
-                missing = self._peers.missing(readers)
-                whom = ", ".join(missing) if missing else output.box.slowest()
-                self.waiting_for = f"{whom} to take {output.topic.key}"
+                whom = self._peers.absent(readers) or output.box.slowest()
+                self._waiting.begin(f"{whom} to take {output.topic.key}", time.monotonic())
                 self._changed.wait(_TICK_S)
 
     # -- receiving -----------------------------------------------------------------------------
@@ -241,7 +249,12 @@ class ZenohBus:
             self._tell(entry)
             if received.is_end:
                 return
-            yield codec.decode(topic.message, received.data, max_bytes=topic.max_bytes)
+            assert received.message is not None
+            yield received.message
+
+    def reads(self, topic: Topic) -> bool:
+        """Whether the topic is among the inputs."""
+        return topic.key in self._inputs
 
     def is_waiting(self, topic: Topic) -> bool:
         """Whether something of the topic has come that was not taken yet."""
@@ -273,8 +286,29 @@ class ZenohBus:
             self._tell(entry)
 
     def _take(self, entries: Sequence[InLink], timeout_s: float | None = None) -> Received | None:
+        """The next message, looked into: what does not fit its topic is passed over."""
         self._disturb()
         deadline = time.monotonic() + timeout_s if timeout_s is not None else None
+        while True:
+            entry = self._wait_for_message(entries, deadline)
+            if entry is None:
+                return None
+            try:
+                received = entry.look_into(entry.box.waiting[0])  # only we take; others append
+            except MessageError as error:
+                with self._changed:
+                    entry.box.refuse_first(str(error))
+                self._wake.set()
+                continue
+            with self._changed:
+                self._waiting.end()
+                for other in entries:
+                    other.wanted = False
+                entry.box.take()
+            return received
+
+    def _wait_for_message(self, entries: Sequence[InLink], deadline: float | None) -> InLink | None:
+        """The input whose message came first; None where none comes in time.  Raises BusError."""
         with self._changed:
             while not any(entry.box.waiting for entry in entries):
                 self._peers.raise_if_refused()
@@ -288,15 +322,11 @@ class ZenohBus:
                     return None
                 for entry in entries:
                     entry.wanted = True
-                whom = ", ".join(dict.fromkeys(self._peers.missing(senders) or senders))
+                whom = self._peers.absent(senders) or ", ".join(dict.fromkeys(senders))
                 what = entries[0].topic.key if len(entries) == 1 else f"{len(entries)} topics"
-                self.waiting_for = f"{what} from {whom}"
+                self._waiting.begin(f"{what} from {whom}", now)
                 self._changed.wait(_TICK_S if deadline is None else min(_TICK_S, deadline - now))
-            self.waiting_for = ""
-            entry = first_arrived(entries)
-            for other in entries:
-                other.wanted = False
-            return entry.box.take()
+            return first_arrived(entries)
 
     # -- checkpoints ---------------------------------------------------------------------------
 
@@ -365,7 +395,9 @@ class ZenohBus:
         """Tell our counts, and send again what is asked for, until we leave."""
         last_tick = time.monotonic()
         while not self._closing:
-            self._wake.wait(max(0.0, last_tick + _TICK_S - time.monotonic()))
+            gap = any(entry.box.gap for entry in self._inputs.values())
+            pause_s = _ASK_AGAIN_S if gap else last_tick + _TICK_S - time.monotonic()
+            self._wake.wait(max(0.0, pause_s))
             self._wake.clear()
             tick = time.monotonic() - last_tick >= _TICK_S
             last_tick = time.monotonic() if tick else last_tick
@@ -391,15 +423,22 @@ class ZenohBus:
                     self._changed.notify_all()
 
     def _tell_health(self) -> None:
+        inputs = {key: entry.box for key, entry in self._inputs.items()}
+        outputs = {key: output.box for key, output in self._outputs.items()}
         with self._changed:
-            health = health_of(
-                self._peers.service,
-                self._peers.incarnation,
-                self.waiting_for,
-                {key: entry.box for key, entry in self._inputs.items()},
-                {key: output.box for key, output in self._outputs.items()},
-            )
+            waiting = self._waiting.told(time.monotonic())
+            incarnation = self._peers.incarnation
+            health = health_of(self._peers.service, incarnation, waiting, inputs, outputs)
+        self._tell_faults()
         self._session.put(f"{self._prefix}/{health_key(health.service)}", codec.encode(health))
+
+    def _tell_faults(self) -> None:
+        inputs = {key: entry.box for key, entry in self._inputs.items()}
+        outputs = {key: output.box for key, output in self._outputs.items()}
+        with self._changed:
+            fault = self._fault_log.line(inputs, outputs)
+        if fault and self._on_fault is not None:
+            self._on_fault(fault)
 
     def _advance_safe(self) -> None:
         """What our newest usable checkpoint has taken will not be asked for again."""
@@ -418,8 +457,9 @@ class ZenohBus:
     def _keep_input(self, entry: InLink, *, tick: bool, greeting: bool) -> None:
         with self._changed:
             ask = NOTHING
-            if entry.box.gap:
-                entry.box.gap, ask = False, NOW
+            now = time.monotonic()
+            if entry.box.gap and now - entry.asked_at >= _ASK_AGAIN_S:
+                entry.box.gap, entry.asked_at, ask = False, now, NOW
             elif tick and entry.wanted and not entry.arrived:
                 ask = IF_OLD
             if tick:

@@ -29,7 +29,8 @@ if sys.byteorder != "little":  # pragma: no cover
 
 
 @cache
-def _scalars(message: type[Header]) -> dict[str, type]:
+def scalars(message: type[Header]) -> dict[str, type]:
+    """Fields of a message that are not arrays, and their types."""
     hints = get_type_hints(message)
     arrays = {spec.name for spec in array_fields(message)}
     return {f.name: hints[f.name] for f in fields(message) if f.name not in arrays}
@@ -42,7 +43,7 @@ def _required(message: type[Header]) -> frozenset[str]:
 
 def encode(message: Header) -> bytes:
     """The bytes of a message.  Raises ValueError, naming the field, for a wrong array."""
-    values: dict[str, Any] = {name: getattr(message, name) for name in _scalars(type(message))}
+    values: dict[str, Any] = {name: getattr(message, name) for name in scalars(type(message))}
     sizes: dict[str, int] = {}
     room = 4096 + sum(len(v) for v in values.values() if isinstance(v, bytes))
     for spec in array_fields(type(message)):
@@ -76,7 +77,7 @@ def decode(message: type[_M], data: bytes, *, max_bytes: int | None = None) -> _
     if missing:
         raise MessageError(f"{message.__name__}: without {', '.join(sorted(missing))}")
     values: dict[str, Any] = {}
-    for name, expected in _scalars(message).items():
+    for name, expected in scalars(message).items():
         if name in content:
             values[name] = _scalar(message, name, expected, content[name])
     sizes: dict[str, int] = {}
@@ -89,7 +90,7 @@ def decode(message: type[_M], data: bytes, *, max_bytes: int | None = None) -> _
 def schema(message: type[Header]) -> bytes:
     """A JSON description of a message for the recording: field name to type, dtype and shape."""
     described: dict[str, Any] = {
-        n: getattr(t, "__name__", str(t)) for n, t in _scalars(message).items()
+        n: getattr(t, "__name__", str(t)) for n, t in scalars(message).items()
     }
     for spec in array_fields(message):
         described[spec.name] = {"dtype": spec.dtype.str, "shape": list(spec.shape)}

@@ -144,11 +144,15 @@ class MeshUpdate(Header, MeshBlocks):
     """Blocks of the live mesh: those that changed, or (``again``) some told as they were before.
 
     segment: of the map; a new one starts with an empty mesh.    voxel_size: in its units.
+    first_key, last_key: of ``again``: between these packed keys, both included, there are no other
+    blocks than those of this message; so whoever missed that one became empty finds out.
     """
 
     segment: int
     voxel_size: float
     again: bool
+    first_key: int = 0
+    last_key: int = -1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,31 @@
+"""What a service passed over, told once a second at most however much comes."""
+
+from collections.abc import Mapping
+
+from pliant.bus.inbox import Inbox
+from pliant.bus.outbox import Outbox
+
+
+class FaultLog:
+    """Remembers what was told, so that each message passed over is counted in one line."""
+
+    def __init__(self, service: str) -> None:
+        self._service = service
+        self._told: dict[str, tuple[int, ...]] = {}
+
+    def line(self, inputs: Mapping[str, Inbox], outputs: Mapping[str, Outbox]) -> str:
+        """What was passed over since the last call; "" where nothing was."""
+        parts: list[str] = []
+        for key, box in inputs.items():
+            new = self._new(key, (box.refused, box.repeated, box.early))
+            words = zip(new, (f"refused ({box.why})", "repeated", "early"), strict=True)
+            parts += [f"{key} {count} {word}" for count, word in words if count]
+        for key, box in outputs.items():
+            (new_credits,) = self._new(f"credit of {key}", (box.refused,))
+            parts += [f"credit of {key} {new_credits} refused"] if new_credits else []
+        return f"{self._service}: messages passed over: {', '.join(parts)}" if parts else ""
+
+    def _new(self, key: str, counts: tuple[int, ...]) -> tuple[int, ...]:
+        before = self._told.get(key, (0,) * len(counts))
+        self._told[key] = counts
+        return tuple(now - then for now, then in zip(counts, before, strict=True))

@@ -1,0 +1,92 @@
+"""Messages that no service of ours sends, to every key of a session: for tests and the soak."""
+
+import struct
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from pliant.bus.health import health_key
+from pliant.bus.session import open_session
+from pliant.messages.topics import TOPICS, status
+from pliant.recording.reader import Recording
+from pliant_services.processes import inputs_of, readers_of
+
+_BURST = 200
+_PATIENCE_S = 60.0
+
+
+def keys_of(fleet: tuple[str, ...]) -> list[str]:
+    """Every key that somebody in the fleet listens to, but the ones that end the session."""
+    keys = [topic.key for topic in TOPICS]
+    for name in fleet:
+        keys += [status(name).key, health_key(name), *(t.key for t in inputs_of(name, fleet))]
+        for topic, readers in readers_of(name, fleet).items():
+            keys += [f"credit/{topic.key}/{reader}" for reader in (*readers, "nobody")]
+    return list(dict.fromkeys(keys))
+
+
+def samples(recording: Path) -> dict[str, bytes]:
+    """A true message of each topic that has one for every frame."""
+    found: dict[str, bytes] = {}
+    for recorded in Recording(recording).messages():
+        if recorded.topic.per_frame:
+            found.setdefault(recorded.topic.key, recorded.data)
+    return found
+
+
+def messages(
+    key: str, true: Mapping[str, bytes], random: np.random.Generator
+) -> Iterator[tuple[bytes, bytes | None]]:
+    """Payloads and envelopes without end."""
+    wrong = [data for topic, data in true.items() if topic != key]
+    old = b"\x81\xa5frame\x00"  # of before most fields
+    future = b"\x82\xa5frame\x00\xa7version\xcd\xff\xff"
+    huge = b"\xff" * 8
+    claims = (  # of bytes, of elements, of keys, of a side of an image, of depth
+        *(b"\xc6" + huge[:4], b"\xdd" + huge[:4], b"\xdf" + huge[:4]),
+        *(b"\x81\xa4grey\x92\x92\xcf" + huge + b"\x01\xc4\x00", b"\x91" * 2000),
+    )
+    while True:
+        sequence = int(random.integers(0, 60))
+        for kind in (0, 1, int(random.integers(2, 256))):
+            envelope = struct.pack("<QB", sequence, kind)
+            yield random.bytes(int(random.integers(0, 300))), envelope
+            yield wrong[int(random.integers(len(wrong)))], envelope
+            yield old, envelope
+            yield future, envelope
+            yield claims[int(random.integers(len(claims)))], envelope
+            if key in true:
+                whole = true[key]
+                yield whole[: int(random.integers(1, len(whole)))], envelope
+        if key in true:
+            for far in (1 << 20, 2**64 - 1):  # skipped
+                yield true[key], struct.pack("<QB", far, 0)
+        yield random.bytes(25), None  # as long as a credit
+        yield struct.pack("<QQQB", 2**63, 0, 0, 2), None  # of a start that was not announced
+        yield b"", random.bytes(int(random.integers(0, 20)))
+
+
+def attack(
+    endpoint: str, session: str, fleet: tuple[str, ...], true: Mapping[str, bytes], each: int
+) -> int:
+    """Send so many to every key; returns how many that were."""
+    random = np.random.default_rng(0)
+    keys = keys_of(fleet)
+    endless = {key: messages(key, true, random) for key in keys}
+    taken = threading.Event()
+    with open_session([endpoint]) as connection:
+        mark = f"pliant/{session}/hostile"
+        held = connection.declare_subscriber(mark, lambda _: taken.set())
+        for done in range(0, each, _BURST):
+            for key in keys:
+                for _ in range(min(_BURST, each - done)):
+                    payload, envelope = next(endless[key])
+                    connection.put(f"pliant/{session}/{key}", payload, attachment=envelope)
+            # Not faster than the router hands on: what it drops tests nobody.
+            taken.clear()
+            connection.put(mark, b"")
+            assert taken.wait(_PATIENCE_S), "the session went away, or hands nothing on"
+        held.undeclare()
+    return each * len(keys)
