@@ -18,6 +18,7 @@ from pliant.messages import topics
 from pliant.messages.types import Surfels
 from pliant.recording.reader import Recording
 from pliant.trajectory import Trajectory
+from pliant_services.replay import config_of
 from pliant_services.results import (
     RECORDING_NAME,
     REPORT_NAME,
@@ -160,6 +161,11 @@ def _count(counts: _Counts, surfels: Surfels, arrival_ns: int) -> None:
     }
 
 
+def _is_metric(run: Run) -> bool:
+    """Depth maps of a sensor are; a map of one camera has a scale of its own."""
+    return config_of(run.recorded.metadata, []).surfels.depth_from == "sensor"
+
+
 def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
     frames = len(counts.alive)
     spent_ns = counts.arrivals_ns[-1] - counts.arrivals_ns[0] if frames else 0
@@ -181,7 +187,7 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         ],
         "last_reason": reasons[-1] if reasons else "no frames",
         "frames_without_pixels": {
-            str(f): why for f, why in sorted(missing.items()) if why != WAITING
+            str(f): why for f, why in sorted(missing.items()) if not why.startswith(WAITING)
         },
         "frames_lost": counts.lost,
         "notes": {str(f): note for f, note in sorted(counts.notes.items())},
@@ -190,6 +196,6 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         "alive_per_frame": counts.alive,
         "surfels_per_frame": counts.listed,
         "last_states": counts.last_states,
-        "scale_is_metric": bool(counts.segments),  # depth maps are metric
+        "scale_is_metric": bool(counts.segments) and _is_metric(run),
         **process_figures(run, frames),
     }

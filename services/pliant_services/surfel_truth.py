@@ -1,14 +1,23 @@
-"""Behind ``pliant eval --surfels``: a recording of surfels against the true depth of its source."""
+"""Behind ``pliant eval --surfels``: a recording of surfels against the truth of its source.
+
+A deforming built-in sequence has exact truth; any other source the true depth of its frames.
+"""
 
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pliant.datasets import Rectifier, open_source
 from pliant.datasets.base import BrokenFrame
+from pliant.datasets.builtin import builtin_folder, is_builtin
+from pliant.datasets.builtin_deforming import SURFACES_NAME
 from pliant.datasets.depth import DepthRectifier
 from pliant.errors import ResultError
+from pliant.evaluation.exact_surfels import ExactSurfels, format_exact
+from pliant.evaluation.surface_truth import SurfaceTruth
 from pliant.evaluation.surfel_truth import SurfelTruth, format_surfels, mean_rows
 from pliant_services.results import RECORDING_NAME
 from pliant_services.surfel_results import recorded_surfels
@@ -19,6 +28,10 @@ def surfels_against_truth(result: Path, source: str, figures: dict[str, Any]) ->
 
     Raises ResultError and DatasetError.
     """
+    folder = builtin_folder(source) if is_builtin(source) else Path(source)
+    if (folder / SURFACES_NAME).is_file():
+        yield _against_surfaces(result, folder, figures)
+        return
     dataset = open_source(source, depth="all")
     rectifier, depths = Rectifier(dataset.calibration), DepthRectifier(dataset.calibration)
     truth = SurfelTruth(rectifier.camera)
@@ -34,9 +47,38 @@ def surfels_against_truth(result: Path, source: str, figures: dict[str, Any]) ->
             continue
         truth.add(surfels.frame, surfels, grey, depth_m)
     if not truth.rows:
-        raise ResultError(f"{result}: has no surfels to judge; was it --profile deformable?")
+        raise ResultError(_nothing(result))
     figures["surfels"] = {
         "frames": [asdict(row) for row in truth.rows],
         "mean": mean_rows(truth.rows),
     }
     yield format_surfels(truth.rows)
+
+
+def _against_surfaces(result: Path, folder: Path, figures: dict[str, Any]) -> str:
+    dataset = open_source(str(folder))
+    truth = SurfaceTruth(folder, Rectifier(dataset.calibration).camera)
+    judge = ExactSurfels(truth)
+    for surfels in recorded_surfels(result / RECORDING_NAME):
+        if surfels.frame >= len(truth):
+            raise ResultError(
+                f"{result}: has more frames than {folder}: name the sequence that it was made of"
+            )
+        if not surfels.missing:
+            judge.add(surfels.frame, surfels)
+    if not judge.rows:
+        raise ResultError(_nothing(result))
+    false, true, _ = judge.curve()
+    kept = np.unique(np.linspace(0, len(false) - 1, 200).astype(int)) if len(false) else []
+    figures["surfels"] = {
+        "frames": [asdict(row) for row in judge.rows],
+        "summary": judge.summary(),
+        "sheets": {name: {"count": n, "rmse": e} for name, (n, e) in judge.by_sheet().items()},
+        "sizes_mm": [{"from": a, "to": b, "rmse": e} for a, b, e in judge.by_size()],
+        "roc": {"false_positive": false[kept].tolist(), "true_positive": true[kept].tolist()},
+    }
+    return format_exact(judge, moving_camera=truth.moving_camera)
+
+
+def _nothing(result: Path) -> str:
+    return f"{result}: has no surfels to judge; was it --profile deformable?"

@@ -1,11 +1,20 @@
 """``pliant run --profile deformable`` with real processes, and what follows from its recording."""
 
+import importlib
 import json
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from running import assert_one_line, pliant
+
+from pliant.export.ply import read_ply
+from pliant_services.export import export_result
 
 pytestmark = pytest.mark.system
 
@@ -39,6 +48,35 @@ def test_a_run_leaves_everything_a_user_opens(result: Path) -> None:
         assert surfels["T_world_camera"].shape == (FRAMES, 4, 4)
 
 
+def test_surfels_are_seen_in_both_viewers(result: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    pytest.importorskip("foxglove_schemas_protobuf")
+    scene_update: Any = importlib.import_module("foxglove_schemas_protobuf.SceneUpdate_pb2")
+    path = export_result(result, "rerun", tmp_path / "run.rrd")
+    command = Path(sys.executable).with_name("rerun")
+    if command.is_file():
+        done = subprocess.run([command, "rrd", "print", path], capture_output=True, text=True)
+        assert "/map/world/surfels" in done.stdout
+        assert "/map/camera/image/surfels" in done.stdout
+    path = export_result(result, "foxglove", tmp_path / "run.mcap")
+    counts: dict[str, int] = {}
+    last = scene_update.SceneUpdate()
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            counts[channel.topic] = counts.get(channel.topic, 0) + 1
+            if channel.topic == "/surfels/quads":
+                last = scene_update.SceneUpdate.FromString(message.data)
+    for topic in ("/surfels/quads", "/surfels/points", "/surfels/image", "/tf"):
+        assert counts[topic] == FRAMES
+    with np.load(result / "surfels.npz") as surfels:
+        centres = surfels["positions"][-surfels["counts"][-1] :]
+    triangles = last.entities[0].triangles[0]
+    corners = np.array([(p.x, p.y, p.z) for p in triangles.points]).reshape(-1, 4, 3)
+    np.testing.assert_allclose(corners.mean(axis=1), centres, atol=1e-5)
+    assert len(triangles.colors) == 4 * len(centres)
+    assert max(triangles.indices) == 4 * len(centres) - 1
+
+
 def test_a_replay_and_a_run_on_the_recording_give_the_same(result: Path, tmp_path: Path) -> None:
     again = pliant(
         "replay", result, "--services", "surfels", "--check", "--output", tmp_path / "replay"
@@ -53,6 +91,30 @@ def test_a_replay_and_a_run_on_the_recording_give_the_same(result: Path, tmp_pat
     expected = (result / "surfels.npz").read_bytes()
     for folder in ("replay", "run"):
         assert (tmp_path / folder / "surfels.npz").read_bytes() == expected, folder
+
+
+def test_the_surface_is_a_mesh_for_every_other_frame(result: Path, tmp_path: Path) -> None:
+    done = pliant(
+        "export", result, "--to", "surface", "--every", "2", "--output", tmp_path / "surface"
+    )
+    assert done.returncode == 0, done.stderr
+    files = sorted((tmp_path / "surface").iterdir())
+    assert [file.name for file in files] == ["000000.ply", "000002.ply"]
+    mesh = read_ply(files[1])
+    assert mesh.faces is not None
+    assert mesh.colours is not None
+    assert len(mesh.faces) > 20
+    assert np.ptp(mesh.colours) > 50  # of the image
+
+
+def test_the_overlay_shows_how_each_surfel_fares(result: Path, tmp_path: Path) -> None:
+    done = pliant("export", result, "--to", "overlay", "--output", tmp_path / "surfels.avi")
+    assert done.returncode == 0, done.stderr
+    video = cv2.VideoCapture(str(tmp_path / "surfels.avi"))
+    pictures = [video.read()[1] for _ in range(FRAMES)]
+    assert not video.read()[0]
+    blue, green, red = np.moveaxis(pictures[-1].astype(int), 2, 0)
+    assert ((green > red + 60) & (green > blue + 60)).sum() > 60 * 10  # alive
 
 
 def test_wrong_use_is_one_line(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import matrix_to_pose, so3_exp
 from pliant.algorithms.surfels.motion import identity_poses
-from pliant.algorithms.surfels.sampling import A, B, Level, X
+from pliant.algorithms.surfels.sampling import A, B, Level, X, make_level
 from pliant.algorithms.surfels.tangent import tangent_jacobian
 from pliant.rendering.paths import SampledPath
 from pliant.rendering.render import (
@@ -70,10 +70,8 @@ def waves(width: int = 160, height: int = 120) -> F32:
 
 def level_of(image: F32, focal: float = 200.0) -> Level:
     height, width = image.shape
-    return Level(
-        np.ascontiguousarray(image).ravel(), width, height, focal, focal,
-        0.5 * (width - 1), 0.5 * (height - 1), 1.0 / focal, 1.0 / focal,
-    )  # fmt: skip
+    middle = 0.5 * (width - 1), 0.5 * (height - 1)
+    return make_level(np.ascontiguousarray(image), focal, focal, *middle)
 
 
 def slanted_surfels(count: int = 1, seed: int = 0) -> F64:

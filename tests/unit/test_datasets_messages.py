@@ -28,13 +28,19 @@ def ros2(path: Path) -> None:
 
 def ros2_mcap(path: Path) -> None:
     ros = Ros(2)
-    bags.write_ros2_mcap(path, ros, bags.usual(ros))
+    bags.write_ros_mcap(path, ros, bags.usual(ros))
+
+
+def ros1_mcap(path: Path) -> None:
+    ros = Ros(1)
+    bags.write_ros_mcap(path, ros, bags.usual(ros))
 
 
 FILES: dict[str, tuple[str, Write]] = {
     "ros 1": ("drive.bag", ros1),
     "ros 2": ("drive", ros2),
     "ros 2 mcap": ("drive.mcap", ros2_mcap),
+    "ros 1 mcap": ("drive.mcap", ros1_mcap),
     "foxglove protobuf": (
         "drive.mcap", lambda path: bags.write_foxglove_mcap(path, raw=True, encoding="protobuf")
     ),

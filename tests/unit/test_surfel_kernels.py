@@ -8,6 +8,7 @@ from surfel_scene import EVERYWHERE, level_of, slanted_surfels, waves
 
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.surfels import motion
+from pliant.algorithms.surfels.align import Templates
 from pliant.algorithms.surfels.birth import make_templates
 from pliant.algorithms.surfels.corners import find_corners, smaller_eigenvalues
 from pliant.algorithms.surfels.damped import factorise, inverse_diagonal, solve
@@ -26,9 +27,10 @@ from pliant.algorithms.surfels.sampling import (
 from pliant.algorithms.surfels.sums import (
     FEATURES,
     correlation,
-    frame_sums,
+    feature_matrix,
     make_features,
-    template_sums,
+    padded,
+    photometric_sums,
 )
 from pliant.algorithms.surfels.tangent import fit_inverse_depth, tangent_jacobian
 
@@ -69,11 +71,9 @@ def test_samples_outside_and_highlights_are_invalid() -> None:
     assert homography(pose, level, h)
     assert sample_patch(h, level, grid, 250.0)
     assert (grid.values == np.float32(INVALID)).any()
-    assert grid.valid.all()
     pose[X] = 0.5
     assert homography(pose, level, h)
     assert sample_patch(h, level, grid, HIGH)
-    assert not grid.valid.any()
     assert (grid.values == np.float32(INVALID)).all()
 
 
@@ -85,15 +85,31 @@ def test_a_patch_that_is_nowhere_is_refused(bad: float) -> None:
     assert not (homography(pose, level, h) and sample_patch(h, level, make_grid(SIDE), HIGH))
 
 
-def sums_of(pose: F64, image: F32, template: F32, mean: float) -> tuple[F32, F64, F64]:
-    """Features (11, n), matrix and sums of a pose, with the frame's own derivatives."""
-    grid, h, level = make_grid(SIDE + 2), np.zeros(9), level_of(image)
+ROW = SIDE + 2
+INNER = (slice(None), np.arange(padded(SIDE)) % ROW < SIDE)
+"""The samples of a texture: two between rows it lacks."""
+
+
+def sums_of(
+    pose: F64, image: F32, texture: F32, mean: float, tau: float = 1e5, blend: float = 1.0
+) -> tuple[float, int, F32, F64, F64]:
+    """Cost, samples seen, features (10, n), matrix and sums of a pose."""
+    grid, h, level = make_grid(ROW), np.zeros(9), level_of(image)
     features = make_features(SIDE)
     matrix, sums = np.zeros((FEATURES, FEATURES)), np.zeros(FEATURES)
     assert homography(pose, level, h)
     assert sample_patch(h, level, grid, HIGH)
-    frame_sums(template, grid, mean, pose[GAIN], pose[BIAS], 1e5, features, matrix, sums)
-    return features, matrix, sums
+    light = pose[GAIN], pose[BIAS], tau, blend
+    cost, seen = photometric_sums(texture, grid, mean, *light, sums)
+    feature_matrix(texture, grid, mean, *light, features, matrix)
+    return cost, seen, features[:FEATURES], matrix, sums
+
+
+def blank() -> F32:
+    """A texture of zeros."""
+    texture = np.zeros((3, padded(SIDE)), np.float32)
+    texture[0, ~INNER[1]] = INVALID
+    return texture
 
 
 def ramps() -> F32:
@@ -110,11 +126,13 @@ def test_jacobians_by_finite_differences(model: int, seed: int) -> None:
     if model == motion.GENERAL:
         pose[F + 2] = 0.8
     pose[GAIN], pose[BIAS] = 1.3, 4.0
-    template, mean = np.zeros((3, SIDE * SIDE), np.float32), 110.0
-    features, matrix, sums = sums_of(pose, image, template, mean)
+    mean = 110.0
+    _, seen, features, matrix, sums = sums_of(pose, image, blank(), mean)
+    assert seen == SIDE * SIDE
+    features = features[INNER]
     n = motion.parameter_count(model)
     mix = np.zeros((FEATURES, motion.MOST_PARAMETERS))
-    motion.mixing(pose, level_of(image), model, False, mix)
+    motion.mixing(pose, level_of(image), model, mix)
     J = features[:FEATURES].T.astype(np.float64) @ mix[:, :n]
     after = np.zeros_like(pose)
     for k in range(n):
@@ -131,69 +149,66 @@ def test_jacobians_by_finite_differences(model: int, seed: int) -> None:
     # The small matrices are those of the whole Jacobian.
     H, g = np.zeros((motion.MOST_PARAMETERS,) * 2), np.zeros(motion.MOST_PARAMETERS)
     scratch = np.zeros((FEATURES, motion.MOST_PARAMETERS))
-    motion.normal_equations(matrix, sums, mix, n, scratch, H, g)
+    motion.hessian(matrix, 1.0, mix, n, scratch, H)
+    motion.gradient(sums, mix, n, g)
     np.testing.assert_allclose(H[:n, :n], J.T @ J, rtol=1e-3, atol=1e-4 * np.abs(H).max())
-    r = features[FEATURES].astype(np.float64)
+    r = pose[GAIN] * (sampled(pose, image).astype(np.float64) - mean) + pose[BIAS]
     np.testing.assert_allclose(g[:n], J.T @ r, rtol=1e-3, atol=1e-4 * np.abs(g).max())
 
 
-def test_template_jacobian_is_the_frame_jacobian_where_they_agree() -> None:
-    image, poses = waves(), slanted_surfels(seed=2)
-    level = level_of(image)
-    templates = make_templates(poses, level, SIDE, HIGH, 0.5, EVERYWHERE, np.inf)
-    pose = poses[0].copy()
-    pose[GAIN], pose[BIAS] = 0.5, 7.0
-    darker = (2.0 * (image - templates.means[0] - 7.0) + templates.means[0]).astype(np.float32)
-    features, _, sums = sums_of(pose, darker, templates.images[0], templates.means[0])
-    mixes = np.zeros((2, FEATURES, motion.MOST_PARAMETERS))
-    motion.mixing(pose, level, 0, False, mixes[0])
-    motion.mixing(pose, level, 0, True, mixes[1])
-    tu, tv, t = templates.images[0, 1], templates.images[0, 2], templates.images[0, 0]
-    grid = make_grid(SIDE)
-    d = grid.i * tu + grid.j * tv
-    own = np.stack(
-        (
-            tu,
-            tv,
-            grid.i * tu,
-            grid.j * tu,
-            grid.i * tv,
-            grid.j * tv,
-            grid.i * d,
-            grid.j * d,
-            t,
-            np.ones_like(t),
-        )
-    ).astype(np.float64)
-    frame = features[:FEATURES].astype(np.float64)
-    for k in range(8):
-        expected = frame.T @ mixes[0][:, k]
-        atol = 1e-3 * np.abs(expected).max()
-        np.testing.assert_allclose(own.T @ mixes[1][:, k], expected, atol=atol)
-    np.testing.assert_allclose(sums, 0.0, atol=0.5)
-
-
-def test_template_sums_against_numpy() -> None:
+def texture_and_moved() -> tuple[F32, Templates, F64]:
+    """An image, the texture of a surfel in it, and that surfel a little beside, lit otherwise."""
     image, poses = waves(), slanted_surfels(seed=5)
-    level = level_of(image)
-    templates = make_templates(poses, level, SIDE, HIGH, 0.5, EVERYWHERE, np.inf)
+    templates = make_templates(poses, level_of(image), SIDE, HIGH, 0.5, EVERYWHERE, np.inf)
     moved = poses[0].copy()
     moved[X] += 0.02
-    grid, h, out, tau = make_grid(SIDE), np.zeros(9), np.zeros(FEATURES), 8.0
-    assert homography(moved, level, h)
-    assert sample_patch(h, level, grid, HIGH)
-    mean = templates.means[0]
-    cost, seen = template_sums(templates.images[0], grid, mean, 1.1, 2.0, tau, out)
-    t, tu, tv = templates.images[0].astype(np.float64)
-    r = 1.1 * (grid.values - mean) + 2.0 - t
+    moved[GAIN], moved[BIAS] = 1.1, 2.0
+    return image, templates, moved
+
+
+def test_texture_and_frame_agree_where_the_surfel_is() -> None:
+    image, templates, _ = texture_and_moved()
+    pose = slanted_surfels(seed=5)[0]
+    pose[GAIN], pose[BIAS] = 2.0, 7.0
+    mean, tau = templates.means[0], 10.0
+    paler = ((image - mean - 7.0) / 2.0 + mean).astype(np.float32)
+    for blend in (0.0, 0.5, 1.0):
+        cost, seen, _, matrix, sums = sums_of(pose, paler, templates.images[0], mean, tau, blend)
+        assert seen == SIDE * SIDE
+        assert cost == pytest.approx((padded(SIDE) - seen) * tau**2, rel=1e-4)
+        scale = np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
+        np.testing.assert_allclose(matrix / scale, templates.matrices[0] / scale, atol=2e-3)
+        np.testing.assert_allclose(sums / np.sqrt(np.diag(matrix)), 0.0, atol=0.5)
+
+
+@pytest.mark.parametrize("blend", [0.0, 0.5, 1.0])
+def test_sums_against_numpy(blend: float) -> None:
+    image, templates, moved = texture_and_moved()
+    mean, tau = templates.means[0], 8.0
+    cost, seen, features, matrix, out = sums_of(moved, image, templates.images[0], mean, tau, blend)
+    wide = sampled(moved, image, ROW).astype(np.float64).reshape(ROW, ROW)
+    t, tu, tv = templates.images[0][INNER].astype(np.float64)
+    level = (1.1 * (wide[1:-1, 1:-1] - mean) + 2.0).ravel()
+    r = level - t
     inside = np.abs(r) < tau
     assert 0 < inside.sum() < len(r)
     assert seen == inside.sum()
-    assert cost == pytest.approx(np.minimum(r**2, tau**2).sum(), rel=1e-4)
-    d = grid.i * tu + grid.j * tv
-    rows = [tu, tv, grid.i * tu, grid.j * tu, grid.i * tv, grid.j * tv, grid.i * d, grid.j * d, t]
-    expected = np.array([*rows, np.ones_like(t)]) @ np.where(inside, r, 0.0)
+    lacking = padded(SIDE) - len(r)
+    assert cost == pytest.approx(np.minimum(r**2, tau**2).sum() + lacking * tau**2, rel=1e-4)
+    u = (1.0 - blend) * tu + blend * 0.55 * (wide[1:-1, 2:] - wide[1:-1, :-2]).ravel()
+    v = (1.0 - blend) * tv + blend * 0.55 * (wide[2:, 1:-1] - wide[:-2, 1:-1]).ravel()
+    half = SIDE // 2
+    j, i = (each.ravel() for each in np.mgrid[-half : half + 1, -half : half + 1])
+    d, grey = i * u + j * v, (1.0 - blend) * t + blend * level
+    rows = np.array([u, v, i * u, j * u, i * v, j * v, i * d, j * d, grey, np.ones_like(t)])
+    rows = np.where(inside, rows, 0.0)
+    np.testing.assert_allclose(features[INNER], rows, atol=1e-3 * np.abs(rows).max())
+    assert not features[:, ~INNER[1]].any()
+    expected = rows @ r
     np.testing.assert_allclose(out, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+    expected = rows @ rows.T
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(matrix / scale, expected / scale, atol=1e-5)
 
 
 def normal_matrix(model: int, omega: float) -> tuple[F64, F64]:
@@ -201,10 +216,10 @@ def normal_matrix(model: int, omega: float) -> tuple[F64, F64]:
     level, n = level_of(image), motion.parameter_count(model)
     templates = make_templates(poses, level, 23, HIGH, 0.5, EVERYWHERE, np.inf)
     mix = np.zeros((FEATURES, motion.MOST_PARAMETERS))
-    motion.mixing(poses[0], level, model, True, mix)
+    motion.mixing(poses[0], level, model, mix)
     H, g = np.zeros((motion.MOST_PARAMETERS,) * 2), np.zeros(motion.MOST_PARAMETERS)
     scratch = np.zeros((FEATURES, motion.MOST_PARAMETERS))
-    motion.normal_equations(templates.matrices[0], np.zeros(FEATURES), mix, n, scratch, H, g)
+    motion.hessian(templates.matrices[0], 1.0, mix, n, scratch, H)
     motion.add_deformation_energy(poses[0], model, omega, H, g)
     return H[: n - 2, : n - 2], poses[0]
 

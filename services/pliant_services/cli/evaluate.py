@@ -30,7 +30,8 @@ def evaluate(
         bool, typer.Option("--mesh", help="The mesh against true depth maps at the keyframes.")
     ] = False,
     surfels: Annotated[
-        bool, typer.Option("--surfels", help="Surfels against the source's depth of every frame.")
+        bool,
+        typer.Option("--surfels", help="Surfels against the source's depth, or exact surfaces."),
     ] = False,
     plot: Annotated[
         Path | None, typer.Option(help="PNG of the error over time (needs matplotlib).")

@@ -25,6 +25,13 @@ def run(
         Literal["first", "all"] | None,
         typer.Option(help="deformable: depth maps that are used [ingest.depth]."),
     ] = None,
+    depth: Annotated[
+        Literal["sensor", "map", "flat"] | None,
+        typer.Option(
+            help="deformable: where surfels start: on depth maps of the source, on our own map of "
+            "a scene that holds still at first, or on a plane [surfels.depth_from]."
+        ),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Result folder [results/<source>].")
     ] = None,
@@ -82,13 +89,16 @@ def run(
     pliant run video.mp4 --fov 70 --set tracking.max_tracks=5000
 
     pliant run path/to/cloth --profile deformable --camera static
+
+    pliant run path/to/tissue --profile deformable --camera moving --depth map
     """
     from pliant_services.pipeline import RunRequest, run_pipeline
 
     sets = [*(overrides or []), *([f"ingest.mode={mode}"] if mode else [])]
-    if profile == "rigid" and (camera or depth_frames):
-        raise typer.BadParameter("--camera and --depth-frames need --profile deformable")
+    if profile == "rigid" and (camera or depth_frames or depth):
+        raise typer.BadParameter("--camera, --depth and --depth-frames need --profile deformable")
     sets += [f"surfels.camera={camera}"] if camera else []
+    sets += [f"surfels.depth_from={depth}"] if depth else []
     sets += [f"ingest.depth={depth_frames}"] if depth_frames else []
     sets += [] if images else ["recorder.images=false"]
     request = RunRequest(

@@ -113,10 +113,11 @@ def undistort(points_plane: F64, lens: Lens) -> F64:
     out = _undistort_radially(target, lens)
     if lens.model in ("pinhole-radtan", "pinhole-rational") and lens.distorts:
         for _ in range(_NEWTON_STEPS):
-            error = distort(out, lens) - target
-            J = _radtan_jacobian(out, lens)
-            det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-            with np.errstate(invalid="ignore", divide="ignore"):
+            # Coefficients may be anything: what comes of absurd ones is refused below.
+            with np.errstate(all="ignore"):
+                error = distort(out, lens) - target
+                J = _radtan_jacobian(out, lens)
+                det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
                 out[..., 0] -= (J[..., 1, 1] * error[..., 0] - J[..., 0, 1] * error[..., 1]) / det
                 out[..., 1] -= (J[..., 0, 0] * error[..., 1] - J[..., 1, 0] * error[..., 0]) / det
     residual = np.hypot(*np.moveaxis(distort(out, lens) - target, -1, 0))

@@ -18,6 +18,7 @@ The YAML is flat, as the ``calib.yaml`` beside an image folder:
     depth_scale: 0.001         # optional: metres per unit of the depth images, with depth_fx,
     depth_fx: 460.0            #   depth_fy, depth_cx, depth_cy (default: the camera's own)
     depth_invalid: [0]         #   and the values that mean "no depth"
+    stereo_baseline: 0.0053    # optional: metres to the right camera of a rectified pair
 """
 
 import math
@@ -39,6 +40,7 @@ COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
 """Names of the distortion coefficients, in the order of OpenCV."""
 _OPTIONAL = {("pinhole-radtan", "k3")}
 _MODELS: tuple[str, ...] = get_args(LensModel)
+_MAX_UNITS = 65535  # of a 16-bit depth map
 _MAX_SIDE_PX = 32767  # what the fixed-point maps can address
 
 
@@ -47,11 +49,13 @@ class DepthImages:
     """How depth images that come with a source are read: metres = value * scale_m.
 
     camera: their pinhole camera.     invalid: values that mean "no depth".
+    baseline_m: of the rectified stereo pair from which they are made; 0 where they come as images.
     """
 
     scale_m: float
     camera: PinholeCamera
     invalid: tuple[int, ...] = (0,)
+    baseline_m: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +141,8 @@ def calibration_yaml(calibration: Calibration) -> str:
         content["fps"] = calibration.fps
     if calibration.depth is not None:
         depth = calibration.depth
+        if depth.baseline_m > 0.0:
+            content["stereo_baseline"] = depth.baseline_m
         content["depth_scale"] = depth.scale_m
         for key in ("fx", "fy", "cx", "cy"):
             content[f"depth_{key}"] = getattr(depth.camera, key)
@@ -233,12 +239,17 @@ def _model(content: dict[str, Any]) -> LensModel:
 def _depth(
     content: dict[str, Any], width: int, height: int, intrinsics: dict[str, float]
 ) -> DepthImages | None:
-    if content.get("depth_scale") is None:
+    baseline = number(content, "stereo_baseline") if content.get("stereo_baseline") else 0.0
+    if baseline < 0.0:
+        raise CalibrationError("stereo_baseline must be positive: metres to the right camera")
+    if content.get("depth_scale") is None and baseline == 0.0:
         return None
     own = {
         key: number(content, f"depth_{key}") if content.get(f"depth_{key}") is not None else value
         for key, value in intrinsics.items()
     }
+    if content.get("depth_scale") is None:  # the farthest, one pixel of disparity, still fits
+        content = {**content, "depth_scale": own["fx"] * baseline / _MAX_UNITS}
     scale = number(content, "depth_scale")
     if scale <= 0.0 or min(own["fx"], own["fy"]) <= 0.0:
         raise CalibrationError("depth_scale, depth_fx and depth_fy must be positive")
@@ -247,7 +258,12 @@ def _depth(
     if not all(isinstance(value, int) for value in values):
         raise CalibrationError(f"depth_invalid is {invalid!r}: expected whole numbers")
     camera = PinholeCamera(width=width, height=height, **own)
-    return DepthImages(scale_m=scale, camera=camera, invalid=tuple(cast(list[int], values)))
+    return DepthImages(
+        scale_m=scale,
+        camera=camera,
+        invalid=tuple(cast(list[int], values)),
+        baseline_m=baseline,
+    )
 
 
 def _check_intrinsics(calibration: Calibration) -> None:

@@ -3,6 +3,8 @@
     FOLDER/depth.txt    "seconds file" a line, as in rgb.txt: 16-bit images, in the units and of the
                         camera that the calibration's ``depth_...`` keys say; 0: nothing measured
 
+or, without that list, the right images of a stereo pair: see ``pliant.datasets.stereo``.
+
 A depth map belongs to the image that is nearest in time, if that is within 20 ms (as in the TUM
 benchmark's tools) and it is the nearest to that image.
 """
@@ -18,9 +20,11 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.rectification import rectified_camera
+from pliant.datasets import stereo
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import Calibration, DepthImages
 from pliant.datasets.images import ListedImage, SourceOptions, read_list
+from pliant.datasets.stereo import StereoPair
 from pliant.errors import CalibrationError, DatasetError
 from pliant.trajectory import associate
 
@@ -39,10 +43,15 @@ def with_depth(
     if options.depth == "none":
         return images
     file = folder / LIST_NAME
-    if not file.is_file():
+    is_stereo = not file.is_file() and (folder / stereo.LIST_NAME).is_file()
+    if is_stereo:
+        file = folder / stereo.LIST_NAME
+        _check_stereo(folder, calibration)
+    elif not file.is_file():
         raise DatasetError(
             f"{folder}: no {LIST_NAME}: surfels need a depth map to start from, listed there like "
-            "the images in rgb.txt"
+            f"the images in rgb.txt, or right images of a rectified pair in {stereo.LIST_NAME}; "
+            "without any, see --depth map and --depth flat"
         )
     maps = read_list(file, folder)
     if calibration.depth is None:
@@ -55,8 +64,28 @@ def with_depth(
         raise DatasetError(f"{file}: no depth map is within 20 ms of an image; correct its times")
     wanted = slice(1 if options.depth == "first" else None)
     pairs = zip(rows[wanted].tolist(), of_maps[wanted].tolist(), strict=True)
-    found = {row: maps[of_map].path for row, of_map in pairs}
+    found: dict[int, Path | StereoPair] = {row: maps[of_map].path for row, of_map in pairs}
+    if is_stereo:
+        depth = calibration.depth
+        found = {
+            row: StereoPair(right, depth.camera.fx, depth.baseline_m, depth.scale_m)
+            for row, right in found.items()
+            if isinstance(right, Path)
+        }
     return [replace(image, depth=found.get(row)) for row, image in enumerate(images)]
+
+
+def _check_stereo(folder: Path, calibration: Calibration) -> None:
+    if calibration.depth is None or calibration.depth.baseline_m == 0.0:
+        raise CalibrationError(
+            f"{folder}: has right images, but its calibration has no stereo_baseline: add the "
+            "metres between the cameras, e.g. stereo_baseline: 0.0053"
+        )
+    if calibration.lens.distorts:
+        raise CalibrationError(
+            f"{folder}: has right images, but its calibration has distortion: rectify both images "
+            "first (cv2.stereoRectify) and give the intrinsics of the rectified ones"
+        )
 
 
 class DepthRectifier:

@@ -5,6 +5,7 @@
     FOLDER/images/...       the files that rgb.txt names, anywhere inside
     FOLDER/groundtruth.txt  optional: true poses, TUM format
     FOLDER/depth.txt        optional: depth maps, listed like the images; see pliant.datasets.depth
+    FOLDER/right.txt        optional: right images of a stereo pair; see pliant.datasets.stereo
 
 or a bare folder of images in the order of their names, 2 before 10, with ``--calibration FILE``
 or ``--fov DEGREES`` where it holds no calib.yaml.  Their times are made up: ``fps`` of the

@@ -12,6 +12,7 @@ from pliant.datasets.base import BrokenFrame, SourceFrame, encoding_of
 from pliant.datasets.calibration import Calibration, calibration_from_fov
 from pliant.datasets.calibration_files import UNDERSTOOD, check_size, read_calibration
 from pliant.datasets.rectifier import decode
+from pliant.datasets.stereo import StereoPair
 from pliant.errors import CalibrationError, DatasetError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".pnm")
@@ -40,11 +41,11 @@ class SourceOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ListedImage:
-    """An image file and its capture time."""
+    """An image file and its capture time.  depth: a depth map, or what one is made from."""
 
     stamp_ns: int
     path: Path
-    depth: Path | None = None
+    depth: Path | StereoPair | None = None
 
 
 class ImageFiles:
@@ -84,7 +85,10 @@ def _read(index: int, image: ListedImage) -> SourceFrame:
     except OSError:
         data = b""  # broken like an empty file: the run goes on without it
     try:
-        depth = image.depth.read_bytes() if image.depth is not None else b""
+        if isinstance(image.depth, StereoPair):
+            depth = image.depth.depth(data)
+        else:
+            depth = image.depth.read_bytes() if image.depth is not None else b""
     except OSError:
         depth = b""  # a frame like those that have none
     return SourceFrame(

@@ -1,5 +1,6 @@
 """The textures of a scene: painted, lit, and shrunk into mip pyramids."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -103,17 +104,28 @@ def make_face(
     density = detail * solid.texels_per_metre
     owner = int(np.searchsorted(solids.first_face, number, side="right")) - 1
     face = number - int(solids.first_face[owner])
+    rng = np.random.default_rng([scene.seed, number])
+
+    def paint(height: int, width: int) -> F32:
+        image = make_texture(rng, height, width, solid.material)
+        light = _light_map(scene, solids, owner, face, width_m, height_m)
+        scale_x = (light.shape[1] - 1) / (density * width_m)
+        scale_y = (light.shape[0] - 1) / (density * height_m)
+        _apply_light(image, light, scale_x, scale_y)
+        return image
+
+    return mip_pyramid(width_m, height_m, density, paint)
+
+
+def mip_pyramid(
+    width_m: float, height_m: float, density: float, paint: Callable[[int, int], F32]
+) -> FaceTexture:
+    """A texture of so many metres.  paint: makes (height, width) texels, float32."""
     # One block more than the surface needs, so that its far edge never meets the texture's end.
     width, height = (
         int(np.ceil((size * density + 1.0) / _BLOCK)) * _BLOCK for size in (width_m, height_m)
     )
-    rng = np.random.default_rng([scene.seed, number])
-    image = make_texture(rng, height, width, solid.material)
-    light = _light_map(scene, solids, owner, face, width_m, height_m)
-    scale_x = (light.shape[1] - 1) / (density * width_m)
-    scale_y = (light.shape[0] - 1) / (density * height_m)
-    _apply_light(image, light, scale_x, scale_y)
-    levels = [image]
+    levels = [paint(height, width)]
     while len(levels) < LEVELS:
         levels.append(shrink(levels[-1]))
     texels = np.concatenate([level.ravel() for level in levels])

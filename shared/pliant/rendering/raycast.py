@@ -23,7 +23,7 @@ class Atlas(NamedTuple):
 
 
 @inline_kernel
-def _bilinear(
+def bilinear(
     texels: U8, offset: Scalar, width: Scalar, height: Scalar, x: Scalar, y: Scalar
 ) -> Scalar:
     """8 bit texels of one level of one face at (x, y), (0, 0) being the middle of the first."""
@@ -93,9 +93,9 @@ def accumulate(
                 level += 1
             w, h = texture_width[face] >> level, texture_height[face] >> level
             a, b = a / (1 << level), b / (1 << level)
-            value = _bilinear(texels, offset[face, level], w, h, a - 0.5, b - 0.5)
+            value = bilinear(texels, offset[face, level], w, h, a - 0.5, b - 0.5)
             if footprint > 1.0:
-                coarse = _bilinear(
+                coarse = bilinear(
                     texels, offset[face, level + 1], w >> 1, h >> 1, 0.5 * a - 0.5, 0.5 * b - 0.5
                 )
                 value += min(footprint - 1.0, 1.0) * (coarse - value)

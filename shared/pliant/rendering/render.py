@@ -18,9 +18,9 @@ from pliant.rendering.scene import Kind, Scene, Solid, SolidArrays, face_sizes, 
 from pliant.rendering.view import Tiles, View, tile_bounds, view_of, visible_tiles
 
 # Offsets of the sub-exposures within a pixel, in sixths: no two share a row or a column.
-_SUB_PIXELS = ((-2.5, 0.5), (1.5, 2.5), (-0.5, -1.5), (2.5, -0.5), (-1.5, 1.5), (0.5, -2.5))
+SUB_PIXELS = ((-2.5, 0.5), (1.5, 2.5), (-0.5, -1.5), (2.5, -0.5), (-1.5, 1.5), (0.5, -2.5))
 # A little sharper than the footprint says: the sub-pixel offsets take care of the rest.
-_FOOTPRINT = 0.7
+FOOTPRINT = 0.7
 
 
 class CameraOptions(Parameters):
@@ -53,6 +53,37 @@ class CameraOptions(Parameters):
             fy=focal,
             cx=0.5 * (self.width - 1),
             cy=0.5 * (self.height - 1),
+        )
+
+
+class FilmOptions(Parameters):
+    """What may be said after the name of every built-in sequence."""
+
+    frames: int | None = Field(
+        default=None, ge=2, description="First frames only; all where not given."
+    )
+    width: int | None = Field(
+        default=None, ge=64, le=2048, description="Columns; 3/4 as many rows."
+    )
+    noise: float = Field(default=2.0, ge=0.0, le=50.0, description="Image noise, grey values.")
+    exposure: float = Field(
+        default=0.2, ge=0.0, lt=1.0, description="Swing of the exposure; 0.2: 20 %."
+    )
+    blur: float = Field(
+        default=0.3, ge=0.0, le=1.0, description="Open shutter, share of the frame time."
+    )
+    seed: int = Field(default=0, ge=0, description="Seed of the noise.")
+
+    def camera(self, width: int = 640) -> CameraOptions:
+        """The camera that films so; width: where none was given."""
+        width = self.width or width
+        return CameraOptions(
+            width=width,
+            height=3 * width // 4,
+            noise=self.noise,
+            exposure=self.exposure,
+            blur=self.blur,
+            seed=self.seed,
         )
 
 
@@ -133,7 +164,7 @@ class Renderer:
         self._tints = _tints(geometry.scene, colour=camera.colour)
         self._rays = [
             pixel_rays(self._camera, camera.distortion, (x / 6.0, y / 6.0)).astype(np.float32)
-            for x, y in _SUB_PIXELS
+            for x, y in SUB_PIXELS
         ]
         self._bounds = [tile_bounds(rays) for rays in self._rays]
         self._rectified_rays = pixel_rays(self._camera, NO_DISTORTION)
@@ -158,7 +189,7 @@ class Renderer:
 
     def _expose(self, time_s: float) -> F32:
         """(H, W, C) light, mean of the sub-exposures while the shutter is open."""
-        camera, n = self._camera, len(_SUB_PIXELS)
+        camera, n = self._camera, len(SUB_PIXELS)
         light = np.zeros((camera.height, camera.width, self._tints.shape[1]), np.float32)
         for i, (rays, bounds) in enumerate(zip(self._rays, self._bounds, strict=True)):
             # Sub-exposures lie evenly about the middle, so that the blur does not shift the image.
@@ -173,7 +204,7 @@ class Renderer:
                 tiles,
                 self._atlas,
                 self._tints,
-                _FOOTPRINT / camera.fx,
+                FOOTPRINT / camera.fx,
                 1.0 / n,
                 light,
             )

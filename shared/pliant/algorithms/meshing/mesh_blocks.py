@@ -6,10 +6,12 @@ from typing import Annotated
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32, U8, BoolArray, Shape
-from pliant.algorithms.meshing.tsdf_blocks import SIDE, pack
+from pliant.algorithms.meshing.tsdf_blocks import SIDE, pack, unpack
 
 LATTICE = SIDE + 1
 """Lattice points along the side of a block's cubes."""
+LAST_KEY = (1 << 63) - 1
+"""No packed key lies behind this one; none lies before 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,9 +103,28 @@ class BlockMesh:
                 triangles=blocks.triangles[face].copy(),
             )
 
+    def clear_span(self, told: I32, first: int, last: int) -> I32:
+        """Let go of blocks whose packed keys lie in [first, last] and that were not ``told``.
+
+        told: (T, 3) keys.  Returns the (N, 3) keys of those that are gone, ascending.
+        """
+        kept = set(pack(told).tolist())
+        gone = sorted(key for key in self._blocks if first <= key <= last and key not in kept)
+        for key in gone:
+            del self._blocks[key]
+        return unpack(np.array(gone, np.int64))
+
+    def packed_keys(self) -> list[int]:
+        """The packed keys of all blocks, ascending."""
+        return sorted(self._blocks)
+
+    def blocks(self, packed_keys: list[int]) -> MeshBlocks:
+        """The held ones of some blocks, which are given in ascending order."""
+        return _joined([self._blocks[key] for key in packed_keys if key in self._blocks])
+
     def snapshot(self) -> MeshBlocks:
         """Everything held, for a viewer that joins late."""
-        return _joined([self._blocks[key] for key in sorted(self._blocks)])
+        return self.blocks(self.packed_keys())
 
     def mesh(self) -> TriangleMesh:
         """One mesh, welded across blocks.  It depends on what is held, not on how it came."""
@@ -138,6 +159,18 @@ def weld(blocks: MeshBlocks) -> TriangleMesh:
         normals=blocks.normals[rows],
         colours=blocks.colours[rows],
         triangles=rank[where[corners]].astype(np.int32).reshape(-1, 3),
+    )
+
+
+def unwelded(blocks: MeshBlocks) -> TriangleMesh:
+    """One mesh with the vertices of each block for itself: blocks may be of different times."""
+    starts = np.cumsum(blocks.vertex_counts) - blocks.vertex_counts
+    return TriangleMesh(
+        positions=blocks.positions,
+        normals=blocks.normals,
+        colours=blocks.colours,
+        triangles=blocks.triangles
+        + np.repeat(starts, blocks.triangle_counts).astype(np.int32)[:, None],
     )
 
 

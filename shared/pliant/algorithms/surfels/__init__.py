@@ -2,6 +2,7 @@
 
 from pliant.algorithms.surfels.joint import learn_equilibrium
 from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.prediction import predict
 from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.tracker import SurfelTracker
 from pliant.algorithms.surfels.warm_up import warm_up
@@ -12,5 +13,6 @@ __all__ = [
     "SurfelState",
     "SurfelTracker",
     "learn_equilibrium",
+    "predict",
     "warm_up",
 ]

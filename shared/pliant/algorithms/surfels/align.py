@@ -5,9 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
-from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.kernel import leaf_kernel
 from pliant.algorithms.surfels import motion
-from pliant.algorithms.surfels.damped import factorise, solve
+from pliant.algorithms.surfels.damped import copy, factorise, solve
+from pliant.algorithms.surfels.rest import Rest, add_rest, rest_cost
 from pliant.algorithms.surfels.sampling import (
     BIAS,
     GAIN,
@@ -18,7 +19,7 @@ from pliant.algorithms.surfels.sampling import (
     make_grid,
     sample_patch,
 )
-from pliant.algorithms.surfels.sums import FEATURES, frame_sums, make_features, template_sums
+from pliant.algorithms.surfels.sums import FEATURES, feature_matrix, make_features, photometric_sums
 
 _N = motion.MOST_PARAMETERS
 _MIN_GAIN = 0.05
@@ -27,7 +28,7 @@ _MIN_GAIN = 0.05
 class Templates(NamedTuple):
     """What is kept of N surfels for one level."""
 
-    images: F32  # (N, 3, n) grey levels without their mean, derivatives along i and j
+    images: F32  # (N, 3, padded(side)) grey levels without their mean, derivatives along i and j
     means: F64  # (N,) grey levels
     counts: F64  # (N,) samples that the template has
     matrices: F64  # (N, FEATURES, FEATURES) sums of products of the template's features
@@ -38,7 +39,7 @@ class Limits(NamedTuple):
     """Parameters of the minimisation, as kernels read them."""
 
     model: int
-    by_template: bool
+    blend: float  # share of the frame in the derivatives of the patch
     tau: float
     highlight: float
     omega_i: float
@@ -49,22 +50,24 @@ class Limits(NamedTuple):
     lambda_down: float
     iterations: int
     min_step_px: float
+    stale_px: float  # how far a surfel moves until its matrix is made anew
     slack: float  # share by which a success may raise the cost
 
 
 class Workspace(NamedTuple):
     """Scratch of one thread."""
 
-    grid: Grid
+    grid: Grid  # one sample wider than a texture on each side
     features: F32
     h: F64
+    before: F64  # (9,) homography of the last accepted pose
     sums: F64
     next_sums: F64
     matrix: F64
-    next_matrix: F64
     mix: F64
     product: F64
     H: F64
+    photometric: F64  # H without the energy of deformation
     L: F64
     scale: F64
     g: F64
@@ -72,37 +75,52 @@ class Workspace(NamedTuple):
     pose: F64
 
 
-def make_workspace(side: int, *, by_template: bool) -> Workspace:
+def make_workspace(side: int) -> Workspace:
     """Scratch for patches of side x side samples."""
     return Workspace(
-        make_grid(side if by_template else side + 2),
-        make_features(side),
-        np.zeros(9), np.zeros(FEATURES), np.zeros(FEATURES),
-        np.zeros((FEATURES, FEATURES)), np.zeros((FEATURES, FEATURES)),
-        np.zeros((FEATURES, _N)), np.zeros((FEATURES, _N)),
-        np.zeros((_N, _N)), np.zeros((_N, _N)), np.zeros(_N), np.zeros(_N), np.zeros(_N),
+        make_grid(side + 2), make_features(side),
+        np.zeros(9), np.zeros(9), np.zeros(FEATURES), np.zeros(FEATURES),
+        np.zeros((FEATURES, FEATURES)), np.zeros((FEATURES, _N)), np.zeros((FEATURES, _N)),
+        np.zeros((_N, _N)), np.zeros((_N, _N)), np.zeros((_N, _N)),
+        np.zeros(_N), np.zeros(_N), np.zeros(_N),
         np.zeros(POSE_FLOATS),
     )  # fmt: skip
 
 
-@fast_kernel
+@leaf_kernel
 def evaluate(
-    pose: F64, level: Level, images: F32, mean: float, limits: Limits, work: Workspace,
-    sums: F64, matrix: F64,
-) -> tuple[float, int]:  # fmt: skip
-    """Saturated photometric cost of Eq. 5 at a pose and its sums; negative cost: not in front."""
+    pose: F64, level: Level, images: F32, mean: float, limits: Limits, work: Workspace, sums: F64
+) -> tuple[float, int]:
+    """Saturated photometric cost of Eq. 5 at a pose, and how many samples are not saturated.
+
+    sums: (FEATURES,), filled.  A negative cost: not in front of the camera.
+    """
     if not homography(pose, level, work.h):
         return -1.0, 0
     if not sample_patch(work.h, level, work.grid, limits.highlight):
         return -1.0, 0
-    if limits.by_template:
-        return template_sums(images, work.grid, mean, pose[GAIN], pose[BIAS], limits.tau, sums)
-    return frame_sums(
-        images, work.grid, mean, pose[GAIN], pose[BIAS], limits.tau, work.features, matrix, sums
+    return photometric_sums(
+        images, work.grid, mean, pose[GAIN], pose[BIAS], limits.tau, limits.blend, sums
     )
 
 
-@fast_kernel
+@leaf_kernel
+def curvature(
+    pose: F64, images: F32, mean: float, template_matrix: F64, limits: Limits, work: Workspace,
+    matrix: F64,
+) -> None:  # fmt: skip
+    """Fill the (FEATURES, FEATURES) matrix of the pose that was evaluated last."""
+    if limits.blend > 0.0:
+        feature_matrix(
+            images, work.grid, mean, pose[GAIN], pose[BIAS], limits.tau, limits.blend,
+            work.features, matrix,
+        )  # fmt: skip
+        return
+    for row in range(FEATURES):
+        copy(template_matrix[row], matrix[row])
+
+
+@leaf_kernel
 def patch_step_px(before: F64, after: F64, half: float) -> float:
     """How far the farthest of the centre and four corners of a patch moves, pixels."""
     farthest = 0.0
@@ -118,53 +136,58 @@ def patch_step_px(before: F64, after: F64, half: float) -> float:
     return farthest
 
 
-@fast_kernel
+@leaf_kernel
 def align(
     pose: F64, level: Level, images: F32, mean: float, count: float, template_matrix: F64,
-    limits: Limits, work: Workspace,
+    point: F64, weight: F64, limits: Limits, work: Workspace,
 ) -> tuple[float, int]:  # fmt: skip
     """Minimise Eq. 11 (hard) or Eq. 13 (soft) from ``pose``, which is overwritten.
 
-    Returns (cost DN^2, evaluations); the cost is negative where the patch is not in front of the
-    camera, and the pose is then unchanged.
+    template_matrix: (FEATURES, FEATURES) of the texture.  point, weight: of its ``Rest``; with it
+    this is Eq. 21 for a camera that is held.  Returns (cost DN^2, evaluations); the
+    cost is negative where the patch is not in front of the camera, and the pose is then unchanged.
     """
     sums, next_sums = work.sums, work.next_sums
-    matrix, next_matrix = work.matrix, work.next_matrix
-    before, candidate = np.empty(9), work.pose
+    before, candidate = work.before, work.pose
     n = motion.parameter_count(limits.model)
-    half = float(limits_side(images) // 2)
-    cost, _ = evaluate(pose, level, images, mean, limits, work, sums, matrix)
+    half = float((work.grid.side - 2) // 2)
+    cost, _ = evaluate(pose, level, images, mean, limits, work, sums)
     if cost < 0.0:
         return cost, 1
-    before[:] = work.h
-    cost += limits.omega_i * motion.deformation_energy(pose)
+    copy(work.h, before)
+    cost += limits.omega_i * motion.deformation_energy(pose) + rest_cost(pose, point, weight)
     # Samples that the template lacks cost the same everywhere; slack is a share of the others.
     lacking = limits.tau * limits.tau * (images.shape[1] - count)
-    damping, accepted, fresh = limits.start_lambda, 0, True
+    damping, accepted, fresh, travelled = limits.start_lambda, 0, True, 1e9
     for iteration in range(limits.iterations):
         if fresh:
-            motion.mixing(pose, level, limits.model, limits.by_template, work.mix)
-            used = template_matrix if limits.by_template else matrix
-            motion.normal_equations(used, sums, work.mix, n, work.product, work.H, work.g)
+            motion.mixing(pose, level, limits.model, work.mix)
+            motion.gradient(sums, work.mix, n, work.g)
+            if travelled > limits.stale_px:
+                curvature(pose, images, mean, template_matrix, limits, work, work.matrix)
+                motion.hessian(work.matrix, 1.0, work.mix, n, work.product, work.photometric)
+                travelled = 0.0
+            for row in range(n):
+                copy(work.photometric[row], work.H[row])
             motion.add_deformation_energy(pose, limits.model, limits.omega_i, work.H, work.g)
+            add_rest(pose, point, weight, work.H, work.g)
         bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
         if not factorise(work.H, n, n - 2, bound, work.L, work.scale):
             return cost, iteration + 1
         solve(work.L, work.scale, n, work.g, work.step)
         motion.apply_step(pose, work.step, limits.model, candidate)
         candidate[GAIN] = max(candidate[GAIN], _MIN_GAIN)
-        next_cost, _ = evaluate(
-            candidate, level, images, mean, limits, work, next_sums, next_matrix
-        )
+        next_cost, _ = evaluate(candidate, level, images, mean, limits, work, next_sums)
         front = next_cost >= 0.0
         next_cost += limits.omega_i * motion.deformation_energy(candidate)
+        next_cost += rest_cost(candidate, point, weight)
         moved = patch_step_px(before, work.h, half) if front else 1e9
         if front and next_cost < cost + limits.slack * (cost - lacking):
-            pose[:POSE_FLOATS] = candidate
-            before[:] = work.h
+            copy(candidate, pose)
+            copy(work.h, before)
             cost, fresh, accepted = next_cost, True, accepted + 1
+            travelled += moved
             sums, next_sums = next_sums, sums
-            matrix, next_matrix = next_matrix, matrix
             damping = bound / limits.lambda_down
         else:
             fresh = False
@@ -175,23 +198,18 @@ def align(
     return cost, limits.iterations + 1
 
 
-@fast_kernel
-def limits_side(images: F32) -> int:
-    """Side of a square patch whose images are (3, side * side)."""
-    return int(np.sqrt(np.float64(images.shape[1])) + 0.5)
-
-
-@fast_kernel
+@leaf_kernel
 def align_all(
-    poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace
-) -> int:
+    poses: F64, active: U8, rest: Rest, level: Level, templates: Templates, limits: Limits,
+    work: Workspace,
+) -> int:  # fmt: skip
     """``align`` for every active surfel with a template of this level; returns evaluations."""
     evaluations = 0
     for k in range(len(poses)):
         if active[k] and templates.usable[k]:
             _, used = align(
                 poses[k], level, templates.images[k], templates.means[k], templates.counts[k],
-                templates.matrices[k], limits, work,
+                templates.matrices[k], rest.points[k], rest.weights[k], limits, work,
             )  # fmt: skip
             evaluations += used
     return evaluations

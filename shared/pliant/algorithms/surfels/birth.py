@@ -23,7 +23,14 @@ from pliant.algorithms.surfels.sampling import (
     make_grid,
     sample_patch,
 )
-from pliant.algorithms.surfels.sums import FEATURES, TEMPLATE_IMAGES, frame_sums, make_features
+from pliant.algorithms.surfels.sums import (
+    FEATURES,
+    TEMPLATE_IMAGES,
+    feature_matrix,
+    first_inner,
+    make_features,
+    padded,
+)
 from pliant.algorithms.surfels.tangent import fit_inverse_depth, tangent_jacobian
 
 _FAR = 0.5 * INVALID
@@ -52,7 +59,7 @@ def find_births(
     which nothing may be born.
     """
     p, level = parameters, pyramid[0]
-    image = level.pixels.reshape(level.height, level.width)
+    image = level.pixels
     allowed = _allowed(depth, image, occupied, p)
     corners = find_corners(
         image,
@@ -116,7 +123,7 @@ def make_templates(
     """
     n = len(poses)
     templates = Templates(
-        np.zeros((n, TEMPLATE_IMAGES, side * side), np.float32),
+        np.zeros((n, TEMPLATE_IMAGES, padded(side)), np.float32),
         np.zeros(n),
         np.zeros(n),
         np.zeros((n, FEATURES, FEATURES)),
@@ -155,7 +162,7 @@ def _fill(
     poses: F64, level: Level, wide: Grid, highlight: float, min_share: float, depth: F64,
     max_off_plane: float, templates: Templates, scratch: F32,
 ) -> None:  # fmt: skip
-    h, sums = np.empty(9), np.empty(FEATURES)
+    h = np.empty(9)
     side = wide.side - 2
     for s in range(len(poses)):
         if not homography(poses[s], level, h) or not sample_patch(h, level, wide, highlight):
@@ -163,27 +170,27 @@ def _fill(
         _leave_out_other_surfaces(h, level, wide, depth, max_off_plane)
         images = templates.images[s]
         count, total, squares = 0, 0.0, 0.0
-        for row in range(side):
-            for column in range(side):
-                k, n = (row + 1) * wide.side + column + 1, row * side + column
-                v = wide.values[k]
-                vu = np.float32(0.5) * (wide.values[k + 1] - wide.values[k - 1])
-                vv = np.float32(0.5) * (wide.values[k + wide.side] - wide.values[k - wide.side])
-                images[0, n] = v
-                good = abs(vu) < _FAR * 0.5 and abs(vv) < _FAR * 0.5 and v < _FAR
-                images[1, n] = vu if good else np.float32(0.0)
-                images[2, n] = vv if good else np.float32(0.0)
-                if v < _FAR:
-                    count, total, squares = count + 1, total + v, squares + v * v
+        for n in range(images.shape[1]):
+            k = first_inner(wide) + n
+            v = wide.values[k] if n % wide.side < side else np.float32(INVALID)
+            images[0, n] = v
+            if not v < _FAR:
+                continue
+            vu = np.float32(0.5) * (wide.values[k + 1] - wide.values[k - 1])
+            vv = np.float32(0.5) * (wide.values[k + wide.side] - wide.values[k - wide.side])
+            # What has no derivatives is no part of the texture.
+            if abs(vu) < _FAR * 0.5 and abs(vv) < _FAR * 0.5:
+                images[1, n], images[2, n] = vu, vv
+            count, total, squares = count + 1, total + v, squares + v * v
         if count < min_share * side * side:
             continue
-        mean = total / count
+        mean = float(total / count)
         templates.means[s], templates.counts[s] = mean, count
         # A sample that the template lacks is saturated in every frame.
-        for n in range(side * side):
+        for n in range(images.shape[1]):
             if images[0, n] < _FAR:
                 images[0, n] -= np.float32(mean)
-        frame_sums(images, wide, mean, 1.0, 0.0, 1.0, scratch, templates.matrices[s], sums)
+        feature_matrix(images, wide, mean, 1.0, 0.0, 1.0, 0.0, scratch, templates.matrices[s])
         templates.usable[s] = 1 if squares / count - mean * mean > _MIN_VARIANCE else 0
 
 

@@ -5,13 +5,20 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.kernel import leaf_kernel
 
 _RIDGE = 1e-9
 """Added to the unit diagonal: directions in which nothing is seen must not blow up."""
 
 
-@fast_kernel
+@leaf_kernel
+def copy(source: F64, target: F64) -> None:
+    """Fill ``target``.  An assignment to a slice makes a copy in between."""
+    for k in range(len(target)):
+        target[k] = source[k]
+
+
+@leaf_kernel
 def factorise(H: F64, n: int, damped: int, damping: float, L: F64, scale: F64) -> bool:
     """Cholesky factor L of D_s (H + lambda D_w) D_s with D_s = diag(H + lambda D_w)^-1/2.
 
@@ -39,7 +46,7 @@ def factorise(H: F64, n: int, damped: int, damping: float, L: F64, scale: F64) -
     return True
 
 
-@fast_kernel
+@leaf_kernel
 def solve(L: F64, scale: F64, n: int, g: F64, step: F64) -> None:
     """step = -(D_s L^-T L^-1 D_s) g, for a factor from ``factorise``."""
     for row in range(n):
@@ -56,7 +63,7 @@ def solve(L: F64, scale: F64, n: int, g: F64, step: F64) -> None:
         step[row] *= scale[row]
 
 
-@fast_kernel
+@leaf_kernel
 def inverse_diagonal(L: F64, scale: F64, n: int, count: int, scratch: F64) -> float:
     """Trace of the leading ``count`` x ``count`` block of the inverse of the factored matrix."""
     trace = 0.0

@@ -9,13 +9,16 @@ from pliant.algorithms.geometry import hat, so3_exp, transform
 from pliant.algorithms.surfels import joint_kernels as kernels
 from pliant.algorithms.surfels.align import Limits, Templates, Workspace
 from pliant.algorithms.surfels.motion import MOST_PARAMETERS
-from pliant.algorithms.surfels.sampling import BIAS, GAIN, Level
+from pliant.algorithms.surfels.rest import Rest
+from pliant.algorithms.surfels.sampling import BIAS, GAIN, Level, X
 from pliant.algorithms.surfels.sums import FEATURES
 from pliant.algorithms.surfels.table import move_poses
 
 _STILL_SHARE = 0.02
 """A level is done when no more than this share of the surfels still moves."""
 _RIDGE = 1e-9
+_REGISTER_STEPS = 3
+_NONE: F64 = np.zeros((0, FEATURES, FEATURES))
 
 
 @dataclass(frozen=True)
@@ -25,11 +28,11 @@ class Equilibrium:
     positions: F64  # (N, 3) metres, world
     weights: F64  # (N, 3, 3) omega_E Sigma^-1, world axes, DN^2 / m^2
 
-    def seen_from(self, T_camera_world: F64) -> tuple[F64, F64]:
+    def seen_from(self, T_camera_world: F64) -> Rest:
         """Positions and weights in the axes of a camera."""
         R = T_camera_world[:3, :3]
         turned = np.ascontiguousarray(R @ self.weights @ R.T)
-        return np.ascontiguousarray(transform(T_camera_world, self.positions)), turned
+        return Rest(np.ascontiguousarray(transform(T_camera_world, self.positions)), turned)
 
 
 def se3_exp(zeta: F64) -> F64:
@@ -46,64 +49,79 @@ def se3_exp(zeta: F64) -> F64:
     return T
 
 
-class _Sums:
-    """Costs and sums of N surfels at their present poses."""
-
-    def __init__(self, count: int) -> None:
-        self.costs = np.zeros(count)
-        self.sums = np.zeros((count, FEATURES))
-        self.matrices = np.zeros((count, FEATURES, FEATURES))
-
-
 def align_rigid(
     poses: F64, active: U8, T_camera_world: F64, level: Level, templates: Templates,
     limits: Limits, work: Workspace,
 ) -> F64:  # fmt: skip
     """Move the camera alone: all surfels stand still in the world.
 
+    The matrices are the textures' own, which shape the steps and not where they end.
     poses: (N, POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
     """
-    now = _Sums(len(poses))
-    usable = active.copy()
-    kernels.evaluate_all(
-        poses, usable, level, templates, limits, work, now.costs, now.sums, now.matrices
-    )
-    light = np.zeros((len(poses), 2, 7))
+    n = len(poses)
+    usable, costs, sums = active.copy(), np.zeros(n), np.zeros((n, FEATURES))
+    kernels.evaluate_all(poses, usable, level, templates, limits, work, costs, sums, _NONE)
+    light = np.zeros((n, 2, 7))
     M, v = np.zeros((6, 6)), np.zeros(6)
     damping, accepted = limits.start_lambda, 0
     for _ in range(limits.iterations):
         rows: BoolArray = usable > 0
         if not rows.any():
             break
-        kernels.rigid_system(
-            poses, usable, level, limits, work, now.sums, now.matrices, light, M, v
-        )
+        kernels.rigid_system(poses, usable, level, work, sums, templates.matrices, light, M, v)
         bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
         zeta = _solve(M, v, bound)
-        motion = se3_exp(zeta)
+        motion, before = se3_exp(zeta), poses.copy()
         moved = move_poses(poses, motion)
         moved[:, GAIN] = np.maximum(moved[:, GAIN] + light[:, 0] @ np.r_[1.0, zeta], 0.05)
         moved[:, BIAS] += light[:, 1] @ np.r_[1.0, zeta]
-        after, still_usable = _Sums(len(poses)), usable.copy()
+        still_usable, new_costs, new_sums = usable.copy(), np.zeros(n), np.zeros((n, FEATURES))
         kernels.evaluate_all(
-            moved, still_usable, level, templates, limits, work,
-            after.costs, after.sums, after.matrices,
-        )  # fmt: skip
+            moved, still_usable, level, templates, limits, work, new_costs, new_sums, _NONE
+        )
         both: BoolArray = still_usable > 0
         if 2 * np.count_nonzero(both) > np.count_nonzero(rows) and (
-            after.costs[both].sum() < now.costs[both].sum() * (1.0 + limits.slack)
+            new_costs[both].sum() < costs[both].sum() * (1.0 + limits.slack)
         ):
             poses[:] = np.where(active[:, None] > 0, moved, move_poses(poses, motion))
             T_camera_world = motion @ T_camera_world
-            now, usable, accepted = after, still_usable, accepted + 1
+            costs, sums, usable = new_costs, new_sums, still_usable
+            accepted += 1
             damping = bound / limits.lambda_down
         else:
             damping = bound * limits.lambda_up
-        # The step of a point at the depth of the scene, in pixels.
-        depth = float(np.median(poses[rows, 2]))
-        moved_px = level.fx * (np.abs(zeta[:3]).max() / depth + np.abs(zeta[3:]).max())
+        moved_px = level.fx * float(np.median(_shift(before[rows], moved[rows])))
         if moved_px * (1.0 + bound) < limits.min_step_px:
             break
+    return T_camera_world
+
+
+def _shift(before: F64, after: F64) -> F64:
+    """(N,) how far surfels move in the image, in units of the focal length."""
+    a, b = before[:, X : X + 3], after[:, X : X + 3]
+    return np.linalg.norm(b[:, :2] / b[:, 2:] - a[:, :2] / a[:, 2:], axis=1)
+
+
+def register(poses: F64, active: U8, T_camera_world: F64, equilibrium: Equilibrium) -> F64:
+    """Minimise Eq. 21 over the camera alone, which only Eq. 20 knows of; no image is needed.
+
+    poses: (N, POSE_FLOATS) in the camera's frame: the images have found them, and they stay.
+    Returns T_camera_world.
+    """
+    rows: BoolArray = active > 0
+    for _ in range(_REGISTER_STEPS):
+        points, weights = equilibrium.seen_from(T_camera_world)
+        W, G = weights[rows], np.zeros((int(rows.sum()), 3, 6))
+        G[:, :, :3] = np.eye(3)
+        # W turns with the camera, too: so a step is about where the surfel is, not where it rests.
+        x, y, z = poses[rows, X : X + 3].T
+        G[:, 0, 4], G[:, 0, 5] = z, -y
+        G[:, 1, 3], G[:, 1, 5] = -z, x
+        G[:, 2, 3], G[:, 2, 4] = y, -x
+        WG, e = W @ G, poses[rows, X : X + 3] - points[rows]
+        rows_of_all = WG.reshape(-1, 6)
+        M, v = G.reshape(-1, 6).T @ rows_of_all, e.ravel() @ rows_of_all
+        T_camera_world = se3_exp(_solve(M, v, 0.0)) @ T_camera_world
     return T_camera_world
 
 
@@ -116,13 +134,12 @@ def align_jointly(
     poses: (N, POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
     """
     n = len(poses)
-    now, usable = _Sums(n), active.copy()
-    kernels.evaluate_all(
-        poses, usable, level, templates, limits, work, now.costs, now.sums, now.matrices
-    )
+    usable, costs, sums = active.copy(), np.zeros(n), np.zeros((n, FEATURES))
+    matrices = np.zeros((n, FEATURES, FEATURES))
+    kernels.evaluate_all(poses, usable, level, templates, limits, work, costs, sums, matrices)
     own, follow = np.zeros((n, MOST_PARAMETERS)), np.zeros((n, MOST_PARAMETERS, 6))
     M, v = np.zeros((6, 6)), np.zeros(6)
-    damping = np.full(n, limits.start_lambda)
+    damping, travelled = np.full(n, limits.start_lambda), np.zeros(n)
     for iteration in range(limits.iterations):
         if not usable.any():
             break
@@ -130,7 +147,7 @@ def align_jointly(
             damping = np.maximum(damping, limits.first_lambda)
         points, weights = equilibrium.seen_from(T_camera_world)
         kernels.joint_system(
-            poses, usable, level, limits, work, now.sums, now.matrices, points, weights,
+            poses, usable, level, limits, work, sums, matrices, points, weights,
             damping, own, follow, M, v,
         )  # fmt: skip
         zeta = _solve(M, v, 0.0)
@@ -139,7 +156,7 @@ def align_jointly(
         steps = own + follow @ zeta
         moving = kernels.step_all(
             poses, usable, level, templates, limits, work, steps, points, weights, damping,
-            now.costs, now.sums, now.matrices,
+            travelled, costs, sums, matrices,
         )  # fmt: skip
         if moving <= _STILL_SHARE * usable.sum():
             break

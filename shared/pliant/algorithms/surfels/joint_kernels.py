@@ -13,21 +13,31 @@ scene has p = Ad zeta instead, with the adjoint of the surfel's own position.
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
-from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.surfels import motion
-from pliant.algorithms.surfels.align import Limits, Templates, Workspace, evaluate, patch_step_px
-from pliant.algorithms.surfels.damped import factorise, solve
-from pliant.algorithms.surfels.sampling import GAIN, POSE_FLOATS, Level, X, homography
+from pliant.algorithms.surfels.align import (
+    Limits,
+    Templates,
+    Workspace,
+    curvature,
+    evaluate,
+    patch_step_px,
+)
+from pliant.algorithms.surfels.damped import copy, factorise, solve
+from pliant.algorithms.surfels.rest import rest_cost
+from pliant.algorithms.surfels.sampling import GAIN, Level, X, homography
 
 _MIN_GAIN = 0.05
 
 
-@fast_kernel
+@leaf_kernel
 def evaluate_all(
     poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
     costs: F64, sums: F64, matrices: F64,
 ) -> None:  # fmt: skip
     """Photometric cost (N,), sums (N, FEATURES) and matrix (N, FEATURES, FEATURES) of surfels.
+
+    matrices: (0, ...) where none are wanted.
 
     Surfels that are not in front of the camera, or have no template here, become inactive.
     """
@@ -37,34 +47,33 @@ def evaluate_all(
         if not templates.usable[s]:
             active[s] = 0
             continue
-        if limits.by_template:
-            matrices[s] = templates.matrices[s]
-        cost, _ = evaluate(
-            poses[s], level, templates.images[s], templates.means[s], limits, work,
-            sums[s], matrices[s],
-        )  # fmt: skip
+        images, mean = templates.images[s], templates.means[s]
+        cost, _ = evaluate(poses[s], level, images, mean, limits, work, sums[s])
         if cost < 0.0:
             active[s] = 0
         else:
             costs[s] = cost
+            if len(matrices) > 0:
+                curvature(poses[s], images, mean, templates.matrices[s], limits, work, matrices[s])
 
 
 @fast_kernel
 def rigid_system(
-    poses: F64, active: U8, level: Level, limits: Limits, work: Workspace, sums: F64,
+    poses: F64, active: U8, level: Level, work: Workspace, sums: F64,
     matrices: F64, light: F64, M: F64, v: F64,
 ) -> None:  # fmt: skip
     """Add up M zeta = v of a rigid scene.  light: (N, 2, 7): gain and bias from (1, zeta)."""
     n = 8
-    A, Q = np.zeros((6, 6)), np.zeros((6, 6))
+    A, Q, QA = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
     q = np.zeros(6)
     M[:] = 0.0
     v[:] = 0.0
     for s in range(len(poses)):
         if not active[s]:
             continue
-        motion.mixing(poses[s], level, motion.ISOMETRIC, limits.by_template, work.mix)
-        motion.normal_equations(matrices[s], sums[s], work.mix, n, work.product, work.H, work.g)
+        motion.mixing(poses[s], level, motion.ISOMETRIC, work.mix)
+        motion.hessian(matrices[s], 1.0, work.mix, n, work.product, work.H)
+        motion.gradient(sums[s], work.mix, n, work.g)
         H, g = work.H, work.g
         # Gain and bias, the last two, are eliminated from the surfel's block.
         det = H[6, 6] * H[7, 7] - H[6, 7] * H[7, 6]
@@ -88,17 +97,19 @@ def rigid_system(
                 l1 -= (i01 * H[6, k] + i11 * H[7, k]) * A[k, c]
             light[s, 0, 1 + c], light[s, 1, 1 + c] = l0, l1
         for r in range(6):
-            for k in range(6):
-                v[r] -= A[k, r] * q[k]
             for c in range(6):
                 total = 0.0
                 for k in range(6):
-                    for m in range(6):
-                        total += A[k, r] * Q[k, m] * A[m, c]
-                M[r, c] += total
+                    total += Q[r, k] * A[k, c]
+                QA[r, c] = total
+        for r in range(6):
+            for k in range(6):
+                v[r] -= A[k, r] * q[k]
+                for c in range(6):
+                    M[r, c] += A[k, r] * QA[k, c]
 
 
-@fast_kernel
+@leaf_kernel
 def _adjoint(pose: F64, A: F64) -> None:
     """Step of a surfel that stands still in the world: (rho + phi x X, phi)."""
     x, y, z = pose[X], pose[X + 1], pose[X + 2]
@@ -133,8 +144,9 @@ def joint_system(
         if not active[s]:
             continue
         W = weights[s]
-        motion.mixing(poses[s], level, limits.model, limits.by_template, work.mix)
-        motion.normal_equations(matrices[s], sums[s], work.mix, n, work.product, work.H, work.g)
+        motion.mixing(poses[s], level, limits.model, work.mix)
+        motion.hessian(matrices[s], 1.0, work.mix, n, work.product, work.H)
+        motion.gradient(sums[s], work.mix, n, work.g)
         motion.add_deformation_energy(poses[s], limits.model, limits.omega_i, work.H, work.g)
         _equilibrium_rows(equilibrium[s], G)
         for r in range(3):
@@ -164,7 +176,7 @@ def joint_system(
                     M[r, c] += G[k, r] * WG[k, c] - WG[k, r] * follow[s, k, c]
 
 
-@fast_kernel
+@leaf_kernel
 def _equilibrium_rows(x: F64, G: F64) -> None:
     """[I, -[x]x]: how a point of the world moves in the camera's frame under a step of T_cw."""
     G[:] = 0.0
@@ -174,28 +186,18 @@ def _equilibrium_rows(x: F64, G: F64) -> None:
     G[2, 3], G[2, 4] = x[1], -x[0]
 
 
-@fast_kernel
-def equilibrium_cost(pose: F64, equilibrium: F64, W: F64) -> float:
-    """omega_E times Eq. 20."""
-    total = 0.0
-    for r in range(3):
-        for c in range(3):
-            er, ec = pose[X + r] - equilibrium[r], pose[X + c] - equilibrium[c]
-            total += er * W[r, c] * ec
-    return float(np.float64(total))
-
-
-@fast_kernel
+@leaf_kernel
 def step_all(
     poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
-    steps: F64, equilibrium: F64, weights: F64, damping: F64, costs: F64, sums: F64, matrices: F64,
+    steps: F64, equilibrium: F64, weights: F64, damping: F64, travelled: F64, costs: F64,
+    sums: F64, matrices: F64,
 ) -> int:  # fmt: skip
     """Take every surfel's step where it lowers its own cost under the new camera.
 
     equilibrium, weights: those of the new camera.  Returns how many surfels still moved.
     """
-    half = float(np.sqrt(np.float64(templates.images.shape[2])) // 2)
-    before = np.empty(9)
+    half = float((work.grid.side - 2) // 2)
+    before = work.before
     moving = 0
     for s in range(len(poses)):
         if not active[s]:
@@ -203,25 +205,25 @@ def step_all(
         candidate = work.pose
         motion.apply_step(poses[s], steps[s], limits.model, candidate)
         candidate[GAIN] = max(candidate[GAIN], _MIN_GAIN)
-        if limits.by_template:
-            work.next_matrix[:] = matrices[s]
         if not homography(poses[s], level, before):
             continue
-        cost, _ = evaluate(
-            candidate, level, templates.images[s], templates.means[s], limits, work,
-            work.next_sums, work.next_matrix,
-        )  # fmt: skip
+        images, mean = templates.images[s], templates.means[s]
+        cost, _ = evaluate(candidate, level, images, mean, limits, work, work.next_sums)
         new = cost + limits.omega_i * motion.deformation_energy(candidate)
-        new += equilibrium_cost(candidate, equilibrium[s], weights[s])
+        new += rest_cost(candidate, equilibrium[s], weights[s])
         old = costs[s] + limits.omega_i * motion.deformation_energy(poses[s])
-        old += equilibrium_cost(poses[s], equilibrium[s], weights[s])
+        old += rest_cost(poses[s], equilibrium[s], weights[s])
         if cost >= 0.0 and new < old * (1.0 + limits.slack):
-            if patch_step_px(before, work.h, half) * (1.0 + damping[s]) > limits.min_step_px:
+            moved = patch_step_px(before, work.h, half)
+            travelled[s] += moved
+            if moved * (1.0 + damping[s]) > limits.min_step_px:
                 moving += 1
-            poses[s, :POSE_FLOATS] = candidate
+            copy(candidate, poses[s])
             costs[s] = cost
-            sums[s] = work.next_sums
-            matrices[s] = work.next_matrix
+            copy(work.next_sums, sums[s])
+            if travelled[s] > limits.stale_px:
+                curvature(candidate, images, mean, templates.matrices[s], limits, work, matrices[s])
+                travelled[s] = 0.0
             damping[s] /= limits.lambda_down
         else:
             damping[s] *= limits.lambda_up

@@ -4,13 +4,20 @@ import math
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, U8
-from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.kernel import leaf_kernel
 from pliant.algorithms.surfels import motion
 from pliant.algorithms.surfels.align import Limits, Templates, Workspace
 from pliant.algorithms.surfels.damped import factorise, inverse_diagonal
-from pliant.algorithms.surfels.sampling import BIAS, GAIN, Grid, Level, homography, sample_patch
-from pliant.algorithms.surfels.sums import correlation
+from pliant.algorithms.surfels.sampling import (
+    BIAS,
+    GAIN,
+    MARGIN,
+    Level,
+    homography,
+    sample_patch,
+)
+from pliant.algorithms.surfels.sums import correlation, first_inner
 
 FRONT, INSIDE, SEEN, CORRELATION, SIGMA, U, V, VERDICTS = 0, 1, 2, 3, 4, 5, 6, 7
 """Columns of a verdict: in front of the camera (0 or 1), shares of the texture inside of the image
@@ -21,16 +28,17 @@ _MAX_SIGMA = 1e3
 _FAR = 1e6
 
 
-@fast_kernel
+@leaf_kernel
 def judge_all(
-    poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, grid: Grid,
-    work: Workspace, out: F64,
+    poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
+    out: F64,
 ) -> None:  # fmt: skip
     """Fill a row of ``out`` (N, VERDICTS) for every active surfel.
 
-    grid: of the side of the templates.  The pixel is left alone where a surfel is not in front.
+    The pixel is left alone where a surfel is not in front.
     """
     parameters = motion.parameter_count(limits.model)
+    grid, at = work.grid, first_inner(work.grid)
     for s in range(len(poses)):
         if not active[s]:
             continue
@@ -42,31 +50,53 @@ def judge_all(
             continue
         verdict[FRONT] = 1.0
         verdict[U], verdict[V] = work.h[2] / work.h[8], work.h[5] / work.h[8]
-        images, m = templates.images[s], templates.means[s]
-        gain, bias = pose[GAIN], pose[BIAS]
-        inside = seen = squares = 0.0
-        count = templates.counts[s]
-        for k in range(len(grid.i)):
-            r = gain * (grid.values[k] - m) + bias - images[0, k]
-            good = abs(r) < limits.tau
-            inside += grid.valid[k] if images[0, k] < _FAR else 0.0
-            seen += 1.0 if good else 0.0
-            squares += r * r if good else 0.0
-        verdict[INSIDE], verdict[SEEN] = inside / count, seen / count
-        verdict[CORRELATION], _ = correlation(images[0], grid.values)
+        t, count = templates.images[s, 0], templates.counts[s]
+        values = grid.values[at : at + len(t)]
+        verdict[INSIDE] = _inside(t, grid.x[at:], grid.y[at:], level) / count
+        seen, squares = _agreeing(t, values, templates.means[s], pose[GAIN], pose[BIAS], limits.tau)
+        verdict[SEEN] = seen / count
+        verdict[CORRELATION], _ = correlation(t, values)
         if seen < parameters:
             continue
-        motion.mixing(pose, level, limits.model, True, work.mix)
-        motion.normal_equations(
-            templates.matrices[s], work.sums, work.mix, parameters, work.product, work.H, work.g
-        )
+        motion.mixing(pose, level, limits.model, work.mix)
         # What is covered tells nothing: the information shrinks with the share that is seen.
+        motion.hessian(
+            templates.matrices[s], verdict[SEEN], work.mix, parameters, work.product, work.H
+        )
         work.g[:] = 0.0
         motion.add_deformation_energy(pose, limits.model, limits.omega_i, work.H, work.g)
-        noise = max(squares / seen, _MIN_NOISE * _MIN_NOISE) / verdict[SEEN]
+        noise = max(squares / seen, _MIN_NOISE * _MIN_NOISE)
         if factorise(work.H, parameters, 0, 0.0, work.L, work.scale):
             trace = inverse_diagonal(work.L, work.scale, parameters, 3, work.step)
             verdict[SIGMA] = min(math.sqrt(noise * trace), _MAX_SIGMA)
+
+
+@leaf_kernel
+def _inside(t: F32, x: F32, y: F32, level: Level) -> float:
+    """How many samples of a texture lie in the image."""
+    zero, one, far = np.float32(0.0), np.float32(1.0), np.float32(_FAR)
+    right, bottom = np.float32(level.width - 1.0), np.float32(level.height - 1.0)
+    count = zero
+    for k in range(len(t)):
+        good = (x[k] > -MARGIN) & (y[k] > -MARGIN) & (x[k] < right) & (y[k] < bottom)
+        count += one if good & (t[k] < far) else zero
+    return float(count)
+
+
+@leaf_kernel
+def _agreeing(
+    t: F32, values: F32, mean: float, gain: float, bias: float, tau: float
+) -> tuple[float, float]:
+    """How many samples are not saturated, and the sum of their squared residuals."""
+    m, g, b, limit = np.float32(mean), np.float32(gain), np.float32(bias), np.float32(tau)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    seen = squares = zero
+    for k in range(len(t)):
+        r = g * (values[k] - m) + b - t[k]
+        good = abs(r) < limit
+        seen += one if good else zero
+        squares += r * r if good else zero
+    return float(seen), float(squares)
 
 
 def new_verdicts(count: int) -> F64:

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.kernel import leaf_kernel
 from pliant.algorithms.surfels.sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, Level, X
 from pliant.algorithms.surfels.sums import FEATURES
 
@@ -27,13 +27,13 @@ MOST_PARAMETERS = RIGID + 3 + 2
 _MIN_STRETCH, _MAX_STRETCH = 0.2, 5.0
 
 
-@fast_kernel
+@leaf_kernel
 def parameter_count(model: int) -> int:
     """Parameters of a step: 6, those of F, gain and bias."""
     return RIGID + model + 2
 
 
-@fast_kernel
+@leaf_kernel
 def deformation_directions(model: int, pose: F64, k: int) -> tuple[float, float, float]:
     """Derivative of (f11, f12, f22) with respect to the k-th parameter of F."""
     if model == CONFORMAL:
@@ -46,8 +46,8 @@ def deformation_directions(model: int, pose: F64, k: int) -> tuple[float, float,
     return (1.0, 0.0, 0.0) if k == 0 else ((0.0, 1.0, 0.0) if k == 1 else (0.0, 0.0, 1.0))
 
 
-@fast_kernel
-def mixing(pose: F64, level: Level, model: int, by_template: bool, out: F64) -> None:
+@leaf_kernel
+def mixing(pose: F64, level: Level, model: int, out: F64) -> None:
     """The (FEATURES, parameters) matrix that mixes the sums' features into Jacobian rows.
 
     A displacement dX of the point X + i a + j b moves the patch along its grid by (w1, w2), where
@@ -83,15 +83,12 @@ def mixing(pose: F64, level: Level, model: int, by_template: bool, out: F64) -> 
             (sv * (d12 * a0 + d22 * b0), sv * (d12 * a1 + d22 * b1), sv * (d12 * a2 + d22 * b2)),
         )  # fmt: skip
     gain = parameters - 2
-    if by_template:
-        # The feature is the template; the residual's derivative is the frame, (T - bias) / gain.
-        out[8, gain], out[9, gain] = 1.0 / pose[GAIN], -pose[BIAS] / pose[GAIN]
-    else:
-        out[8, gain] = 1.0
+    # The feature is the texture; the residual's derivative is the frame, (T - bias) / gain.
+    out[8, gain], out[9, gain] = 1.0 / pose[GAIN], -pose[BIAS] / pose[GAIN]
     out[9, gain + 1] = 1.0
 
 
-@fast_kernel
+@leaf_kernel
 def _turn(
     out: F64,
     column: int,
@@ -108,25 +105,19 @@ def _turn(
     out[7, column] = -(n[2][0] * b[0] + n[2][1] * b[1] + n[2][2] * b[2])
 
 
-@fast_kernel
-def normal_equations(
-    matrix: F64, sums: F64, mix: F64, parameters: int, scratch: F64, H: F64, g: F64
-) -> None:
-    """H = mix' matrix mix and g = mix' sums, both of the photometric cost alone.
+@leaf_kernel
+def hessian(matrix: F64, share: float, mix: F64, parameters: int, scratch: F64, H: F64) -> None:
+    """H = share mix' matrix mix, of the photometric cost alone.
 
-    scratch: (FEATURES, MOST_PARAMETERS).
+    share: of the texture that is seen.  scratch: (FEATURES, MOST_PARAMETERS).
     """
     for row in range(FEATURES):
         for column in range(parameters):
             total = 0.0
             for k in range(FEATURES):
                 total += matrix[row, k] * mix[k, column]
-            scratch[row, column] = total
+            scratch[row, column] = share * total
     for row in range(parameters):
-        total = 0.0
-        for k in range(FEATURES):
-            total += mix[k, row] * sums[k]
-        g[row] = total
         for column in range(row + 1):
             total = 0.0
             for k in range(FEATURES):
@@ -134,10 +125,21 @@ def normal_equations(
             H[row, column] = H[column, row] = total
 
 
-@fast_kernel
+@leaf_kernel
+def gradient(sums: F64, mix: F64, parameters: int, g: F64) -> None:
+    """g = mix' sums: half of the gradient of the photometric cost."""
+    for row in range(parameters):
+        total = 0.0
+        for k in range(FEATURES):
+            total += mix[k, row] * sums[k]
+        g[row] = total
+
+
+@leaf_kernel
 def apply_step(pose: F64, step: F64, model: int, out: F64) -> None:
     """Eq. 6: move, turn and deform a surfel.  pose, out: (POSE_FLOATS,)."""
-    out[:POSE_FLOATS] = pose[:POSE_FLOATS]
+    for k in range(POSE_FLOATS):
+        out[k] = pose[k]
     for k in range(3):
         out[X + k] += step[k]
     _rotate(out, A, step[3], step[4], step[5])
@@ -159,7 +161,7 @@ def apply_step(pose: F64, step: F64, model: int, out: F64) -> None:
     out[BIAS] = pose[BIAS] + step[parameters - 1]
 
 
-@fast_kernel
+@leaf_kernel
 def _rotate(pose: F64, start: int, wx: float, wy: float, wz: float) -> None:
     """Turn one tangent by a rotation vector (Rodrigues)."""
     x, y, z = pose[start], pose[start + 1], pose[start + 2]
@@ -175,13 +177,13 @@ def _rotate(pose: F64, start: int, wx: float, wy: float, wz: float) -> None:
     pose[start + 2] = z + s * uz + c * (wx * uy - wy * ux)
 
 
-@fast_kernel
+@leaf_kernel
 def deformation_energy(pose: F64) -> float:
     """||F - I||^2 of Eq. 12, Frobenius: the off-diagonal element counts twice."""
     return float((pose[F] - 1.0) ** 2 + 2.0 * pose[F + 1] ** 2 + (pose[F + 2] - 1.0) ** 2)
 
 
-@fast_kernel
+@leaf_kernel
 def add_deformation_energy(pose: F64, model: int, weight: float, H: F64, g: F64) -> None:
     """Add omega_I ||F - I||^2 (Eq. 13) to the normal equations."""
     e11, e12, e22 = pose[F] - 1.0, pose[F + 1], pose[F + 2] - 1.0

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
-from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.surfels.sampling import A, B, X
 
 
@@ -26,7 +26,7 @@ def no_edges() -> Edges:
     return Edges(np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
-@fast_kernel
+@leaf_kernel
 def own_coordinates(pose: F64, d: F64, out: F64) -> None:
     """Coefficients of a vector in A, B and A x B of a surfel."""
     a0, a1, a2 = pose[A], pose[A + 1], pose[A + 2]
@@ -43,7 +43,7 @@ def own_coordinates(pose: F64, d: F64, out: F64) -> None:
     out[0], out[1], out[2] = (da * bb - db * ab) / det, (db * aa - da * ab) / det, dn
 
 
-@fast_kernel
+@leaf_kernel
 def own_vector(pose: F64, c: F64, out: F64) -> None:
     """The vector of such coefficients."""
     a0, a1, a2 = pose[A], pose[A + 1], pose[A + 2]

@@ -69,7 +69,35 @@ class SurfelParameters(Parameters):
         description="Neighbours are off each other's plane by at most this share of the distance.",
     )
     together_steps: int = Field(
-        default=4, ge=1, description="Steps of all surfels together at each level."
+        default=3, ge=1, description="Steps of all surfels together at full size."
+    )
+    coarse_together_steps: int = Field(
+        default=2, ge=0, description="The same at each coarser level."
+    )
+
+    depth_from: Literal["sensor", "map", "flat"] = Field(
+        default="sensor",
+        description="Where surfels start: sensor: depth maps that come with the images.  map: our "
+        "own map of a scene that holds nearly still at first, seen by a camera that moves.  flat: "
+        "a plane in front of the camera, one unit away; then only motion in the image is right.",
+    )
+    map_keyframes: int = Field(
+        default=5, ge=2, description="Keyframes that our own map has before surfels start on it."
+    )
+    map_sigma: float = Field(
+        default=0.01,
+        gt=0.0,
+        description="Points of our own map count whose depth is known to this share of itself, for "
+        "half a pixel of noise.",
+    )
+    map_points: int = Field(
+        default=200, ge=3, description="Such points in the keyframe on which surfels start."
+    )
+    prediction: Literal["auto", "none", "tracks"] = Field(
+        default="auto",
+        description="tracks: each surfel starts where the extrema about it went, and else where "
+        "the dominant flow leads (not in the paper; the tracking service runs, too).  auto: where "
+        "the tracking service runs anyway.",
     )
 
     max_surfels: int = Field(default=500, ge=1, le=20_000, description="Most surfels at a time.")
@@ -101,7 +129,7 @@ class SurfelParameters(Parameters):
         default=5e-4, ge=0.0, description="Relative noise that no depth is expected to be below."
     )
     max_depth_residual: float = Field(
-        default=0.01, gt=0.0, description="Most rms of the tangent's fit, relative to depth."
+        default=0.005, gt=0.0, description="Most rms of the tangent's fit, relative to depth."
     )
     min_depth_share: float = Field(
         default=0.5, gt=0.0, le=1.0, description="Least share of the window that has that surface."
@@ -125,10 +153,17 @@ class SurfelParameters(Parameters):
         description="Least share of a patch inside of the image and on the surfel's plane.",
     )
 
-    jacobian: Literal["template", "frame"] = Field(
-        default="frame",
+    jacobian: Literal["template", "both", "frame"] = Field(
+        default="both",
         description="Derivatives of Eq. 5 from the frame's patch (forward, as the paper), or from "
-        "the texture, the same in every step: faster, converges less often.",
+        "the texture: faster, converges less often.  both: at the coarse scales of a static camera "
+        "their mean, which converges most often, otherwise the frame's.",
+    )
+    stale_px: float = Field(
+        default=0.3,
+        ge=0.0,
+        description="The sums of products of the derivatives are kept until a surfel has moved as "
+        "far as this.  They shape the steps, and not where they end.",
     )
     saturation: float = Field(
         default=40.0, gt=0.0, description="A residual beyond this counts as this, DN."

@@ -5,7 +5,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.kernel import fast_kernel
-from pliant.algorithms.surfels.sampling import Level
+from pliant.algorithms.surfels.sampling import Level, make_level
 from pliant.algorithms.tracking.pyramid import halve
 
 
@@ -48,20 +48,8 @@ def make_pyramid(image: U8, camera: PinholeCamera, levels: int) -> list[Level]:
     pixels = smooth(image)
     for level in range(levels):
         scale = float(2**level)
-        fx, fy = camera.fx / scale, camera.fy / scale
-        out.append(
-            Level(
-                pixels.ravel(),
-                pixels.shape[1],
-                pixels.shape[0],
-                fx,
-                fy,
-                (camera.cx + 0.5) / scale - 0.5,
-                (camera.cy + 0.5) / scale - 0.5,
-                1.0 / fx,
-                1.0 / fy,
-            )
-        )
+        cx, cy = (camera.cx + 0.5) / scale - 0.5, (camera.cy + 0.5) / scale - 0.5
+        out.append(make_level(pixels, camera.fx / scale, camera.fy / scale, cx, cy))
         pixels = halve(pixels)
     return out
 

@@ -1,7 +1,8 @@
 """Where the grid of a surfel falls in an image, and the grey levels there (DSDT, Eq. 5).
 
-Coordinates and gather are two loops over all samples: the first is vector arithmetic, the second
-is loads alone.  One loop that does both is several times slower.
+A sample needs four pixels.  They lie side by side in one 64-bit word (``pack``), so that a sample
+is one load.  Coordinates, loads and interpolation are loops of their own over all samples: all but
+the loads are vector arithmetic.  One loop that does everything is several times slower.
 
 A surfel in the camera frame is a row of POSE_FLOATS numbers: position X, tangents A and B (the
 columns of R J0, metres per unit of normalised coordinate), F as (f11, f12, f22), gain and bias.
@@ -11,16 +12,21 @@ Gain and bias act on grey levels from which the template's mean has been taken.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.algorithms.arrays import F32, F64, U32, U64
+from pliant.algorithms.kernel import kernel, leaf_kernel
 
 X, A, B, F, GAIN, BIAS, POSE_FLOATS = 0, 3, 6, 9, 12, 13, 14
 """Where the parts of a surfel's row begin, and its length."""
 
 INVALID = 1.0e9
 """Grey level of a sample outside of the image or on a highlight: it is saturated for sure."""
+
+_ONE = 256.0
+"""Grey level 1 in a packed pixel."""
+
+MARGIN = np.float32(0.005)
+"""A sample this far outside of the image, in pixels, is still inside."""
 
 _LARGEST = 1e9
 """No entry of a homography is larger in any scene: metres times pixels."""
@@ -32,7 +38,8 @@ MIN_DEPTH_SHARE = 0.05
 class Level(NamedTuple):
     """One level of an image pyramid, as kernels read it."""
 
-    pixels: F32  # (H * W,) grey levels
+    pixels: F32  # (H, W) grey levels
+    quads: U64  # (H * W,) each pixel with those to its right, below and below right, see ``pack``
     width: int
     height: int
     fx: float  # intrinsics of this level, pixels
@@ -43,31 +50,62 @@ class Level(NamedTuple):
     step_v: float
 
 
+def make_level(pixels: F32, fx: float, fy: float, cx: float, cy: float) -> Level:
+    """A level of (H, W) grey levels from 0 to 255, with intrinsics in its own pixels."""
+    height, width = pixels.shape
+    return Level(pixels, pack(pixels), width, height, fx, fy, cx, cy, 1.0 / fx, 1.0 / fy)
+
+
+@kernel
+def pack(image: F32) -> U64:
+    """(H * W,) words of four pixels, 16 bits each, the least: itself, right, below, below right.
+
+    image: (H, W) grey levels from 0 to 255, kept to 1/256: what the first levels of a pyramid of
+    8 bit images are multiples of.  The last row and column have no such four, and are 0.
+    """
+    height, width = image.shape
+    out = np.zeros(height * width, np.uint64)
+    above, below = np.empty(width, np.uint64), np.empty(width, np.uint64)
+    _fixed_point(image[0], above)
+    for row in range(height - 1):
+        _fixed_point(image[row + 1], below)
+        target = out[row * width : (row + 1) * width]
+        for k in range(width - 1):
+            high = below[k] << np.uint64(32) | below[k + 1] << np.uint64(48)
+            target[k] = above[k] | above[k + 1] << np.uint64(16) | high
+        above, below = below, above
+    return out
+
+
+@leaf_kernel
+def _fixed_point(row: F32, out: U64) -> None:
+    for k in range(len(out)):
+        out[k] = np.uint64(np.int32(row[k] * np.float32(_ONE) + np.float32(0.5)))
+
+
 class Grid(NamedTuple):
     """The symmetric grid of a patch, and room for its samples."""
 
     side: int  # samples along an edge
     i: F32  # (side * side,) column, 0 in the middle
     j: F32  # (side * side,) row, 0 in the middle
-    above: NDArray[np.uint32]  # the pixel above and left
-    across: F32  # how far to the right of it, 0 to 1
-    down: F32  # how far below
-    valid: F32  # 1 inside of the image, else 0
+    x: F32  # where they fall in the image, pixels
+    y: F32
+    above: U32  # the pixel above and left
+    quads: U64  # the four pixels around
     values: F32  # grey levels
 
 
 def make_grid(side: int) -> Grid:
     """A grid of side x side samples one pixel apart; side is odd."""
-    half = side // 2
+    half, n = side // 2, side * side
     j, i = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float32)
-    zeros = np.zeros((5, side * side), np.float32)
-    return Grid(
-        side, i.ravel().copy(), j.ravel().copy(), zeros[0].astype(np.uint32),
-        zeros[1].copy(), zeros[2].copy(), zeros[3].copy(), zeros[4].copy(),
-    )  # fmt: skip
+    x, y, values = (np.zeros(n, np.float32) for _ in range(3))
+    above, quads = np.zeros(n, np.uint32), np.zeros(n, np.uint64)
+    return Grid(side, i.ravel().copy(), j.ravel().copy(), x, y, above, quads, values)
 
 
-@fast_kernel
+@leaf_kernel
 def homography(pose: F64, level: Level, out: F64) -> bool:
     """The 9 numbers, row by row, that map the grid (i, j, 1) to homogeneous pixels.
 
@@ -88,7 +126,7 @@ def homography(pose: F64, level: Level, out: F64) -> bool:
     return out[8] > 0.0 and largest < _LARGEST
 
 
-@fast_kernel
+@leaf_kernel
 def sample_patch(h: F64, level: Level, grid: Grid, highlight: float) -> bool:
     """Fill ``grid.values`` with bilinear grey levels; INVALID outside and above ``highlight``.
 
@@ -99,53 +137,67 @@ def sample_patch(h: F64, level: Level, grid: Grid, highlight: float) -> bool:
     nearest = h[8] - half * (abs(h[6]) + abs(h[7]))
     if not nearest > MIN_DEPTH_SHARE * h[8]:
         return False
-    _coordinates(h, level, grid)
-    _gather(level, grid, np.float32(highlight))
+    # Just short of the last pixel, so that the pixel to the right is there as well.
+    right, bottom = np.float32(level.width - 1.001), np.float32(level.height - 1.001)
+    _coordinates(h, grid.i, grid.j, grid.x, grid.y)
+    _pixels(grid.x, grid.y, right, bottom, np.uint32(level.width), grid.above)
+    _load(level.quads, grid.above, grid.quads)
+    _interpolate(grid.x, grid.y, right, bottom, grid.quads, np.float32(highlight), grid.values)
     return True
 
 
-@fast_kernel
-def _coordinates(h: F64, level: Level, grid: Grid) -> None:
+@leaf_kernel
+def _coordinates(h: F64, i: F32, j: F32, x: F32, y: F32) -> None:
     h0, h1, h2 = np.float32(h[0]), np.float32(h[1]), np.float32(h[2])
     h3, h4, h5 = np.float32(h[3]), np.float32(h[4]), np.float32(h[5])
     h6, h7, h8 = np.float32(h[6]), np.float32(h[7]), np.float32(h[8])
-    one, zero = np.float32(1.0), np.float32(0.0)
-    # Just short of the last pixel, so that the pixel to the right is there as well.
-    right, bottom = np.float32(level.width - 1.001), np.float32(level.height - 1.001)
-    width = np.uint32(level.width)
-    for k in range(len(grid.i)):
-        i, j = grid.i[k], grid.j[k]
-        w = one / (h6 * i + h7 * j + h8)
-        x = (h0 * i + h1 * j + h2) * w
-        y = (h3 * i + h4 * j + h5) * w
+    one = np.float32(1.0)
+    for k in range(len(i)):
+        w = one / (h6 * i[k] + h7 * j[k] + h8)
+        x[k] = (h0 * i[k] + h1 * j[k] + h2) * w
+        y[k] = (h3 * i[k] + h4 * j[k] + h5) * w
+
+
+@leaf_kernel
+def _pixels(
+    x: F32, y: F32, right: np.float32, bottom: np.float32, width: np.uint32, out: U32
+) -> None:
+    zero = np.float32(0.0)
+    for k in range(len(out)):
         # Written so that what is not a number ends at a valid pixel.
-        u = x if x > zero else zero
-        v = y if y > zero else zero
+        u = x[k] if x[k] > zero else zero
+        v = y[k] if y[k] > zero else zero
         u = u if u < right else right
         v = v if v < bottom else bottom
-        column, row = np.int32(u), np.int32(v)
-        grid.above[k] = np.uint32(row) * width + np.uint32(column)
-        grid.across[k] = u - np.float32(column)
-        grid.down[k] = v - np.float32(row)
-        grid.valid[k] = one if abs(x - u) + abs(y - v) < np.float32(0.01) else zero
+        out[k] = np.uint32(np.int32(v)) * width + np.uint32(np.int32(u))
 
 
-@kernel
-def _gather(level: Level, grid: Grid, highlight: np.float32) -> float:
-    """Interpolate.  The sum, in order, keeps LLVM from gather instructions, which are slower."""
-    pixels, width = level.pixels, np.uint64(level.width)
-    one = np.uint64(1)
-    values, across, down, valid = grid.values, grid.across, grid.down, grid.valid
-    index = grid.above
-    outside = np.float32(INVALID)
-    total = np.float32(0.0)
-    for k in range(len(values)):
-        above = np.uint64(index[k])
-        below = above + width
-        p, q = pixels[above], pixels[below]
-        p += across[k] * (pixels[above + one] - p)
-        q += across[k] * (pixels[below + one] - q)
-        v = p + down[k] * (q - p)
-        total += v
-        values[k] = v if (valid[k] > np.float32(0.5)) & (v <= highlight) else outside
-    return float(total)
+@leaf_kernel
+def _load(quads: U64, index: U32, out: U64) -> None:
+    for k in range(len(out)):
+        out[k] = quads[index[k]]
+
+
+@leaf_kernel
+def _interpolate(
+    x: F32, y: F32, right: np.float32, bottom: np.float32, quads: U64, highlight: np.float32,
+    out: F32,
+) -> None:  # fmt: skip
+    zero, outside, mask = np.float32(0.0), np.float32(INVALID), np.uint64(0xFFFF)
+    unit = np.float32(1.0 / _ONE)
+    for k in range(len(out)):
+        u, v = x[k], y[k]
+        inside = (u > -MARGIN) & (v > -MARGIN) & (u < right + MARGIN) & (v < bottom + MARGIN)
+        u = u if u > zero else zero
+        v = v if v > zero else zero
+        u = u if u < right else right
+        v = v if v < bottom else bottom
+        across, down = u - np.float32(np.int32(u)), v - np.float32(np.int32(v))
+        quad = quads[k]
+        p = np.float32(np.int32(quad & mask))
+        q = np.float32(np.int32((quad >> np.uint64(16)) & mask))
+        r = np.float32(np.int32((quad >> np.uint64(32)) & mask))
+        s = np.float32(np.int32(quad >> np.uint64(48)))
+        top = p + across * (q - p)
+        value = unit * (top + down * (r + across * (s - r) - top))
+        out[k] = value if inside & (value <= highlight) else outside

@@ -7,6 +7,16 @@ is a mixture of eight functions of the grid, and of two for gain and bias,
 
 Vu and Vv being derivatives of the patch along its own grid.  One 10 x 10 matrix over the samples
 therefore serves every deformation model and both cameras; ``motion`` has the mixing.
+
+The derivatives are those of the frame's patch (forward, as the paper), of the texture, or their
+mean.  The matrix shapes the steps, and not where they end: that is settled by the sums of features
+times residual.  So these are made at every step, and the matrix, which costs twice as much, only
+after a surfel has moved.
+
+A patch is sampled one pixel wider on every side, for its derivatives.  Its textures keep the rows
+of that grid, with two samples between rows that the texture lacks, so that a sample and
+its neighbours stand at fixed distances and one loop serves all: sample k is at ``first_inner``
++ k of it.
 """
 
 import math
@@ -14,7 +24,7 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
+from pliant.algorithms.kernel import leaf_kernel
 from pliant.algorithms.surfels.sampling import Grid
 
 FEATURES = 10
@@ -22,40 +32,66 @@ TEMPLATE_IMAGES = 3
 """Grey level (mean removed) and the derivatives along i and j."""
 
 _FAR = 1.0e6
-_I, _J, _D = FEATURES + 1, FEATURES + 2, FEATURES + 3
-"""Rows of the scratch of ``frame_sums``: the grid, and D; before them features and residual."""
+_I, _J, _D = FEATURES, FEATURES + 1, FEATURES + 2
+"""Rows of the scratch of ``feature_matrix``: the grid, and D; before them the features."""
+
+
+def padded(side: int) -> int:
+    """Samples of a texture of side x side, with the two between its rows that it lacks."""
+    return side * (side + 2) - 2
 
 
 def make_features(side: int) -> F32:
-    """Scratch of ``frame_sums`` for patches of side x side samples."""
-    half = side // 2
-    features = np.zeros((FEATURES + 4, side * side), np.float32)
-    j, i = np.mgrid[-half : half + 1, -half : half + 1]
-    features[_I], features[_J] = i.ravel(), j.ravel()
+    """Scratch of ``feature_matrix`` for textures of side x side."""
+    n, half = padded(side), side // 2
+    features = np.zeros((FEATURES + 3, n), np.float32)
+    features[_I] = np.arange(n) % (side + 2) - half
+    features[_J] = np.arange(n) // (side + 2) - half
     return features
 
 
-@fast_kernel
-def template_sums(
-    template: F32, grid: Grid, mean: float, gain: float, bias: float, tau: float, out: F64
-) -> tuple[float, int]:
-    """Saturated cost, and the sums of features times residual with the template's derivatives.
+@leaf_kernel
+def first_inner(grid: Grid) -> int:
+    """Where in the grid of a patch, one sample wider on each side, its first sample stands."""
+    return grid.side + 1
 
-    template: (3, n) images.  out: (FEATURES,).  Returns (cost DN^2, samples not saturated).
+
+@leaf_kernel
+def photometric_sums(
+    images: F32, grid: Grid, mean: float, gain: float, bias: float, tau: float, blend: float,
+    out: F64,
+) -> tuple[float, int]:  # fmt: skip
+    """Saturated cost, and the sums of features times residual.
+
+    images: (TEMPLATE_IMAGES, n) of the texture.  blend: share of the frame in the derivatives; the
+    rest are the texture's.  out: (FEATURES,).  Returns (cost DN^2, samples not saturated).
     """
-    i, j, values = grid.i, grid.j, grid.values
-    t, tu, tv = template[0], template[1], template[2]
-    zero, one = np.float32(0.0), np.float32(1.0)
-    m, g, b = np.float32(mean), np.float32(gain), np.float32(bias)
-    limit, top = np.float32(tau), np.float32(tau * tau)
+    return _sums(
+        grid.i, grid.j, grid.values, grid.side, images[0], images[1], images[2],
+        np.float32(mean), np.float32(gain), np.float32(bias), np.float32(tau), np.float32(blend),
+        out,
+    )  # fmt: skip
+
+
+@leaf_kernel
+def _sums(
+    gi: F32, gj: F32, values: F32, wide: int, t: F32, tu: F32, tv: F32, m: np.float32,
+    g: np.float32, b: np.float32, limit: np.float32, blend: np.float32, out: F64,
+) -> tuple[float, int]:  # fmt: skip
+    n, at = len(t), wide + 1
+    i, j, here = gi[at : at + n], gj[at : at + n], values[at : at + n]
+    left, right = values[at - 1 : at - 1 + n], values[at + 1 : at + 1 + n]
+    above, below = values[at - wide : at - wide + n], values[at + wide : at + wide + n]
+    zero, one, far = np.float32(0.0), np.float32(1.0), np.float32(_FAR)
+    rest, slope = one - blend, np.float32(0.5) * g * blend
     s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = s9 = cost = seen = zero
-    for k in range(len(values)):
-        r = g * (values[k] - m) + b - t[k]
-        inside = abs(r) < limit
+    for k in range(n):
+        r = g * (here[k] - m) + b - t[k]
+        u, v = right[k] - left[k], below[k] - above[k]
+        inside = (abs(r) < limit) & (abs(u) < far) & (abs(v) < far)
         r = r if inside else zero
-        cost += r * r if inside else top
         seen += one if inside else zero
-        p, q = tu[k] * r, tv[k] * r
+        p, q = (slope * u + rest * tu[k]) * r, (slope * v + rest * tv[k]) * r
         d = i[k] * p + j[k] * q
         s0 += p
         s1 += q
@@ -65,98 +101,84 @@ def template_sums(
         s5 += j[k] * q
         s6 += i[k] * d
         s7 += j[k] * d
-        s8 += t[k] * r if inside else zero
+        s8 += t[k] * r
         s9 += r
+        cost += r * r
     out[0], out[1], out[2], out[3], out[4] = s0, s1, s2, s3, s4
-    out[5], out[6], out[7], out[8], out[9] = s5, s6, s7, s8, s9
-    return float(cost), int(seen)
+    # The frame's own patch, gain and bias applied, is the texture plus the residual.
+    out[5], out[6], out[7], out[8], out[9] = s5, s6, s7, s8 + blend * cost, s9
+    return float(cost + limit * limit * (np.float32(n) - seen)), int(seen)
 
 
 @leaf_kernel
-def frame_sums(
-    template: F32,
-    grid: Grid,
-    mean: float,
-    gain: float,
-    bias: float,
-    tau: float,
-    features: F32,
-    matrix: F64,
-    out: F64,
-) -> tuple[float, int]:
-    """As ``template_sums``, with the derivatives of the frame's own patch (forward, as the paper).
+def feature_matrix(
+    images: F32, grid: Grid, mean: float, gain: float, bias: float, tau: float, blend: float,
+    features: F32, out: F64,
+) -> None:  # fmt: skip
+    """Sums of products of the features, for the samples that ``photometric_sums`` counts.
 
-    grid: one sample wider on each side than the template.  features: from ``make_features``.
-    matrix: (FEATURES, FEATURES), filled with the sums of products of the features.
+    The arguments are those of ``photometric_sums``.  features: from ``make_features``, filled.
+    out: (FEATURES, FEATURES).
     """
-    wide = grid.side
-    side = wide - 2
-    n = side * side
-    m, g, b = np.float32(mean), np.float32(gain), np.float32(bias)
-    limit, top = np.float32(tau), np.float32(tau * tau)
-    zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
-    far = np.float32(_FAR)
-    slope = half * g
-    f0, f1, f8, f9, f10 = features[0], features[1], features[8], features[9], features[10]
-    for row in range(side):
-        start, at = (row + 1) * wide + 1, row * side
-        here, before = grid.values[start : start + side], grid.values[start - 1 : start - 1 + side]
-        after = grid.values[start + 1 : start + 1 + side]
-        above = grid.values[start - wide : start - wide + side]
-        below = grid.values[start + wide : start + wide + side]
-        row0, row1, row8 = f0[at : at + side], f1[at : at + side], f8[at : at + side]
-        for k in range(side):
-            row0[k] = slope * (after[k] - before[k])
-        for k in range(side):
-            row1[k] = slope * (below[k] - above[k])
-        for k in range(side):
-            row8[k] = here[k] - m
-    t = template[0]
+    _features(
+        grid.values, grid.side, images[0], images[1], images[2], np.float32(mean),
+        np.float32(gain), np.float32(bias), np.float32(tau), np.float32(blend), features,
+    )  # fmt: skip
+    _products(features, out)
+
+
+@leaf_kernel
+def _features(
+    values: F32, wide: int, t: F32, tu: F32, tv: F32, m: np.float32, g: np.float32, b: np.float32,
+    limit: np.float32, blend: np.float32, features: F32,
+) -> None:  # fmt: skip
+    n, at = len(t), wide + 1
+    here = values[at : at + n]
+    left, right = values[at - 1 : at - 1 + n], values[at + 1 : at + 1 + n]
+    above, below = values[at - wide : at - wide + n], values[at + wide : at + wide + n]
+    zero, one, far = np.float32(0.0), np.float32(1.0), np.float32(_FAR)
+    rest, slope = one - blend, np.float32(0.5) * g * blend
+    fu, fv, level, seen = features[0], features[1], features[8], features[9]
+    # One array to write in one loop: with several of them LLVM does not vectorise.
     for k in range(n):
-        f10[k] = g * f8[k] + b - t[k]
+        r = g * (here[k] - m) + b - t[k]
+        u, v = right[k] - left[k], below[k] - above[k]
+        inside = (abs(r) < limit) & (abs(u) < far) & (abs(v) < far)
+        seen[k] = one if inside else zero
     for k in range(n):
-        inside = (abs(f10[k]) < limit) & (abs(f0[k]) < far) & (abs(f1[k]) < far)
-        f9[k] = one if inside else zero
-    _times(f0, f9, f0)
-    _times(f1, f9, f1)
-    _times(f8, f9, f8)
-    _times(f10, f9, f10)
-    cost = seen = zero
+        fu[k] = (slope * (right[k] - left[k]) + rest * tu[k]) * seen[k]
     for k in range(n):
-        cost += f10[k] * f10[k]
-        seen += f9[k]
-    cost += top * (np.float32(n) - seen)
+        fv[k] = (slope * (below[k] - above[k]) + rest * tv[k]) * seen[k]
+    for k in range(n):
+        level[k] = (t[k] + blend * (g * (here[k] - m) + b - t[k])) * seen[k]
     i, j, d = features[_I], features[_J], features[_D]
-    _times(i, f0, features[2])
-    _times(j, f0, features[3])
-    _times(i, f1, features[4])
-    _times(j, f1, features[5])
+    _times(i, fu, features[2])
+    _times(j, fu, features[3])
+    _times(i, fv, features[4])
+    _times(j, fv, features[5])
     f2, f5 = features[2], features[5]
     for k in range(n):
         d[k] = f2[k] + f5[k]
     _times(i, d, features[6])
     _times(j, d, features[7])
-    _products(features, n, matrix, out)
-    return float(cost), int(seen)
 
 
 @leaf_kernel
 def _times(a: F32, b: F32, out: F32) -> None:
-    """One product in one loop: with several arrays to write LLVM does not vectorise."""
     for k in range(len(out)):
         out[k] = a[k] * b[k]
 
 
 @leaf_kernel
-def _products(features: F32, n: int, matrix: F64, out: F64) -> None:
-    """Scalar products of all rows with each other and with the last, four at a time."""
+def _products(features: F32, out: F64) -> None:
+    """Scalar products of all rows with each other, four at a time."""
     for row in range(FEATURES):
         a = features[row]
         for column in range(0, row + 1, 4):
-            b, c = features[column], features[min(column + 1, FEATURES)]
-            d, e = features[min(column + 2, FEATURES)], features[min(column + 3, FEATURES)]
+            b, c = features[column], features[min(column + 1, row)]
+            d, e = features[min(column + 2, row)], features[min(column + 3, row)]
             s0 = s1 = s2 = s3 = np.float32(0.0)
-            for k in range(n):
+            for k in range(len(a)):
                 s0 += a[k] * b[k]
                 s1 += a[k] * c[k]
                 s2 += a[k] * d[k]
@@ -164,15 +186,10 @@ def _products(features: F32, n: int, matrix: F64, out: F64) -> None:
             sums = (s0, s1, s2, s3)
             for m in range(4):
                 if column + m <= row:
-                    matrix[row, column + m] = matrix[column + m, row] = sums[m]
-        r = features[FEATURES]
-        total = np.float32(0.0)
-        for k in range(n):
-            total += a[k] * r[k]
-        out[row] = total
+                    out[row, column + m] = out[column + m, row] = sums[m]
 
 
-@fast_kernel
+@leaf_kernel
 def correlation(template: F32, values: F32) -> tuple[float, int]:
     """ZNCC of two patches over the samples that both have, and how many these are."""
     n = sa = sb = saa = sbb = sab = np.float32(0.0)

@@ -17,16 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8, BoolArray
-from pliant.algorithms.surfels import joint_kernels, judge
 from pliant.algorithms.surfels import together_kernels as kernels
 from pliant.algorithms.surfels.align import Limits, Templates, Workspace
 from pliant.algorithms.surfels.motion import MOST_PARAMETERS, RIGID
 from pliant.algorithms.surfels.neighbours import Edges
-from pliant.algorithms.surfels.sampling import Grid, Level
+from pliant.algorithms.surfels.rest import Rest
+from pliant.algorithms.surfels.sampling import Level, X
 from pliant.algorithms.surfels.sums import FEATURES
 
 _CG_ITERATIONS = 60
-_CG_TOLERANCE = 1e-5
+_CG_TOLERANCE = 1e-4
 _FEW = 3
 _HELD_SHARE = 0.25
 _DIAGONAL = np.arange(RIGID)
@@ -46,41 +46,50 @@ class Hold:
 
 
 def align_together(
-    poses: F64, start: F64, active: U8, edges: Edges, level: Level, templates: Templates,
-    limits: Limits, work: Workspace, grid: Grid, hold: Hold,
+    poses: F64, start: F64, active: U8, edges: Edges, rest: Rest, level: Level,
+    templates: Templates, limits: Limits, work: Workspace, hold: Hold,
 ) -> BoolArray:  # fmt: skip
     """Move all surfels as one, from the present poses, which are overwritten.
 
     poses: (N, POSE_FLOATS) in the camera's frame.  start: the same of the last frame: from there
-    what is not seen is carried.  active: (N,) 1 where the image may be looked at.  Returns (N,)
-    which surfels have torn themselves off their neighbours: their pose is that of ``start``.
+    what is not seen is carried.  active: (N,) 1 where the image may be looked at.  rest: Eq. 20
+    for a camera that is held; the pairs know nothing of it, since a motion of all leaves them as
+    they are.  Returns (N,) which surfels have torn themselves off their neighbours: their pose is
+    that of ``start``.
     """
     n, pairs = len(poses), len(edges.ends)
-    seen = _fitting(poses, active, level, templates, limits, work, grid, hold)
-    poses[seen == 0] = start[seen == 0]
     costs, sums = np.zeros(n), np.zeros((n, FEATURES))
     matrices = np.zeros((n, FEATURES, FEATURES))
-    joint_kernels.evaluate_all(poses, seen, level, templates, limits, work, costs, sums, matrices)
+    seen = active.copy()
+    kernels.look_at_all(
+        poses, start, seen, level, templates, limits, work, hold.min_zncc, hold.min_visible,
+        costs, sums, matrices,
+    )  # fmt: skip
     S, b, x = np.zeros((n, RIGID, RIGID)), np.zeros((n, RIGID)), np.zeros((n, RIGID))
     inner = np.zeros((n, MOST_PARAMETERS - RIGID))
     follow = np.zeros((n, MOST_PARAMETERS - RIGID, RIGID))
     w, residuals, arms = np.zeros(pairs), np.zeros((pairs, 2, 3)), np.zeros((pairs, 2, 3))
-    damping = np.full(n, limits.start_lambda)
+    damping, travelled = np.full(n, limits.start_lambda), np.zeros(n)
+    # What is not seen goes where its neighbours do.
+    weights = np.where(seen[:, None, None] > 0, rest.weights, 0.0)
     for _ in range(hold.steps):
         kernels.reduce_all(poses, seen, level, limits, work, sums, matrices, S, b, inner, follow)
         kernels.edge_rows(poses, edges, hold.tear, w, residuals, arms)
-        damped = S.copy()
+        damped, descent = S.copy(), b.copy()
         damped[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping[:, None]
+        held = weights @ (poses[:, X : X + 3] - rest.points)[:, :, None]
+        damped[:, :3, :3] += weights
+        descent[:, :3] += held[:, :, 0]
         pull = hold.weight * w / edges.lengths**2
         kernels.solve_together(
-            damped, b, edges, arms, residuals, pull / hold.strain**2, pull / hold.bend**2,
+            damped, descent, edges, arms, residuals, pull / hold.strain**2, pull / hold.bend**2,
             _CG_ITERATIONS, _CG_TOLERANCE, x,
         )  # fmt: skip
         if not np.isfinite(x).all():
             break
         kernels.step_together(
             poses, seen, level, templates, limits, work, S, b, inner, follow, x, damping,
-            costs, sums, matrices,
+            travelled, costs, sums, matrices,
         )  # fmt: skip
     kernels.edge_rows(poses, edges, hold.tear, w, residuals, arms)
     torn = torn_off(edges, w, n)
@@ -98,16 +107,3 @@ def torn_off(edges: Edges, weights: F64, count: int) -> BoolArray:
     degree = np.bincount(ends, minlength=count)
     held = np.bincount(ends, weights=np.repeat(weights, 2), minlength=count)
     return (degree >= _FEW) & (held < _HELD_SHARE * degree)
-
-
-def _fitting(
-    poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
-    grid: Grid, hold: Hold,
-) -> U8:  # fmt: skip
-    """(N,) 1 where the image shows the surfel near its present pose."""
-    seen = active & templates.usable
-    verdicts = judge.new_verdicts(len(poses))
-    judge.judge_all(poses, seen, level, templates, limits, grid, work, verdicts)
-    seen[verdicts[:, judge.CORRELATION] < hold.min_zncc] = 0
-    seen[verdicts[:, judge.SEEN] < hold.min_visible] = 0
-    return seen

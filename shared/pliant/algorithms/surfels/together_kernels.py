@@ -3,18 +3,54 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
-from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.surfels import motion
-from pliant.algorithms.surfels.align import Limits, Templates, Workspace, evaluate
-from pliant.algorithms.surfels.damped import factorise, solve
+from pliant.algorithms.surfels.align import (
+    Limits,
+    Templates,
+    Workspace,
+    curvature,
+    evaluate,
+    patch_step_px,
+)
+from pliant.algorithms.surfels.damped import copy, factorise, solve
 from pliant.algorithms.surfels.neighbours import Edges, own_vector
-from pliant.algorithms.surfels.sampling import GAIN, POSE_FLOATS, Level, X
+from pliant.algorithms.surfels.sampling import GAIN, Level, X, homography
+from pliant.algorithms.surfels.sums import correlation, first_inner
 
 _RIGID = motion.RIGID
 _MIN_GAIN = 0.05
 
 
-@fast_kernel
+@leaf_kernel
+def look_at_all(
+    poses: F64, start: F64, active: U8, level: Level, templates: Templates, limits: Limits,
+    work: Workspace, min_zncc: float, min_visible: float, costs: F64, sums: F64, matrices: F64,
+) -> None:  # fmt: skip
+    """Costs, sums and matrices where the image shows a surfel near its present pose.
+
+    Where it does not, ``active`` becomes 0 and the pose that of ``start``.
+    """
+    for s in range(len(poses)):
+        images, mean = templates.images[s], templates.means[s]
+        cost, found = 0.0, active[s] > 0 and templates.usable[s] > 0
+        if found:
+            cost, seen = evaluate(poses[s], level, images, mean, limits, work, sums[s])
+            found = cost >= 0.0 and seen >= min_visible * templates.counts[s]
+            if found:
+                at = first_inner(work.grid)
+                zncc, _ = correlation(images[0], work.grid.values[at : at + images.shape[1]])
+                found = zncc >= min_zncc
+        if found:
+            active[s] = 1
+            costs[s] = cost
+            curvature(poses[s], images, mean, templates.matrices[s], limits, work, matrices[s])
+        else:
+            active[s] = 0
+            copy(start[s], poses[s])
+
+
+@leaf_kernel
 def reduce_all(
     poses: F64, active: U8, level: Level, limits: Limits, work: Workspace, sums: F64,
     matrices: F64, S: F64, b: F64, inner: F64, follow: F64,
@@ -24,46 +60,55 @@ def reduce_all(
     S: (N, 6, 6), b: (N, 6): S x = -b without neighbours.  inner: (N, 5), follow: (N, 5, 6): the
     eliminated parameters step by -inner - follow x.
     """
-    n = motion.parameter_count(limits.model)
-    m = n - _RIGID
-    C, L, scale = np.zeros((m, m)), np.zeros((m, m)), np.zeros(m)
-    rhs, x = np.zeros(m), np.zeros(m)
     for s in range(len(poses)):
         S[s] = 0.0
         b[s] = 0.0
         inner[s] = 0.0
         follow[s] = 0.0
-        if not active[s]:
-            continue
-        H, g = work.H, work.g
-        motion.mixing(poses[s], level, limits.model, limits.by_template, work.mix)
-        motion.normal_equations(matrices[s], sums[s], work.mix, n, work.product, H, g)
-        motion.add_deformation_energy(poses[s], limits.model, limits.omega_i, H, g)
-        C[:] = H[_RIGID:n, _RIGID:n]
-        if not factorise(C, m, 0, 0.0, L, scale):
-            continue
+        if active[s]:
+            _reduce(
+                poses[s], level, limits, work, sums[s], matrices[s], S[s], b[s], inner[s], follow[s]
+            )
+
+
+@leaf_kernel
+def _reduce(
+    pose: F64, level: Level, limits: Limits, work: Workspace, sums: F64, matrix: F64, S: F64,
+    b: F64, inner: F64, follow: F64,
+) -> None:  # fmt: skip
+    n = motion.parameter_count(limits.model)
+    m = n - _RIGID
+    H, g, rhs, x = work.H, work.g, work.step, work.scale[m:]
+    motion.mixing(pose, level, limits.model, work.mix)
+    motion.hessian(matrix, 1.0, work.mix, n, work.product, H)
+    motion.gradient(sums, work.mix, n, g)
+    motion.add_deformation_energy(pose, limits.model, limits.omega_i, H, g)
+    if not factorise(H[_RIGID:n, _RIGID:n], m, 0, 0.0, work.L, work.scale):
+        return
+    for k in range(m):
+        rhs[k] = -g[_RIGID + k]
+    solve(work.L, work.scale, m, rhs, x)
+    for k in range(m):
+        inner[k] = x[k]
+    for c in range(_RIGID):
         for k in range(m):
-            rhs[k] = -g[_RIGID + k]
-        solve(L, scale, m, rhs, x)
-        inner[s, :m] = x
+            rhs[k] = -H[_RIGID + k, c]
+        solve(work.L, work.scale, m, rhs, x)
+        for k in range(m):
+            follow[k, c] = x[k]
+    for r in range(_RIGID):
+        total = g[r]
+        for k in range(m):
+            total -= H[r, _RIGID + k] * inner[k]
+        b[r] = total
         for c in range(_RIGID):
+            total = H[r, c]
             for k in range(m):
-                rhs[k] = -H[_RIGID + k, c]
-            solve(L, scale, m, rhs, x)
-            follow[s, :m, c] = x
-        for r in range(_RIGID):
-            total = g[r]
-            for k in range(m):
-                total -= H[r, _RIGID + k] * inner[s, k]
-            b[s, r] = total
-            for c in range(_RIGID):
-                total = H[r, c]
-                for k in range(m):
-                    total -= H[r, _RIGID + k] * follow[s, k, c]
-                S[s, r, c] = total
+                total -= H[r, _RIGID + k] * follow[k, c]
+            S[r, c] = total
 
 
-@fast_kernel
+@leaf_kernel
 def edge_rows(
     poses: F64, edges: Edges, tear: float, weights: F64, residuals: F64, arms: F64
 ) -> None:
@@ -85,94 +130,93 @@ def edge_rows(
         weights[e] = 1.0 / (1.0 + ratio) ** 2
 
 
-@fast_kernel
-def _edge_times(arms: F64, xi: F64, xj: F64, r: F64, c: F64) -> None:
-    """The two residuals' change under steps of both ends: omega x v is the change of an arm."""
-    for k in range(3):
-        k1, k2 = (k + 1) % 3, (k + 2) % 3
-        turn_i = xi[3 + k1] * arms[0, k2] - xi[3 + k2] * arms[0, k1]
-        turn_j = xj[3 + k1] * arms[1, k2] - xj[3 + k2] * arms[1, k1]
-        r[k] = xj[k] - xi[k] - 0.5 * (turn_i + turn_j)
-        c[k] = turn_j - turn_i
+@leaf_kernel
+def _add_edges(
+    edges: Edges, arms: F64, w: F64, bend: F64, residuals: F64, x: F64, sign: float, y: F64
+) -> None:
+    """y += sign J' W (J x + residuals), J being the derivative of all pairs' residuals.
+
+    omega x v is the change of an arm v under a turn omega, and u . (omega x v) = omega . (v x u).
+    """
+    for e in range(len(edges.ends)):
+        i, j = edges.ends[e, 0], edges.ends[e, 1]
+        p0, p1, p2 = arms[e, 0, 0], arms[e, 0, 1], arms[e, 0, 2]
+        q0, q1, q2 = arms[e, 1, 0], arms[e, 1, 1], arms[e, 1, 2]
+        i3, i4, i5, j3, j4, j5 = x[i, 3], x[i, 4], x[i, 5], x[j, 3], x[j, 4], x[j, 5]
+        a0, a1, a2 = i4 * p2 - i5 * p1, i5 * p0 - i3 * p2, i3 * p1 - i4 * p0
+        b0, b1, b2 = j4 * q2 - j5 * q1, j5 * q0 - j3 * q2, j3 * q1 - j4 * q0
+        pull, turn = sign * w[e], sign * bend[e]
+        r0 = pull * (x[j, 0] - x[i, 0] - 0.5 * (a0 + b0) + residuals[e, 0, 0])
+        r1 = pull * (x[j, 1] - x[i, 1] - 0.5 * (a1 + b1) + residuals[e, 0, 1])
+        r2 = pull * (x[j, 2] - x[i, 2] - 0.5 * (a2 + b2) + residuals[e, 0, 2])
+        c0 = turn * (b0 - a0 + residuals[e, 1, 0])
+        c1 = turn * (b1 - a1 + residuals[e, 1, 1])
+        c2 = turn * (b2 - a2 + residuals[e, 1, 2])
+        y[i, 0] -= r0
+        y[i, 1] -= r1
+        y[i, 2] -= r2
+        y[j, 0] += r0
+        y[j, 1] += r1
+        y[j, 2] += r2
+        u0, u1, u2 = -0.5 * r0 - c0, -0.5 * r1 - c1, -0.5 * r2 - c2
+        v0, v1, v2 = -0.5 * r0 + c0, -0.5 * r1 + c1, -0.5 * r2 + c2
+        y[i, 3] += p1 * u2 - p2 * u1
+        y[i, 4] += p2 * u0 - p0 * u2
+        y[i, 5] += p0 * u1 - p1 * u0
+        y[j, 3] += q1 * v2 - q2 * v1
+        y[j, 4] += q2 * v0 - q0 * v2
+        y[j, 5] += q0 * v1 - q1 * v0
 
 
-@fast_kernel
-def _edge_back(arms: F64, r: F64, c: F64, yi: F64, yj: F64) -> None:
-    """Adds the transpose of ``_edge_times``."""
-    for k in range(3):
-        k1, k2 = (k + 1) % 3, (k + 2) % 3
-        yi[k] -= r[k]
-        yj[k] += r[k]
-        # u . (omega x v) = omega . (v x u)
-        ui1, ui2 = -0.5 * r[k1] - c[k1], -0.5 * r[k2] - c[k2]
-        uj1, uj2 = -0.5 * r[k1] + c[k1], -0.5 * r[k2] + c[k2]
-        yi[3 + k] += arms[0, k1] * ui2 - arms[0, k2] * ui1
-        yj[3 + k] += arms[1, k1] * uj2 - arms[1, k2] * uj1
-
-
-@fast_kernel
-def _times(S: F64, edges: Edges, arms: F64, w: F64, bend: F64, x: F64, y: F64) -> None:
-    r, c = np.empty(3), np.empty(3)
+@leaf_kernel
+def _times(S: F64, edges: Edges, arms: F64, w: F64, bend: F64, none: F64, x: F64, y: F64) -> None:
+    """y = (S + J' W J) x.  none: residuals that are all zero."""
     for s in range(len(x)):
         for row in range(_RIGID):
             total = 0.0
             for column in range(_RIGID):
                 total += S[s, row, column] * x[s, column]
             y[s, row] = total
-    for e in range(len(edges.ends)):
-        i, j = edges.ends[e, 0], edges.ends[e, 1]
-        _edge_times(arms[e], x[i], x[j], r, c)
-        for k in range(3):
-            r[k] *= w[e]
-            c[k] *= bend[e]
-        _edge_back(arms[e], r, c, y[i], y[j])
+    _add_edges(edges, arms, w, bend, none, x, 1.0, y)
 
 
-@fast_kernel
-def _start(
-    S: F64, b: F64, edges: Edges, arms: F64, residuals: F64, w: F64, bend: F64, L: F64, scale: F64,
-    q: F64,
-) -> None:  # fmt: skip
-    """Right-hand side q (N, 6), and factors of each surfel's own block with its pairs."""
-    blocks = S.copy()
-    unit, back = np.zeros((2, _RIGID)), np.zeros((2, _RIGID))
-    r, c = np.zeros(3), np.zeros(3)
-    for s in range(len(S)):
-        for row in range(_RIGID):
-            q[s, row] = -b[s, row]
+@leaf_kernel
+def _add_block(v: F64, w: float, bend: float, side: float, block: F64) -> None:
+    """Add a pair's J' W J of one end alone.  v: its arm.  side: -1 for the first end, else 1."""
+    squares = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    turn, cross = 0.25 * w + bend, 0.5 * side * w
+    for k in range(3):
+        k1, k2 = (k + 1) % 3, (k + 2) % 3
+        block[k, k] += w
+        block[3 + k, 3 + k] += turn * squares
+        for m in range(3):
+            block[3 + k, 3 + m] -= turn * v[k] * v[m]
+        # [v]x: row k has -v[k2] in column k1 and v[k1] in column k2.
+        block[k, 3 + k1] -= cross * v[k2]
+        block[3 + k1, k] -= cross * v[k2]
+        block[k, 3 + k2] += cross * v[k1]
+        block[3 + k2, k] += cross * v[k1]
+
+
+@leaf_kernel
+def _factors(edges: Edges, arms: F64, w: F64, bend: F64, blocks: F64, L: F64, scale: F64) -> None:
+    """Factors of each surfel's own block with its pairs.  blocks: (N, 6, 6) S, overwritten."""
     for e in range(len(edges.ends)):
         i, j = edges.ends[e, 0], edges.ends[e, 1]
-        for k in range(3):
-            r[k], c[k] = -w[e] * residuals[e, 0, k], -bend[e] * residuals[e, 1, k]
-        _edge_back(arms[e], r, c, q[i], q[j])
-        for end in range(2):
-            s = i if end == 0 else j
-            for column in range(_RIGID):
-                unit[:] = 0.0
-                unit[end, column] = 1.0
-                back[:] = 0.0
-                _edge_times(arms[e], unit[0], unit[1], r, c)
-                for k in range(3):
-                    r[k] *= w[e]
-                    c[k] *= bend[e]
-                _edge_back(arms[e], r, c, back[0], back[1])
-                for row in range(_RIGID):
-                    blocks[s, row, column] += back[end, row]
-    for s in range(len(S)):
+        _add_block(arms[e, 0], w[e], bend[e], -1.0, blocks[i])
+        _add_block(arms[e, 1], w[e], bend[e], 1.0, blocks[j])
+    for s in range(len(blocks)):
         factorise(blocks[s], _RIGID, 0, 0.0, L[s], scale[s])
 
 
-@fast_kernel
+@leaf_kernel
 def _precondition(L: F64, scale: F64, q: F64, z: F64) -> float:
-    """z = M^-1 q; returns q . z."""
+    """z = -M^-1 q; returns -q . z."""
     total = 0.0
-    rhs = np.empty(_RIGID)
     for s in range(len(q)):
+        solve(L[s], scale[s], _RIGID, q[s], z[s])
         for k in range(_RIGID):
-            rhs[k] = -q[s, k]
-        solve(L[s], scale[s], _RIGID, rhs, z[s])
-        for k in range(_RIGID):
-            total += q[s, k] * z[s, k]
+            total -= q[s, k] * z[s, k]
     return float(np.float64(total))
 
 
@@ -189,40 +233,43 @@ def solve_together(
     """
     n = len(S)
     L, scale = np.zeros((n, _RIGID, _RIGID)), np.zeros((n, _RIGID))
-    q, z = np.zeros((n, _RIGID)), np.zeros((n, _RIGID))
-    p, y = np.zeros((n, _RIGID)), np.zeros((n, _RIGID))
-    _start(S, b, edges, arms, residuals, w, bend, L, scale, q)
+    z, p, y = np.zeros((n, _RIGID)), np.zeros((n, _RIGID)), np.zeros((n, _RIGID))
+    none = np.zeros_like(residuals)
+    _factors(edges, arms, w, bend, S.copy(), L, scale)
     x[:] = 0.0
+    # q is the gradient at x, and z the preconditioned descent.
+    q = b.copy()
+    _add_edges(edges, arms, w, bend, residuals, x, 1.0, q)
     rho = _precondition(L, scale, q, z)
     first = rho
     p[:] = z
     for iteration in range(iterations):
         if not rho > tolerance * first:
             return iteration
-        _times(S, edges, arms, w, bend, p, y)
-        curvature = (p * y).sum()
-        if not curvature > 0.0:
+        _times(S, edges, arms, w, bend, none, p, y)
+        energy = (p * y).sum()
+        if not energy > 0.0:
             return iteration
-        alpha = rho / curvature
+        alpha = rho / energy
         x += alpha * p
-        q -= alpha * y
+        q += alpha * y
         before = rho
         rho = _precondition(L, scale, q, z)
         p[:] = z + (rho / before) * p
     return iterations
 
 
-@fast_kernel
+@leaf_kernel
 def step_together(
     poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
-    S: F64, b: F64, inner: F64, follow: F64, x: F64, damping: F64, costs: F64, sums: F64,
-    matrices: F64,
+    S: F64, b: F64, inner: F64, follow: F64, x: F64, damping: F64, travelled: F64, costs: F64,
+    sums: F64, matrices: F64,
 ) -> None:  # fmt: skip
     """Take the steps of all surfels whose images agree; the others' damping grows."""
     n = motion.parameter_count(limits.model)
-    step = np.zeros(motion.MOST_PARAMETERS)
+    step, half = work.step, float((work.grid.side - 2) // 2)
     for s in range(len(poses)):
-        step[:_RIGID] = x[s]
+        copy(x[s], step[:_RIGID])
         for k in range(n - _RIGID):
             step[_RIGID + k] = -inner[s, k]
             for c in range(_RIGID):
@@ -231,14 +278,10 @@ def step_together(
         motion.apply_step(poses[s], step, limits.model, candidate)
         candidate[GAIN] = max(candidate[GAIN], _MIN_GAIN)
         if not active[s]:
-            poses[s, :POSE_FLOATS] = candidate
+            copy(candidate, poses[s])
             continue
-        if limits.by_template:
-            work.next_matrix[:] = matrices[s]
-        cost, _ = evaluate(
-            candidate, level, templates.images[s], templates.means[s], limits, work,
-            work.next_sums, work.next_matrix,
-        )  # fmt: skip
+        images, mean = templates.images[s], templates.means[s]
+        cost, _ = evaluate(candidate, level, images, mean, limits, work, work.next_sums)
         expected = 0.0
         for r in range(_RIGID):
             expected += 2.0 * b[s, r] * x[s, r]
@@ -246,10 +289,14 @@ def step_together(
                 expected += x[s, r] * S[s, r, c] * x[s, c]
         bound = costs[s] * (1.0 + limits.slack) + 2.0 * max(expected, 0.0)
         if cost >= 0.0 and cost < bound:
-            poses[s, :POSE_FLOATS] = candidate
+            if homography(poses[s], level, work.before):
+                travelled[s] += patch_step_px(work.before, work.h, half)
+            copy(candidate, poses[s])
             costs[s] = cost
-            sums[s] = work.next_sums
-            matrices[s] = work.next_matrix
+            copy(work.next_sums, sums[s])
+            if travelled[s] > limits.stale_px:
+                curvature(candidate, images, mean, templates.matrices[s], limits, work, matrices[s])
+                travelled[s] = 0.0
             damping[s] /= limits.lambda_down
         else:
             damping[s] *= 10.0 * limits.lambda_up

@@ -5,21 +5,26 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
+from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.surfels import judge
-from pliant.algorithms.surfels.align import Limits, Templates, align_all, make_workspace
+from pliant.algorithms.surfels.align import Limits, align_all, make_workspace
 from pliant.algorithms.surfels.birth import find_births
-from pliant.algorithms.surfels.joint import Equilibrium, align_jointly, align_rigid
+from pliant.algorithms.surfels.joint import Equilibrium, align_jointly, align_rigid, register
 from pliant.algorithms.surfels.motion import MODELS
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import start_at, targets
 from pliant.algorithms.surfels.pyramid import make_pyramid, usable_levels
-from pliant.algorithms.surfels.sampling import BIAS, GAIN, A, B, F, Level, X, make_grid
+from pliant.algorithms.surfels.rest import Rest, no_rest
+from pliant.algorithms.surfels.sampling import BIAS, GAIN, A, B, F, Level, X
 from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.table import SurfelTable, move_poses
 from pliant.algorithms.surfels.together import Hold, align_together
 
 _FOUND_AGAIN_ZNCC = 0.9
 """A surfel that was missing must fit better than one that was followed: chance has had tries."""
+_BLENDS = {"template": (0.0, 0.0), "both": (0.5, 1.0), "frame": (1.0, 1.0)}
+"""Share of the frame in the derivatives of a patch, at the coarse scales of a static camera and
+otherwise: with a moving camera the mean finds fewer surfels again after a jump."""
 
 
 class SurfelTracker:
@@ -30,10 +35,7 @@ class SurfelTracker:
 
     def __init__(self, parameters: SurfelParameters) -> None:
         self._parameters = parameters
-        self._work = make_workspace(
-            parameters.patch_px, by_template=parameters.jacobian == "template"
-        )
-        self._grid = make_grid(parameters.patch_px)
+        self._work = make_workspace(parameters.patch_px)
         self._table = SurfelTable()
         self._camera: PinholeCamera | None = None
         self._T_world_camera: F64 = np.eye(4)
@@ -56,31 +58,37 @@ class SurfelTracker:
         return self._result()
 
     def track(
-        self, image: U8, prediction: F64 | None = None, depth: F64 | None = None
+        self,
+        image: U8,
+        prediction: F64 | None = None,
+        depth: F64 | None = None,
+        timer: StageTimer = no_stages,
     ) -> SurfelFrame:
         """Follow all surfels into the next frame.
 
         image: (H, W) uint8.  prediction: (N, 2) displacements in pixels from the last frame, in the
         order of the last result, NaN where there is none.  depth: (H, W) metres of this frame, for
-        new surfels where there is room.  Raises ValueError before ``start``, and for arrays of
-        another size.
+        new surfels where there is room.  timer: told of each stage.  Raises ValueError before
+        ``start``, and for arrays of another size.
         """
         if self._camera is None:
             raise ValueError("track() before start(): surfels need a depth map to begin with")
-        pyramid = self._pyramid(image)
+        with timer("pyramid"):
+            pyramid = self._pyramid(image)
         goals = self._goals(prediction, len(pyramid))
         self._frame += 1
-        torn: BoolArray = np.zeros(len(self._table), np.bool_)
         poses = move_poses(self._table.guesses, inverse(self._T_world_camera))
         active = np.ones(len(poses), np.uint8)
         if self._parameters.camera == "static":
             self._start_at(goals, pyramid[-1], poses, active)
-            torn = self._align(pyramid, poses, active)
+            torn = self._align(pyramid, poses, active, timer)
         else:
-            self._align_with_camera(pyramid, poses, goals)
-        self._judge(pyramid[0], poses, active, torn)
+            torn = self._align_with_camera(pyramid, poses, goals, timer)
+        with timer("judge"):
+            self._judge(pyramid[0], poses, active, torn)
         if depth is not None:
-            self._give_birth(pyramid, _checked_depth(depth, self._camera))
+            with timer("births"):
+                self._give_birth(pyramid, _checked_depth(depth, self._camera))
         return self._result()
 
     def set_equilibrium(self, ids: I64, positions: F64, covariances: F64) -> None:
@@ -124,74 +132,109 @@ class SurfelTracker:
             if templates:
                 start_at(poses, active, goals, level, templates[-1], limits, self._work)
 
-    def _align(self, pyramid: list[Level], poses: F64, active: U8) -> BoolArray:
+    def _align(self, pyramid: list[Level], poses: F64, active: U8, timer: StageTimer) -> BoolArray:
         """Coarse to fine: the solution of a scale is the guess of the next (section VI-A2)."""
-        # With a moving camera the equilibrium of section V is what holds the surfels.
-        together = self._parameters.camera == "static" and len(self._table.edges.ends) > 0
-        start, torn = poses.copy(), np.zeros(len(poses), np.bool_)
+        together = len(self._table.edges.ends) > 0
+        start, torn, rest = poses.copy(), np.zeros(len(poses), np.bool_), no_rest(len(poses))
         for number in range(len(pyramid) - 1, -1, -1):
-            level, templates = pyramid[number], self._table.templates[number]
-            limits = self._limits(fine=number == 0)
+            level = pyramid[number]
             # Alone each finds its place in the image; at full size depth would go astray.
             if number > 0 or not together or len(pyramid) == 1:
-                align_all(poses, active, level, templates, limits, self._work)
+                self._align_alone(number, level, poses, active, rest, timer)
             if together:
-                torn = self._hold_together(level, poses, start, active, templates, limits)
+                torn = self._hold_together(number, level, poses, start, active, rest, timer)
         return torn
+
+    def _align_alone(
+        self, number: int, level: Level, poses: F64, active: U8, rest: Rest, timer: StageTimer
+    ) -> None:
+        templates, limits = self._table.templates[number], self._limits(fine=number == 0)
+        with timer(f"alone, level {number}"):
+            align_all(poses, active, rest, level, templates, limits, self._work)
 
     def _hold_together(
         self,
+        number: int,
         level: Level,
         poses: F64,
         start: F64,
         active: U8,
-        templates: Templates,
-        limits: Limits,
+        rest: Rest,
+        timer: StageTimer,
     ) -> BoolArray:
         p = self._parameters
-        hold = Hold(
-            p.omega_e, p.strain, p.bend, p.tear, p.together_steps, p.min_zncc, p.min_visible
-        )
-        return align_together(
-            poses, start, active, self._table.edges, level, templates, limits, self._work,
-            self._grid, hold,
-        )  # fmt: skip
+        steps = p.together_steps if number == 0 else p.coarse_together_steps
+        hold = Hold(p.omega_e, p.strain, p.bend, p.tear, steps, p.min_zncc, p.min_visible)
+        with timer(f"together, level {number}"):
+            return align_together(
+                poses, start, active, self._table.edges, rest, level,
+                self._table.templates[number], self._limits(fine=number == 0), self._work, hold,
+            )  # fmt: skip
 
-    def _align_with_camera(self, pyramid: list[Level], poses: F64, goals: F64 | None) -> None:
-        """Section V: rigid at the coarsest level first, then Eq. 21 from coarse to fine."""
-        table, p = self._table, self._parameters
-        followed = table.tracked.astype(np.uint8)
+    def _align_with_camera(
+        self, pyramid: list[Level], poses: F64, goals: F64 | None, timer: StageTimer
+    ) -> BoolArray:
+        """Section V: rigid at the coarsest level first, then Eq. 21 from coarse to fine.
+
+        With neighbours camera and surfels take turns: surfels before a camera that is held, then
+        the camera that fits them.  The image decides far more of a surfel's place than its
+        equilibrium does, so one turn a level comes close.  Returns which surfels have left their
+        neighbours.
+        """
+        table, p, coarsest = self._table, self._parameters, len(pyramid) - 1
+        n = len(table)
+        followed, everyone = table.tracked.astype(np.uint8), np.ones(n, np.uint8)
         if int(followed.sum()) < p.min_alive:
-            followed = np.ones(len(table), np.uint8)
+            followed = everyone
+        torn = np.zeros(n, np.bool_)
+        together = p.camera == "moving" and len(table.edges.ends) > 0 and coarsest > 0
         T_camera_world = inverse(self._T_world_camera)
         equilibrium = Equilibrium(table.rest, p.omega_e * table.information)
-        for number in range(len(pyramid) - 1, -1, -1):
+        for number in range(coarsest, -1, -1):
             level, templates = pyramid[number], table.templates[number]
             limits = self._limits(fine=number == 0)
-            if number == len(pyramid) - 1 or p.camera == "static_map":
-                T_camera_world = align_rigid(
-                    poses, followed, T_camera_world, level, templates, limits, self._work
-                )
-            if p.camera == "moving":
-                if number == len(pyramid) - 1:
-                    self._start_at(goals, level, poses, followed)
-                T_camera_world = align_jointly(
-                    poses, followed, T_camera_world, equilibrium, level, templates, limits,
-                    self._work,
-                )  # fmt: skip
+            if number == coarsest or p.camera == "static_map":
+                # Turn and shift are nearly the same in the image: a last camera takes short steps.
+                share = 0.1 if p.camera == "static_map" else 1.0
+                short = limits._replace(min_step_px=share * limits.min_step_px)
+                with timer(f"camera alone, level {number}"):
+                    T_camera_world = align_rigid(
+                        poses, followed, T_camera_world, level, templates, short, self._work
+                    )
+            if p.camera == "static_map":
+                continue
+            if number == coarsest:
+                self._start_at(goals, level, poses, followed)
+            if not together:
+                with timer(f"camera and surfels, level {number}"):
+                    T_camera_world = align_jointly(
+                        poses, followed, T_camera_world, equilibrium, level, templates, limits,
+                        self._work,
+                    )  # fmt: skip
+                continue
+            # What was missing is looked for, too, but says nothing of the camera.
+            rest = equilibrium.seen_from(T_camera_world)
+            if number > 0:
+                self._align_alone(number, level, poses, everyone, rest, timer)
+            else:
+                start = move_poses(table.guesses, T_camera_world)
+                torn = self._hold_together(number, level, poses, start, everyone, rest, timer)
+            with timer("camera"):
+                T_camera_world = register(poses, followed, T_camera_world, equilibrium)
         self._T_world_camera = inverse(T_camera_world)
-        if p.camera == "moving":
+        if p.camera == "moving" and not together:
             # What was missing is looked for where the camera says that it should be.
             missing = 1 - followed
-            rest = move_poses(table.poses, T_camera_world)
-            poses[missing > 0] = rest[missing > 0]
-            self._align(pyramid, poses, missing)
+            poses[missing > 0] = move_poses(table.guesses, T_camera_world)[missing > 0]
+            for number in range(coarsest, -1, -1):
+                self._align_alone(number, pyramid[number], poses, missing, no_rest(n), timer)
+        return torn
 
     def _judge(self, level: Level, poses: F64, active: U8, torn: BoolArray) -> None:
         """Keep what was found; what was not stays where it was last good."""
         table, p = self._table, self._parameters
         judge.judge_all(
-            poses, active, level, table.templates[0], self._limits(fine=True), self._grid,
+            poses, active, level, table.templates[0], self._limits(fine=True),
             self._work, table.verdicts,
         )  # fmt: skip
         verdicts = table.verdicts
@@ -211,7 +254,7 @@ class SurfelTracker:
         table.poses[good] = world[good]
         # With neighbours, what is not seen is looked for where they have carried it.
         table.guesses = table.poses.copy()
-        if p.neighbours and p.camera == "static" and not self._lost:
+        if p.neighbours and p.camera != "static_map" and not self._lost:
             carried = ~good & np.isfinite(world).all(axis=1)
             table.guesses[carried] = world[carried]
 
@@ -237,14 +280,14 @@ class SurfelTracker:
         rows = (table.born == self._frame).astype(np.uint8)
         judge.judge_all(
             move_poses(table.poses, inverse(self._T_world_camera)), rows, pyramid[0],
-            table.templates[0], self._limits(fine=True), self._grid, self._work, table.verdicts,
+            table.templates[0], self._limits(fine=True), self._work, table.verdicts,
         )  # fmt: skip
 
     def _limits(self, *, fine: bool) -> Limits:
         p = self._parameters
         return Limits(
             MODELS.index(p.model),
-            p.jacobian == "template",
+            _BLENDS[p.jacobian][fine or p.camera != "static"],
             p.saturation,
             p.highlight,
             p.omega_i if p.model != "isometric" else 0.0,
@@ -255,6 +298,7 @@ class SurfelTracker:
             p.lambda_down,
             p.fine_iterations if fine else p.coarse_iterations,
             p.fine_step_px if fine else p.coarse_step_px,
+            p.stale_px,
             p.slack,
         )
 

@@ -1,0 +1,63 @@
+"""Sequences for the tables of surfels: images, depth maps and truth, loaded once."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.tracking import ExtremaTracker, TrackingParameters
+from pliant.algorithms.tracks import FrameTracks
+from pliant.datasets import Rectifier, open_source
+from pliant.datasets.base import BrokenFrame
+from pliant.datasets.builtin import builtin_folder, is_builtin, is_deforming
+from pliant.datasets.depth import DepthRectifier
+from pliant.errors import DatasetError
+from pliant.evaluation.surface_truth import SurfaceTruth
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """What all rows share.  Depth maps are empty where nobody needs them."""
+
+    camera: PinholeCamera
+    images: list[U8]
+    depths: list[F64]
+    truth: SurfaceTruth | None
+
+    @cached_property
+    def tracks(self) -> list[FrameTracks]:
+        """What the tracking service would make of the images."""
+        tracker = ExtremaTracker(self.camera.width, self.camera.height, TrackingParameters(), 0)
+        return [tracker.track(image) for image in self.images]
+
+
+def load(source: str, frames: int, *, all_depths: bool = False) -> Sequence:
+    """Its first frames.  With exact surfaces only the first depth map, or ``all_depths``.
+
+    Raises DatasetError.
+    """
+    folder = str(builtin_folder(source)) if is_builtin(source) else source
+    dataset = open_source(folder, depth="all")
+    rectifier, depths = Rectifier(dataset.calibration), DepthRectifier(dataset.calibration)
+    exact = is_deforming(source)
+    images: list[U8] = []
+    maps: list[F64] = []
+    for frame in dataset:
+        if len(images) == frames:
+            break
+        try:
+            grey, _ = rectifier.rectify(frame)
+            # Only one that has no exact surfaces is judged by its depth in every frame.
+            needed = frame.depth and (not exact or not maps or all_depths)
+            depth = depths.rectify(frame.index, frame.depth) if needed else np.zeros((0, 0))
+        except BrokenFrame as error:
+            raise DatasetError(f"{source}: {error}") from None
+        images.append(grey)
+        maps.append(depth)
+    if not images or not maps[0].size:
+        raise DatasetError(f"{source}: its first frame has no depth map to start from")
+    truth = SurfaceTruth(Path(folder), rectifier.camera) if exact else None
+    return Sequence(rectifier.camera, images, maps, truth)

@@ -1,0 +1,81 @@
+"""The depth of a new keyframe as our own map knows it: what surfels start from without a sensor.
+
+DSDT takes its first depth from a stereo pair or a sensor.  One camera alone has the map of bundle
+adjustment, as long as the scene holds nearly still: what moves meanwhile has no certain depth.
+"""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.keyframe_delta import KeyframeDelta
+from pliant.algorithms.map_delta import TRACKING, MapDelta
+from pliant.algorithms.meshing import KeyframeSurfaces, SeenPoints
+from pliant.algorithms.meshing.keyframe_surface import SurfaceParameters
+from pliant.algorithms.surfels import SurfelParameters
+from pliant.map_history import CurrentMap
+
+
+class MapDepth:
+    """Waits for a keyframe that knows enough depths.  A function of what it is told.
+
+    problem: why the last frame is none, "" where it is one.
+    """
+
+    def __init__(self, camera: PinholeCamera, parameters: SurfelParameters) -> None:
+        self._camera = camera
+        self._parameters = parameters
+        self._map = CurrentMap()
+        self.problem = ""
+
+    def take(
+        self, update: MapDelta, keyframes: KeyframeDelta, frame: int
+    ) -> tuple[F64, F64] | None:
+        """Take in what a frame tells of the map.
+
+        Returns (depth, T_world_camera) where the frame became a keyframe to start on: (H, W) along
+        the optical axis in units of the map, 0 where nothing is known, and (4, 4).
+        """
+        self._map.take(update, frame)
+        if update.state != TRACKING:
+            self.problem = update.reason or "there is none yet"
+            return None
+        of_segment = [k for k in self._map.keyframes.values() if k.segment == update.segment]
+        if len(of_segment) < self._parameters.map_keyframes:
+            self.problem = f"{len(of_segment)} keyframes so far"
+            return None
+        if keyframes.new < 0:
+            return None
+        points = self._certain(keyframes)
+        if len(points.ids) < self._parameters.map_points:
+            self.problem = (
+                f"{len(points.ids)} points of certain depth, {self._parameters.map_points} needed: "
+                "the camera must move, and the scene hold nearly still at first"
+            )
+            return None
+        T_world_camera = pose_to_matrix(self._map.keyframes[keyframes.new].pose_world_camera)
+        surfaces = KeyframeSurfaces(self._camera, SurfaceParameters())
+        found = surfaces.surface(T_world_camera, points).depth_map
+        if found is None:
+            self.problem = "its points make no surface"
+            return None
+        self.problem = ""
+        return found.depths.astype(np.float64), T_world_camera
+
+    def _certain(self, keyframes: KeyframeDelta) -> SeenPoints:
+        """What the new keyframe observes, without points whose depth is uncertain."""
+        bounds = np.concatenate([[0], np.cumsum(keyframes.counts)])
+        row = int(np.flatnonzero(keyframes.keyframe_ids == keyframes.new)[0])
+        told = slice(int(bounds[row]), int(bounds[row + 1]))
+        rows, points = self._map.points_of(keyframes.point_ids[told])
+        sigmas = np.asarray(points.sigmas, np.float32)
+        noise_px = SurfaceParameters().noise_px
+        good = np.flatnonzero(sigmas * noise_px < self._parameters.map_sigma)
+        return SeenPoints(
+            ids=points.ids[good],
+            points_px=keyframes.points_px[told][rows][good],
+            points_world=points.positions[good],
+            sigmas=sigmas[good],
+            keyframes=np.asarray(points.keyframes, np.int32)[good],
+        )
