@@ -11,18 +11,21 @@ from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.errors import ResultError
 from pliant.export.euroc import write_euroc
 from pliant.export.kitti import write_kitti
-from pliant.export.movie import beside, write_animation
+from pliant.export.movie import beside, write_animation, write_movie
 from pliant.export.overlay import OverlayFrame, TrackPainter, write_overlay_video
 from pliant.export.picture import choose_view, render_map, write_map_picture
 from pliant.export.tum import write_tum
 from pliant.map_history import MapHistory, Points
 from pliant.messages import topics
+from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Extrema, MapUpdate
 from pliant.recording.reader import Recording
 from pliant.trajectory import Trajectory
 from pliant_services import export_models
 from pliant_services.export_models import camera_of, rectified_images
+from pliant_services.export_surface import overlay_pictures, surfaces
 from pliant_services.results import RECORDING_NAME, read_run
+from pliant_services.surfel_results import has_surfels
 
 _OVERVIEW_FRAMES = 40
 _OVERVIEW_WIDTH = 960
@@ -42,13 +45,19 @@ class RecordedFrame:
     update: MapUpdate
 
 
-def export_result(result: Path, to: str, output: Path | None, *, force: bool = False) -> Path:
+def export_result(
+    result: Path, to: str, output: Path | None, *, force: bool = False, every: int | None = None
+) -> Path:
     """Write one export of a result folder or a recording and return where.
+
+    every: of surfaces, which frames.
 
     Raises ResultError for an unknown kind, and for what is there already unless ``force``.
     """
     if to not in EXPORTS:
         raise ResultError(f"--to {to}: choose {', '.join(EXPORTS)}")
+    if every is not None and EXPORTS[to][1] is not surfaces:
+        raise ResultError(f"--every: {to} has no such option, surface has")
     if not result.exists():
         raise ResultError(f"{result}: no such result folder or recording")
     folder = result if result.is_dir() else None
@@ -59,7 +68,10 @@ def export_result(result: Path, to: str, output: Path | None, *, force: bool = F
         raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
     if path.exists() and path.samefile(recording.files[0]):
         raise ResultError(f"{path}: is the recording itself: choose another --output")
-    write(recording, path, folder)
+    if every is not None:
+        surfaces(recording, path, folder, every)
+    else:
+        write(recording, path, folder)
     return path
 
 
@@ -86,6 +98,10 @@ def recorded_frames(recording: Recording) -> Iterator[RecordedFrame]:
 
 
 def _overlay(recording: Recording, path: Path, folder: Path | None) -> None:
+    if has_surfels(recording.path):
+        fps = _frames_per_second(recording, topics.SURFELS)
+        write_movie(path, overlay_pictures(recording), fps=fps)
+        return
     stream = camera_of(recording)
     frames = (_overlay_frame(frame, stream) for frame in recorded_frames(recording))
     write_overlay_video(path, frames, fps=_frames_per_second(recording), scale=1)
@@ -151,8 +167,8 @@ def _poses(write: Callable[[Path, Trajectory], None]) -> Export:
     return export
 
 
-def _frames_per_second(recording: Recording) -> float:
-    stamps = [m.stamp_ns for m in recording.decoded(topics.EXTREMA)]
+def _frames_per_second(recording: Recording, topic: Topic = topics.EXTREMA) -> float:
+    stamps = [m.stamp_ns for m in recording.decoded(topic)]
     steps = np.diff(stamps)
     return float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else 30.0
 
@@ -166,6 +182,7 @@ EXPORTS: dict[str, tuple[str, Export]] = {
     "ply": ("points_longest.ply", export_models.ply),
     "colmap": ("colmap", export_models.colmap),
     "images": ("images", export_models.images),
+    "surface": ("surface", surfaces),
     "overlay": ("overlay.mp4", _overlay),
     "picture": ("picture.png", _picture),
     "overview": ("overview.webp", _overview),

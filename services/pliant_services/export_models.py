@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import U8
+from pliant.algorithms.meshing import TriangleMesh
 from pliant.datasets import Rectifier, calibration_from_yaml
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import Calibration, calibration_yaml
@@ -30,17 +31,29 @@ MESH_NAME = "mesh.ply"
 def draw(recording: Recording, canvas: Canvas, mesh: Path | None = None) -> None:
     """Draw a whole recording in file order; memory holds one message and the map."""
     scene = Scene(canvas)
-    scene.take(topics.STREAM, camera_of(recording), 0)  # images may have been recorded before it
+    scene.take(topics.STREAM, camera_of(recording), 0, 0)  # images may have been recorded before it
     for recorded in recording.messages():
-        scene.take(recorded.topic, recorded.decode(), recorded.sequence)
+        message = recorded.decode()
+        scene.take(recorded.topic, message, recorded.sequence, recorded.log_time_ns)
     scene.close()
-    if mesh is not None and mesh.is_file():
-        surface = read_ply(mesh)
-        if surface.faces is not None:
-            at, segment = scene.last
-            canvas.mesh(
-                at, max(0, segment), "surface", surface.points, surface.faces, surface.colours
-            )
+    if mesh is not None and mesh.is_file() and not scene.mesh.is_final:
+        surface = _surface_of(mesh)
+        if surface is not None:
+            scene.mesh.show(scene.last, surface)
+
+
+def _surface_of(path: Path) -> TriangleMesh | None:
+    """The mesh of a PLY file, None where it is a cloud of points."""
+    data = read_ply(path)
+    if data.faces is None:
+        return None
+    grey = np.full((len(data.points), 3), 200, np.uint8)
+    return TriangleMesh(
+        positions=data.points,
+        normals=np.zeros_like(data.points) if data.normals is None else data.normals,
+        colours=grey if data.colours is None else data.colours,
+        triangles=data.faces,
+    )
 
 
 def foxglove(recording: Recording, path: Path, folder: Path | None) -> None:

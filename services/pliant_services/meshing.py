@@ -61,5 +61,6 @@ def _publish(bus: Bus, header: Header, changes: Iterable[LiveChange]) -> None:
         message = MeshUpdate.of(
             header, change.blocks, frame_id=WORLD_FRAME_ID,
             segment=change.segment, voxel_size=change.voxel_size, again=change.again,
+            first_key=change.span[0], last_key=change.span[1],
         )  # fmt: skip
         bus.publish(topics.MESH_BLOCKS, message)

@@ -2,7 +2,9 @@
 
 import json
 import os
+import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -16,9 +18,10 @@ from pliant.bus.session import Identity, open_session
 from pliant.errors import MessageError, ResultError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic, by_key
-from pliant.messages.types import MapUpdate, StreamEnd
+from pliant.messages.types import StreamEnd
 from pliant.recording import parts
 from pliant.recording.reader import Recording
+from pliant.viewers.canvas import Canvas
 from pliant.viewers.rerun import RerunCanvas, Where
 from pliant.viewers.scene import Scene
 from pliant_services.export_models import MESH_NAME, camera_of, draw
@@ -28,7 +31,9 @@ SESSION_NAME = "session.json"
 """In the result folder while a run goes on: how to reach it."""
 _ENVELOPE_BYTES = 9
 _WAITING = 512  # messages between the network and the drawing; the oldest give way
-_GONE_S = 1.0
+_WAITING_BYTES = 256 << 20
+_ASK_S = 0.5
+_GONE_S = 0.2  # what is on the way when the last service has gone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +53,8 @@ class ViewRequest:
 
 def run_view(request: ViewRequest) -> None:
     """Show it.  Raises PliantError."""
+    # Whatever ends us: Rerun's server goes with us.
+    signal.signal(signal.SIGTERM, _leave)
     where = _where(request)
     endpoints, session = request.endpoints, request.session
     if not endpoints and request.source is not None and request.source.is_dir():
@@ -66,12 +73,19 @@ def run_view(request: ViewRequest) -> None:
             follow(endpoints, session, canvas, request.patience_s, request.identity)
         elif recording is not None and request.source is not None:
             draw(recording, canvas, request.source / MESH_NAME)
+        if request.web:
+            canvas.send()
+            _stay()
     finally:
+        if not canvas.is_watched:
+            print("the window of Rerun is closed, or could not open", file=sys.stderr)
         canvas.close()
     if request.save is not None:
         print(request.save)
-    if request.web:
-        _stay()
+
+
+def _leave(number: int, _: object) -> None:
+    sys.exit(128 + number)
 
 
 def running_session(result: Path) -> tuple[list[str], str]:
@@ -97,7 +111,7 @@ def follow(
     Raises BusError where nothing listens, ResultError where the session does not run.
     """
     prefix = f"pliant/{session}/view/"
-    waiting: deque[tuple[Topic, int, bytes]] = deque(maxlen=_WAITING)
+    waiting = Backlog(_WAITING, _WAITING_BYTES)
 
     def on_sample(sample: zenoh.Sample) -> None:
         envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
@@ -109,7 +123,8 @@ def follow(
         ):
             return
         kind = topics.STREAM_END if envelope[-1] else topic
-        waiting.append((kind, int.from_bytes(envelope[:8], "little"), sample.payload.to_bytes()))
+        sequence = int.from_bytes(envelope[:8], "little")
+        waiting.put(Arrived(kind, sequence, time.monotonic_ns(), sample.payload.to_bytes()))
 
     with open_session(endpoints, identity) as connection:
         held: list[Any] = [
@@ -121,35 +136,78 @@ def follow(
             if time.monotonic() > deadline:
                 raise ResultError("no such session runs there: `pliant status` lists what does")
             time.sleep(0.1)
-        _draw_while(canvas, waiting, lambda: _runs(connection, session))
+        _draw_while(canvas, waiting, lambda: canvas.is_watched and _runs(connection, session))
         held.clear()
 
 
-def _draw_while(
-    canvas: RerunCanvas, waiting: deque[tuple[Topic, int, bytes]], runs: Callable[[], bool]
-) -> None:
+@dataclass(frozen=True)
+class Arrived:
+    """A message as it came, and when."""
+
+    topic: Topic
+    sequence: int
+    arrived_ns: int
+    data: bytes
+
+
+class Backlog:
+    """What came and is not drawn yet, bounded in number and size: the oldest give way."""
+
+    def __init__(self, most: int, most_bytes: int) -> None:
+        self._most, self._most_bytes = most, most_bytes
+        self._items: deque[Arrived] = deque()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def put(self, item: Arrived) -> None:
+        """Add the newest."""
+        with self._lock:
+            self._items.append(item)
+            self._bytes += len(item.data)
+            while len(self._items) > self._most or (
+                self._bytes > self._most_bytes and len(self._items) > 1
+            ):
+                self._bytes -= len(self._items.popleft().data)
+
+    def take(self) -> Arrived | None:
+        """The oldest, None where there is nothing."""
+        with self._lock:
+            if not self._items:
+                return None
+            item = self._items.popleft()
+            self._bytes -= len(item.data)
+            return item
+
+
+def _draw_while(canvas: Canvas, waiting: Backlog, goes_on: Callable[[], bool]) -> None:
+    """Draw until nothing more comes and all is drawn: the final mesh comes last of all.
+
+    goes_on: whether a service still runs, and somebody looks on.
+    """
     scene = Scene(canvas)
-    asked = time.monotonic()
-    over = False
-    while not over:
-        if not waiting:
-            if time.monotonic() - asked > _GONE_S:
-                asked, over = time.monotonic(), not runs()
+    asked, is_over = time.monotonic(), False
+    while True:
+        if not is_over and time.monotonic() - asked > _ASK_S:
+            is_over, asked = not goes_on(), time.monotonic()
+        arrived = waiting.take()
+        if arrived is None:
+            if is_over and time.monotonic() - asked > _GONE_S:
+                break
             time.sleep(0.005)
             continue
-        topic, sequence, data = waiting.popleft()
+        topic = arrived.topic
         behind = len(waiting) > _WAITING // 8
-        if behind and topic in (topics.SOURCE, topics.EXTREMA):
-            continue  # newest wins; updates of the map are kept while there is room
+        if behind and topic in (topics.SOURCE, topics.EXTREMA, topics.SURFELS):
+            continue  # newest wins; updates of the map and mesh are kept while there is room
         try:
-            message = codec.decode(topic.message, data, max_bytes=topic.max_bytes)
+            message = codec.decode(topic.message, arrived.data, max_bytes=topic.max_bytes)
         except MessageError:
             continue
-        if isinstance(message, StreamEnd):
-            over = message.topic == topics.MAP_FINAL.key
-        else:
-            scene.take(topic, message, sequence)
-            over = isinstance(message, MapUpdate) and topic == topics.MAP_FINAL
+        if not isinstance(message, StreamEnd):
+            scene.take(topic, message, arrived.sequence, arrived.arrived_ns)
     scene.close()
     if scene.missed_updates:
         print(

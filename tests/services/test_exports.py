@@ -86,8 +86,14 @@ def test_rerun_reads_both_its_file_and_foxgloves(result: Path, tmp_path: Path) -
         done = subprocess.run([command, *arguments], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
     done = subprocess.run([command, "rrd", "print", recording], capture_output=True, text=True)
-    for entity in ("camera/image", "camera/image/tracks", "points/0", "path"):
-        assert f"/map/world/{entity}" in done.stdout
+    for entity in (
+        "camera/image",
+        "camera/image/tracks",
+        "world/points/0",
+        "world/path",
+        "world/mesh/final/0",
+    ):
+        assert f"/map/{entity}" in done.stdout
 
 
 def test_colmap_reads_a_model_whose_points_are_where_its_images_see_them(model: Path) -> None:
@@ -202,3 +208,10 @@ def test_points_that_were_missed_are_right_after_the_next_snapshot() -> None:
             assert len(theirs) > 0.5 * len(true)
     assert len(full) == len(alive)
     assert full.take_changed()[-1] == (born - 1) // BLOCK_POINTS
+
+
+def test_every_is_for_surfaces(result: Path, tmp_path: Path) -> None:
+    with pytest.raises(ResultError, match="--every: tum has no such option"):
+        export_result(result, "tum", tmp_path / "poses.txt", every=2)
+    with pytest.raises(ResultError, match="has no surfels"):
+        export_result(result, "surface", tmp_path / "surface")

@@ -1,10 +1,16 @@
 """`pliant view` and `pliant run --save`, on a machine without a display."""
 
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from pliant.bus.session import free_endpoint
+from pliant.errors import ResultError
+from pliant.viewers.rerun import RerunCanvas
+from pliant.viewers.rerun_program import listens
 
 pytestmark = pytest.mark.system
 
@@ -30,8 +36,16 @@ def test_a_run_is_seen_live_and_afterwards(tmp_path: Path) -> None:
     for path in (live, after):
         printed = subprocess.run([command, "rrd", "print", path], capture_output=True, text=True)
         assert printed.returncode == 0, printed.stderr
-        for entity in ("camera", "camera/image", "camera/image/tracks", "points/0", "path"):
-            assert f"/map/world/{entity}" in printed.stdout, f"{path.name}: {entity}"
+        for entity in (
+            "camera",
+            "camera/image",
+            "camera/image/tracks",
+            "world/points/0",
+            "world/path",
+            "world/mesh/final/0",
+        ):
+            assert f"/map/{entity}" in printed.stdout, f"{path.name}: {entity}"
+        assert "/map/world/mesh/live/" in printed.stdout, path.name
 
 
 def test_wrong_requests_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,3 +67,28 @@ def test_wrong_requests_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert says in done.stderr
         assert done.stderr.count("\n") == 1, done.stderr
     assert there.read_text() == "mine"
+
+
+def test_a_taken_port_is_one_line() -> None:
+    pytest.importorskip("rerun")
+    with socket.create_server(("0.0.0.0", 0)) as taken, socket.create_server(("", 0)) as free:
+        web_port, grpc_port = taken.getsockname()[1], free.getsockname()[1]
+        free.close()
+        with pytest.raises(ResultError, match="is taken here"):
+            RerunCanvas("web", name="taken", web_port=web_port, grpc_port=grpc_port)
+
+
+def test_rerun_listens_on_this_machine_alone_and_leaves_with_us() -> None:
+    """Its own library would listen to everybody."""
+    pytest.importorskip("rerun")
+    grpc_port, web_port = (int(free_endpoint().rsplit(":", 1)[1]) for _ in range(2))
+    canvas = RerunCanvas("web", name="local", web_port=web_port, grpc_port=grpc_port)
+    try:
+        tables = [Path(f"/proc/net/{name}").read_text() for name in ("tcp", "tcp6")]
+        rows = [line.split() for table in tables for line in table.splitlines()[1:]]
+        addresses = {row[1] for row in rows if row[3] == "0A"}  # those that listen
+        for port in (grpc_port, web_port):
+            assert {a for a in addresses if a.endswith(f":{port:04X}")} == {f"0100007F:{port:04X}"}
+    finally:
+        canvas.close()
+    assert not any(listens(port) for port in (grpc_port, web_port))

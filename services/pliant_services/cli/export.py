@@ -12,12 +12,16 @@ def export(
         str,
         typer.Option(
             "--to",
-            help="foxglove, rerun, tum, kitti, euroc, ply, colmap, images, overlay or picture.",
+            help="foxglove, rerun, tum, kitti, euroc, ply, colmap, images, surface, overlay, "
+            "picture or overview.",
         ),
     ],
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="Where to write [in the result folder]."),
+    ] = None,
+    every: Annotated[
+        int | None, typer.Option(min=1, help="surface: a mesh of every so-manyth frame [1].")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
 ) -> None:
@@ -29,8 +33,10 @@ def export(
 
     pliant export results/room --to colmap --output models/room
 
+    pliant export results/cloth --to surface --every 10
+
     pliant export recording.mcap --to kitti --output poses.txt
     """
     from pliant_services.export import export_result
 
-    typer.echo(str(export_result(result, to, output, force=force)))
+    typer.echo(str(export_result(result, to, output, force=force, every=every)))

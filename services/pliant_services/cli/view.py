@@ -25,7 +25,7 @@ def view(
     ] = 0.0,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
-    """Image with tracks, camera path, points and mesh, in Rerun.  It never slows a run.
+    """Image with tracks, camera path, points, mesh and surfels, in Rerun.  It never slows a run.
 
     pliant view results/room
 

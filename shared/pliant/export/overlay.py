@@ -106,25 +106,22 @@ class TrackPainter:
             cv2.circle(canvas, centre, radius, colour, thickness, cv2.LINE_AA, _SHIFT)
 
     def _with_bar(self, canvas: U8, frame: OverlayFrame, mapped: BoolArray | None) -> U8:
-        height, width = canvas.shape[:2]
-        bar = np.full((_BAR_PX, width, 3), 18, np.uint8)
         ages = frame.tracks.ages
         words = [f"frame {frame.number}", f"{len(ages)} tracks"]
         if mapped is not None:
             words.append(f"{int(mapped.sum())} in the map")
         words += [frame.status] if frame.status else []
-        font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5
-        cv2.putText(bar, "   ".join(words), (10, 20), font, size, _TEXT, 1, cv2.LINE_AA)
+        picture = _with_words(canvas, "   ".join(words))
+        bar, width = picture[-_BAR_PX:], picture.shape[1]
         if width >= 600:
+            font = cv2.FONT_HERSHEY_SIMPLEX
             ramp = np.repeat(np.array(self._palette, np.uint8)[None], 8, axis=0)
             left = width - 4 * _COLOURS - 44
             bar[11:19, left : left + 4 * _COLOURS] = np.repeat(ramp, 4, axis=1)
             cv2.putText(bar, "age 0", (left - 46, 20), font, 0.42, _TEXT, 1, cv2.LINE_AA)
             end = (left + 4 * _COLOURS + 6, 20)
             cv2.putText(bar, f"{OLDEST}", end, font, 0.42, _TEXT, 1, cv2.LINE_AA)
-        picture = np.concatenate([canvas, bar])
-        # Video codecs want even sizes.
-        return np.ascontiguousarray(picture[: height + _BAR_PX - height % 2, : width - width % 2])
+        return picture
 
 
 def palette(size: int) -> list[tuple[int, int, int]]:
@@ -133,6 +130,30 @@ def palette(size: int) -> list[tuple[int, int, int]]:
     steps = np.linspace(40, 200, size).round().astype(np.uint8)[:, None]
     bgr = cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[:, 0]
     return [(int(r), int(g), int(b)) for b, g, r in bgr]
+
+
+def draw_marks(
+    image: U8, points_px: F32, colours: U8, words: str, *, scale: int | None = None
+) -> U8:
+    """An image with a small disc at each point and a bar of words under it, (H', W', 3) RGB.
+
+    image: (H, W) grey or (H, W, 3) RGB.    points_px: (N, 2).    colours: (N, 3) RGB.
+    """
+    scale = scale or (2 if image.shape[1] < 1000 else 1)
+    canvas = _enlarge(image, scale)
+    centres = _fixed_point(points_px, scale).tolist()
+    for centre, colour in zip(centres, colours.tolist(), strict=True):
+        cv2.circle(canvas, centre, (2 * scale) << _SHIFT, colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+    return _with_words(canvas, words)
+
+
+def _with_words(canvas: U8, words: str) -> U8:
+    """The picture with a bar of words under it, of even sizes, as video codecs want them."""
+    height, width = canvas.shape[:2]
+    bar = np.full((_BAR_PX, width, 3), 18, np.uint8)
+    cv2.putText(bar, words, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT, 1, cv2.LINE_AA)
+    picture = np.concatenate([canvas, bar])
+    return np.ascontiguousarray(picture[: height + _BAR_PX - height % 2, : width - width % 2])
 
 
 def _enlarge(image: U8, scale: int) -> U8:

@@ -1,5 +1,6 @@
 """The coarse mesh of one map segment while it grows, and what of it has changed."""
 
+import bisect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from pliant.algorithms.arrays import F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.meshing import BlockMesh, DepthMap, MeshBlocks, TsdfParameters
-from pliant.algorithms.meshing.mesh_blocks import select_blocks
+from pliant.algorithms.meshing.mesh_blocks import LAST_KEY, no_blocks
 from pliant.algorithms.stages import StageTimer
 from pliant.fusion.volume import TsdfVolume
 
@@ -99,12 +100,19 @@ class LiveMesh:
             self.held.apply(new)
             return new
 
-    def again(self) -> MeshBlocks:
-        """The next blocks in turn, as they were told: whoever came late has all of them in time."""
-        held = self.held.snapshot()
-        chosen = np.zeros(len(held.keys), np.bool_)
-        if len(chosen):
-            rows = (self._next_again + np.arange(min(self._again, len(chosen)))) % len(chosen)
-            chosen[rows] = True
-            self._next_again = int(self._next_again + self._again) % len(chosen)
-        return select_blocks(held, chosen)
+    def again(self) -> tuple[MeshBlocks, tuple[int, int]]:
+        """The next blocks in turn, as they were told, and the span of packed keys they fill.
+
+        Whoever came late, or missed a change, has all of them after one turn; and what he holds
+        within the span beside them is no more.  (0, -1): no span, as nothing is told again.
+        """
+        if self._again == 0:
+            return no_blocks(), (0, -1)
+        keys = self.held.packed_keys()
+        first = self._next_again
+        start = bisect.bisect_left(keys, first)
+        chosen = keys[start : start + self._again]
+        is_last = start + self._again >= len(keys)
+        last = LAST_KEY if is_last else chosen[-1]
+        self._next_again = 0 if is_last else last + 1
+        return self.held.blocks(chosen), (first, last)

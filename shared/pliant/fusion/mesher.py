@@ -37,12 +37,16 @@ _MAX_NOTE = 200
 
 @dataclass(frozen=True)
 class LiveChange:
-    """Blocks of the live mesh of a segment that changed, or are told again."""
+    """Blocks of the live mesh of a segment that changed, or are told again.
+
+    span: of packed keys; there are no other blocks within it.  (0, -1): it says nothing.
+    """
 
     segment: int
     voxel_size: float
     blocks: MeshBlocks
     again: bool = False
+    span: tuple[int, int] = (0, -1)
 
 
 @dataclass(frozen=True)
@@ -245,7 +249,8 @@ class Mesher:
         if blocks is None:
             return []
         size = self._live.volume.voxel_size
+        again, span = self._live.again()
         return [
             LiveChange(self._segment, size, blocks),
-            LiveChange(self._segment, size, self._live.again(), again=True),
+            LiveChange(self._segment, size, again, again=True, span=span),
         ]

@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.meshing import TriangleMesh
 from pliant.viewers.point_blocks import PointBlocks
+from pliant.viewers.surfel_quads import SurfelPicture
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,12 @@ class Canvas(Protocol):
         """The points after everything was said."""
         ...
 
-    def mesh(
-        self, at: Moment, segment: int, name: str, vertices: F32, faces: I32, colours: U8 | None
-    ) -> None:
-        """A piece of surface, in place of what had this name: (N, 3), (F, 3), (N, 3) RGB."""
+    def mesh(self, at: Moment, segment: int, name: str, mesh: TriangleMesh) -> None:
+        """A piece of surface, in place of what had this name; without triangles it goes."""
+        ...
+
+    def surfels(self, at: Moment, segment: int, surfels: SurfelPicture) -> None:
+        """All surfels, in the world and on the image, in place of those before."""
         ...
 
     def forget(self, at: Moment, segment: int) -> None:

@@ -4,8 +4,9 @@
     /tf              map -> world -> camera, every frame with a pose
     /map/points      the points that changed, every ten frames
     /map/path        positions of the keyframes
-    /map/mesh        surface
+    /map/mesh        surface: the live mesh as it grew, then the final one in its place
     /map/all_points  the whole map, once, at the end of a segment
+    /surfels/quads, /surfels/points, /surfels/image   every frame of the deformable profile
 
 Stamps are capture times: a recording gives the same bytes each time.  Poses and points are as
 they were known at the time.  Needs its definitions: ``pip install 'pliant[foxglove]'``.
@@ -22,14 +23,18 @@ from mcap.writer import CompressionType, Writer
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.meshing import TriangleMesh
 from pliant.errors import ResultError
 from pliant.viewers.age_colours import age_buckets
 from pliant.viewers.canvas import Moment
 from pliant.viewers.point_blocks import PointBlocks
+from pliant.viewers.scene_mesh import some_triangles
+from pliant.viewers.surfel_quads import SurfelPicture
 
 _ROW = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
 _FLOAT32, _UINT8 = 7, 1  # foxglove.PackedElementField.NumericType
 _POINTS, _LINE_STRIP = 1, 0  # foxglove.PointsAnnotation.Type, foxglove.LinePrimitive.Type
+_THIS_ENTITY, _ALL_ENTITIES = 0, 1  # foxglove.SceneEntityDeletion.Type, of the topic
 _ENTITY_FACES = 50_000
 Z_UP_XYZW = (-0.5, 0.5, -0.5, 0.5)
 """Rotation of R_map_world: the first camera looks along x of the map, whose z is up (REP-103)."""
@@ -50,6 +55,7 @@ class FoxgloveFile:
         self._channels: dict[str, int] = {}
         self._sequences: dict[str, int] = {}
         self._camera: PinholeCamera | None = None
+        self._parts: dict[str, int] = {}
         self._kind("PointCloud")  # said now, before a file is there
         try:
             self._file = path.open("wb")
@@ -134,32 +140,47 @@ class FoxgloveFile:
         """Everything."""
         self._write("/map/all_points", at, self._cloud(segment, *points.everything()))
 
-    def mesh(
-        self, at: Moment, segment: int, name: str, vertices: F32, faces: I32, colours: U8 | None
-    ) -> None:
+    def mesh(self, at: Moment, segment: int, name: str, mesh: TriangleMesh) -> None:
         """A surface, in entities of 50,000 triangles."""
-        for part, first in enumerate(range(0, len(faces), _ENTITY_FACES)):
-            chosen = faces[first : first + _ENTITY_FACES]
-            used, corners = np.unique(chosen, return_inverse=True)
+        starts = range(0, len(mesh.triangles), _ENTITY_FACES)
+        for part, first in enumerate(starts):
             update, entity = self._entity(at, segment, f"{name}/{part}")
-            triangles = entity.triangles.add()
-            triangles.pose.orientation.w = 1.0
-            for vertex in vertices[used].tolist():
-                _fill(triangles.points.add(), "xyz", vertex)
-            if colours is None:
-                triangles.color.CopyFrom(self._colour(200, 200, 200))
-            else:
-                for rgb in (colours[used] / 255.0).tolist():
-                    _fill(triangles.colors.add(a=1.0), "rgb", rgb)
-            triangles.indices.extend(corners.ravel().tolist())
+            _add_triangles(
+                entity, some_triangles(mesh, mesh.triangles[first : first + _ENTITY_FACES])
+            )
             self._write("/map/mesh", at, update, stamped=False)
+        for part in range(len(starts), self._parts.get(name, 0)):
+            update = self._kind("SceneUpdate")()
+            deletion = update.deletions.add(type=_THIS_ENTITY, id=f"{name}/{part}")
+            deletion.timestamp.FromNanoseconds(at.stamp_ns)
+            self._write("/map/mesh", at, update, stamped=False)
+        self._parts[name] = len(starts)
+
+    def surfels(self, at: Moment, segment: int, surfels: SurfelPicture) -> None:
+        """Quads, their centres for readers that know no quads, and those on the image."""
+        update, entity = self._entity(at, segment, "surfels")
+        _add_triangles(entity, surfels.quads)
+        self._write("/surfels/quads", at, update, stamped=False)
+        cloud = self._cloud(segment, surfels.centres, surfels.colours)
+        self._write("/surfels/points", at, cloud)
+        annotations = self._kind("ImageAnnotations")()
+        if len(surfels.points_px):
+            group = annotations.points.add(type=_POINTS, thickness=4.0)
+            group.timestamp.FromNanoseconds(at.stamp_ns)
+            for (u, v), rgb in zip(
+                surfels.points_px.tolist(), surfels.point_colours.tolist(), strict=True
+            ):
+                group.points.add(x=u, y=v)
+                group.outline_colors.append(self._colour(*rgb))
+        self._write("/surfels/image", at, annotations, stamped=False)
 
     def forget(self, at: Moment, segment: int) -> None:
         """Take the lines and the mesh of a segment away."""
         update = self._kind("SceneUpdate")()
-        deletion = update.deletions.add(type=1)  # everything of this topic
+        deletion = update.deletions.add(type=_ALL_ENTITIES)
         deletion.timestamp.FromNanoseconds(at.stamp_ns)
-        for topic in ("/map/path", "/map/mesh"):
+        self._parts.clear()
+        for topic in ("/map/path", "/map/mesh", "/surfels/quads"):
             if topic in self._channels:
                 self._write(topic, at, update, stamped=False)
 
@@ -247,6 +268,31 @@ def _definitions(kind: Any) -> bytes:
         file.CopyToProto(files.file.add())
     data: bytes = files.SerializeToString(deterministic=True)
     return data
+
+
+def _add_triangles(entity: Any, mesh: TriangleMesh) -> None:
+    """Fill a list of triangles; its two lists of records are laid out here, one by one is slow."""
+    triangles = entity.triangles.add()
+    triangles.pose.orientation.w = 1.0
+    numbers = {name: f.number for name, f in triangles.DESCRIPTOR.fields_by_name.items()}
+    colours = np.concatenate([mesh.colours / 255.0, np.ones((len(mesh.colours), 1))], axis=1)
+    triangles.MergeFromString(
+        _records(numbers["points"], mesh.positions) + _records(numbers["colors"], colours)
+    )
+    triangles.indices.extend(mesh.triangles.ravel().tolist())
+
+
+def _records(number: int, rows: F32 | F64) -> bytes:
+    """Rows of doubles as the protobuf records that a repeated field holds."""
+    width = rows.shape[1]
+    layout = np.dtype(
+        [("tag", "u1"), ("size", "u1"), ("row", [("tag", "u1"), ("x", "<f8")], width)]
+    )
+    records = np.zeros(len(rows), layout)
+    records["tag"], records["size"] = number << 3 | 2, 9 * width  # length-delimited
+    records["row"]["tag"] = np.arange(1, width + 1) << 3 | 1  # 64 bits
+    records["row"]["x"] = rows
+    return records.tobytes()
 
 
 def _fill(record: Any, names: str, values: Any) -> None:

@@ -1,9 +1,14 @@
 """A run as Rerun entities: in its viewer, in a browser, or in an ``.rrd`` file.
 
-    map/world/camera/image, .../tracks   the image with its tracks, at the camera in space
-    map/world/points/N, path, mesh/N     the map; each block by itself, so that little is sent
-    curves/lag, curves/milliseconds      how the services fare
-    notes                                lines for the user
+    map/camera/image, .../tracks, .../surfels   the image and what is seen in it, at the camera
+    map/world/points/N, path                    the map; each block by itself: little is sent
+    map/world/mesh/live/X_Y_Z, mesh/final/N     the mesh, in groups of blocks while it grows
+    map/world/surfels                           small quads
+    curves/lag, milliseconds, rate, stages      how the services fare
+    notes                                       lines for the user
+
+The camera stands beside the worlds of the map's segments, so that the image stays where it is when
+the map is lost and the next world begins.
 
 Time runs by "frame" and by "capture".  Needs Rerun: ``pip install 'pliant[view]'``.
 """
@@ -12,22 +17,39 @@ import importlib
 import os
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import quote
 
-from pliant.algorithms.arrays import F32, F64, I32, U8
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import matrix_to_pose, pose_to_matrix
+from pliant.algorithms.meshing import TriangleMesh
 from pliant.errors import ResultError
 from pliant.viewers.age_colours import track_colours
 from pliant.viewers.canvas import Moment
 from pliant.viewers.foxglove import Z_UP_XYZW, world_name
 from pliant.viewers.point_blocks import PointBlocks
+from pliant.viewers.rerun_program import RerunProgram, address_of, listens
+from pliant.viewers.surfel_quads import SurfelPicture
 
 Where = Literal["window", "web"] | Path
 """Rerun's own window, a browser, or a file."""
 
 _PATH_COLOUR = (255, 160, 0)
 _IMAGE_DISTANCE = 0.3  # of the frustum, in the map's arbitrary unit
+_ANSWER_S = 1.0
+_POINT_RADIUS = 1.0  # the mesh is seen between them
+_SERVICE_COLOURS = ((80, 160, 255), (255, 160, 0), (90, 200, 110), (230, 90, 160), (200, 200, 90))
+_SURFEL_RADIUS = 2.5
+_OUTSIDE_IS_OPEN = "Front"  # a room is looked into from without
 _MEMORY_LIMIT = "1GiB"
 _WEB_PORT, _GRPC_PORT = 9090, 9876
+_LAYOUT = "pliant-2"
+"""Rerun keeps a user's layout by this name: to be counted up when entities or views change."""
+_CAMERA = "map/camera"
+_IMAGE = f"{_CAMERA}/image"
+_T_MAP_WORLD = pose_to_matrix(np.array([0.0, 0.0, 0.0, *Z_UP_XYZW]))
 
 
 def load_rerun() -> Any:
@@ -49,8 +71,12 @@ class RerunCanvas:
     ) -> None:
         """Open it.  Raises ResultError where Rerun is missing or the file cannot be written."""
         self._rr = rr = load_rerun()
-        self._stream: Any = rr.RecordingStream("pliant", recording_id=name)
+        self._server: RerunProgram | None = None
+        self._stream: Any = rr.RecordingStream(_LAYOUT, recording_id=name)
         self._segment = 0
+        self._is_window = False
+        self._curves: set[str] = set()
+        self._services: dict[str, int] = {}
         blueprint = self._blueprint()
         if isinstance(where, Path):
             try:
@@ -59,51 +85,80 @@ class RerunCanvas:
                 raise ResultError(f"{where}: cannot be written ({error.strerror})") from None
             self._stream.save(where, default_blueprint=blueprint)
         elif where == "web":
-            address = self._stream.serve_grpc(
-                grpc_port=grpc_port, default_blueprint=blueprint, server_memory_limit=_MEMORY_LIMIT
-            )
-            rr.serve_web_viewer(web_port=web_port, open_browser=False, connect_to=address)
-            self.address = f"http://localhost:{web_port}/?url={address}"
+            serving = ["--serve-web", "--web-viewer-port", str(web_port)]
+            limit = ["--server-memory-limit", _MEMORY_LIMIT]
+            self._server = RerunProgram([grpc_port, web_port], [*serving, *limit])
+            address = address_of(grpc_port)
+            self._stream.connect_grpc(address, default_blueprint=blueprint)
+            self.address = f"http://localhost:{web_port}/?url={quote(address, safe='')}"
         else:
-            self._stream.spawn(
-                default_blueprint=blueprint, memory_limit="50%", hide_welcome_screen=True
-            )
+            self._is_window = True
+            if not listens(grpc_port):  # else one is open already
+                RerunProgram([grpc_port], ["--hide-welcome-screen", "--memory-limit", "50%"])
+            self._stream.connect_grpc(address_of(grpc_port), default_blueprint=blueprint)
         self._place_world(0)
 
     address = ""
     """Where a browser finds it."""
 
+    @property
+    def is_watched(self) -> bool:
+        """False where a window was to be drawn in and is closed, or never opened."""
+        if not self._is_window:
+            return True
+        return listens(_GRPC_PORT)
+
+    def send(self) -> None:
+        """Send what is left.
+
+        What a window did not take before it was closed goes: Rerun would wait for it for ever.
+        """
+        while self.is_watched:
+            try:
+                self._stream.flush(timeout_sec=_ANSWER_S)
+                break
+            except RuntimeError:  # not yet: it may be slow, or gone
+                continue
+
     def close(self) -> None:
-        """Send what is left, and finish a file."""
-        self._stream.flush()
+        """Send what is left, and finish a file; nothing can be seen in a browser any more."""
+        self.send()
         self._stream.disconnect()
+        if self._server is not None:
+            self._server.close()
 
     # -- the canvas ----------------------------------------------------------------------------
 
     def camera(self, camera: PinholeCamera) -> None:
         """The pinhole, whose origin is the corner of the first pixel in Rerun."""
-        self._camera = camera
-        self._place_camera()
+        pinhole = self._rr.Pinhole(
+            resolution=(camera.width, camera.height),
+            focal_length=(camera.fx, camera.fy),
+            principal_point=(camera.cx + 0.5, camera.cy + 0.5),
+            camera_xyz=self._rr.ViewCoordinates.RDF,
+            image_plane_distance=_IMAGE_DISTANCE,
+        )
+        self._stream.log(_IMAGE, pinhole, static=True)
 
     def image(self, at: Moment, data: bytes, encoding: str) -> None:
         """The image as it is encoded."""
         image = self._rr.EncodedImage(contents=data, media_type=f"image/{encoding}")
-        self._log(at, f"{self._camera_path}/image", image)
+        self._log(at, _IMAGE, image)
 
     def tracks(self, at: Moment, points_px: F32, ages: I32) -> None:
         """Tracks by age, blue to orange."""
         points = self._rr.Points2D(points_px + 0.5, colors=track_colours(ages), radii=1.5)
-        self._log(at, f"{self._camera_path}/image/tracks", points)
+        self._log(at, f"{_IMAGE}/tracks", points)
 
     def pose(self, at: Moment, segment: int, pose_world_camera: F64) -> None:
         """Where the camera is."""
         if segment != self._segment:
             self._place_world(segment)
+        pose = matrix_to_pose(_T_MAP_WORLD @ pose_to_matrix(pose_world_camera))
         placed = self._rr.Transform3D(
-            translation=pose_world_camera[:3],
-            quaternion=self._rr.Quaternion(xyzw=pose_world_camera[3:]),
+            translation=pose[:3], quaternion=self._rr.Quaternion(xyzw=pose[3:])
         )
-        self._log(at, self._camera_path, placed)
+        self._log(at, _CAMERA, placed)
 
     def path(self, at: Moment, segment: int, positions: F64) -> None:
         """One line through the keyframes."""
@@ -114,25 +169,24 @@ class RerunCanvas:
         """The blocks that changed."""
         for number in changed:
             xyz, rgb = points.block(number)
-            radius = self._rr.Radius.ui_points(1.5)
+            radius = self._rr.Radius.ui_points(_POINT_RADIUS)
             cloud = self._rr.Points3D(xyz, colors=rgb, radii=radius)
             self._log(at, f"{_world(segment)}/points/{number}", cloud)
 
     def whole_map(self, at: Moment, segment: int, points: PointBlocks) -> None:
         """Nothing: the blocks stay."""
 
-    def mesh(
-        self, at: Moment, segment: int, name: str, vertices: F32, faces: I32, colours: U8 | None
-    ) -> None:
+    def mesh(self, at: Moment, segment: int, name: str, mesh: TriangleMesh) -> None:
         """A piece of surface."""
-        path = f"{_world(segment)}/mesh/{name}"
-        if not len(faces):
-            self._log(at, path, self._rr.Clear(recursive=False))
-            return
-        surface = self._rr.Mesh3D(
-            vertex_positions=vertices, triangle_indices=faces, vertex_colors=colours
+        self._log_mesh(at, f"{_world(segment)}/mesh/{name}", mesh, _OUTSIDE_IS_OPEN)
+
+    def surfels(self, at: Moment, segment: int, surfels: SurfelPicture) -> None:
+        """All quads as one mesh, and their centres on the image."""
+        self._log_mesh(at, f"{_world(segment)}/surfels", surfels.quads, "DoubleSided")
+        points = self._rr.Points2D(
+            surfels.points_px + 0.5, colors=surfels.point_colours, radii=_SURFEL_RADIUS
         )
-        self._log(at, path, surface)
+        self._log(at, f"{_IMAGE}/surfels", points)
 
     def forget(self, at: Moment, segment: int) -> None:
         """Clear a world."""
@@ -140,7 +194,15 @@ class RerunCanvas:
 
     def measure(self, at: Moment, name: str, value: float) -> None:
         """A point of a curve."""
-        self._log(at, f"curves/{name.replace(' ', '_')}", self._rr.Scalars(value))
+        path = f"curves/{name.replace(' ', '_')}"
+        _, service, *stage = name.split("/")
+        if not stage and path not in self._curves:
+            self._curves.add(path)
+            order = self._services.setdefault(service, len(self._services))
+            colour = _SERVICE_COLOURS[order % len(_SERVICE_COLOURS)]
+            line = self._rr.SeriesLines(colors=[colour], names=[service])
+            self._stream.log(path, line, static=True)
+        self._log(at, path, self._rr.Scalars(value))
 
     def note(self, at: Moment, text: str) -> None:
         """A line of the log."""
@@ -148,31 +210,24 @@ class RerunCanvas:
 
     # -- entities ------------------------------------------------------------------------------
 
-    _camera: PinholeCamera | None = None
-
-    @property
-    def _camera_path(self) -> str:
-        return f"{_world(self._segment)}/camera"
-
     def _place_world(self, segment: int) -> None:
         self._segment = segment
         turned = self._rr.Transform3D(quaternion=self._rr.Quaternion(xyzw=Z_UP_XYZW))
         self._stream.log("map", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._stream.log(_world(segment), turned, static=True)
-        self._place_camera()
 
-    def _place_camera(self) -> None:
-        if self._camera is None:
+    def _log_mesh(self, at: Moment, path: str, mesh: TriangleMesh, faces: str) -> None:
+        if not len(mesh.triangles):
+            self._log(at, path, self._rr.Clear(recursive=False))
             return
-        c = self._camera
-        pinhole = self._rr.Pinhole(
-            resolution=(c.width, c.height),
-            focal_length=(c.fx, c.fy),
-            principal_point=(c.cx + 0.5, c.cy + 0.5),
-            camera_xyz=self._rr.ViewCoordinates.RDF,
-            image_plane_distance=_IMAGE_DISTANCE,
+        surface = self._rr.Mesh3D(
+            vertex_positions=mesh.positions,
+            triangle_indices=mesh.triangles,
+            vertex_normals=mesh.normals,
+            vertex_colors=mesh.colours,
+            face_rendering=faces,
         )
-        self._stream.log(f"{self._camera_path}/image", pinhole, static=True)
+        self._log(at, path, surface)
 
     def _log(self, at: Moment, path: str, what: Any) -> None:
         self._stream.set_time("frame", sequence=at.frame)
@@ -181,17 +236,27 @@ class RerunCanvas:
 
     def _blueprint(self) -> Any:
         rrb: Any = importlib.import_module("rerun.blueprint")
+        no_legend = rrb.PlotLegend(visible=False)  # a service has one colour in all plots
         return rrb.Blueprint(
             rrb.Horizontal(
                 rrb.Spatial3DView(origin="map", name="Map"),
                 rrb.Vertical(
-                    rrb.Spatial2DView(
-                        origin=f"{_world(0)}/camera/image", name="Image", contents="$origin/**"
-                    ),
+                    rrb.Spatial2DView(origin=_IMAGE, name="Image", contents="$origin/**"),
                     rrb.TimeSeriesView(
-                        origin="curves/milliseconds", name="Milliseconds a frame by stage"
+                        origin="curves/milliseconds",
+                        name="Milliseconds a frame",
+                        plot_legend=rrb.PlotLegend(corner="LeftTop"),
                     ),
-                    rrb.TimeSeriesView(origin="curves/lag", name="Frames behind the source"),
+                    rrb.Horizontal(
+                        rrb.TimeSeriesView(
+                            origin="curves/rate", name="Frames per second", plot_legend=no_legend
+                        ),
+                        rrb.TimeSeriesView(
+                            origin="curves/lag",
+                            name="Frames behind the source",
+                            plot_legend=no_legend,
+                        ),
+                    ),
                     row_shares=[3, 1, 1],
                 ),
                 column_shares=[3, 2],

@@ -22,11 +22,17 @@ from pliant.messages.types import (
     Extrema,
     Header,
     MapUpdate,
+    MeshPiece,
+    MeshUpdate,
     SourceImage,
     Status,
+    Surfels,
 )
 from pliant.viewers.canvas import Canvas, Moment
 from pliant.viewers.point_blocks import PointBlocks
+from pliant.viewers.rates import Rates
+from pliant.viewers.scene_mesh import SceneMesh
+from pliant.viewers.scene_surfels import SceneSurfels
 
 REDRAW_FRAMES = 10
 """Points are drawn again this often; in between they hardly move."""
@@ -55,10 +61,19 @@ class Scene:
         self._drawn = -REDRAW_FRAMES
         self._last = Moment(0, 0)
         self._entered = 0
+        self._rates = Rates()
+        self._reported: dict[str, int] = {}
+        self.mesh = SceneMesh(canvas)
+        """The final mesh of a result may be shown by it, where the messages brought none."""
+        self._surfels = SceneSurfels(canvas)
         self.missed_updates = 0
 
-    def take(self, topic: Topic, message: Header, sequence: int) -> None:
-        """Draw a message.  sequence: its number in its topic, which tells what was missed."""
+    def take(self, topic: Topic, message: Header, sequence: int, arrived_ns: int) -> None:
+        """Draw a message.
+
+        sequence: its number in its topic, which tells what was missed.    arrived_ns: when it came,
+        by whatever clock: rates are measured by it.
+        """
         at = Moment(message.frame, message.stamp_ns)
         if isinstance(message, CameraStream):
             self._begin(message)
@@ -69,8 +84,14 @@ class Scene:
             self._canvas.tracks(at, message.points_px, message.ages)
         elif isinstance(message, MapUpdate):
             self._take_update(at, message, sequence, final=topic.key == topics.MAP_FINAL.key)
+        elif isinstance(message, MeshUpdate):
+            self.mesh.take_blocks(at, message)
+        elif isinstance(message, MeshPiece):
+            self.mesh.take_piece(at, message)
+        elif isinstance(message, Surfels):
+            self._surfels.take(at, message)
         elif isinstance(message, Status):
-            self._take_status(at, message)
+            self._take_status(at, message, arrived_ns)
 
     def close(self) -> None:
         """Draw what is left: the whole map, now that nothing more can come."""
@@ -79,14 +100,15 @@ class Scene:
             self._canvas.whole_map(self._last, self._world.segment, self._world.points)
 
     @property
-    def last(self) -> tuple[Moment, int]:
-        """The last moment of the map, and its segment (-1 without any)."""
-        return self._last, self._world.segment
+    def last(self) -> Moment:
+        """The last moment of the map."""
+        return self._last
 
     def _begin(self, stream: CameraStream) -> None:
         if self._rectifier is None:  # told again for those who come late
             self._rectifier = Rectifier(calibration_from_yaml(stream.calibration))
             self._canvas.camera(stream.camera)
+            self._surfels.camera = stream.camera
 
     def _draw_image(self, at: Moment, frame: SourceFrame) -> None:
         if self._rectifier is None or frame.dropped:
@@ -111,6 +133,7 @@ class Scene:
             if world.segment >= 0:
                 self._draw_map(at)
                 self._canvas.whole_map(at, world.segment, world.points)
+                self.mesh.begin(at, update.segment)
                 self._canvas.forget(at, world.segment)
             world = self._world = _World(segment=update.segment)
             self._drawn = at.frame - REDRAW_FRAMES
@@ -170,12 +193,21 @@ class Scene:
             positions = np.array([pose[:3] for _, pose in ordered])
             self._canvas.path(at, world.segment, positions)
 
-    def _take_status(self, at: Moment, status: Status) -> None:
-        for stage, seconds in zip(status.stages, status.seconds.tolist(), strict=True):
-            self._canvas.measure(at, f"milliseconds/{status.service}/{stage}", 1e3 * seconds)
+    def _take_status(self, at: Moment, status: Status, arrived_ns: int) -> None:
+        is_new = status.frame > self._reported.get(status.service, -1)
+        self._reported[status.service] = status.frame
+        if is_new:  # else it is the service's last word: what it did after the last frame
+            for stage, seconds in zip(status.stages, status.seconds.tolist(), strict=True):
+                self._canvas.measure(at, f"stages/{status.service}/{stage}", 1e3 * seconds)
+            self._canvas.measure(
+                at, f"milliseconds/{status.service}", 1e3 * float(status.seconds.sum())
+            )
         self._canvas.measure(
             at, f"lag/{status.service}", float(max(0, self._entered - status.frame))
         )
+        rate = self._rates.take(status.service, status.frame, arrived_ns)
+        if rate is not None:
+            self._canvas.measure(at, f"rate/{status.service}", rate)
         if status.note:
             self._canvas.note(at, f"{status.service}: {status.note}")
 

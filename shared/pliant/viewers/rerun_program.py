@@ -1,0 +1,70 @@
+"""Rerun's own program, listening on this machine alone: the library's servers listen to all."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+
+from pliant.errors import ResultError
+
+LOOPBACK = "127.0.0.1"
+_UP_S = 30.0
+_LOOK_S = 0.05
+
+
+class RerunProgram:
+    """A viewer or a server of Rerun's in a process of its own."""
+
+    def __init__(self, ports: Sequence[int], arguments: Sequence[str]) -> None:
+        """Start it and wait until it listens.
+
+        ports: those that it listens on; the first one takes the data.    arguments: the rest.
+        Raises ResultError where a port is taken, or the program does not come up.
+        """
+        for port in ports:
+            if listens(port):
+                raise ResultError(
+                    f"port {port} is taken here: another viewer may be open; close it, or choose "
+                    "another --web-port"
+                )
+        command = [sys.executable, "-m", "rerun", "--bind", LOOPBACK, "--port", str(ports[0])]
+        self._process = subprocess.Popen(
+            [*command, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # a window stays when we leave, and Ctrl-C is not for it
+        )
+        deadline = time.monotonic() + _UP_S
+        while not all(listens(port) for port in ports):
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                self.close()
+                raise ResultError(
+                    "Rerun does not come up: `python -m rerun` says why; --save FILE.rrd needs "
+                    "no viewer"
+                )
+            time.sleep(_LOOK_S)
+
+    def close(self) -> None:
+        """End it, and what it started."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+
+def address_of(port: int) -> str:
+    """Where the program takes data."""
+    return f"rerun+http://{LOOPBACK}:{port}/proxy"
+
+
+def listens(port: int) -> bool:
+    """Whether something on this machine takes connections at a port."""
+    try:
+        socket.create_connection((LOOPBACK, port), timeout=1.0).close()
+    except OSError:
+        return False
+    return True
