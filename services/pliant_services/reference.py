@@ -6,6 +6,7 @@ what a frame holds.
 
 import hashlib
 import json
+import os
 import tempfile
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -43,7 +44,8 @@ def fingerprint() -> dict[str, str]:
     features = ",".join(sorted(k for k, on in llvm.get_host_cpu_features().items() if on))
     digest = hashlib.sha256(features.encode()).hexdigest()[:16]
     cpu = {"cpu": llvm.get_host_cpu_name(), "cpu_features": digest}
-    return {**cpu, **{name: version(name) for name in _PACKAGES}}
+    blas = {"blas": os.environ.get("OPENBLAS_CORETYPE", "")}  # else what the processor can do
+    return {**cpu, **blas, **{name: version(name) for name in _PACKAGES}}
 
 
 def make_input(path: Path) -> None:

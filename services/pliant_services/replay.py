@@ -7,6 +7,7 @@ one reads it: so memory stays that of one message, and nothing depends on timing
 import importlib
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from pliant.messages.types import CameraStream, Header, Image, SourceImage, Stre
 from pliant.recording.reader import Recorded, Recording
 from pliant.recording.summary import Summary
 from pliant.recording.writer import RecordingWriter
+from pliant_services.ahead import Do, behind, read_ahead
 from pliant_services.ingest import rectified
 from pliant_services.monitor import StatusMonitor
 from pliant_services.processes import PROCESSES, Process, outputs_of
@@ -107,29 +109,38 @@ class Replay:
                 self._run_service(process, writer, Recording(output))
 
     def _run_service(self, process: Process, writer: RecordingWriter, made: Recording) -> None:
-        outputs = outputs_of(process.name)
-        sink = _Sink(writer, outputs)
         inputs = {
-            topic: self._input(topic, made if topic in self.made else self._recorded)
-            for topic in process.inputs
+            topic: self.messages(topic, made if topic in self.made else self._recorded)
+            for topic in self._inputs_of(process)
         }
-        bus = ReplayBus(inputs, through_codec=False, on_publish=sink.publish)
-        module = importlib.import_module(process.module)
-        complete = False
-        try:
-            module.run(bus, self._config, StatusMonitor(bus, process.name))
-            complete = True
-        finally:
-            sink.end(complete=complete)
+        with behind() as do:
+            sink = _Sink(writer, outputs_of(process.name), do)
+            bus = ReplayBus(inputs, through_codec=False, on_publish=sink.publish)
+            module = importlib.import_module(process.module)
+            complete = False
+            try:
+                module.run(bus, self._config, StatusMonitor(bus, process.name))
+                complete = True
+            finally:
+                sink.end(complete=complete)
 
-    def _input(self, topic: Topic, recording: Recording) -> Iterator[Header]:
+    def messages(self, topic: Topic, recording: Recording | None = None) -> Iterator[Header]:
         """A topic as a service reads it; of a recording that was cut off, what all topics have."""
-        messages = self._images() if topic == topics.IMAGE else recording.decoded(topic)
-        return islice(messages, self._frames()) if topic.per_frame else messages
+        if topic == topics.IMAGE:
+            found = read_ahead(self._images())  # they take half as long as tracking
+        else:
+            found = (recording or self._recorded).decoded(topic)
+        return islice(found, self._frames()) if topic.per_frame else found
+
+    def _inputs_of(self, process: Process) -> tuple[Topic, ...]:
+        """What it reads: as in the run, and what other services of this replay make."""
+        recorded = self._summary.topics
+        there = (t for t in process.optional if t in self.made or t.key in recorded)
+        return (*process.inputs, *there)
 
     def _frames(self) -> int:
         """Frames that every recorded input has."""
-        wanted = {t for process in self._services for t in process.inputs if t.per_frame}
+        wanted = {t for p in self._services for t in self._inputs_of(p) if t.per_frame}
         keys = {topics.SOURCE.key} | {t.key for t in wanted if t.logged and t not in self.made}
         found = self._summary.topics
         return min((found[key].messages if key in found else 0) for key in keys)
@@ -161,8 +172,9 @@ class Replay:
 class _Sink:
     """Writes what a service publishes, numbered as on the bus."""
 
-    def __init__(self, writer: RecordingWriter, outputs: Iterable[Topic]) -> None:
+    def __init__(self, writer: RecordingWriter, outputs: Iterable[Topic], do: Do) -> None:
         self._writer = writer
+        self._do = do
         self._sent = dict.fromkeys(outputs, 0)
 
     def publish(self, topic: Topic, message: Header) -> None:
@@ -177,13 +189,15 @@ class _Sink:
             self._write(topic, topics.STREAM_END, closing)
 
     def _write(self, of: Topic, topic: Topic, message: Header) -> None:
-        self._writer.write(
+        write = partial(
+            self._writer.write,
             topic,
-            codec.encode(message),
+            codec.encode(message),  # now: the service may go on with the arrays
             sequence=self._sent[of],
             log_time_ns=time.time_ns(),
             publish_time_ns=message.stamp_ns,
         )
+        self._do(write)
         self._sent[of] += 1
 
 
@@ -192,7 +206,7 @@ def affected(services: Sequence[Process]) -> set[str]:
     stale: set[Topic] = set()
     affected: set[str] = set()
     for process in PROCESSES:  # in the order in which they read each other
-        if process in services or stale & set(process.inputs):
+        if process in services or stale & {*process.inputs, *process.optional}:
             stale |= set(process.outputs)
             affected |= {topic.key for topic in outputs_of(process.name)}
     return affected

@@ -89,8 +89,11 @@ def test_a_full_disk_is_one_line_and_what_was_written_is_readable(tmp_path: Path
         "sys.argv = ['pliant', *sys.argv[1:]];"
         "runpy.run_module('pliant_services.cli', run_name='__main__')"
     )
+    # Put on the disk often: a quick machine would else meet the limit before the first second.
+    often = ["--set", "recorder.sync_interval_s=0.02"]
+    run = ["run", f"{TINY}?frames=30", "--output", str(tmp_path / "r"), *often]
     done = subprocess.run(
-        [sys.executable, "-c", code, "run", f"{TINY}?frames=30", "--output", str(tmp_path / "r")],
+        [sys.executable, "-c", code, *run],
         capture_output=True,
         text=True,
         timeout=300,

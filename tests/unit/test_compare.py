@@ -87,7 +87,7 @@ def test_a_tolerance_of_no_field_is_refused(tmp_path: Path) -> None:
 def test_every_array_field_is_compared(message: type) -> None:
     sizes: dict[str, int] = {}
     values = {"frame": 0, "stamp_ns": 0, "frame_id": ""}
-    for name, kind in codec._scalars(message).items():
+    for name, kind in codec.scalars(message).items():
         values.setdefault(name, () if "tuple" in str(kind) else kind())
     for spec in array_fields(message):
         shape = [s if isinstance(s, int) else sizes.setdefault(s, 2) for s in spec.shape]

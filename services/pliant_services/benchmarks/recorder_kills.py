@@ -78,7 +78,8 @@ def _one(path: Path, after_s: float) -> tuple[float, int, int]:
     killer.start()
     lines = process.stdout.read().splitlines()
     killed = time.monotonic()
-    process.wait()
+    if process.wait() != -signal.SIGKILL:
+        raise PliantError("the recorder ended by itself, before it was killed")
     process.stdout.close()
     killer.join()
     whole = path.with_name("whole.mcap")

@@ -47,10 +47,7 @@ def synthetic(frame: int) -> list[tuple[Topic, Header]]:
 
 
 def _filled(message: type[Header], frame: int, stamp: int, random: np.random.Generator) -> Header:
-    values: dict[str, Any] = {
-        name: {"int": 0, "str": "", "float": 0.0}.get(getattr(kind, "__name__", ""), ())
-        for name, kind in codec._scalars(message).items()
-    }
+    values: dict[str, Any] = {name: kind() for name, kind in codec.scalars(message).items()}
     values |= {"frame": frame, "stamp_ns": stamp, "frame_id": "camera"}
     for spec in array_fields(message):
         shape = [s if isinstance(s, int) else _ROWS[message] for s in spec.shape]

@@ -31,6 +31,23 @@ def tracking(
     _print(measure(source, load_config(None, overrides or []), frames))
 
 
+@app.command("surfel-speed")
+def surfel_speed(
+    source: Annotated[
+        str | None, typer.Argument(help="Folder with depth, or built-in:NAME.  Default: a board.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames to measure.")] = 17,
+    surfels: Annotated[int, typer.Option(min=8, help="Most surfels.")] = 500,
+) -> None:
+    """Surfels per stage, beside OpenCV's pyramidal LK for the same points.
+
+    pliant bench surfel-speed path/to/cloth
+    """
+    from pliant_services.benchmarks.surfel_speed import measure
+
+    _print(measure(source, frames, surfels))
+
+
 @app.command()
 def codec() -> None:
     """Packing and unpacking an image.
@@ -175,6 +192,21 @@ def recording_cost(
 
 
 @app.command()
+def replay(
+    recording: Annotated[Path, typer.Argument(help="Result folder or recording.")],
+    service: Annotated[str, typer.Option(help="Which one.")] = "tracking",
+    runs: Annotated[int, typer.Option(min=1, help="Of each, in turns.")] = 3,
+) -> None:
+    """Frames a second of a replayed service, beside the same service on messages in memory.
+
+    pliant bench replay results/room --service tracking
+    """
+    from pliant_services.benchmarks.replay_rate import measure
+
+    _print(measure(recording, service, runs))
+
+
+@app.command()
 def kills(
     source: Annotated[str, typer.Argument(help="Of 300 frames.")] = "built-in:room",
     count: Annotated[int, typer.Option(min=1, help="How often each.")] = 20,
@@ -187,6 +219,32 @@ def kills(
     from pliant_services.benchmarks.whole_runs import kills
 
     _print(kills(source, count, seed))
+
+
+@app.command()
+def latency(images: Annotated[int, typer.Option(min=50, help="To send.")] = 1000) -> None:
+    """What a hop over the bus adds to a 361 kB image: TCP and mutual TLS through a router.
+
+    pliant bench latency
+    """
+    from pliant_services.benchmarks.latency import measure
+
+    _print(measure(images))
+
+
+@app.command()
+def endurance(
+    source: Annotated[str, typer.Argument(help="built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(min=1, help="At most.")] = 108_000,
+    minutes: Annotated[float, typer.Option(min=0.1, help="At most.")] = 60.0,
+) -> None:
+    """An hour's worth of frames at full speed: memory, file handles, threads of each service.
+
+    pliant bench endurance built-in:room --minutes 10
+    """
+    from pliant_services.benchmarks.endurance import measure
+
+    _print(measure(source, frames, minutes))
 
 
 @app.command()
@@ -232,6 +290,38 @@ def mesh_live(
     from pliant_services.benchmarks.mesh import measure_live
 
     _print(measure_live(result, groundtruth, overrides or []))
+
+
+@app.command()
+def surfels(
+    sources: Annotated[
+        list[str] | None, typer.Argument(help="Instead of the tables' own sequences.")
+    ] = None,
+    tracks: Annotated[
+        str | None, typer.Option(help="mdh_23frames_301pts.npz of the Kinect paper.")
+    ] = None,
+    tables: Annotated[
+        str, typer.Option(help="targets,models,sizes,scales,cameras,neighbours,troubles,limits")
+    ] = "",
+    frames: Annotated[int, typer.Option(min=2, help="Of each sequence.")] = 60,
+    count: Annotated[int, typer.Option("--surfels", min=8, help="At most.")] = 200,
+    quick: Annotated[bool, typer.Option("--quick", help="A few rows of each table.")] = False,
+) -> None:
+    """Surfels on deforming sequences with exact truth: models, sizes, scales, cameras, troubles.
+
+    pliant bench surfels --tracks kinect_paper_tracks/mdh_23frames_301pts.npz
+
+    pliant bench surfels --quick
+
+    pliant bench surfels path/to/cloth "built-in:sliding?light=0.5" --tables models,sizes
+    """
+    from pliant_services.benchmarks.surfels import measure
+
+    chosen = [name for name in tables.split(",") if name]
+    lines = measure(
+        sources or [], tracks=tracks, tables=chosen, frames=frames, surfels=count, quick=quick
+    )
+    _print(lines)
 
 
 def _print(lines: Iterable[str]) -> None:

@@ -1,0 +1,50 @@
+"""Work on another core: what a replay reads, before it is asked for, and what it writes, after."""
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Final, TypeVar
+
+_Item = TypeVar("_Item")
+_AHEAD = 3
+_END: Final = object()
+
+
+def read_ahead(items: Iterable[_Item]) -> Generator[_Item]:
+    """The same items in the same order; the next ones are made while one is looked at.
+
+    Raises what ``items`` raises, in its place.
+    """
+    iterator = iter(items)
+
+    def following() -> _Item | object:
+        return next(iterator, _END)
+
+    with ThreadPoolExecutor(1) as pool:
+        waiting = deque(pool.submit(following) for _ in range(_AHEAD))
+        while (item := waiting.popleft().result()) is not _END:
+            waiting.append(pool.submit(following))
+            yield item  # type: ignore[misc]
+
+
+Do = Callable[[Callable[[], None]], None]
+
+
+@contextmanager
+def behind() -> Generator[Do]:
+    """Gives what has jobs done in the order in which they are given, some of them later.
+
+    It waits where others still wait, and raises what an earlier one raised; leaving, all are done.
+    """
+    waiting: deque[Future[None]] = deque()
+    with ThreadPoolExecutor(1) as pool:
+
+        def do(job: Callable[[], None]) -> None:
+            waiting.append(pool.submit(job))
+            while len(waiting) > _AHEAD:
+                waiting.popleft().result()
+
+        yield do
+        for job in waiting:
+            job.result()
