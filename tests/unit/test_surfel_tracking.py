@@ -123,6 +123,29 @@ def test_gain_and_bias_take_up_the_light(
     assert np.median(result.biases[good]) == pytest.approx(-10 / 0.7, abs=5.0)
 
 
+@pytest.mark.parametrize("mode", ["static", "moving", "static_map"])
+@pytest.mark.parametrize("neighbours", [0, 8])
+def test_what_does_not_follow_the_light_stays_as_it_was(
+    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]], mode: str, neighbours: int
+) -> None:
+    frames, camera, _ = board
+    brighter = np.minimum(frames[1].image.astype(np.int32) + 8, 255).astype(np.uint8)
+    held = {}
+    for kind in ("both", "bias", "none"):
+        changes = {"camera": mode, "neighbours": neighbours, "illumination": kind}
+        tracker = SurfelTracker(SMALL.model_copy(update=changes))
+        tracker.start(frames[0].image, frames[0].depth_m, camera)
+        result = tracker.track(brighter)
+        good = result.state == SurfelState.TRACKED
+        assert good.mean() > 0.9
+        held[kind] = result.gains[good] == 1.0, result.biases[good]
+    assert held["both"][0].mean() < 0.05
+    assert held["bias"][0].all()
+    assert np.median(held["bias"][1]) == pytest.approx(-8.0, abs=0.5)
+    assert held["none"][0].all()
+    assert (held["none"][1] == 0.0).all()
+
+
 def test_black_frame_jump_and_cover_are_stated(
     board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
 ) -> None:

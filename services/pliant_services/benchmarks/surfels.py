@@ -22,6 +22,8 @@ from pliant_services.host import one_thread_each
 _STATIC = ("sliding", "objects", "stretching", "stretching?poisson=1", "stretching?held=1")
 _BREATHING = tuple(f"breathing?amplitude={share}" for share in ("0", "0.01", "0.03", "0.08"))
 _MODELS = ("isometric", "conformal", "equiareal", "general")
+_LIGHTS = ("light=0.3", "exposure=0.2")
+_ILLUMINATION = ("both", "bias", "none")
 _AREAS = ("auc", "auc_visible")
 _SIDES = (11, 15, 23, 31, 45)
 _CAMERAS = {"SM": "static_map", "SC": "static", "moving": "moving"}
@@ -47,6 +49,7 @@ TABLES = (
     "scales",
     "cameras",
     "neighbours",
+    "illumination",
     "predictions",
     "troubles",
     LIMITS,
@@ -126,6 +129,9 @@ def _rows(table: str, sources: list[str], tracks: str | None) -> list[_Row]:
         return _each(moving, {name: {"camera": mode} for name, mode in _CAMERAS.items()})
     if table == "neighbours":
         return _each(still, {f"{count} neighbours": {"neighbours": count} for count in (0, 8)})
+    if table == "illumination":
+        lit = sources or [*few, *(_with(source, light) for source in few for light in _LIGHTS)]
+        return _each(lit, {name: {"illumination": name} for name in _ILLUMINATION})
     if table == "predictions":
         jumping = sources or [*few, *(_with(s, f"drop={n}") for s in few for n in (8, 12))]
         return _each(jumping, {name: {"prediction": name} for name in ("none", "tracks")})

@@ -39,6 +39,7 @@ class Limits(NamedTuple):
     """Parameters of the minimisation, as kernels read them."""
 
     model: int
+    light: int  # of motion.ILLUMINATION
     blend: float  # share of the frame in the derivatives of the patch
     tau: float
     highlight: float
@@ -161,7 +162,7 @@ def align(
     damping, accepted, fresh, travelled = limits.start_lambda, 0, True, 1e9
     for iteration in range(limits.iterations):
         if fresh:
-            motion.mixing(pose, level, limits.model, work.mix)
+            motion.mixing(pose, level, limits.model, work.mix, limits.light)
             motion.gradient(sums, work.mix, n, work.g)
             if travelled > limits.stale_px:
                 curvature(pose, images, mean, template_matrix, limits, work, work.matrix)

@@ -68,7 +68,9 @@ def align_rigid(
         rows: BoolArray = usable > 0
         if not rows.any():
             break
-        kernels.rigid_system(poses, usable, level, work, sums, templates.matrices, light, M, v)
+        kernels.rigid_system(
+            poses, usable, level, work, sums, templates.matrices, light, M, v, limits.light
+        )
         bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
         zeta = _solve(M, v, bound)
         motion, before = se3_exp(zeta), poses.copy()

@@ -60,9 +60,12 @@ def evaluate_all(
 @fast_kernel
 def rigid_system(
     poses: F64, active: U8, level: Level, work: Workspace, sums: F64,
-    matrices: F64, light: F64, M: F64, v: F64,
+    matrices: F64, light: F64, M: F64, v: F64, illumination: int = 3,
 ) -> None:  # fmt: skip
-    """Add up M zeta = v of a rigid scene.  light: (N, 2, 7): gain and bias from (1, zeta)."""
+    """Add up M zeta = v of a rigid scene.  light: (N, 2, 7): gain and bias from (1, zeta).
+
+    illumination: of motion.ILLUMINATION.
+    """
     n = 8
     A, Q, QA = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
     q = np.zeros(6)
@@ -71,11 +74,15 @@ def rigid_system(
     for s in range(len(poses)):
         if not active[s]:
             continue
-        motion.mixing(poses[s], level, motion.ISOMETRIC, work.mix)
+        motion.mixing(poses[s], level, motion.ISOMETRIC, work.mix, illumination)
         motion.hessian(matrices[s], 1.0, work.mix, n, work.product, work.H)
         motion.gradient(sums[s], work.mix, n, work.g)
         H, g = work.H, work.g
-        # Gain and bias, the last two, are eliminated from the surfel's block.
+        # Gain and bias, the last two, are eliminated from the surfel's block.  One that is held
+        # has rows of zeros: with any pivot it takes no step.
+        for k in range(6, 8):
+            if H[k, k] == 0.0:
+                H[k, k] = 1.0
         det = H[6, 6] * H[7, 7] - H[6, 7] * H[7, 6]
         if not det > 1e-6 * H[6, 6] * H[7, 7]:
             light[s] = 0.0
@@ -144,7 +151,7 @@ def joint_system(
         if not active[s]:
             continue
         W = weights[s]
-        motion.mixing(poses[s], level, limits.model, work.mix)
+        motion.mixing(poses[s], level, limits.model, work.mix, limits.light)
         motion.hessian(matrices[s], 1.0, work.mix, n, work.product, work.H)
         motion.gradient(sums[s], work.mix, n, work.g)
         motion.add_deformation_energy(poses[s], limits.model, limits.omega_i, work.H, work.g)

@@ -58,7 +58,7 @@ def judge_all(
         verdict[CORRELATION], _ = correlation(t, values)
         if seen < parameters:
             continue
-        motion.mixing(pose, level, limits.model, work.mix)
+        motion.mixing(pose, level, limits.model, work.mix, limits.light)
         # What is covered tells nothing: the information shrinks with the share that is seen.
         motion.hessian(
             templates.matrices[s], verdict[SEEN], work.mix, parameters, work.product, work.H

@@ -24,6 +24,10 @@ MODELS = ("isometric", "conformal", "equiareal", "general")
 RIGID = 6
 MOST_PARAMETERS = RIGID + 3 + 2
 
+ILLUMINATION = {"none": 0, "bias": 2, "both": 3}
+"""Which of gain (1) and bias (2) follow the light; the other keeps its value of birth."""
+_GAIN_BIT, _BIAS_BIT = 1, 2
+
 _MIN_STRETCH, _MAX_STRETCH = 0.2, 5.0
 
 
@@ -47,12 +51,14 @@ def deformation_directions(model: int, pose: F64, k: int) -> tuple[float, float,
 
 
 @leaf_kernel
-def mixing(pose: F64, level: Level, model: int, out: F64) -> None:
+def mixing(pose: F64, level: Level, model: int, out: F64, light: int = 3) -> None:
     """The (FEATURES, parameters) matrix that mixes the sums' features into Jacobian rows.
 
     A displacement dX of the point X + i a + j b moves the patch along its grid by (w1, w2), where
     dX = w1 a + w2 b + s (X + i a + j b): along the ray nothing changes.  With the rows n1, n2, n3
     of [a b X]^-1 that is w1 = n1 dX - i n3 dX and w2 = n2 dX - j n3 dX.
+
+    light: of ILLUMINATION.  Nothing depends on a gain or bias that is held, so it takes no step.
     """
     su, sv = level.step_u, level.step_v
     f11, f12, f22 = pose[F], pose[F + 1], pose[F + 2]
@@ -84,8 +90,10 @@ def mixing(pose: F64, level: Level, model: int, out: F64) -> None:
         )  # fmt: skip
     gain = parameters - 2
     # The feature is the texture; the residual's derivative is the frame, (T - bias) / gain.
-    out[8, gain], out[9, gain] = 1.0 / pose[GAIN], -pose[BIAS] / pose[GAIN]
-    out[9, gain + 1] = 1.0
+    if light & _GAIN_BIT:
+        out[8, gain], out[9, gain] = 1.0 / pose[GAIN], -pose[BIAS] / pose[GAIN]
+    if light & _BIAS_BIT:
+        out[9, gain + 1] = 1.0
 
 
 @leaf_kernel

@@ -29,6 +29,12 @@ class SurfelParameters(Parameters):
         "23 px holds it at its shape by 1e5 to 1e7 DN^2 of its own.  No effect when isometric.",
     )
 
+    illumination: Literal["both", "bias", "none"] = Field(
+        default="both",
+        description="What follows the light in each surfel and frame: gain and bias of Eq. 5, the "
+        "bias alone, or nothing, as if the light never changed.",
+    )
+
     omega_e: float = Field(
         default=25.0,
         gt=0.0,

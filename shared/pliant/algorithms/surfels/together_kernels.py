@@ -79,7 +79,7 @@ def _reduce(
     n = motion.parameter_count(limits.model)
     m = n - _RIGID
     H, g, rhs, x = work.H, work.g, work.step, work.scale[m:]
-    motion.mixing(pose, level, limits.model, work.mix)
+    motion.mixing(pose, level, limits.model, work.mix, limits.light)
     motion.hessian(matrix, 1.0, work.mix, n, work.product, H)
     motion.gradient(sums, work.mix, n, g)
     motion.add_deformation_energy(pose, limits.model, limits.omega_i, H, g)

@@ -10,7 +10,7 @@ from pliant.algorithms.surfels import judge
 from pliant.algorithms.surfels.align import Limits, align_all, make_workspace
 from pliant.algorithms.surfels.birth import find_births
 from pliant.algorithms.surfels.joint import Equilibrium, align_jointly, align_rigid, register
-from pliant.algorithms.surfels.motion import MODELS
+from pliant.algorithms.surfels.motion import ILLUMINATION, MODELS
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import start_at, targets
 from pliant.algorithms.surfels.pyramid import make_pyramid, usable_levels
@@ -287,6 +287,7 @@ class SurfelTracker:
         p = self._parameters
         return Limits(
             MODELS.index(p.model),
+            ILLUMINATION[p.illumination],
             _BLENDS[p.jacobian][fine or p.camera != "static"],
             p.saturation,
             p.highlight,
