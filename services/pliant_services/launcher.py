@@ -30,7 +30,7 @@ from pliant_services.relay import Relay
 READY_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 5.0
 _POLL_S = 0.05
-_MOST_DEATHS = 3  # of one service at the same frame
+MOST_DEATHS = 3  # of one service at the same frame
 
 
 class ServiceDiedError(PliantError):
@@ -202,7 +202,7 @@ class Fleet:
         last, times = self._deaths.get(child.name, (-1, 0))
         times = times + 1 if frame == last else 1
         self._deaths[child.name] = (frame, times)
-        if times >= _MOST_DEATHS:
+        if times >= MOST_DEATHS:
             raise ServiceDiedError(
                 f"frame {frame} killed {child.name} {times} times: {child.obituary()}"
             )

@@ -18,14 +18,10 @@ except PliantError as error:
 """
 
 
-def choose_profile(config: Config, *, restartable: bool) -> tuple[str, str]:
+def choose_profile(config: Config) -> tuple[str, str]:
     """The profile of services to start, and one line that says why there is no mesh."""
     if not config.meshing.enabled:
         return "points", ""
-    if restartable:
-        return "points", (
-            "no mesh while services may be started again: afterwards `pliant mesh` makes it"
-        )
     problem = why_no_mesh()
     return ("points", f"no mesh: {problem}") if problem else (WITH_MESH, "")
 

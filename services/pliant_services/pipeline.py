@@ -26,6 +26,7 @@ from pliant.recording import parts
 from pliant_services import warm_up
 from pliant_services.ingest import DROPPED
 from pliant_services.launcher import Fleet
+from pliant_services.mesh_afterwards import add_mesh
 from pliant_services.mesh_check import WITH_MESH, choose_profile
 from pliant_services.mesh_results import FILES as MESH_FILES
 from pliant_services.processes import PROFILES, deformable_fleet, reads_depth
@@ -103,19 +104,28 @@ def run_pipeline(request: RunRequest) -> int:
     if profile == _DEFORMABLE:
         profile = deformable_fleet(config)
     else:
-        profile, without_mesh = choose_profile(config, restartable=state is not None)
+        profile, without_mesh = choose_profile(config)
         if without_mesh:
             progress.say(without_mesh)
         if profile == WITH_MESH:
             check_voxel_sizes(Rectifier(dataset.calibration).camera, config.meshing.tsdf)
+    mesh_afterwards = state is not None and profile == WITH_MESH
     fleet = Fleet(
-        PROFILES[profile],
+        PROFILES["points" if mesh_afterwards else profile],
         log_folder=output / "logs",
         on_status=progress.on_status,
         port=request.port,
         state=state,
     )
     interrupted, failure = _go_through(request, config, output, fleet, progress)
+    if failure is None and mesh_afterwards:
+        progress.say("meshing what was recorded ...")
+        try:
+            add_mesh(output)
+        except KeyboardInterrupt:
+            interrupted = True
+        except PliantError as error:
+            failure = error
     if failure is None and not interrupted:
         shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
     return _finish(output, interrupted=interrupted, failure=failure)

@@ -113,16 +113,7 @@ class Replay:
             topic: self.messages(topic, made if topic in self.made else self._recorded)
             for topic in self._inputs_of(process)
         }
-        with behind() as do:
-            sink = _Sink(writer, outputs_of(process.name), do)
-            bus = ReplayBus(inputs, through_codec=False, on_publish=sink.publish)
-            module = importlib.import_module(process.module)
-            complete = False
-            try:
-                module.run(bus, self._config, StatusMonitor(bus, process.name))
-                complete = True
-            finally:
-                sink.end(complete=complete)
+        run_on(process, inputs, self._config, writer)
 
     def messages(self, topic: Topic, recording: Recording | None = None) -> Iterator[Header]:
         """A topic as a service reads it; of a recording that was cut off, what all topics have."""
@@ -167,6 +158,25 @@ class Replay:
                 key = end.topic
             if key not in self._affected:
                 _write(writer, message)
+
+
+def run_on(
+    process: Process,
+    inputs: Mapping[Topic, Iterable[Header]],
+    config: Config,
+    writer: RecordingWriter,
+) -> None:
+    """Run a service on messages; what it makes is recorded, numbered and closed as on the bus."""
+    with behind() as do:
+        sink = _Sink(writer, outputs_of(process.name), do)
+        bus = ReplayBus(inputs, through_codec=False, on_publish=sink.publish)
+        module = importlib.import_module(process.module)
+        complete = False
+        try:
+            module.run(bus, config, StatusMonitor(bus, process.name))
+            complete = True
+        finally:
+            sink.end(complete=complete)
 
 
 class _Sink:

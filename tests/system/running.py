@@ -91,11 +91,20 @@ def running(*arguments: object, env: dict[str, str] | None = None) -> Generator[
 
 def services_of(pid: int) -> dict[str, int]:
     """Process ids of a launcher's services by name."""
+    rows = _children(pid)
+    return {row[row.index("service") + 1]: int(row[0]) for row in rows if "service" in row}
+
+
+def children(pid: int, text: str) -> list[int]:
+    """Process ids of those children whose command has the text."""
+    return [int(row[0]) for row in _children(pid) if text in " ".join(row)]
+
+
+def _children(pid: int) -> list[list[str]]:
     listed = subprocess.run(
         ["ps", "-ww", "-o", "pid=,args=", "--ppid", str(pid)], capture_output=True, text=True
     )
-    rows = [row.split() for row in listed.stdout.splitlines()]
-    return {row[row.index("service") + 1]: int(row[0]) for row in rows if "service" in row}
+    return [row.split() for row in listed.stdout.splitlines()]
 
 
 def has_ended(pid: int, timeout_s: float) -> bool:

@@ -1,11 +1,13 @@
 """A run with a mesh, the mesh made again, and runs that have none and say why."""
 
 import json
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
-from running import TINY, assert_one_line, pliant
+from running import TINY, assert_one_line, children, digests, pliant, running
 
 from pliant.export.ply import read_ply
 
@@ -45,6 +47,25 @@ def test_the_mesh_against_the_truth(result: Path, tmp_path: Path) -> None:
     assert found["within"] > 0.9
     assert found["covered"] > 0.5
     assert found["normal_deg"] < 8.0
+
+
+def test_a_mesher_that_is_killed_fuses_again_and_the_mesh_is_that_of_an_ordinary_run(
+    result: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "restartable"
+    with running(TINY, "--on-crash", "restart", "--output", output) as run:
+        run.wait_for("meshing what was recorded")
+        while not (meshers := children(run.process.pid, "mesh_afterwards")):
+            assert run.process.poll() is None
+        os.kill(meshers[0], signal.SIGKILL)
+        code, _, errors = run.finish()
+    assert code == 0, errors
+    assert digests(output) == digests(result)
+    for name in ("mesh.ply", "mesh_coarse.ply", "mesh.png"):
+        assert (output / name).read_bytes() == (result / name).read_bytes(), name
+    assert pliant("info", output).returncode == 0
+    meshes = [json.loads((of / "report.json").read_text())["mesh"] for of in (output, result)]
+    assert meshes[0] == meshes[1]
 
 
 def test_the_mesh_is_made_again_with_other_parameters(result: Path, tmp_path: Path) -> None:

@@ -1,0 +1,287 @@
+"""Services killed, long: see scripts/soak.  Each run is one of ``pliant run --on-crash restart``.
+
+A kill comes at a random moment: so long after a random frame as a few frames take.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent / "system"))
+
+from running import (
+    FILES,
+    TINY,
+    Running,
+    children,
+    command,
+    digests,
+    has_ended,
+    running,
+    services_of,
+)
+
+from pliant.bus.session import free_endpoint, open_session
+from pliant.messages import codec, topics
+from pliant.messages.types import Status
+from pliant_services.mesh_results import FILES as MESHES
+from pliant_services.processes import PROFILES
+from pliant_services.surfel_results import SURFELS_NAME
+from pliant_services.viewing import SESSION_NAME
+
+TIMEOUT_S = 300.0
+LATER_S = 0.1
+"""The longest time from a frame to the kill: some frames."""
+SETTINGS = ("--on-crash", "restart", "--set", "bus.checkpoint_frames=6")
+POWER_CUT, ROUTER = "all and the launcher, then --resume", "router"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of run.  told: the service whose frames are waited for."""
+
+    arguments: Sequence[str]
+    services: Sequence[str]
+    files: Sequence[str]
+    frames: int
+    told: str
+
+
+POINTS = Kind((TINY, "--set", "meshing.enabled=false"), PROFILES["points"], FILES, 40,
+              "bundle_adjustment")  # fmt: skip
+MESH = Kind((TINY,), ("meshing",), (*FILES, *MESHES), 40, "meshing")
+SURFELS = Kind(
+    ("built-in:tiny?frames=20", "--profile", "deformable", "--set", "surfels.max_surfels=300"),
+    PROFILES["deformable"],
+    ("trajectory.txt", SURFELS_NAME),
+    20,
+    "surfels",
+)  # fmt: skip
+
+
+@dataclass
+class Tally:
+    """How many kills met a service that ran, and how many runs had the same bytes."""
+
+    victim: str
+    kills: int = 0
+    same: int = 0
+    differing: list[str] = field(default_factory=list[str])
+
+
+def results(folder: Path, kind: Kind) -> dict[str, str]:
+    """Digests of the files that depend on nothing but the input."""
+    return {name: sha256((folder / name).read_bytes()).hexdigest() for name in kind.files}
+
+
+def undisturbed(kind: Kind, folder: Path) -> dict[str, str]:
+    """The results of a run in which nobody dies."""
+    with running(*kind.arguments, *SETTINGS, "--output", folder) as run:
+        code, _, errors = run.finish()
+    assert code == 0, errors
+    return results(folder, kind)
+
+
+def rows(victims: Sequence[tuple[Kind, str]], kills: int, seed: int) -> Iterator[Tally]:
+    """For each victim the runs that followed so many kills."""
+    with tempfile.TemporaryDirectory(prefix="pliant-soak-") as name:
+        expected: dict[str, dict[str, str]] = {}
+        for kind, victim in victims:
+            if kind.told not in expected:
+                expected[kind.told] = undisturbed(kind, Path(name) / kind.told)
+            yield _tally(kind, victim, kills, seed, expected[kind.told])
+
+
+def _tally(kind: Kind, victim: str, kills: int, seed: int, expected: dict[str, str]) -> Tally:
+    tally, random = Tally(victim), np.random.default_rng(seed)
+    for _ in range(2 * kills):  # a run may be over before it is killed
+        if tally.kills == kills:
+            break
+        frame = int(random.integers(0, kind.frames - 1))
+        later = float(random.uniform(0.0, LATER_S))
+        with tempfile.TemporaryDirectory(prefix="pliant-soak-") as folder:
+            killed, found = _RUNS.get(victim, one_killed)(kind, victim, Path(folder), frame, later)
+        differing = [file for file in expected if found.get(file) != expected[file]]
+        tally.kills += killed
+        tally.same += killed and not differing
+        tally.differing += differing
+        words = "the same bytes" if not differing else f"DIFFERS: {', '.join(differing)}"
+        print(f"{victim} killed at frame {frame} + {later:.3f} s ({killed}): {words}",
+              file=sys.stderr)  # fmt: skip
+    return tally
+
+
+def one_killed(
+    kind: Kind, victim: str, folder: Path, frame: int, later: float
+) -> tuple[bool, dict[str, str]]:
+    """A run in which a service, or all at once, are killed; whether they ran, and the results."""
+    names = kind.services if victim == "all at once" else (victim,)
+    output = folder / "run"
+    with running(*kind.arguments, *SETTINGS, "--output", output) as run:
+        with Told(run, output, kind.told, frame):
+            threading.Event().wait(later)
+            killed = _kill(services_of(run.process.pid), names)
+        code, _, errors = run.finish()
+    if code != 0:
+        print(errors, file=sys.stderr)
+        return killed, {}
+    return killed, results(output, kind)
+
+
+def mesher_killed(
+    kind: Kind, victim: str, folder: Path, frame: int, later: float
+) -> tuple[bool, dict[str, str]]:
+    """A run whose mesher is killed: it begins when the others have ended.  frame: decides when."""
+    output = folder / "run"
+    with running(*kind.arguments, *SETTINGS, "--output", output) as run:
+        run.wait_for("meshing what was recorded")
+        threading.Event().wait(frame / kind.frames * 2.0 + later)
+        meshers = children(run.process.pid, "mesh_afterwards")
+        killed = _kill(dict(zip((victim,), meshers, strict=False)), (victim,))
+        code, _, errors = run.finish()
+    if code != 0:
+        print(errors, file=sys.stderr)
+        return killed, {}
+    return killed, results(output, kind)
+
+
+def power_cut(
+    kind: Kind, victim: str, folder: Path, frame: int, later: float
+) -> tuple[bool, dict[str, str]]:
+    """Everything is killed at once, the launcher, too; then the run is taken up again."""
+    output = folder / "run"
+    with running(*kind.arguments, *SETTINGS, "--output", output) as run:
+        with Told(run, output, kind.told, frame):
+            threading.Event().wait(later)
+            services = services_of(run.process.pid)
+            run.process.kill()
+            killed = _kill(services, kind.services)
+        run.process.wait()
+        assert all(has_ended(pid, TIMEOUT_S) for pid in services.values())
+    if not (output / "state").is_dir():
+        return False, results(output, kind)  # it was over
+    done = subprocess.run(
+        command("run", kind.arguments[0], "--resume", "--output", output),
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+    if done.returncode != 0:
+        print(done.stderr, file=sys.stderr)
+        return killed, {}
+    return killed, results(output, kind)
+
+
+def router_killed(
+    kind: Kind, victim: str, folder: Path, frame: int, later: float
+) -> tuple[bool, dict[str, str]]:
+    """A session in parts whose router dies and returns; and its results."""
+    endpoint = free_endpoint()
+    config = folder / "config.yaml"
+    config.write_text("bus: {checkpoint_frames: 6}\n")
+    common = ["--connect", endpoint, "--session", "soak", "--state", folder / "state"]
+    common += ["--config", config]
+    extra: dict[str, list[object]] = {
+        "ingest": ["--source", TINY],
+        "recorder": ["--output", folder / "recording.mcap", "--results"],
+    }
+    with ExitStack() as stack:
+        router = stack.enter_context(_router(endpoint))
+        # Connected before the first frame; its own connection need not survive.
+        with Followed(endpoint, "soak", kind.told) as followed:
+            services = [
+                stack.enter_context(
+                    subprocess.Popen(command("service", name, *common, *extra.get(name, [])))
+                )
+                for name in kind.services
+            ]
+            followed.wait_for(frame)
+            threading.Event().wait(later)
+            router.kill()
+            router.wait()
+        running_still = any(service.poll() is None for service in services)
+        stack.enter_context(_router(endpoint))
+        codes = [service.wait(TIMEOUT_S) for service in services]
+    return running_still, digests(folder) if codes == [0] * len(codes) else {}
+
+
+_RUNS: dict[str, Callable[[Kind, str, Path, int, float], tuple[bool, dict[str, str]]]] = {
+    "meshing": mesher_killed,
+    POWER_CUT: power_cut,
+    ROUTER: router_killed,
+}
+
+
+class Followed:
+    """Waits for frames that a service of a session tells of."""
+
+    def __init__(self, endpoint: str, session: str, service: str) -> None:
+        self._changed = threading.Condition()
+        self._frame = -1
+        self._session = open_session([endpoint])
+        key = f"pliant/{session}/{topics.status(service).key}"
+        self._held = self._session.declare_subscriber(key, self._on_sample)
+
+    def _on_sample(self, sample) -> None:
+        if sample.attachment is None or sample.attachment.to_bytes()[-1:] != b"\0":
+            return
+        frame = codec.decode(Status, sample.payload.to_bytes()).frame
+        with self._changed:
+            self._frame = max(frame, self._frame)
+            self._changed.notify_all()
+
+    def wait_for(self, frame: int) -> None:
+        with self._changed:
+            assert self._changed.wait_for(lambda: self._frame >= frame, TIMEOUT_S)
+
+    def __enter__(self) -> "Followed":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._session.close()
+
+
+class Told:
+    """``with``: a run that has told of a frame of a service."""
+
+    def __init__(self, run: Running, output: Path, service: str, frame: int) -> None:
+        run.wait_for("services are up")
+        where = json.loads((output / SESSION_NAME).read_text())
+        self._followed = Followed(where["endpoint"], where["session"], service)
+        self._frame = frame
+
+    def __enter__(self) -> None:
+        self._followed.wait_for(self._frame)
+
+    def __exit__(self, *_: object) -> None:
+        self._followed.__exit__()
+
+
+def _kill(pids: dict[str, int], names: Sequence[str]) -> bool:
+    """Kill -9 of all of them; whether each was there."""
+    killed = [name in pids for name in names]
+    for name in names:
+        with suppress(ProcessLookupError):
+            if name in pids:
+                os.kill(pids[name], signal.SIGKILL)
+    return all(killed)
+
+
+def _router(endpoint: str) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        command("router", "--listen", endpoint, "--once"), stderr=subprocess.PIPE, text=True
+    )
+    assert process.stderr is not None
+    assert "router on" in process.stderr.readline()
+    return process
