@@ -26,6 +26,7 @@ from pliant.messages.types import (
     Keyframe,
     MapUpdate,
 )
+from pliant_services.link_images import receive_images
 from pliant_services.monitor import Monitor
 
 _JPEG_QUALITY = 95
@@ -41,8 +42,8 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
 
     # waiting: images of the frames from which a map may yet start, by frame number.
     last, mapper, waiting = resume(bus, start)
-    images, extrema = receive(bus, topics.IMAGE, Image), receive(bus, topics.EXTREMA, Extrema)
-    for image, tracks in join(images, extrema):
+    extrema = receive(bus, topics.EXTREMA, Extrema)
+    for image, tracks in join(receive_images(bus), extrema):
         if tracks.missing:
             delta = mapper.skip(tracks.frame)
         else:

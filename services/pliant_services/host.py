@@ -21,6 +21,7 @@ from pliant.bus.zenoh_bus import ZenohBus
 from pliant.config import Config
 from pliant.errors import SourceLostError
 from pliant_services import processes
+from pliant_services.link_images import packed_topics
 from pliant_services.monitor import StatusMonitor
 from pliant_services.warm_up import load_kernels
 
@@ -96,6 +97,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
             **observer_windows(config, options.fleet),
             **(checkpoint_windows(config, options.fleet) if restartable else {}),
         },
+        packed=packed_topics(config.bus),
         disturb=random_delays(options.delays_ms),
         identity=options.identity,
         on_fault=lambda line: print(line, file=sys.stderr, flush=True),

@@ -3,7 +3,8 @@
 in   an image folder, a video, a camera, a built-in sequence
 out  camera/stream   once: the camera
      camera/source   every frame: its bytes as they came
-     camera/image    every frame: rectified; empty where it was dropped or does not decode
+     camera/image    every frame: rectified; empty where it was dropped or does not decode; over a
+                     link as ``link_images`` says
      camera/depth    every frame: the bytes of its depth map, where it has one that somebody wants
 """
 
@@ -21,6 +22,7 @@ from pliant.datasets.rectifier import Rectifier
 from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import topics
 from pliant.messages.types import CAMERA_FRAME_ID, CameraStream, Depth, Header, Image, SourceImage
+from pliant_services.link_images import Sender
 from pliant_services.monitor import Monitor
 
 DROPPED = "dropped"
@@ -36,6 +38,7 @@ def run(
     """
     live = dataset.is_live if config.ingest.mode == "auto" else config.ingest.mode == "live"
     rectifier = Rectifier(dataset.calibration)
+    link = Sender(config.bus, dataset.calibration)
 
     def start() -> tuple[int, int, int]:
         bus.publish(topics.STREAM, _stream(dataset, rectifier, live=live))
@@ -49,11 +52,12 @@ def run(
             if source.index < begin:  # sent before we were started again
                 continue
             with monitor.stage("rectify"):
+                source, made_from = link.source(source)
                 image = rectified(source, rectifier)
             dropped += source.dropped
             broken += bool(image.missing) and not source.dropped
-            bus.publish(topics.SOURCE, _source_message(source))
-            bus.publish(topics.IMAGE, image)
+            bus.publish(topics.SOURCE, _source_message(source, made_from))
+            bus.publish(topics.IMAGE, link.image(image, source))
             bus.publish(topics.DEPTH, _depth_message(source))
             monitor.report(image, dropped=dropped, broken=broken)
             bus.checkpoint(image.frame, (image.frame + 1, dropped, broken))
@@ -166,7 +170,7 @@ def _header(source: SourceFrame) -> Header:
     return Header(frame=source.index, stamp_ns=source.stamp_ns, frame_id=CAMERA_FRAME_ID)
 
 
-def _source_message(source: SourceFrame) -> SourceImage:
+def _source_message(source: SourceFrame, made_from: str) -> SourceImage:
     return SourceImage(
         frame=source.index,
         stamp_ns=source.stamp_ns,
@@ -175,6 +179,7 @@ def _source_message(source: SourceFrame) -> SourceImage:
         width=source.width,
         height=source.height,
         data=source.data,
+        made_from=made_from,
     )
 
 

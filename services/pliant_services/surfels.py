@@ -35,6 +35,7 @@ from pliant.messages.types import (
     MapUpdate,
     Surfels,
 )
+from pliant_services.link_images import receive_images
 from pliant_services.monitor import Monitor
 
 WAITING = "waiting for depth"
@@ -121,7 +122,7 @@ def _check(bus: Bus, config: Config) -> None:
 
 def _hear(bus: Bus) -> Iterator[_Heard]:
     """Everything for each frame, whatever the fleet makes."""
-    pairs = join(receive(bus, topics.IMAGE, Image), receive(bus, topics.DEPTH, Depth))
+    pairs = join(receive_images(bus), receive(bus, topics.DEPTH, Depth))
     heard = (_Heard(image, depth) for image, depth in pairs)
     if bus.reads(topics.EXTREMA):
         extrema = receive(bus, topics.EXTREMA, Extrema)

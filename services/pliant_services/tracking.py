@@ -7,10 +7,11 @@ out  tracks/extrema   one per frame: tracks and all maxima; empty where the fram
 
 from pliant.algorithms.tracking import ExtremaTracker
 from pliant.algorithms.tracks import FrameTracks
-from pliant.bus.base import Bus, receive, receive_one, resume
+from pliant.bus.base import Bus, receive_one, resume
 from pliant.config import Config
 from pliant.messages import topics
-from pliant.messages.types import CameraStream, Extrema, Image
+from pliant.messages.types import CameraStream, Extrema
+from pliant_services.link_images import receive_images
 from pliant_services.monitor import Monitor
 
 
@@ -22,7 +23,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         return ExtremaTracker(stream.width, stream.height, config.tracking, config.seed)
 
     tracker = resume(bus, start)
-    for image in receive(bus, topics.IMAGE, Image):
+    for image in receive_images(bus):
         if image.missing:
             tracks = FrameTracks.empty()
         else:

@@ -54,6 +54,12 @@ class BusParameters(Parameters):
         ge=1,
         description="Frames between two checkpoints of a service, where services are restarted.",
     )
+    link_images: Literal["raw", "lossless", "jpeg"] = Field(
+        default="raw",
+        description="How the ingest sends images.  raw: fastest on one machine.  lossless: half "
+        "the bytes, the same pixels.  jpeg: a fifth or less; what is recorded are these JPEGs.",
+    )
+    jpeg_quality: int = Field(default=90, ge=1, le=100, description="Of bus.link_images=jpeg.")
 
 
 class RecorderParameters(Parameters):

@@ -9,6 +9,7 @@ import pytest
 from pliant.config import config_yaml, load_config
 from pliant.errors import ConfigError, RecordingError
 from pliant.messages import topics
+from pliant.messages.types import SourceImage
 from pliant.recording.compare import compare
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
@@ -40,6 +41,21 @@ def replay(result: Path, output: Path, *services: str, overrides: tuple[str, ...
         check=True,
     )
     return run_replay(request)
+
+
+def test_a_run_over_a_link_with_jpegs_records_them_and_a_replay_makes_the_same_of_them(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "jpegs"
+    settings = ("--set", "bus.link_images=jpeg", "--set", "bus.jpeg_quality=80")
+    done = pliant("run", f"{TINY}?frames=12", "--output", folder, *settings)
+    assert done.returncode == 0, done.stderr
+    sources = list(Recording(folder / "recording.mcap").decoded(topics.SOURCE))
+    assert {(s.encoding, s.made_from) for s in sources if isinstance(s, SourceImage)} == {
+        ("jpeg", "png, quality 80")
+    }
+    assert recorded_config(summarise(folder / "recording.mcap"), ()).bus.link_images == "jpeg"
+    assert replay(folder, tmp_path / "again", *PIPELINE) == SAME
 
 
 @pytest.mark.parametrize("services", [PIPELINE[:1], PIPELINE[1:], PIPELINE], ids="+".join)

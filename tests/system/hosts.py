@@ -121,7 +121,7 @@ class Spread:
     folder: Path
     where: Mapping[str, str]
     source: str = TINY
-    settings: str = "bus: {checkpoint_frames: 6, window: 4}\n"
+    settings: str = "bus: {checkpoint_frames: 6, window: 4, link_images: lossless}\n"
     router: "subprocess.Popen[str]" = field(init=False)
     services: dict[str, "subprocess.Popen[str]"] = field(default_factory=dict)
 

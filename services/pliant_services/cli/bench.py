@@ -148,6 +148,20 @@ def mesh_parts(
 
 
 @app.command()
+def images(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(min=1, help="Frames to measure.")] = 12,
+) -> None:
+    """Images for a link between machines: how small, and what that costs on either side.
+
+    pliant bench images path/to/sequence
+    """
+    from pliant_services.benchmarks.images import measure
+
+    _print(measure(source, frames))
+
+
+@app.command()
 def accuracy(
     sources: Sources,
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("results/bench"),

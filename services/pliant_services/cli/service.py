@@ -23,6 +23,9 @@ def service(
         str, typer.Option(help="The services of this session, separated by commas.")
     ] = "",
     config_file: Annotated[Path | None, typer.Option("--config", help="YAML file.")] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE over the file; may be repeated.")
+    ] = None,
     source: Annotated[str, typer.Option(help="ingest: where frames come from.")] = "",
     calibration: Annotated[
         Path | None, typer.Option(help="ingest: calibration of a video or camera.")
@@ -74,7 +77,7 @@ def service(
     unknown = [other for other in (*names, name) if other not in BY_NAME or name not in names]
     if unknown:
         raise PliantError(f"--fleet {fleet}: choose from {', '.join(BY_NAME)}, including {name}")
-    config = load_config(config_file)
+    config = load_config(config_file, overrides or [])
     arguments: dict[str, Any] = {}
     if name == "ingest":
         from pliant.datasets import open_source

@@ -75,14 +75,25 @@ class CameraStream(Header):
         )
 
 
+@dataclass(frozen=True)
+class Rows:
+    """Says of a field of bytes that they are rows, as many as another field says (0: none)."""
+
+    field: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class SourceImage(Header):
-    """A frame as it came: ``encoding`` says how ``data`` is read.  Empty where it was dropped."""
+    """A frame as it came: ``encoding`` says how ``data`` is read.  Empty where it was dropped.
+
+    made_from: "" as it came; else what it was before it became a JPEG for a link, and the quality.
+    """
 
     encoding: str
     width: int
     height: int
-    data: bytes
+    data: Annotated[bytes, Rows("height")]
+    made_from: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,11 +112,15 @@ class Image(Header):
 
     grey: (H, W).     colour: (H, W, 3) RGB, or (0, 0, 3) where the source has none.
     missing: "" or why there are no pixels ("dropped", "broken: ..."); both arrays are empty then.
+    jpeg, calibration: over a link, instead of pixels, what they are made from: the source's JPEG
+    and its camera as YAML; ``pliant_services.link_images`` makes them.
     """
 
     grey: Annotated[U8, Shape("H", "W")]
     colour: Annotated[U8, Shape("A", "B", 3)]
     missing: str = ""
+    jpeg: bytes = b""
+    calibration: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,125 @@
+"""Images over a link: readers work on what the source gave, or on the JPEG that is recorded."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from pliant.bus.replay_bus import ReplayBus
+from pliant.config import load_config
+from pliant.datasets import open_source
+from pliant.datasets.base import Dataset, SourceFrame, encoding_of
+from pliant.datasets.calibration import calibration_yaml
+from pliant.datasets.jpeg import jpeg_size
+from pliant.errors import MessageError
+from pliant.messages import codec, topics
+from pliant.messages.topics import Topic
+from pliant.messages.types import Header, Image, SourceImage
+from pliant_services import ingest
+from pliant_services.link_images import receive_images, whole
+from pliant_services.monitor import SilentMonitor
+
+FRAMES = 3
+
+
+class _Jpegs:
+    """The built-in frames, as a camera that gives JPEGs has them; the second one is broken."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._dataset = dataset
+        self.name, self.calibration = dataset.name, dataset.calibration
+        self.is_live, self.frame_count, self.ground_truth_path = False, FRAMES, None
+
+    def __iter__(self):
+        for frame in self._dataset:
+            data = cv2.imencode(".jpg", cv2.imdecode(np.frombuffer(frame.data, np.uint8), 1))[1]
+            cut = data.tobytes()[: 400 if frame.index == 1 else None]
+            yield SourceFrame(
+                index=frame.index, stamp_ns=frame.stamp_ns, encoding=encoding_of(cut), data=cut
+            )
+
+
+def ingested(how: str, *, jpegs: bool = False) -> dict[Topic, list[Header]]:
+    dataset: Dataset = open_source(f"built-in:tiny?frames={FRAMES}&distortion=-0.2,0.1,0,0")
+    bus = ReplayBus({})
+    config = load_config(overrides=[f"bus.link_images={how}", "bus.jpeg_quality=70"])
+    source = _Jpegs(dataset) if jpegs else dataset
+    ingest.run(bus, config, SilentMonitor(), source, stopping=lambda: False)
+    return bus.outputs
+
+
+def read(sent: dict[Topic, list[Header]]) -> list[Image]:
+    return list(receive_images(ReplayBus({topics.IMAGE: sent[topics.IMAGE]})))
+
+
+def wire(images: list[Image]) -> list[bytes]:
+    return [codec.encode(image) for image in images]
+
+
+@pytest.mark.parametrize("jpegs", [False, True])
+def test_lossless_is_lossless_also_of_jpegs_which_cross_themselves(jpegs: bool) -> None:
+    raw, lossless = ingested("raw", jpegs=jpegs), ingested("lossless", jpegs=jpegs)
+    assert wire(read(lossless)) == wire(read(raw))
+    assert lossless[topics.SOURCE] == raw[topics.SOURCE]
+    crossing = [image.jpeg for image in lossless[topics.IMAGE] if isinstance(image, Image)]
+    sources = [source.data for source in raw[topics.SOURCE] if isinstance(source, SourceImage)]
+    assert crossing == ([sources[0], b"", sources[2]] if jpegs else [b""] * FRAMES)
+
+
+def test_what_is_worked_on_is_the_jpeg_that_is_recorded() -> None:
+    sent = ingested("jpeg")
+    for source, image in zip(sent[topics.SOURCE], sent[topics.IMAGE], strict=True):
+        assert isinstance(source, SourceImage)
+        assert isinstance(image, Image)
+        assert source.made_from == "png, quality 70"
+        assert source.encoding == "jpeg"
+        assert image.jpeg == source.data
+        assert image.grey.size == 0
+    again = ingest.run  # a run from the recorded frames, without a link
+    bus = ReplayBus({})
+    dataset = _Recorded(sent[topics.SOURCE], open_source("built-in:tiny?distortion=-0.2,0.1,0,0"))
+    again(bus, load_config(), SilentMonitor(), dataset, stopping=lambda: False)
+    assert wire(read(bus.outputs)) == wire(read(sent))
+    assert wire(read(sent)) != wire(read(ingested("raw")))
+
+
+class _Recorded(_Jpegs):
+    def __init__(self, sources: list[Header], dataset: Dataset) -> None:
+        super().__init__(dataset)
+        self._sources = sources
+
+    def __iter__(self):
+        for source in self._sources:
+            assert isinstance(source, SourceImage)
+            yield SourceFrame(
+                index=source.frame, stamp_ns=source.stamp_ns,
+                encoding=source.encoding, data=source.data,
+            )  # fmt: skip
+
+
+def test_a_jpeg_that_is_none_of_the_camera_s_is_refused_before_it_is_decoded() -> None:
+    sent = ingested("jpeg")[topics.IMAGE][0]
+    assert isinstance(sent, Image)
+    large = cv2.imencode(".jpg", np.zeros((999, 7), np.uint8))[1].tobytes()
+    assert jpeg_size(large) == (7, 999)
+    for jpeg in (large, b"\xff\xd8\xff", b"noise", sent.jpeg[:300]):
+        with pytest.raises(MessageError, match="frame 0"):
+            whole(replace(sent, jpeg=jpeg))
+    with pytest.raises(MessageError, match="frame 0"):
+        whole(replace(sent, calibration="model: none"))
+
+
+def test_the_size_is_found_behind_other_segments() -> None:
+    jpeg = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+    comment = b"\xff\xfe\x00\x06text"
+    assert jpeg_size(jpeg[:2] + comment + b"\xff" + jpeg[2:]) == (64, 48)
+    for length in range(2, 20):
+        assert jpeg_size(jpeg[:length]) is None
+
+
+def test_the_calibration_that_crosses_is_the_source_s() -> None:
+    dataset = open_source("built-in:tiny?frames=2&distortion=-0.2,0.1,0,0")
+    sent = ingested("jpeg")[topics.IMAGE][0]
+    assert isinstance(sent, Image)
+    assert sent.calibration == calibration_yaml(dataset.calibration)
