@@ -1,5 +1,6 @@
 """Work on another core: what a replay reads, before it is asked for, and what it writes, after."""
 
+import sys
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -8,6 +9,8 @@ from typing import Final, TypeVar
 
 _Item = TypeVar("_Item")
 _AHEAD = 3
+_BEHIND = 32
+_TURN_S = 5e-5
 _END: Final = object()
 
 
@@ -42,9 +45,24 @@ def behind() -> Generator[Do]:
 
         def do(job: Callable[[], None]) -> None:
             waiting.append(pool.submit(job))
-            while len(waiting) > _AHEAD:
+            while len(waiting) > _BEHIND:
                 waiting.popleft().result()
 
         yield do
         for job in waiting:
             job.result()
+
+
+@contextmanager
+def quick_turns() -> Generator[None]:
+    """Threads take turns a hundred times as often as usual.
+
+    Who comes back from a kernel, which runs without Python's lock, waits for it no longer than
+    this; as usual it would be as long as the kernels of a frame take.
+    """
+    usual = sys.getswitchinterval()
+    sys.setswitchinterval(_TURN_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(usual)

@@ -6,10 +6,11 @@ one reads it: so memory stays that of one message, and nothing depends on timing
 
 import importlib
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from threading import Event
 
 import yaml
 
@@ -20,12 +21,12 @@ from pliant.datasets.own_recording import recorded_frame
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import RecordingError
 from pliant.messages import codec, topics
-from pliant.messages.topics import Topic
+from pliant.messages.topics import Topic, by_key
 from pliant.messages.types import CameraStream, Header, Image, SourceImage, StreamEnd
 from pliant.recording.reader import Recorded, Recording
 from pliant.recording.summary import Summary
 from pliant.recording.writer import RecordingWriter
-from pliant_services.ahead import Do, behind, read_ahead
+from pliant_services.ahead import Do, behind, quick_turns, read_ahead
 from pliant_services.ingest import rectified
 from pliant_services.monitor import StatusMonitor
 from pliant_services.processes import PROCESSES, Process, outputs_of
@@ -103,17 +104,16 @@ class Replay:
         Raises PliantError; KeyboardInterrupt leaves a recording that is closed and incomplete.
         """
         with RecordingWriter(output, metadata) as writer:
-            self._copy(writer)
             for process in self._services:
                 writer.sync()  # what was made so far is the input of this one
-                self._run_service(process, writer, Recording(output))
-
-    def _run_service(self, process: Process, writer: RecordingWriter, made: Recording) -> None:
-        inputs = {
-            topic: self.messages(topic, made if topic in self.made else self._recorded)
-            for topic in self._inputs_of(process)
-        }
-        run_on(process, inputs, self._config, writer)
+                made = Recording(output)
+                inputs = {
+                    topic: self.messages(topic, made if topic in self.made else self._recorded)
+                    for topic in self._inputs_of(process)
+                }
+                first = process == self._services[0]  # it reads nothing of what is copied
+                beside = partial(self._copy, writer) if first else None
+                run_on(process, inputs, self._config, writer, beside)
 
     def messages(self, topic: Topic, recording: Recording | None = None) -> Iterator[Header]:
         """A topic as a service reads it; of a recording that was cut off, what all topics have."""
@@ -148,9 +148,11 @@ class Replay:
             assert isinstance(source, SourceImage)
             yield rectified(recorded_frame(source), rectifier)
 
-    def _copy(self, writer: RecordingWriter) -> None:
+    def _copy(self, writer: RecordingWriter, failed: Event) -> None:
         """What the services do not touch: it makes the new recording one that can be replayed."""
-        for message in self._recorded.messages():
+        for message in self._recorded.messages(*self._untouched()):
+            if failed.is_set():  # or interrupted
+                return
             key = message.topic.key
             if message.topic == topics.STREAM_END:
                 end = message.decode()
@@ -159,15 +161,26 @@ class Replay:
             if key not in self._affected:
                 _write(writer, message)
 
+    def _untouched(self) -> list[Topic]:
+        found = (by_key(key) for key in self._summary.topics if key not in self._affected)
+        return [topics.STREAM_END, *(topic for topic in found if topic is not None)]
+
 
 def run_on(
     process: Process,
     inputs: Mapping[Topic, Iterable[Header]],
     config: Config,
     writer: RecordingWriter,
+    beside: Callable[[Event], None] | None = None,
 ) -> None:
-    """Run a service on messages; what it makes is recorded, numbered and closed as on the bus."""
-    with behind() as do:
+    """Run a service on messages; what it makes is recorded, numbered and closed as on the bus.
+
+    beside: done by the thread that writes, before it writes; told when the service has failed.
+    """
+    failed = Event()
+    with quick_turns(), behind() as do:
+        if beside is not None:
+            do(partial(beside, failed))
         sink = _Sink(writer, outputs_of(process.name), do)
         bus = ReplayBus(inputs, through_codec=False, on_publish=sink.publish)
         module = importlib.import_module(process.module)
@@ -176,6 +189,8 @@ def run_on(
             module.run(bus, config, StatusMonitor(bus, process.name))
             complete = True
         finally:
+            if not complete:
+                failed.set()
             sink.end(complete=complete)
 
 

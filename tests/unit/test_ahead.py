@@ -1,12 +1,13 @@
 """Reading ahead changes when things are made, and nothing else."""
 
+import sys
 from collections.abc import Iterator
 from functools import partial
 from itertools import count, islice
 
 import pytest
 
-from pliant_services.ahead import behind, read_ahead
+from pliant_services.ahead import behind, quick_turns, read_ahead
 
 
 def test_all_items_come_in_their_order() -> None:
@@ -67,3 +68,10 @@ def test_the_first_error_is_the_one_that_is_told() -> None:
 
     with pytest.raises(KeyError, match="the first"):
         both()
+
+
+def test_turns_are_as_before_when_all_is_done() -> None:
+    usual = sys.getswitchinterval()
+    with quick_turns():
+        assert sys.getswitchinterval() < usual
+    assert sys.getswitchinterval() == usual

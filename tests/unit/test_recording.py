@@ -7,7 +7,7 @@ import pytest
 from pliant.algorithms.tracks import FrameTracks
 from pliant.errors import RecordingError
 from pliant.messages import codec, topics
-from pliant.messages.types import Extrema, Header
+from pliant.messages.types import Extrema, Header, SourceImage
 from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
 
@@ -116,3 +116,18 @@ def test_the_final_map_comes_after_the_updates_that_it_corrects(tmp_path: Path) 
             recording.write(topic, b"x", sequence=count, log_time_ns=count, publish_time_ns=count)
     assert [r.sequence for r in Recording(path).messages()] == [0, 2, 3, 1]
     assert [r.sequence for r in Recording(path).messages(topics.MAP_FINAL)] == [1]
+
+
+def test_what_nobody_asked_for_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    image = SourceImage(
+        frame=0, stamp_ns=0, frame_id="", encoding="mono8", width=80, height=10, data=b"X" * 800
+    )
+    with RecordingWriter(path, {}) as recording:
+        for topic, message in ((topics.SOURCE, image), (topics.EXTREMA, extrema(0))):
+            data = codec.encode(message)
+            recording.write(topic, data, sequence=0, log_time_ns=1, publish_time_ns=1)
+    path.write_bytes(path.read_bytes().replace(b"XXXX", b"XYYX", 1))
+    assert not list(Recording(path).messages())  # up to the first damage
+    assert [m.sequence for m in Recording(path).messages(topics.EXTREMA)] == [0]
+    assert not list(Recording(path).messages(topics.SOURCE))

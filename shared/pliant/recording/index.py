@@ -1,7 +1,6 @@
 """The index at the end of a recording: any moment is found without reading what precedes it."""
 
 import heapq
-import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,13 +14,10 @@ from mcap.records import Channel
 
 from pliant.errors import RecordingError
 from pliant.messages.topics import Topic, by_key
-from pliant.recording.layout import FOOTER, MAGIC, RECORD
+from pliant.recording.layout import CHUNK_INDEX, CHUNK_PLACE, FOOTER, MAGIC, RECORD
 from pliant.recording.parts import parts_of
 from pliant.recording.reader import Recorded, check_version
 from pliant.recording.scan import Damage, StoredMessage, scan_chunk
-
-_CHUNK = struct.Struct("<QQQQI")  # start, end, offset, length, size of the channels' places
-_PLACE = struct.Struct("<HQ")  # channel, offset of its message index
 
 
 @dataclass(frozen=True)
@@ -145,9 +141,9 @@ class Index:
             at += length
         topics = {n: by_key(c.topic.removeprefix("/")) for n, c in channels.items()}
         for at, _ in entries:
-            start, end, offset, _, places = _CHUNK.unpack_from(summary, at)
-            body = summary[at + _CHUNK.size : at + _CHUNK.size + places]
-            found = (topics.get(number) for number, _ in _PLACE.iter_unpack(body))
+            start, end, offset, _, places = CHUNK_INDEX.unpack_from(summary, at)
+            body = summary[at + CHUNK_INDEX.size : at + CHUNK_INDEX.size + places]
+            found = (topics.get(number) for number, _ in CHUNK_PLACE.iter_unpack(body))
             held = frozenset(topic for topic in found if topic is not None)
             self.chunks.append(IndexedChunk(len(self.chunks), file, offset, start, end, held))
 

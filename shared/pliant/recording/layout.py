@@ -23,6 +23,8 @@ CHUNK_START = struct.Struct("<QQQII")  # start, end, size, checksum, length of t
 CHUNK_SIZE = struct.Struct("<Q")  # stored size
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 FOOTER = struct.Struct("<BQQQI")
+CHUNK_INDEX = struct.Struct("<QQQQI")  # start, end, offset, length, size of the channels' places
+CHUNK_PLACE = struct.Struct("<HQ")  # channel, offset of its message index
 
 _ZSTD_LEVEL = -5  # `pliant bench compression`: 900 MB/s; level 1 saves 5 % more at 350 MB/s
 

@@ -58,6 +58,8 @@ class Recording:
     def messages(self, *topics: Topic) -> Iterator[Recorded]:
         """Messages in file order up to the first damage; of all known topics if none is named.
 
+        Of a closed recording, damage to other topics' chunks is none: they are not read.
+
         The final map comes last, as it was told: a recorder that was started again gets what
         waited for it topic by topic, and so may have it before the updates that it corrects.
         """

@@ -24,6 +24,8 @@ from pliant.errors import RecordingError
 from pliant.recording.layout import (
     BLOCK_BYTES,
     CHUNK_BYTES,
+    CHUNK_INDEX,
+    CHUNK_PLACE,
     CHUNK_SIZE,
     CHUNK_START,
     COMPRESSIONS,
@@ -95,7 +97,8 @@ def scan(path: Path, size_limit: Callable[[str], int]) -> Iterator[Item]:
     """Everything in the file that is intact, in order.
 
     ``size_limit`` says for a topic's name how large a message may be; where it says 0, messages are
-    passed over unread.  Raises RecordingError for a file that is none or cannot be read.
+    passed over unread, and chunks that an intact index says to hold nothing else are not even
+    looked at.  Raises RecordingError for a file that is none or cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -132,6 +135,7 @@ class _Walk:
         self._size_limit = size_limit
         self._limits: dict[int, int] = {}
         self._channels: dict[int, Channel] = {}
+        self._unwanted: dict[int, int] = {}  # where such a chunk stands, and where it ends
         for channel in (channels or {}).values():
             self._know(channel)
         self._summary_start = self._read_summary() if channels is None else -1
@@ -153,6 +157,9 @@ class _Walk:
                 raise RecordingError(f"{self._path}: not an MCAP recording")
             yield Damage(0, at, "the beginning of the file")
         while at < self._size:
+            if at in self._unwanted:
+                at = intact = self._unwanted[at]
+                continue
             record = self._read(at, RECORD.size)
             opcode, length = RECORD.unpack(record) if len(record) == RECORD.size else (0, 0)
             body, end = at + RECORD.size, at + RECORD.size + length
@@ -234,7 +241,7 @@ class _Walk:
             yield from self._messages(self._records(chunk), chunk, whole)
             return
         records = self._records(chunk).read(chunk.size)  # the usual one: read once, whole
-        if (chunk.checksum, chunk.size) != self._checked(BytesIO(records), chunk):
+        if chunk.size != len(records) or chunk.checksum not in (0, zlib.crc32(records)):
             yield Damage(chunk.at, chunk.end - chunk.at, _WRONG)
             return
         yield from self._messages(BytesIO(records), chunk, whole)
@@ -326,6 +333,7 @@ class _Walk:
         if stated not in (0, zlib.crc32(tail[: FOOTER.size - 4], crc)):
             return -1
         at = start
+        chunks: list[bytes] = []
         while at < end:
             record = self._read(at, RECORD.size)
             if len(record) < RECORD.size:
@@ -335,8 +343,25 @@ class _Walk:
                 channel = self._parse(Channel.read, at + RECORD.size, length)
                 if channel is not None:
                     self._know(channel)
+            elif opcode == Opcode.CHUNK_INDEX and length <= RECORD_LIMIT:
+                chunks.append(self._read(at + RECORD.size, length))
             at += RECORD.size + length
+        if 0 in self._limits.values():
+            self._unwanted = dict(filter(None, map(self._passed_chunk, chunks)))
         return start
+
+    def _passed_chunk(self, index: bytes) -> tuple[int, int] | None:
+        """Where a chunk begins and ends of whose messages none is wanted, as the index has it."""
+        if len(index) < CHUNK_INDEX.size:
+            return None
+        _, _, start, length, size = CHUNK_INDEX.unpack_from(index)
+        places = index[CHUNK_INDEX.size : CHUNK_INDEX.size + size]
+        if not size or len(places) < size or size % CHUNK_PLACE.size:  # says not what it holds
+            return None
+        if any(self._limits.get(n, 1) for n, _ in CHUNK_PLACE.iter_unpack(places)):
+            return None
+        end = start + length
+        return (start, end) if RECORD.size < length and end <= self._size else None
 
     def _parse(self, read: Callable[[ReadDataStream], _R], body: int, length: int) -> _R | None:
         if length > min(RECORD_LIMIT, self._size - body):
