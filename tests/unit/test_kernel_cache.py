@@ -1,11 +1,14 @@
-"""Kernels on disk: kept between processes, compiled anew when what they are built from changes."""
+"""Kernels on disk: kept between processes, compiled anew when what they are built from changes,
+and the same code in the process that compiled them and in all others."""
 
+import struct
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pliant
-from pliant.algorithms import kernel, kernel_cache
+from pliant.algorithms import kernel, kernel_cache, kernel_linking
 
 _KERNEL = """
 from pliant.algorithms.kernel import kernel
@@ -21,10 +24,33 @@ _CALL = (
     "from pliant.algorithms.scaled import scaled; "
     "print(scaled(2.0), sum(scaled.stats.cache_hits.values()))"
 )
+# A helper that calls itself is never wholly part of its caller.
+_HELPED = """
+from pliant.algorithms.kernel import kernel
+
+@kernel
+def helper(x):
+    return x if x < 2.0 else helper(x - 1.0) + helper(x - 2.0)
+
+@kernel
+def helped(x):
+    return 3.0 * helper(x)
+"""
 
 
-def _call(root: Path) -> str:
-    command = [sys.executable, "-B", "-c", _CALL]
+def _package(root: Path) -> Path:
+    package = root / "pliant" / "algorithms"
+    package.mkdir(parents=True)
+    for module in (kernel, kernel_cache, kernel_linking):
+        source = Path(module.__file__)
+        (package / source.name).write_bytes(source.read_bytes())
+    for folder in (package, package.parent):
+        (folder / "__init__.py").touch()
+    return package
+
+
+def _call(root: Path, code: str = _CALL) -> str:
+    command = [sys.executable, "-B", "-c", code]
     done = subprocess.run(
         command, env={"PYTHONPATH": str(root)}, capture_output=True, text=True, check=True
     )
@@ -32,13 +58,7 @@ def _call(root: Path) -> str:
 
 
 def test_a_constant_of_another_module_changes_the_kernel(tmp_path: Path) -> None:
-    package = tmp_path / "pliant" / "algorithms"
-    package.mkdir(parents=True)
-    for module in (kernel, kernel_cache):
-        source = Path(module.__file__)
-        (package / source.name).write_bytes(source.read_bytes())
-    for folder in (package, package.parent):
-        (folder / "__init__.py").touch()
+    package = _package(tmp_path)
     (package / "scaled.py").write_text(_KERNEL)
 
     (package / "constants.py").write_text("FACTOR = 3.0\n")
@@ -54,3 +74,38 @@ def test_sources_are_followed_through_imports() -> None:
     found = {str(path.relative_to(algorithms)) for path in paths}
     assert {"tracking/advance.py", "tracking/patches.py", "kernel.py", "kernel_cache.py"} <= found
     assert not any(name.startswith("bundle/") for name in found)
+
+
+def test_a_kernel_calls_the_helpers_in_its_own_object_file(tmp_path: Path) -> None:
+    """The linker would take those of whichever kernel was loaded first: they may round unlike."""
+    package = _package(tmp_path)
+    (package / "helped.py").write_text(_HELPED)
+    call = "from pliant.algorithms.helped import helped; print(helped(9.0))"
+    assert _call(tmp_path, call) == _call(tmp_path, call) == "102.0"
+    (file,) = package.rglob("helped.helped-*.nbc")
+    found = [binding for name, binding in _functions(_object(file)) if "helper" in name]
+    assert found == ["local"]
+
+
+def _object(file: Path) -> bytes:
+    """The object file that Numba keeps there among other things."""
+    data = file.read_bytes()
+    return data[data.index(b"\x7fELF") :]
+
+
+def _functions(elf: bytes) -> Iterator[tuple[str, str]]:
+    """Names and bindings of the functions that a 64-bit ELF file defines."""
+    assert elf[:5] == b"\x7fELF\x02"
+    sections_at = struct.unpack_from("<Q", elf, 40)[0]
+    count = struct.unpack_from("<H", elf, 60)[0]
+    sections = [struct.unpack_from("<IIQQQQIIQQ", elf, sections_at + 64 * i) for i in range(count)]
+    (table,) = [section for section in sections if section[1] == 2]
+    names = sections[table[6]][4]
+    for at in range(table[4], table[4] + table[5], 24):
+        name, info, _, section, _, _ = struct.unpack_from("<IBBHQQ", elf, at)
+        if info & 15 == 2 and section != 0:
+            start = names + name
+            yield (
+                elf[start : elf.index(b"\0", start)].decode(),
+                {0: "local", 1: "global", 2: "weak"}[info >> 4],
+            )

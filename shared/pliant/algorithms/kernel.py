@@ -13,6 +13,7 @@ from typing import Any, TypeVar, cast
 import numba
 
 from pliant.algorithms.kernel_cache import SourcesCache
+from pliant.algorithms.kernel_linking import keep_copies_apart
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -45,6 +46,7 @@ def leaf_kernel(function: _Function) -> _Function:
 
 
 def _compile(function: _Function, **options: Any) -> _Function:
+    keep_copies_apart()
     dispatcher: Any = numba.njit(**_OPTIONS, **options)(function)
     dispatcher._cache = SourcesCache(dispatcher.py_func)
     return cast(_Function, dispatcher)
