@@ -222,3 +222,18 @@ def test_wrong_sources_get_one_clear_line(source: str, message: str, tmp_path: P
         builtin_folder(source.format(tmp=tmp_path), cache=tmp_path / "cache")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_the_camera_is_on_its_way_when_the_first_shutter_opens() -> None:
+    scene = deforming_scene("breathing", DEFORMING["breathing"].options())
+    opens, middle, closes = (scene.path.T_world_camera(t)[:3, 3] for t in (-0.005, 0.0, 0.005))
+    assert np.linalg.norm(closes - opens) > 1e-4
+    np.testing.assert_allclose(0.5 * (opens + closes), middle, atol=1e-5)
+
+
+def test_a_longer_film_goes_on() -> None:
+    options = DEFORMING["breathing"].options(seconds=10.0)
+    scene = deforming_scene("breathing", options)
+    assert scene.frames == 300
+    late = [scene.path.T_world_camera(t)[:3, 3] for t in (8.0, 9.0)]
+    assert np.linalg.norm(late[1] - late[0]) > 0.005

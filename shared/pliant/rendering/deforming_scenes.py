@@ -35,6 +35,7 @@ _STILL = SplinePath(
     tremble_rad=0.0,
     up=np.array([0.0, -1.0, 0.0]),
 )
+_LEAD_S = 0.1  # the shutter of the first frame opens before its middle
 _TOOL_PERIOD_S = 2.4
 _DROP_EVERY = 20  # frames
 
@@ -93,6 +94,9 @@ class BreathingOptions(DeformingOptions):
         ge=0.0,
         le=0.2,
         description="Of the motion, as a share of the depth; 0: rigid.",
+    )
+    seconds: float = Field(
+        default=4.0, ge=1.0, le=60.0, description="How long it is, and the way of the camera."
     )
 
 
@@ -221,18 +225,20 @@ def _breathing(options: DeformingOptions, _tracks: F64 | None) -> DeformingScene
         return np.stack([x, y, z - rise * hill], axis=2)
 
     rng = np.random.default_rng(3)
-    points = rng.uniform(-1.0, 1.0, (2, 13, 3)) * np.array(
+    stations = round(13 * options.seconds / 4.0)
+    points = rng.uniform(-1.0, 1.0, (2, stations, 3)) * np.array(
         [[[0.09, 0.07, 0.06]], [[0.07, 0.05, 0.0]]]
     )
     targets = points[1] + np.array([0.0, 0.0, _DEPTH_M])
     path = SplinePath(
         [(float(a), float(b), float(c)) for a, b, c in points[0]],
         [(float(a), float(b), float(c)) for a, b, c in targets],
-        duration_s=4.0,
+        duration_s=options.seconds,
         up=np.array([0.0, -1.0, 0.0]),
+        lead_s=_LEAD_S,
     )
     sheets = (Sheet("surface", _TISSUE, 1.5, 1.2, shape),)
-    return DeformingScene("breathing", sheets, path, frames=120)
+    return DeformingScene("breathing", sheets, path, frames=round(30.0 * options.seconds))
 
 
 def _objects(_options: DeformingOptions, _tracks: F64 | None) -> DeformingScene:

@@ -49,10 +49,14 @@ class SplinePath:
     tremble_m: float = 0.003
     tremble_rad: float = 0.005
     up: F64 = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    lead_s: float = (
+        0.0  # on its way so long before time 0: what opens a little earlier sees it move
+    )
 
     def T_world_camera(self, time_s: float) -> F64:
         """(4, 4) pose at a time; times outside are clamped to the ends."""
-        part = min(max(time_s / self.duration_s, 0.0), 1.0)
+        part = (time_s + self.lead_s) / (self.duration_s + self.lead_s)
+        part = min(max(part, 0.0), 1.0)
         position = _bspline(np.array(self.positions, np.float64), part)
         target = _bspline(np.array(self.targets, np.float64), part)
         T = look_at(position, target, up=self.up)
