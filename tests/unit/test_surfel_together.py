@@ -7,7 +7,7 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.surfels import motion
 from pliant.algorithms.surfels import together_kernels as kernels
 from pliant.algorithms.surfels.neighbours import Edges, find_edges, join_edges, keep_rows
-from pliant.algorithms.surfels.sampling import A, B, X
+from pliant.algorithms.surfels.sampling import A, B, F, X
 from pliant.algorithms.surfels.together import torn_off
 
 N = 12
@@ -66,6 +66,19 @@ def test_pairs_follow_their_rows() -> None:
     new = find_edges(poses, np.ones(N, np.int64), N - 2, 3, 0.3)
     assert (new.ends.max(axis=1) >= N - 2).all()
     assert len(join_edges(old, new).ends) == len(old.ends) + len(new.ends)
+
+
+def test_a_stretch_that_surfels_know_of_costs_nothing() -> None:
+    poses = plane()
+    edges = pairs_of(poses)
+    pulled = poses.copy()
+    stretch = np.array([[1.2, 0.05], [0.05, 0.9]])
+    pulled[:, X : X + 2] = poses[:, X : X + 2] @ stretch
+    pulled[:, F : F + 3] = (1.2, 0.05, 0.9)
+    _, residuals, _ = rows_of(pulled, edges)
+    np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
+    pulled[:, F : F + 3] = (1.0, 0.0, 1.0)
+    assert np.abs(rows_of(pulled, edges)[1]).max() > 1e-3
 
 
 def test_a_rigid_motion_costs_nothing() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
-from pliant.algorithms.surfels.sampling import A, B, X
+from pliant.algorithms.surfels.sampling import A, B, F, X
 
 
 class Edges(NamedTuple):
@@ -45,12 +45,14 @@ def own_coordinates(pose: F64, d: F64, out: F64) -> None:
 
 @leaf_kernel
 def own_vector(pose: F64, c: F64, out: F64) -> None:
-    """The vector of such coefficients."""
+    """The vector of such coefficients, stretched by the surfel's own F: the identity at birth."""
+    f11, f12, f22 = pose[F], pose[F + 1], pose[F + 2]
+    i, j = f11 * c[0] + f12 * c[1], f12 * c[0] + f22 * c[1]
     a0, a1, a2 = pose[A], pose[A + 1], pose[A + 2]
     b0, b1, b2 = pose[B], pose[B + 1], pose[B + 2]
-    out[0] = c[0] * a0 + c[1] * b0 + c[2] * (a1 * b2 - a2 * b1)
-    out[1] = c[0] * a1 + c[1] * b1 + c[2] * (a2 * b0 - a0 * b2)
-    out[2] = c[0] * a2 + c[1] * b2 + c[2] * (a0 * b1 - a1 * b0)
+    out[0] = i * a0 + j * b0 + c[2] * (a1 * b2 - a2 * b1)
+    out[1] = i * a1 + j * b1 + c[2] * (a2 * b0 - a0 * b2)
+    out[2] = i * a2 + j * b2 + c[2] * (a0 * b1 - a1 * b0)
 
 
 @fast_kernel
