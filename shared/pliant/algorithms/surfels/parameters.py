@@ -113,7 +113,7 @@ class SurfelParameters(Parameters):
         le=63,
         description="Side of a surfel's patch, px of each pyramid level, odd.",
     )
-    levels: int = Field(default=3, ge=1, le=6, description="Levels of the pyramid.")
+    levels: int = Field(default=4, ge=1, le=6, description="Levels of the pyramid.")
     spacing_px: int = Field(
         default=7, ge=1, description="Non-maximum suppression of corners and room of a surfel, px."
     )
