@@ -35,7 +35,7 @@ FILES = (TRAJECTORY_NAME, SURFELS_NAME, REPORT_NAME)
 
 _PER_SURFEL = (
     *("ids", "positions", "tangents", "deformations", "points_px", "zncc", "visible", "sigma"),
-    *("gains", "biases", "state", "age", "born"),
+    *("gains", "biases", "state", "age", "born", "tried"),
 )
 
 

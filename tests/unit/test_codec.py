@@ -5,16 +5,17 @@ from typing import get_args, get_origin
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pliant.algorithms.arrays import array_fields
+from pliant.algorithms.surfels import SurfelFrame
 from pliant.algorithms.tracks import FrameTracks
 from pliant.errors import MessageError
 from pliant.messages import codec
 from pliant.messages.topics import TOPICS, status
-from pliant.messages.types import Extrema, Header, Image
+from pliant.messages.types import Extrema, Header, Image, Surfels
 
 MESSAGES = sorted({t.message for t in (*TOPICS, status("ingest"))}, key=lambda m: m.__name__)
 _SCALARS = {
@@ -46,6 +47,7 @@ def messages(draw: st.DrawFn, message: type[Header]) -> Header:
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.__name__)
+@settings(suppress_health_check=[HealthCheck.too_slow])  # a busy machine is no fault of theirs
 @given(data=st.data())
 def test_round_trip_of_every_message(message: type[Header], data: st.DataObject) -> None:
     sent = data.draw(messages(message))
@@ -117,6 +119,13 @@ def test_a_missing_field_is_named_and_an_unknown_one_passed_over() -> None:
     del content["ids"]
     with pytest.raises(MessageError, match="ids"):
         codec.decode(Extrema, msgpack.packb(content))
+
+
+def test_surfels_of_a_recording_that_does_not_tell_where_they_were_tried() -> None:
+    header = Header(frame=0, stamp_ns=0, frame_id="world")
+    content = msgpack.unpackb(codec.encode(Surfels.of(header, SurfelFrame.empty())))
+    del content["tried"]
+    assert codec.decode(Surfels, msgpack.packb(content)).tried.shape == (0, 3)
 
 
 def test_a_message_beyond_its_limit_is_refused_unread() -> None:

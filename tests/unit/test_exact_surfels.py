@@ -158,6 +158,29 @@ def test_the_curve_of_the_zncc_has_a_known_area(sliding: SurfaceTruth) -> None:
     judge.add(3, surfels_at(sliding, found, T, state, zncc))
     low = np.count_nonzero(wrong & (zncc < 0.5)) / np.count_nonzero(wrong)
     assert judge.summary()["auc"] == pytest.approx(low + 0.5 * (1.0 - low))
+    assert judge.summary()["auc_image"] == judge.summary()["auc"]
+
+
+def test_what_was_not_kept_counts_where_it_was_tried(sliding: SurfaceTruth) -> None:
+    start, T = world_of(sliding, 0)
+    n = len(start)
+    exact, _ = world_of(sliding, 3)
+    wrong = np.arange(n) % 2 == 1
+    found = exact * np.where(wrong, 1.05, 1.0)[:, None]  # along the ray: the image cannot tell
+    state = np.where(wrong, SurfelState.OUTLIER, SurfelState.TRACKED)
+    zncc = np.where(wrong, 0.3, 0.9)
+    for tried, auc, in_place in ((found, 1.0, True), (exact, np.nan, True), (None, 1.0, False)):
+        judge = ExactSurfels(sliding)
+        judge.add(0, surfels_at(sliding, start, T, np.zeros(n), np.ones(n)))
+        frame = surfels_at(sliding, found, T, state, zncc)
+        if tried is None:  # an old recording: at its pixel, at the depth that was kept
+            shifted = frame.points_px + np.where(wrong, 9.0, 0.0)[:, None].astype(np.float32)
+            frame = replace(frame, points_px=shifted)
+        else:
+            frame = replace(frame, tried=tried)
+        judge.add(3, frame)
+        assert judge.summary()["auc"] == pytest.approx(auc, nan_ok=True)
+        assert np.isnan(judge.summary()["auc_image"]) == in_place
 
 
 def test_losses_and_restarts(sliding: SurfaceTruth) -> None:

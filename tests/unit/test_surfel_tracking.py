@@ -8,8 +8,10 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.surfels import SurfelFrame, SurfelParameters, SurfelState, SurfelTracker
+from pliant.algorithms.surfels.again import held_by, look_again
 from pliant.algorithms.surfels.align import Templates, align_all, make_workspace
 from pliant.algorithms.surfels.rest import no_rest
+from pliant.algorithms.surfels.sampling import X
 from pliant.rendering.render import RenderedFrame
 
 SMALL = SurfelParameters(max_surfels=60, levels=2)
@@ -107,6 +109,51 @@ def test_batch_is_one_by_one(
         align_all(alone[k : k + 1], np.ones(1, np.uint8), no_rest(1), level, one, limits, fresh)
     assert (together != start).any()
     assert together.tobytes() == alone.tobytes()
+
+
+def test_a_second_look_finds_what_was_carried_past_its_image(
+    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
+) -> None:
+    frames, camera, _ = board
+    tracker = SurfelTracker(SMALL)
+    tracker.start(frames[0].image, frames[0].depth_m, camera)
+    table, level = tracker._table, tracker._pyramid(frames[0].image)[0]
+    n = len(table)
+    off = table.poses.copy()
+    off[:, X] += 1.2 / camera.fx * off[:, X + 2]
+    wanted = (np.arange(n) % 2).astype(np.uint8)
+    for strain, left in ((0.02, 0.5), (0.2, 0.25)):  # neighbours that hold less, let go
+        found = off.copy()
+        look_again(
+            found, wanted, table.edges, level, table.templates[0], tracker._limits(fine=True),
+            make_workspace(23), omega_e=25.0, strain=strain,
+        )  # fmt: skip
+        np.testing.assert_array_equal(found[wanted == 0], off[wanted == 0])
+        errors = np.linalg.norm((found - table.poses)[wanted > 0, X : X + 3], axis=1)
+        assert np.median(errors) < left * 1.2 / camera.fx
+    held = held_by(table.edges, n, 25.0, 0.02)
+    ends, lengths = table.edges.ends, table.edges.lengths
+    mine = (ends == 0).any(axis=1)
+    np.testing.assert_allclose(held[0], (25.0 / (0.02 * lengths[mine]) ** 2).sum() * np.eye(3))
+
+
+def test_what_was_tried_is_told(
+    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
+) -> None:
+    frames, camera, _ = board
+    tracker = SurfelTracker(SMALL)
+    first = tracker.start(frames[0].image, frames[0].depth_m, camera)
+    np.testing.assert_array_equal(first.tried, first.positions)
+    second = tracker.track(frames[1].image)
+    good = second.state == SurfelState.TRACKED
+    np.testing.assert_array_equal(second.tried[good], second.positions[good])
+    covered = frames[2].image.copy()
+    covered[:, 160:] = 60
+    third = tracker.track(covered)
+    bad = third.state != SurfelState.TRACKED
+    assert bad.any()
+    assert (third.tried[bad] != third.positions[bad]).any(axis=1).mean() > 0.9
+    assert_finite(third)
 
 
 def test_gain_and_bias_take_up_the_light(

@@ -24,7 +24,7 @@ _BREATHING = tuple(f"breathing?amplitude={share}" for share in ("0", "0.01", "0.
 _MODELS = ("isometric", "conformal", "equiareal", "general")
 _LIGHTS = ("light=0.3", "exposure=0.2")
 _ILLUMINATION = ("both", "bias", "none")
-_AREAS = ("auc", "auc_visible")
+_AREAS = ("auc", "auc_visible", "auc_image")
 _SIDES = (11, 15, 23, 31, 45)
 _CAMERAS = {"SM": "static_map", "SC": "static", "moving": "moving"}
 _TROUBLES = ("tool=1", "light=0.3", "gloss=1", "drop=4", "tool=1&light=0.3&gloss=1&drop=4")
@@ -39,7 +39,7 @@ _HEADER = (
         "alive at end",
         "of those in view",
     ),
-    *("dragged", "AUC", "AUC in view", "camera %", "until loss", "ms a frame"),
+    *("dragged", "AUC", "AUC in view", "AUC 1 px", "camera %", "until loss", "ms a frame"),
 )
 LIMITS = "limits"
 TABLES = (
@@ -206,7 +206,7 @@ def _measure(sequence: Sequence, parameters: SurfelParameters) -> list[str]:
     depth = sequence.depths[0][sequence.depths[0] > 0.0].mean()
     mean, last = mean_rows(by_depth.rows), by_depth.rows[-1]
     shares = [f"{100.0 * mean[name] / depth:.2f}" for name in ("rmse", "rmse_all")]
-    return [*shares, "", "", f"{last.alive / max(1, last.judged):.1%}", *[""] * 6, milliseconds]
+    return [*shares, "", "", f"{last.alive / max(1, last.judged):.1%}", *[""] * 7, milliseconds]
 
 
 def _exact_cells(exact: ExactSurfels) -> list[str]:

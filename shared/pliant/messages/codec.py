@@ -44,7 +44,7 @@ def scalars(message: type[Header]) -> dict[str, type]:
 
 @cache
 def _required(message: type[Header]) -> frozenset[str]:
-    return frozenset(f.name for f in fields(message) if f.default is MISSING)
+    return frozenset(f.name for f in fields(message) if f.default is f.default_factory is MISSING)
 
 
 @cache

@@ -1,6 +1,6 @@
 """What is said of the surfels in one frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Annotated
 
@@ -17,6 +17,10 @@ class SurfelState(IntEnum):
     OCCLUDED = 2  # too much of its patch is saturated, covered or on a highlight
     OUTSIDE = 3  # left the image, or went behind the camera
     LOST = 4  # none of the above was mended for long; is still looked for
+
+
+def _not_told() -> F64:
+    return np.zeros((0, 3))
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,9 @@ class SurfelFrame:
     state: Annotated[U8, Shape("N")]  # SurfelState
     age: Annotated[I32, Shape("N")]  # frames since birth
     born: Annotated[I32, Shape("N")]  # frame of birth
+    # (N, 3) metres, world: of the pose that zncc and visible speak of, kept or not; or (0, 3)
+    # in recordings that were made before it was told.
+    tried: Annotated[F64, Shape("T", 3)] = field(default_factory=_not_told)
 
     def __post_init__(self) -> None:
         check_arrays(self)

@@ -37,6 +37,7 @@ class SurfelTable:
     missing: I32 = field(default_factory=lambda: np.zeros(0, np.int32))  # frames since last good
     verdicts: F64 = field(default_factory=lambda: new_verdicts(0))
     guesses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # where to look next
+    tried: F64 = field(default_factory=lambda: np.zeros((0, 3)))  # what was judged last
     edges: Edges = field(default_factory=no_edges)
 
     def __len__(self) -> int:
@@ -57,6 +58,7 @@ class SurfelTable:
         )
         self.poses = np.concatenate([self.poses, poses])
         self.guesses = np.concatenate([self.guesses, poses])
+        self.tried = np.concatenate([self.tried, poses[:, X : X + 3]])
         self.rest = np.concatenate([self.rest, poses[:, X : X + 3]])
         self.information = np.concatenate([self.information, information])
         self.ids = np.concatenate([self.ids, np.arange(first_id, first_id + n)])
@@ -79,6 +81,7 @@ class SurfelTable:
             "missing",
             "verdicts",
             "guesses",
+            "tried",
         ):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[rows]))
 

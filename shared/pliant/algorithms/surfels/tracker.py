@@ -7,6 +7,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.surfels import judge
+from pliant.algorithms.surfels.again import look_again
 from pliant.algorithms.surfels.align import Limits, align_all, make_workspace
 from pliant.algorithms.surfels.birth import find_births
 from pliant.algorithms.surfels.joint import Equilibrium, align_jointly, align_rigid, register
@@ -233,11 +234,20 @@ class SurfelTracker:
     def _judge(self, level: Level, poses: F64, active: U8, torn: BoolArray) -> None:
         """Keep what was found; what was not stays where it was last good."""
         table, p = self._table, self._parameters
-        judge.judge_all(
-            poses, active, level, table.templates[0], self._limits(fine=True),
-            self._work, table.verdicts,
-        )  # fmt: skip
-        verdicts = table.verdicts
+        verdicts, templates, limits = table.verdicts, table.templates[0], self._limits(fine=True)
+        judge.judge_all(poses, active, level, templates, limits, self._work, verdicts)
+        if len(table.edges.ends) and p.camera != "static_map":
+            unlike = (verdicts[:, judge.CORRELATION] < p.min_zncc) & (
+                verdicts[:, judge.FRONT] > 0.0
+            )
+            again = (active > 0) & (unlike | torn) & (verdicts[:, judge.INSIDE] >= p.min_visible)
+            again = again.astype(np.uint8)
+            look_again(
+                poses, again, table.edges, level, templates, limits, self._work,
+                omega_e=p.omega_e, strain=p.strain,
+            )  # fmt: skip
+            judge.judge_all(poses, again, level, templates, limits, self._work, verdicts)
+            torn = torn & (again == 0)
         wanted = np.where(table.missing > 0, max(p.min_zncc, _FOUND_AGAIN_ZNCC), p.min_zncc)
         state = np.full(len(table), SurfelState.TRACKED, np.uint8)
         state[verdicts[:, judge.CORRELATION] < wanted] = SurfelState.OUTLIER
@@ -251,6 +261,8 @@ class SurfelTracker:
         table.state = state
         self._lost = int(good.sum()) < p.min_alive
         world = move_poses(poses, self._T_world_camera)
+        finite = np.isfinite(world).all(axis=1, keepdims=True)
+        table.tried = np.where(finite, world[:, X : X + 3], table.poses[:, X : X + 3])
         table.poses[good] = world[good]
         # With neighbours, what is not seen is looked for where they have carried it.
         table.guesses = table.poses.copy()
@@ -329,6 +341,7 @@ class SurfelTracker:
             state=table.state.copy(),
             age=(self._frame - table.born).astype(np.int32),
             born=table.born.copy(),
+            tried=table.tried.copy(),
         )
 
 
