@@ -64,7 +64,8 @@ PROCESSES: tuple[Process, ...] = (
         optional=(topics.EXTREMA, topics.MAP_UPDATE, topics.KEYFRAME),
         outputs=(topics.SURFELS,),
     ),
-    Process("recorder", "pliant_services.recorder", observer=True),
+    # Senders keep what it has not taken, some seconds' worth, and wait for it beyond.
+    Process("recorder", "pliant_services.recorder", observer=True, niceness=5),
 )
 
 BY_NAME = {process.name: process for process in PROCESSES}

@@ -7,7 +7,7 @@ import pytest
 from pliant.algorithms.tracks import FrameTracks
 from pliant.errors import RecordingError
 from pliant.messages import codec, topics
-from pliant.messages.types import Extrema, Header, SourceImage
+from pliant.messages.types import Depth, Extrema, Header, SourceImage
 from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
 
@@ -131,3 +131,15 @@ def test_what_nobody_asked_for_is_not_read(tmp_path: Path) -> None:
     assert not list(Recording(path).messages())  # up to the first damage
     assert [m.sequence for m in Recording(path).messages(topics.EXTREMA)] == [0]
     assert not list(Recording(path).messages(topics.SOURCE))
+
+
+def test_a_chunk_of_more_messages_than_the_system_writes_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, {}) as recording:
+        for frame in range(2000):
+            data = codec.encode(Depth(frame=frame, stamp_ns=0, frame_id="", data=b""))
+            recording.write(
+                topics.DEPTH, data, sequence=frame, log_time_ns=frame, publish_time_ns=0
+            )
+    found = [message.decode().frame for message in Recording(path).messages()]
+    assert found == list(range(2000))

@@ -48,6 +48,7 @@ class InLink:
 
     safe: messages that we will never ask for again.     wanted: the service waits for this topic.
     arrived: whether one came since the last tick.     ended: its end was kept before we started.
+    told: messages taken when we last told our counts.
     asked_at: when we asked for what is missing.
     """
 
@@ -55,17 +56,18 @@ class InLink:
         self.topic = topic
         self.sender = sender
         self.box = Inbox(limit)
-        self.safe = 0
+        self.safe = self.told = 0
         self.asked_at = float("-inf")
         self.wanted = self.arrived = self.ended = False
         self._shared = shared
         self._credit = _publisher(shared, f"credit/{topic.key}/{reader}")
         key = f"{shared.prefix}/{topic.key}"
-        self._held = shared.session.declare_subscriber(key, self._on_sample)
+        self._held = shared.session.declare_subscriber(key, _directly(self._on_sample))
 
     def tell(self, incarnation: int, ask: int = NOTHING) -> None:
         """Tell the sender our counts."""
-        self._credit.put(_CREDIT.pack(incarnation, self.box.taken, self.safe, ask))
+        self.told = taken = self.box.taken
+        self._credit.put(_CREDIT.pack(incarnation, taken, self.safe, ask))
 
     def start_from(self, taken: int) -> None:
         """Go on behind ``taken`` messages."""
@@ -97,10 +99,10 @@ class InLink:
         with self._shared.changed:
             self.box.refuse(why)
 
-    def look_into(self, received: Received) -> Received:
+    def look_into(self, received: Received, *, views: bool = False) -> Received:
         """The message with what is in it.  Raises MessageError where it does not fit the topic."""
         topic = topics.STREAM_END if received.is_end else self.topic
-        message = codec.decode(topic.message, received.data, max_bytes=topic.max_bytes)
+        message = codec.decode(topic.message, received.data, max_bytes=topic.max_bytes, views=views)
         if isinstance(message, StreamEnd) and received.is_end:
             found, expected = (message.topic, message.messages), (self.topic.key, received.sequence)
             if found != expected:
@@ -128,7 +130,7 @@ class OutLink:
         self._shared = shared
         self._publisher = _publisher(shared, topic.key)
         key = f"{shared.prefix}/credit/{topic.key}/*"
-        self._held = shared.session.declare_subscriber(key, self._on_credit)
+        self._held = shared.session.declare_subscriber(key, _directly(self._on_credit))
 
     def send(self, kind: int, payload: bytes) -> None:
         """Number a message, keep it, and send it."""
@@ -175,6 +177,11 @@ class OutLink:
 def first_arrived(links: Sequence[InLink]) -> InLink:
     """The link whose first waiting message arrived first."""
     return min((e for e in links if e.box.waiting), key=lambda e: e.box.waiting[0].arrival)
+
+
+def _directly(callback: Callable[[zenoh.Sample], None]) -> "zenoh.handlers.Callback[zenoh.Sample]":
+    """In Zenoh's own thread, not in one more for each topic that every message must wake."""
+    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def _publisher(shared: Shared, key: str) -> zenoh.Publisher:

@@ -88,6 +88,7 @@ class ZenohBus:
         Raises BusError when no endpoint answers.
         """
         self._patience_s = patience_s
+        self._tell_every = max(1, window // 4)
         self._checkpoints = checkpoints
         self._packed = frozenset(packed)
         self._disturb = disturb or (lambda: None)
@@ -269,12 +270,16 @@ class ZenohBus:
 
         None whenever nothing has come for ``timeout_s``.  Vouches for nothing: see
         ``acknowledge``.  For the recorder, the one service whose output may depend on arrival.
+        Arrays of the messages are read-only.
         """
         entries = [entry for entry in self._inputs.values() if not entry.ended]
         while entries:
-            received = self._take(entries, timeout_s)
+            received = self._take(entries, timeout_s, views=True)
             if received is not None:
-                self._tell(self._inputs[received.topic.key])
+                entry = self._inputs[received.topic.key]
+                # Each credit wakes the router and the sender: now and then is enough.
+                if received.is_end or entry.box.taken - entry.told >= self._tell_every:
+                    self._tell(entry)
                 if received.is_end:
                     entries = [entry for entry in entries if entry.topic is not received.topic]
             yield received
@@ -288,7 +293,9 @@ class ZenohBus:
         for entry in told:
             self._tell(entry)
 
-    def _take(self, entries: Sequence[InLink], timeout_s: float | None = None) -> Received | None:
+    def _take(
+        self, entries: Sequence[InLink], timeout_s: float | None = None, *, views: bool = False
+    ) -> Received | None:
         """The next message, looked into: what does not fit its topic is passed over."""
         self._disturb()
         deadline = time.monotonic() + timeout_s if timeout_s is not None else None
@@ -297,7 +304,7 @@ class ZenohBus:
             if entry is None:
                 return None
             try:
-                received = entry.look_into(entry.box.waiting[0])  # only we take; others append
+                received = entry.look_into(entry.box.waiting[0], views=views)  # others append
             except MessageError as error:
                 with self._changed:
                     entry.box.refuse_first(str(error))

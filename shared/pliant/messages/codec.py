@@ -85,8 +85,13 @@ def encode(message: Header, *, packed: bool = False) -> bytes:
     return packed
 
 
-def decode(message: type[_M], data: bytes, *, max_bytes: int | None = None) -> _M:
-    """The message in ``data``.  Raises MessageError for everything else."""
+def decode(
+    message: type[_M], data: bytes, *, max_bytes: int | None = None, views: bool = False
+) -> _M:
+    """The message in ``data``.  Raises MessageError for everything else.
+
+    views: for who only looks at it; its arrays are read-only, and cost no copy.
+    """
     if max_bytes is not None and len(data) > max_bytes:
         raise MessageError(
             f"{message.__name__}: {len(data)} bytes, more than the {max_bytes} allowed"
@@ -112,7 +117,9 @@ def decode(message: type[_M], data: bytes, *, max_bytes: int | None = None) -> _
     sizes: dict[str, int] = {}
     for spec in array_fields(message):
         if spec.name in content:
-            values[spec.name] = _array(message, spec, content[spec.name], sizes, limit)
+            array = _array(message, spec, content[spec.name], sizes, limit)
+            # 0.1 ms for an image: numba would compile every kernel once more for read-only views.
+            values[spec.name] = array if views or array.flags.writeable else array.copy()
             if isinstance(content[spec.name][1], msgpack.ExtType):
                 limit -= values[spec.name].nbytes
     return message(**values)
@@ -130,12 +137,12 @@ def schema(message: type[Header]) -> bytes:
 
 
 def _scalar(message: type, name: str, expected: Any, value: Any) -> Any:
+    if type(value) is expected:
+        return value
     if get_origin(expected) is tuple:
         (element, _) = get_args(expected)
         if isinstance(value, list) and all(type(item) is element for item in value):
             return tuple(value)
-    elif type(value) is expected:
-        return value
     elif expected is float and type(value) is int:
         return float(value)
     wanted = getattr(expected, "__name__", str(expected))
@@ -161,9 +168,8 @@ def _array(message: type, spec: ArrayField, value: Any, sizes: dict[str, int], l
         return pixels.reshape(shape)
     if math.prod(shape) * spec.dtype.itemsize != len(raw):
         raise MessageError(f"{where}: {len(raw)} bytes do not fill shape {shape} of {spec.dtype}")
-    # A copy, 0.1 ms for an image: numba would compile every kernel once more for read-only views.
     try:
-        return np.frombuffer(raw, spec.dtype).reshape(shape).copy()
+        return np.frombuffer(raw, spec.dtype).reshape(shape)
     except (ValueError, OverflowError):  # an empty array with a side beyond all sizes
         raise MessageError(f"{where}: bad shape {str(shape)[:80]}") from None
 

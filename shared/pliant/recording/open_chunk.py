@@ -61,15 +61,18 @@ class OpenChunk:
 
     def finish(self, offset: int) -> tuple[list[bytes], ChunkIndex]:
         """What goes to the file at ``offset``, and its entry in the index of the whole."""
-        records = b"".join(self._parts)
-        stored = layout.compress(records, self.compression)
+        # What is stored as it is needs no copy of itself.
+        records = [b"".join(self._parts)] if self.compression else self._parts
+        stored = [layout.compress(records[0], self.compression)] if self.compression else records
+        stored_size = sum(map(len, stored))
+        crc = 0
+        for part in records:
+            crc = zlib.crc32(part, crc)
         name = self.compression.encode()
-        start = layout.CHUNK_START.pack(
-            self.start_ns, self.end_ns, len(records), zlib.crc32(records), len(name)
-        )
-        head = start + name + layout.CHUNK_SIZE.pack(len(stored))
-        length = len(head) + len(stored)
-        written = [layout.RECORD.pack(Opcode.CHUNK, length) + head, stored]
+        start = layout.CHUNK_START.pack(self.start_ns, self.end_ns, self.size, crc, len(name))
+        head = start + name + layout.CHUNK_SIZE.pack(stored_size)
+        length = len(head) + stored_size
+        written = [layout.RECORD.pack(Opcode.CHUNK, length) + head, *stored]
         after = offset + layout.RECORD.size + length
         places: dict[int, int] = {}
         indices: list[bytes] = []
@@ -88,8 +91,8 @@ class OpenChunk:
             message_index_offsets=places,
             message_index_length=size,
             compression=self.compression,
-            compressed_size=len(stored),
-            uncompressed_size=len(records),
+            compressed_size=stored_size,
+            uncompressed_size=self.size,
         )
         return [*written, *indices], index
 

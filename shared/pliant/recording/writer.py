@@ -3,8 +3,10 @@
 import errno
 import os
 import time
+from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 
@@ -27,6 +29,9 @@ from pliant.recording import layout
 from pliant.recording.layout import CHUNK_BYTES
 from pliant.recording.open_chunk import OpenChunk, as_bytes
 from pliant.recording.summary_section import closing
+
+_AT_ONCE = 1024
+"""Parts that the system takes in one call (IOV_MAX)."""
 
 
 class RecordingWriter:
@@ -184,12 +189,12 @@ class RecordingWriter:
 
     def _put(self, *parts: bytes) -> None:
         """Write all of it: a raw file may take a part at a time."""
-        waiting = [memoryview(part) for part in parts if part]
+        waiting = deque(memoryview(part) for part in parts if part)
         while waiting:
-            written = os.writev(self._file.fileno(), waiting)
+            written = os.writev(self._file.fileno(), list(islice(waiting, _AT_ONCE)))
             self._size += written
             while waiting and written >= len(waiting[0]):
-                written -= len(waiting.pop(0))
+                written -= len(waiting.popleft())
             if waiting:
                 waiting[0] = waiting[0][written:]
 
