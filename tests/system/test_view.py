@@ -11,6 +11,7 @@ from pliant.bus.session import free_endpoint
 from pliant.errors import ResultError
 from pliant.viewers.rerun import RerunCanvas
 from pliant.viewers.rerun_program import listens
+from pliant_services.benchmarks.viewer_cost import run_with
 
 pytestmark = pytest.mark.system
 
@@ -92,3 +93,10 @@ def test_rerun_listens_on_this_machine_alone_and_leaves_with_us() -> None:
     finally:
         canvas.close()
     assert not any(listens(port) for port in (grpc_port, web_port))
+
+
+def test_a_viewer_that_is_stopped_for_good_changes_nothing() -> None:
+    """It stops itself at its first message: whoever waited for it would wait for ever."""
+    without, stopped = (run_with(kind, "built-in:tiny") for kind in ("none", "stopped"))
+    assert stopped.was_stopped
+    assert stopped.files == without.files

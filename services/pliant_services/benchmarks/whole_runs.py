@@ -6,7 +6,8 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from statistics import median
 
@@ -30,7 +31,7 @@ def losses(source: str, runs: int) -> Iterator[str]:
     for number in range(runs):
         with tempfile.TemporaryDirectory() as folder:
             output = Path(folder)
-            _run(source, output, SERVICES)
+            run_once(source, output, SERVICES)
             books = write_results(output)["recorder"]
             files = {name: (output / name).read_bytes() for name in FILES}
         first = first or files
@@ -54,7 +55,7 @@ def recording_cost(source: str, runs: int) -> Iterator[str]:
     for _ in range(runs):
         for name, services in (("on", with_recorder), ("off", without)):
             with tempfile.TemporaryDirectory() as folder:
-                rates[name].append(_run(source, Path(folder), services))
+                rates[name].append(run_once(source, Path(folder), services))
     on, off = median(rates["on"]), median(rates["off"])
     rows = [("off", f"{off:.1f}", "1.00"), ("on", f"{on:.1f}", f"{on / off:.2f}")]
     yield markdown(("recording", "frames/s", "of that without"), rows)
@@ -81,20 +82,24 @@ def _files_of_a_run(
 ) -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder)
-        _run(source, output, services, state=output / STATE_FOLDER, kill=kill)
+        run_once(source, output, services, state=output / STATE_FOLDER, kill=kill)
         write_results(output)
         return {name: (output / name).read_bytes() for name in FILES}
 
 
-def _run(
+def run_once(
     source: str,
     output: Path,
     services: Sequence[str],
     *,
     state: Path | None = None,
     kill: tuple[float, Sequence[str]] | None = None,
+    beside: Callable[[Fleet], AbstractContextManager[object]] = nullcontext,
 ) -> float:
-    """One run; returns its frames a second.  kill: at which share of the run, and whom."""
+    """One run; returns its frames a second.
+
+    kill: at which share of the run, and whom.     beside: entered before the services start.
+    """
     warm_up.compile_kernels(print)
     request = RunRequest(source=source)
     prepare(output, config_yaml(load_config()))
@@ -108,8 +113,9 @@ def _run(
 
     fleet = Fleet(services, log_folder=output / "logs", on_status=on_status, state=state)
     try:
-        fleet.start(lambda name: service_arguments(name, request, output))
-        fleet.wait()
+        with beside(fleet):
+            fleet.start(lambda name: service_arguments(name, request, output))
+            fleet.wait()
     finally:
         fleet.close()
     return (len(times) - 1) / (times[-1] - times[0])

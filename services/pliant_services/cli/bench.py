@@ -205,6 +205,20 @@ def recording_cost(
     _print(recording_cost(source, runs))
 
 
+@app.command("viewer-cost")
+def viewer_cost(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    runs: Annotated[int, typer.Option(min=1, help="Of each kind, in turns.")] = 1,
+) -> None:
+    """Frames a second without a viewer, with one that draws, and with one that is stopped.
+
+    pliant bench viewer-cost built-in:room
+    """
+    from pliant_services.benchmarks.viewer_cost import measure
+
+    _print(measure(source, runs))
+
+
 @app.command()
 def replay(
     recording: Annotated[Path, typer.Argument(help="Result folder or recording.")],
