@@ -11,7 +11,7 @@ from pliant.algorithms.surfels import motion
 from pliant.algorithms.surfels.align import Templates
 from pliant.algorithms.surfels.birth import make_templates
 from pliant.algorithms.surfels.corners import find_corners, smaller_eigenvalues
-from pliant.algorithms.surfels.damped import factorise, inverse_diagonal, solve
+from pliant.algorithms.surfels.damped import factorise, inverse_diagonal, invert, solve
 from pliant.algorithms.surfels.sampling import (
     BIAS,
     GAIN,
@@ -294,6 +294,12 @@ def test_steps_against_numpy() -> None:
     solve(L, scale, n, g, step)
     damped = H + np.diag(np.r_[0.5 * np.diag(H)[:6], 0.0, 0.0])
     np.testing.assert_allclose(step, -np.linalg.solve(damped, g), rtol=1e-5)
+    inverse = np.zeros((n, n))
+    invert(L, scale, n, np.zeros(n), inverse)
+    scale_of_rows = np.sqrt(np.diag(damped))
+    unit = inverse * np.outer(scale_of_rows, scale_of_rows)
+    expected = np.linalg.inv(damped / np.outer(scale_of_rows, scale_of_rows))
+    np.testing.assert_allclose(unit, expected, rtol=1e-5, atol=1e-6)
     trace = inverse_diagonal(L, scale, n, 3, np.zeros(n))
     assert trace == pytest.approx(np.trace(np.linalg.inv(damped)[:3, :3]), rel=1e-5)
     assert not factorise(np.full((n, n), np.nan), n, 6, 0.5, L, scale)

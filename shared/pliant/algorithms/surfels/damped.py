@@ -64,6 +64,15 @@ def solve(L: F64, scale: F64, n: int, g: F64, step: F64) -> None:
 
 
 @leaf_kernel
+def invert(L: F64, scale: F64, n: int, scratch: F64, out: F64) -> None:
+    """out = D_s L^-T L^-1 D_s, the inverse of the factored matrix: many solves are products."""
+    for column in range(n):
+        for row in range(n):
+            scratch[row] = -1.0 if row == column else 0.0
+        solve(L, scale, n, scratch, out[column])
+
+
+@leaf_kernel
 def inverse_diagonal(L: F64, scale: F64, n: int, count: int, scratch: F64) -> float:
     """Trace of the leading ``count`` x ``count`` block of the inverse of the factored matrix."""
     trace = 0.0

@@ -13,7 +13,7 @@ from pliant.algorithms.surfels.align import (
     evaluate,
     patch_step_px,
 )
-from pliant.algorithms.surfels.damped import copy, factorise, solve
+from pliant.algorithms.surfels.damped import copy, factorise, invert, solve
 from pliant.algorithms.surfels.neighbours import Edges, own_vector
 from pliant.algorithms.surfels.sampling import GAIN, Level, X, homography
 from pliant.algorithms.surfels.sums import correlation, first_inner
@@ -172,11 +172,10 @@ def _add_edges(
 def _times(S: F64, edges: Edges, arms: F64, w: F64, bend: F64, none: F64, x: F64, y: F64) -> None:
     """y = (S + J' W J) x.  none: residuals that are all zero."""
     for s in range(len(x)):
-        for row in range(_RIGID):
-            total = 0.0
-            for column in range(_RIGID):
-                total += S[s, row, column] * x[s, column]
-            y[s, row] = total
+        x0, x1, x2, x3, x4, x5 = x[s, 0], x[s, 1], x[s, 2], x[s, 3], x[s, 4], x[s, 5]
+        for k in range(_RIGID):
+            m = S[s, k]
+            y[s, k] = m[0] * x0 + m[1] * x1 + m[2] * x2 + m[3] * x3 + m[4] * x4 + m[5] * x5
     _add_edges(edges, arms, w, bend, none, x, 1.0, y)
 
 
@@ -199,25 +198,59 @@ def _add_block(v: F64, w: float, bend: float, side: float, block: F64) -> None:
 
 
 @leaf_kernel
-def _factors(edges: Edges, arms: F64, w: F64, bend: F64, blocks: F64, L: F64, scale: F64) -> None:
-    """Factors of each surfel's own block with its pairs.  blocks: (N, 6, 6) S, overwritten."""
+def _inverses(
+    edges: Edges, arms: F64, w: F64, bend: F64, blocks: F64, L: F64, scale: F64, out: F64
+) -> None:
+    """Inverse of each surfel's own block with its pairs.  blocks: (N, 6, 6) S, overwritten.
+
+    L: (6, 6), scale: (2, 6), scratch.  out: (N, 6, 6).
+    """
     for e in range(len(edges.ends)):
         i, j = edges.ends[e, 0], edges.ends[e, 1]
         _add_block(arms[e, 0], w[e], bend[e], -1.0, blocks[i])
         _add_block(arms[e, 1], w[e], bend[e], 1.0, blocks[j])
     for s in range(len(blocks)):
-        factorise(blocks[s], _RIGID, 0, 0.0, L[s], scale[s])
+        if factorise(blocks[s], _RIGID, 0, 0.0, L, scale[0]):
+            invert(L, scale[0], _RIGID, scale[1], out[s])
 
 
 @leaf_kernel
-def _precondition(L: F64, scale: F64, q: F64, z: F64) -> float:
+def _precondition(inverses: F64, q: F64, z: F64) -> float:
     """z = -M^-1 q; returns -q . z."""
     total = 0.0
     for s in range(len(q)):
-        solve(L[s], scale[s], _RIGID, q[s], z[s])
+        q0, q1, q2, q3, q4, q5 = q[s, 0], q[s, 1], q[s, 2], q[s, 3], q[s, 4], q[s, 5]
         for k in range(_RIGID):
-            total -= q[s, k] * z[s, k]
+            m = inverses[s, k]
+            value = m[0] * q0 + m[1] * q1 + m[2] * q2 + m[3] * q3 + m[4] * q4 + m[5] * q5
+            z[s, k] = -value
+            total += q[s, k] * value
     return float(np.float64(total))
+
+
+@leaf_kernel
+def _dot(a: F64, b: F64) -> float:
+    total = 0.0
+    for s in range(len(a)):
+        for k in range(_RIGID):
+            total += a[s, k] * b[s, k]
+    return float(np.float64(total))
+
+
+@leaf_kernel
+def _add(factor: float, a: F64, out: F64) -> None:
+    """out += factor a, without an array in between."""
+    for s in range(len(a)):
+        for k in range(_RIGID):
+            out[s, k] += factor * a[s, k]
+
+
+@leaf_kernel
+def _scale_and_add(factor: float, a: F64, out: F64) -> None:
+    """out = factor out + a."""
+    for s in range(len(a)):
+        for k in range(_RIGID):
+            out[s, k] = factor * out[s, k] + a[s, k]
 
 
 @fast_kernel
@@ -232,30 +265,32 @@ def solve_together(
     steps.  Returns iterations.
     """
     n = len(S)
-    L, scale = np.zeros((n, _RIGID, _RIGID)), np.zeros((n, _RIGID))
+    inverses = np.zeros((n, _RIGID, _RIGID))
     z, p, y = np.zeros((n, _RIGID)), np.zeros((n, _RIGID)), np.zeros((n, _RIGID))
     none = np.zeros_like(residuals)
-    _factors(edges, arms, w, bend, S.copy(), L, scale)
+    _inverses(
+        edges, arms, w, bend, S.copy(), np.zeros((_RIGID, _RIGID)), np.zeros((2, _RIGID)), inverses
+    )
     x[:] = 0.0
     # q is the gradient at x, and z the preconditioned descent.
     q = b.copy()
     _add_edges(edges, arms, w, bend, residuals, x, 1.0, q)
-    rho = _precondition(L, scale, q, z)
+    rho = _precondition(inverses, q, z)
     first = rho
     p[:] = z
     for iteration in range(iterations):
         if not rho > tolerance * first:
             return iteration
         _times(S, edges, arms, w, bend, none, p, y)
-        energy = (p * y).sum()
+        energy = _dot(p, y)
         if not energy > 0.0:
             return iteration
         alpha = rho / energy
-        x += alpha * p
-        q += alpha * y
+        _add(alpha, p, x)
+        _add(alpha, y, q)
         before = rho
-        rho = _precondition(L, scale, q, z)
-        p[:] = z + (rho / before) * p
+        rho = _precondition(inverses, q, z)
+        _scale_and_add(rho / before, z, p)
     return iterations
 
 
