@@ -119,7 +119,10 @@ def _rows(table: str, sources: list[str], tracks: str | None) -> list[_Row]:
     if table == "targets":
         return _each([*still, *([] if sources else moving)], {"default": {}})
     if table == "models":
-        return _each([*still, *one_moving], {model: {"model": model} for model in _MODELS})
+        kinds: dict[str, dict[str, Any]] = {model: {"model": model} for model in _MODELS}
+        # Without the pull towards the isometry, which keeps soft models from saying anything.
+        kinds |= {f"{model}, free": {"model": model, "omega_i": 0.0} for model in _MODELS[1:]}
+        return _each([*still, *one_moving], kinds)
     if table == "sizes":
         return _each(few, {f"{side} px": {"patch_px": side} for side in _SIDES})
     if table == "scales":
