@@ -49,14 +49,24 @@ def docker(*arguments: object, stdin: bytes | None = None) -> str:
     return done.stdout.strip()
 
 
+COMPOSES: dict[str, list[str]] = {"1.29": ["docker-compose"], "v2": ["docker", "compose"]}
+"""Docker's compose in its two forms."""
+
+
+def compose_command(form: str) -> list[str]:
+    """The command of a form; skips where it is not installed."""
+    command = COMPOSES[form]
+    installed = shutil.which(command[0]) and call(*command, "version").returncode == 0
+    return command if installed else pytest.skip(f"{' '.join(command)} is not installed")
+
+
 def compose_commands() -> list[list[str]]:
-    """Those that are installed: docker-compose 1.29, and version 2."""
-    found: list[list[str]] = []
-    if shutil.which("docker-compose"):
-        found.append(["docker-compose"])
-    if shutil.which("docker") and call("docker", "compose", "version").returncode == 0:
-        found.append(["docker", "compose"])
-    return found
+    """Those that are installed."""
+    return [
+        command
+        for command in COMPOSES.values()
+        if shutil.which(command[0]) and call(*command, "version").returncode == 0
+    ]
 
 
 def skip_without_engine() -> None:
@@ -84,7 +94,7 @@ def build_image() -> None:
     assert built.returncode == 0, built.stdout + built.stderr
 
 
-def fill_cache(volume: str) -> None:
+def fill_cache(volume: str, source: str) -> None:
     """Put this machine's kernels into a new volume, as Numba looks for them in a container, and
     the rendered source."""
     import pliant
@@ -96,7 +106,7 @@ def fill_cache(volume: str) -> None:
             folder = str(_PACKAGE / file.parents[1].relative_to(here))
             name = f"{Path(folder).name}_{hashlib.sha1(folder.encode()).hexdigest()}"
             archive.add(file, f"kernels/{name}/{file.name}")
-        sequence = builtin_folder(SOURCE)
+        sequence = builtin_folder(source)
         archive.add(sequence, f"sequences/{sequence.name}")
     script = f"tar -C {_CACHE} -xo && chmod -R a+rwX {_CACHE}"
     docker(
@@ -108,21 +118,27 @@ def fill_cache(volume: str) -> None:
 
 @dataclass
 class Session:
-    """A compose project.  files: its compose files.     port: of its router on this machine."""
+    """A compose project.  files: its compose files.     port: of its router on this machine.
+    command: the form of compose that is used; the first one of those that are there, if none.
+    """
 
     name: str
     results: Path
     files: list[Path]
     settings: dict[str, str] = field(default_factory=dict[str, str])
     port: int = field(default_factory=lambda: int(free_endpoint().rsplit(":", 1)[1]))
+    command: list[str] = field(default_factory=lambda: compose_commands()[0])
 
     def compose(self, *arguments: object) -> str:
         """Output of a command of compose that must not fail."""
-        files = [part for file in self.files for part in ("--file", str(file))]
-        command = [*compose_commands()[0], *files, "--project-name", self.name]
-        done = call(*command, *arguments, env=self.environment)
+        done = self.try_compose(*arguments)
         assert done.returncode == 0, done.stdout + done.stderr + self.logs()
         return done.stdout
+
+    def try_compose(self, *arguments: object) -> subprocess.CompletedProcess[str]:
+        files = [part for file in self.files for part in ("--file", str(file))]
+        command = [*self.command, *files, "--project-name", self.name]
+        return call(*command, *arguments, env=self.environment)
 
     @property
     def environment(self) -> dict[str, str]:
@@ -167,24 +183,26 @@ class Session:
 
 @contextmanager
 def session(
-    name: str, results: Path, *files: Path, cache: str = "", **settings: str
+    name: str, results: Path, *files: Path, form: str = "", **settings: str
 ) -> Iterator[Session]:
     """A compose project whose containers, networks and volumes are gone afterwards."""
+    command = compose_command(form) if form else compose_commands()[0]
     results.mkdir(parents=True, exist_ok=True)
     results.chmod(0o777)
-    project = Session(name, results, list(files), settings)
+    project = Session(name, results, list(files), settings, command=command)
+    volume = f"{name}_cache"
+    # Version 2 takes a volume for its own by its labels; another one it uses with a warning.
+    labels = {"project": name, "volume": "cache"}
     try:
-        docker("volume", "create", f"{name}_{cache or 'cache'}")
-        fill_cache(f"{name}_{cache or 'cache'}")
+        docker(
+            *("volume", "create", volume),
+            *(f"--label=com.docker.compose.{key}={value}" for key, value in labels.items()),
+        )
+        fill_cache(volume, project.environment["PLIANT_SOURCE"])
         yield project
     finally:
-        files_of = [part for file in files for part in ("--file", str(file))]
-        call(
-            *compose_commands()[0], *files_of, "--project-name", name,
-            "down", "--volumes", "--remove-orphans", "--timeout", "0",
-            env=project.environment,
-        )  # fmt: skip
-        call("docker", "volume", "rm", "--force", f"{name}_{cache or 'cache'}")
+        project.try_compose("down", "--volumes", "--remove-orphans", "--timeout", "0")
+        call("docker", "volume", "rm", "--force", volume)
 
 
 @contextmanager
