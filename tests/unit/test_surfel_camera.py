@@ -7,7 +7,7 @@ from surfel_scene import motion as rigid_motion
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse, so3_log
+from pliant.algorithms.geometry import hat, inverse, so3_log
 from pliant.algorithms.surfels import (
     SurfelParameters,
     SurfelState,
@@ -18,7 +18,12 @@ from pliant.algorithms.surfels import (
 from pliant.algorithms.surfels.align import make_workspace
 from pliant.algorithms.surfels.birth import make_templates
 from pliant.algorithms.surfels.joint import Equilibrium, register, se3_exp
-from pliant.algorithms.surfels.joint_kernels import evaluate_all, joint_system, rigid_system
+from pliant.algorithms.surfels.joint_kernels import (
+    evaluate_all,
+    joint_system,
+    register_system,
+    rigid_system,
+)
 from pliant.algorithms.surfels.rest import add_rest, rest_cost
 from pliant.algorithms.surfels.sampling import X
 from pliant.algorithms.surfels.table import move_poses
@@ -212,6 +217,28 @@ def test_rest_by_finite_differences() -> None:
     np.testing.assert_array_equal(H[:3, :3], W)
     assert not g[3:].any()
     assert not H[3:].any()
+
+
+def test_equilibrium_in_the_axes_of_a_camera() -> None:
+    """And the camera's system from it, against numpy."""
+    poses, rng = slanted_surfels(9, 2), np.random.default_rng(5)
+    T = se3_exp(np.array([0.2, -0.1, 0.3, 0.4, 0.2, -0.3]))
+    roots, X0 = rng.standard_normal((9, 3, 3)), rng.standard_normal((9, 3))
+    W0 = roots @ roots.transpose(0, 2, 1)
+    points, weights = Equilibrium(X0, W0).seen_from(T)
+    np.testing.assert_allclose(points, X0 @ T[:3, :3].T + T[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(weights, T[:3, :3] @ W0 @ T[:3, :3].T, atol=1e-12)
+    active = np.array([1, 1, 0, 1, 1, 1, 1, 0, 1], np.uint8)
+    M, v = np.ones((6, 6)), np.ones(6)
+    register_system(poses, active, points, weights, M, v)
+    expected_M, expected_v = np.zeros((6, 6)), np.zeros(6)
+    for s in np.flatnonzero(active):
+        x = poses[s, X : X + 3]
+        G = np.hstack([np.eye(3), -hat(x)])
+        expected_M += G.T @ weights[s] @ G
+        expected_v += G.T @ weights[s] @ (x - points[s])
+    np.testing.assert_allclose(M, expected_M, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(v, expected_v, rtol=1e-9, atol=1e-9)
 
 
 def test_camera_that_fits_the_surfels() -> None:

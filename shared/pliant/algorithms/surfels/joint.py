@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8, BoolArray
-from pliant.algorithms.geometry import hat, so3_exp, transform
+from pliant.algorithms.geometry import hat, so3_exp
 from pliant.algorithms.surfels import joint_kernels as kernels
 from pliant.algorithms.surfels.align import Limits, Templates, Workspace
 from pliant.algorithms.surfels.motion import MOST_PARAMETERS
-from pliant.algorithms.surfels.rest import Rest
+from pliant.algorithms.surfels.rest import Rest, no_rest, turn_rest
 from pliant.algorithms.surfels.sampling import BIAS, GAIN, Level, X
 from pliant.algorithms.surfels.sums import FEATURES
 from pliant.algorithms.surfels.table import move_poses
@@ -30,9 +30,9 @@ class Equilibrium:
 
     def seen_from(self, T_camera_world: F64) -> Rest:
         """Positions and weights in the axes of a camera."""
-        R = T_camera_world[:3, :3]
-        turned = np.ascontiguousarray(R @ self.weights @ R.T)
-        return Rest(np.ascontiguousarray(transform(T_camera_world, self.positions)), turned)
+        seen = no_rest(len(self.positions))
+        turn_rest(T_camera_world, self.positions, self.weights, seen.points, seen.weights)
+        return seen
 
 
 def se3_exp(zeta: F64) -> F64:
@@ -110,19 +110,10 @@ def register(poses: F64, active: U8, T_camera_world: F64, equilibrium: Equilibri
     poses: (N, POSE_FLOATS) in the camera's frame: the images have found them, and they stay.
     Returns T_camera_world.
     """
-    rows: BoolArray = active > 0
+    M, v = np.zeros((6, 6)), np.zeros(6)
     for _ in range(_REGISTER_STEPS):
         points, weights = equilibrium.seen_from(T_camera_world)
-        W, G = weights[rows], np.zeros((int(rows.sum()), 3, 6))
-        G[:, :, :3] = np.eye(3)
-        # W turns with the camera, too: so a step is about where the surfel is, not where it rests.
-        x, y, z = poses[rows, X : X + 3].T
-        G[:, 0, 4], G[:, 0, 5] = z, -y
-        G[:, 1, 3], G[:, 1, 5] = -z, x
-        G[:, 2, 3], G[:, 2, 4] = y, -x
-        WG, e = W @ G, poses[rows, X : X + 3] - points[rows]
-        rows_of_all = WG.reshape(-1, 6)
-        M, v = G.reshape(-1, 6).T @ rows_of_all, e.ravel() @ rows_of_all
+        kernels.register_system(poses, active, points, weights, M, v)
         T_camera_world = se3_exp(_solve(M, v, 0.0)) @ T_camera_world
     return T_camera_world
 

@@ -193,6 +193,31 @@ def _equilibrium_rows(x: F64, G: F64) -> None:
     G[2, 3], G[2, 4] = x[1], -x[0]
 
 
+@fast_kernel
+def register_system(poses: F64, active: U8, equilibrium: F64, weights: F64, M: F64, v: F64) -> None:
+    """Add up M zeta = v of a camera that fits surfels which stay where they are.
+
+    equilibrium: (N, 3), weights: (N, 3, 3) of a ``Rest``.  M: (6, 6), v: (6,), overwritten.
+    """
+    G, WG, e = np.zeros((3, 6)), np.zeros((3, 6)), np.zeros(3)
+    M[:] = 0.0
+    v[:] = 0.0
+    for s in range(len(poses)):
+        if not active[s]:
+            continue
+        W = weights[s]
+        # W turns with the camera, too: so a step is about where the surfel is, not where it rests.
+        _equilibrium_rows(poses[s, X : X + 3], G)
+        for r in range(3):
+            e[r] = poses[s, X + r] - equilibrium[s, r]
+            for c in range(6):
+                WG[r, c] = W[r, 0] * G[0, c] + W[r, 1] * G[1, c] + W[r, 2] * G[2, c]
+        for r in range(6):
+            v[r] += e[0] * WG[0, r] + e[1] * WG[1, r] + e[2] * WG[2, r]
+            for c in range(6):
+                M[r, c] += G[0, r] * WG[0, c] + G[1, r] * WG[1, c] + G[2, r] * WG[2, c]
+
+
 @leaf_kernel
 def step_all(
     poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,

@@ -27,6 +27,24 @@ def no_rest(count: int) -> Rest:
 
 
 @leaf_kernel
+def turn_rest(T: F64, points: F64, weights: F64, seen: F64, turned: F64) -> None:
+    """Positions and weights in the axes of a camera.
+
+    T: (4, 4) T_camera_world.  points: (N, 3), weights: (N, 3, 3), world.  seen: (N, 3), turned:
+    (N, 3, 3), filled.
+    """
+    for s in range(len(points)):
+        p, W, out = points[s], weights[s], turned[s]
+        for r in range(3):
+            seen[s, r] = T[r, 0] * p[0] + T[r, 1] * p[1] + T[r, 2] * p[2] + T[r, 3]
+            a = T[r, 0] * W[0, 0] + T[r, 1] * W[1, 0] + T[r, 2] * W[2, 0]
+            b = T[r, 0] * W[0, 1] + T[r, 1] * W[1, 1] + T[r, 2] * W[2, 1]
+            c = T[r, 0] * W[0, 2] + T[r, 1] * W[1, 2] + T[r, 2] * W[2, 2]
+            for k in range(3):
+                out[r, k] = a * T[k, 0] + b * T[k, 1] + c * T[k, 2]
+
+
+@leaf_kernel
 def rest_cost(pose: F64, point: F64, W: F64) -> float:
     """omega_E times Eq. 20, DN^2.  point: (3,).  W: (3, 3)."""
     total = 0.0
