@@ -238,11 +238,14 @@ def _broken(report: dict[str, Any]) -> list[str]:
     return [why for why in report["frames_without_pixels"].values() if why != DROPPED]
 
 
-def summary(report: dict[str, Any]) -> list[str]:
-    """The report in a few lines."""
+def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
+    """The report in a few lines.  has_map: False where nobody was to make one, as in a replay."""
     if report.get("profile") == _DEFORMABLE:
         return [*surfel_summary(report), *_faults(report)]
     frames = report["frames"]
+    if not has_map:
+        median = f"median per frame: {report['median_tracks_per_frame']:.0f} tracks"
+        return [f"{frames} frames, no map: bundle_adjustment was not replayed", median]
     lines = [
         f"{frames} frames at {report['frames_per_second']:.1f} frames/s, "
         f"{report['frames_with_pose']} with a pose ({100.0 * report['success_rate']:.1f} %), "

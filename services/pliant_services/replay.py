@@ -96,7 +96,8 @@ class Replay:
         self._config = config
         made = [topic for process in services for topic in process.outputs]
         self.made: tuple[Topic, ...] = tuple(made)
-        self._affected = affected(services)
+        self.affected = affected(services)
+        """Keys of the topics that are not taken over: they would be out of date."""
 
     def run(self, output: Path, metadata: Mapping[str, Mapping[str, str]]) -> None:
         """Write the new recording: what came before the services as it was, and what they make.
@@ -158,11 +159,11 @@ class Replay:
                 end = message.decode()
                 assert isinstance(end, StreamEnd)
                 key = end.topic
-            if key not in self._affected:
+            if key not in self.affected:
                 _write(writer, message)
 
     def _untouched(self) -> list[Topic]:
-        found = (by_key(key) for key in self._summary.topics if key not in self._affected)
+        found = (by_key(key) for key in self._summary.topics if key not in self.affected)
         return [topics.STREAM_END, *(topic for topic in found if topic is not None)]
 
 

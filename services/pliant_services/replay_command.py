@@ -80,7 +80,8 @@ def run_replay(request: ReplayRequest) -> int:
     else:
         replay.run(made, metadata)
     report = write_outputs(output)
-    for line in summary(report):
+    has_map = topics.MAP_UPDATE in replay.made or topics.MAP_UPDATE.key not in replay.affected
+    for line in summary(report, has_map=has_map):
         print(line)
     print(f"results in {output}/")
     if not request.check:

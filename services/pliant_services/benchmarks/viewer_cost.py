@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,7 +56,7 @@ def _viewer(
     kind: str, output: Path, stopped: list[bool]
 ) -> Callable[[Fleet], AbstractContextManager[None]]:
     @contextmanager
-    def beside(fleet: Fleet) -> Iterator[None]:
+    def beside(fleet: Fleet) -> Generator[None]:
         if kind == "none":
             yield
             return
