@@ -20,6 +20,7 @@ from pliant.algorithms.mapping.neighbours import (
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.patches import cut_patches, sample_colours
 from pliant.algorithms.mapping.reacquisition import Reacquired
+from pliant.algorithms.mapping.retirement import collect_garbage, most_redundant, seen_by_none
 from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.tables import (
@@ -61,7 +62,8 @@ class ActiveMap:
 
     points: rows shared by all segments.    keyframes: of this segment, oldest first.
     window: those under adjustment.    links: rows of the living tracks.
-    removed_ids: points removed since the last call of ``take_removed``.
+    retired: keyframes that left for good.   removed_ids: points removed since the last call of
+    ``take_removed``.
     """
 
     def __init__(
@@ -77,6 +79,7 @@ class ActiveMap:
         self.camera = camera
         self.parameters = parameters
         self.keyframes: list[Keyframe] = []
+        self.retired = 0
         self.links = TrackLinks()
         self.window = self._window([], fixed=0, outside=0)
         self._next_keyframe_id = first_keyframe_id
@@ -327,24 +330,7 @@ class ActiveMap:
 
     def collect_garbage(self) -> None:
         """Give back the rows of dead candidates and of merged points."""
-        points = self.points
-        used = points.state[: points.count]
-        dead = (used == CANDIDATE) & (points.segment[: points.count] == self.segment)
-        dead[self.links.rows[self.links.rows != UNLINKED]] = False
-        merged = used == MERGED
-        gone = np.flatnonzero(dead | merged).astype(np.int32)
-        # A point may have been merged into one that was merged in its turn.
-        while (points.alias[points.alias[gone]] != points.alias[gone]).any():
-            points.alias[gone] = points.alias[points.alias[gone]]
-        first = points.first_keyframe[: points.count]
-        first_dead = int(first[dead].min()) if dead.any() else self._next_keyframe_id
-        first_merged = int(first[merged].min()) if merged.any() else self._next_keyframe_id
-        for keyframe in self.keyframes:
-            if keyframe.id >= first_merged:
-                keyframe.follow_aliases(points)
-            if keyframe.id >= first_dead:
-                keyframe.keep(~dead[keyframe.rows])
-        points.free(gone)
+        collect_garbage(self.points, self.keyframes, self.links.rows, self.segment)
 
     def rebuild_window(self) -> None:
         """The newest keyframes move; older ones that see the same points are fixed."""
@@ -353,6 +339,10 @@ class ActiveMap:
         outside = self.keyframes[: -sizes.keyframes]
         for keyframe in outside[-1:]:
             self._leave_window(keyframe)
+        if len(self.keyframes) > max(sizes.kept_keyframes, sizes.final_max_keyframes):
+            # Not the one that has just left: it is not told yet.
+            self._retire(self.keyframes.pop(most_redundant(outside[:-1])))
+            outside = self.keyframes[: -sizes.keyframes]
         older = near_keyframes(outside, moving[-1], _NEAR_KEYFRAMES)
         if older:
             fixed = most_shared(older, moving, self.points)[: sizes.fixed]
@@ -379,6 +369,12 @@ class ActiveMap:
         self.remove_outliers()
         self.window.update_statistics(self.camera)
         return correction
+
+    def _retire(self, keyframe: Keyframe) -> None:
+        """The map forgets a keyframe, and the points that only this one saw."""
+        self.retired += 1
+        rows = seen_by_none(keyframe.rows, self.keyframes, self.links.rows, self.points)
+        self.points.retire(rows)
 
     def _leave_window(self, keyframe: Keyframe) -> None:
         self.points.base_keyframes[keyframe.rows] += 1

@@ -48,6 +48,8 @@ class PointRows:
         self.strikes: U8 = np.zeros(1024, np.uint8)
         self.misses: U8 = np.zeros(1024, np.uint8)
         self.patches: U8 = np.zeros((1024, PATCH, PATCH), np.uint8)
+        self.retired = 0
+        """Points of the map that were told and are not held any more."""
         self._free: I32 = np.zeros(0, np.int32)
         self._next_id = 0
 
@@ -76,6 +78,17 @@ class PointRows:
         """Give back rows that nothing refers to any more."""
         self.state[rows] = FREE
         self._free = np.concatenate([self._free, rows])
+
+    def retire(self, rows: I32) -> None:
+        """Give back the rows of points that stay as they were told last."""
+        self.retired += len(rows)
+        self.free(rows)
+
+    def retire_all(self) -> None:
+        """Give back every row: no segment goes on."""
+        used = self.state[: self.count]
+        self.retired += int(np.count_nonzero(used == MAPPED))
+        self.free(np.flatnonzero(used != FREE).astype(np.int32))
 
     def promote(self, rows: I32) -> None:
         """Make candidates points of the map: they get their ids, in the order given."""

@@ -109,7 +109,7 @@ class Mapper:
     @property
     def point_count(self) -> int:
         """Points of the map now, of all segments."""
-        return int(np.count_nonzero(self._points.state == MAPPED))
+        return self._points.retired + int(np.count_nonzero(self._points.state == MAPPED))
 
     def finish(self) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
@@ -127,7 +127,8 @@ class Mapper:
 
     def _finishes(self, active: ActiveMap) -> bool:
         limits = self._parameters.window
-        return limits.final_adjustment and len(active.keyframes) <= limits.final_max_keyframes
+        few = len(active.keyframes) + active.retired <= limits.final_max_keyframes
+        return limits.final_adjustment and few
 
     def _add_pose(
         self, active: ActiveMap, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int
@@ -162,6 +163,7 @@ class Mapper:
 
     def _begin(self, start: Start, tracks: FrameTracks, grey: U8 | None, colour: U8 | None) -> int:
         """Let the map start, and give poses to the frames that waited, backwards."""
+        self._points.retire_all()  # of earlier segments, which have been told
         self._map = ActiveMap(
             self._segments, self._points, self._keyframes, self._camera, self._parameters
         )

@@ -145,6 +145,12 @@ class WindowParameters(Parameters):
     final_max_keyframes: int = Field(
         default=200, ge=3, description="Keyframes above which the final adjustment is left out"
     )
+    kept_keyframes: int = Field(
+        default=200,
+        ge=30,
+        description="Keyframes to come back to: beyond (and beyond final_max_keyframes) those most "
+        "like another leave the active map, which bounds its memory; they stay in the results",
+    )
 
 
 class PointParameters(Parameters):
