@@ -23,7 +23,6 @@ CUTS_S = (5.0, 30.0, 60.0)
 STOP_S = 60.0
 FAULT_FRAME = 10
 HOSTILE = 100_000  # on each key
-SLOWED_MS = 60_000  # of every tenth message: a run of minutes, in which they all come
 IMAGES = 1000
 Row = tuple[str, bool, str]
 
@@ -86,7 +85,7 @@ def hostile_rows(undisturbed: dict[str, str]) -> Iterator[Row]:
         run(first)
         ended, found = "", dict[str, str]()
         try:
-            found = run_attacked(second, first / "recording.mcap", HOSTILE, slowed_ms=SLOWED_MS)
+            found = run_attacked(second, first / "recording.mcap", HOSTILE)
         except ServiceDiedError as error:
             ended = f"; the run ended: {error}"
         logs = sorted((second / "logs").glob("*.log"))

@@ -29,7 +29,7 @@ from pliant_services.results import RECORDING_NAME
 
 SESSION_NAME = "session.json"
 """In the result folder while a run goes on: how to reach it."""
-_ENVELOPE_BYTES = 9
+_ENVELOPE_BYTES = 17
 _WAITING = 512  # messages between the network and the drawing; the oldest give way
 _WAITING_BYTES = 256 << 20
 _ASK_S = 0.5

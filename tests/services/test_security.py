@@ -115,7 +115,7 @@ def test_a_viewer_sees_a_session_through_the_router_and_a_late_one_its_camera(fo
     ):
         token = ingest.liveliness().declare_token("pliant/s/ready/ingest/1/2/0.1.0")
         for payload in (b"no camera", camera):
-            ingest.put("pliant/s/camera/stream", payload, attachment=bytes(9))
+            ingest.put("pliant/s/camera/stream", payload, attachment=bytes(17))
         held = [
             viewer.declare_subscriber("pliant/s/view/**", on_sample),
             viewer.liveliness().declare_token("pliant/s/viewer/1"),

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from pliant.bus.health import health_key
+from pliant.bus.links import ENVELOPE
 from pliant.bus.session import open_session
-from pliant.messages.topics import TOPICS, status
+from pliant.messages.topics import TOPICS, by_key, status
 from pliant.recording.reader import Recording
 from pliant_services.processes import inputs_of, readers_of
 
@@ -37,10 +38,14 @@ def samples(recording: Path) -> dict[str, bytes]:
 
 
 def messages(
-    key: str, true: Mapping[str, bytes], random: np.random.Generator
+    key: str, true: Mapping[str, bytes], random: np.random.Generator, announced: int
 ) -> Iterator[tuple[bytes, bytes | None]]:
-    """Payloads and envelopes without end."""
-    wrong = [data for topic, data in true.items() if topic != key]
+    """Payloads and envelopes without end.  announced: which start of its sender the others know."""
+    topic, every = by_key(key), {other: by_key(other) for other in true}
+    message = topic.message if topic is not None else None
+    # What fits a topic, and has the next number and a sender that is known, is believed.
+    wrong = [true[k] for k, other in every.items() if other and other.message is not message]
+    fitting = [true[k] for k, other in every.items() if other and other.message is message]
     old = b"\x81\xa5frame\x00"  # of before most fields
     future = b"\x82\xa5frame\x00\xa7version\xcd\xff\xff"
     huge = b"\xff" * 8
@@ -51,18 +56,21 @@ def messages(
     while True:
         sequence = int(random.integers(0, 60))
         for kind in (0, 1, int(random.integers(2, 256))):
-            envelope = struct.pack("<QB", sequence, kind)
+            envelope = ENVELOPE.pack(sequence, announced, kind)
+            stranger = ENVELOPE.pack(sequence, int(random.integers(2**63)), kind)
             yield random.bytes(int(random.integers(0, 300))), envelope
             yield wrong[int(random.integers(len(wrong)))], envelope
             yield old, envelope
             yield future, envelope
+            for data in fitting:
+                yield data, stranger
             yield claims[int(random.integers(len(claims)))], envelope
             if key in true:
                 whole = true[key]
                 yield whole[: int(random.integers(1, len(whole)))], envelope
         if key in true:
             for far in (1 << 20, 2**64 - 1):  # skipped
-                yield true[key], struct.pack("<QB", far, 0)
+                yield true[key], ENVELOPE.pack(far, announced, 0)
         yield random.bytes(25), None  # as long as a credit
         yield struct.pack("<QQQB", 2**63, 0, 0, 2), None  # of a start that was not announced
         yield b"", random.bytes(int(random.integers(0, 20)))
@@ -74,9 +82,16 @@ def attack(
     """Send so many to every key; returns how many that were."""
     random = np.random.default_rng(0)
     keys = keys_of(fleet)
-    endless = {key: messages(key, true, random) for key in keys}
+    senders = {t.key: name for name in fleet for t in readers_of(name, fleet)}
     taken = threading.Event()
     with open_session([endpoint]) as connection:
+        tokens = connection.liveliness().get(f"pliant/{session}/ready/**")
+        told = (str(reply.ok.key_expr).split("/") for reply in tokens if reply.ok is not None)
+        starts = {parts[3]: int(parts[4]) for parts in told}
+        assert starts.keys() >= set(fleet)
+        endless = {
+            key: messages(key, true, random, starts.get(senders.get(key, ""), 0)) for key in keys
+        }
         mark = f"pliant/{session}/hostile"
         held = connection.declare_subscriber(mark, lambda _: taken.set())
         for done in range(0, each, _BURST):

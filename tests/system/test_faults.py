@@ -27,6 +27,7 @@ from pliant_services.results import write_results
 pytestmark = pytest.mark.system
 
 SERVICES = PROFILES["points"]
+_HELD_S, _LET_GO_S = 10.0, 0.01
 REQUEST = RunRequest(source=TINY)
 
 
@@ -35,12 +36,8 @@ def run(
     victims: Callable[[Status, Fleet], Sequence[str]] = lambda status, fleet: (),
     *,
     resume: bool = False,
-    slowed_ms: int = 0,
 ) -> dict[str, str]:
-    """One run in which the victims of each status are killed; returns the result files.
-
-    slowed_ms: of every tenth message of the tracker, the longest delay.
-    """
+    """One run in which the victims of each status are killed; returns the result files."""
     config = load_config(overrides=["bus.checkpoint_frames=6"])
     if not resume:
         prepare(output, config_yaml(config))
@@ -58,8 +55,7 @@ def run(
         state=output / STATE_FOLDER,
     )
     try:
-        slowed = {"tracking": ["--delays-ms", str(slowed_ms)]} if slowed_ms else {}
-        fleet.start(lambda name: [*service_arguments(name, REQUEST, output), *slowed.get(name, [])])
+        fleet.start(lambda name: service_arguments(name, REQUEST, output))
         fleet.wait()
     finally:
         fleet.close()
@@ -136,10 +132,10 @@ def test_messages_that_no_service_sends_are_counted_told_and_change_nothing(
     assert "credit of camera/image" in (tmp_path / "logs" / "ingest.log").read_text()
 
 
-def run_attacked(output: Path, recording: Path, each: int, *, slowed_ms: int = 0) -> dict[str, str]:
+def run_attacked(output: Path, recording: Path, each: int) -> dict[str, str]:
     """A run that meets so many hostile messages on every key; returns the result files.
 
-    slowed_ms: slow the run down instead of stopping its source: nobody can be stopped for long.
+    Its source is held up meanwhile, not for so long at a time that it would be taken for dead.
     """
     attackers: list[threading.Thread] = []
     failures: list[Exception] = []
@@ -149,21 +145,24 @@ def run_attacked(output: Path, recording: Path, each: int, *, slowed_ms: int = 0
             source = fleet.pids["ingest"]
 
             def work() -> None:
-                if not slowed_ms:
-                    os.kill(source, signal.SIGSTOP)
                 try:
                     attack(fleet.endpoint, fleet.session, SERVICES, samples(recording), each)
                 except Exception as error:
                     failures.append(error)
-                finally:
-                    if not slowed_ms:
-                        os.kill(source, signal.SIGCONT)
+
+            def hold() -> None:
+                while attackers[0].is_alive():
+                    os.kill(source, signal.SIGSTOP)
+                    attackers[0].join(_HELD_S)
+                    os.kill(source, signal.SIGCONT)
+                    attackers[0].join(_LET_GO_S)
 
             attackers.append(threading.Thread(target=work))
             attackers[0].start()  # no Zenoh call in a callback
+            threading.Thread(target=hold).start()
         return ()
 
-    found = run(output, hold_and_attack, slowed_ms=slowed_ms)
+    found = run(output, hold_and_attack)
     assert attackers
     attackers[0].join()
     assert not failures, failures

@@ -10,6 +10,7 @@ import pytest
 
 from pliant.bus.base import Window
 from pliant.bus.checkpoints import Checkpoints
+from pliant.bus.links import ENVELOPE
 from pliant.bus.session import free_endpoint, open_router
 from pliant.bus.zenoh_bus import ZenohBus
 from pliant.errors import BusError, MessageError
@@ -238,7 +239,7 @@ def test_a_sender_that_ignores_credit_fills_no_memory(endpoint: str) -> None:
         rude = bus._session.declare_publisher(f"pliant/test/{topics.IMAGE.key}")
         box = bus._inputs[topics.IMAGE.key].box
         for sequence in range(10 * WINDOW):
-            rude.put(b"no message", attachment=sequence.to_bytes(8, "little") + b"\x00")
+            rude.put(b"no message", attachment=sequence.to_bytes(8, "little") + bytes(9))
         with bus._changed:
             assert bus._changed.wait_for(lambda: len(box.waiting) == box.limit, PATIENCE_S)
         assert box.limit == 2 * WINDOW
@@ -268,11 +269,11 @@ def test_what_is_no_message_is_counted_told_and_asked_for_again(endpoint: str) -
             StreamEnd(frame=0, stamp_ns=0, frame_id="", topic="x", messages=0, complete=True)
         )
         for payload, envelope in (
-            (end, bytes(8) + b"\x01"),
-            (b"no image", bytes(9)),
-            (codec.encode(image(0)), bytes(8) + b"\x07"),
+            (end, bytes(16) + b"\x01"),
+            (b"no image", bytes(17)),
+            (codec.encode(image(0)), bytes(16) + b"\x07"),
             (codec.encode(image(0)), b"short"),
-            (codec.encode(image(9)), (9).to_bytes(8, "little") + b"\x00"),
+            (codec.encode(image(9)), (9).to_bytes(8, "little") + bytes(9)),
         ):
             rude.put(payload, attachment=envelope)
         with bus._changed:
@@ -347,3 +348,26 @@ def test_a_reader_stays_until_its_sender_has_its_last_credits(endpoint: str) -> 
         assert bus._peers.missing(["ingest"]) == ["ingest"]
     thread.join(PATIENCE_S)
     assert result == [None]
+
+
+def test_whoever_writes_as_a_start_of_the_sender_that_was_not_announced_is_not_believed(
+    endpoint: str,
+) -> None:
+    """Not even a message that fits, under the next number: it is refused unread."""
+    with reader(endpoint) as bus, writer(endpoint) as sender:
+        rude = bus._session.declare_publisher(f"pliant/test/{topics.IMAGE.key}")
+        box = bus._inputs[topics.IMAGE.key].box
+        with bus._changed:
+            assert bus._changed.wait_for(lambda: bus._peers.here.get("ingest"), PATIENCE_S)
+        rude.put(codec.encode(image(7)), attachment=bytes(17))
+        # What is sent next on the same connection has come when this one has been looked at.
+        rude.put(b"", attachment=ENVELOPE.pack(99, sender._peers.incarnation, 0))
+        with bus._changed:
+            assert bus._changed.wait_for(lambda: box.early, PATIENCE_S)
+        assert box.refused == 1
+        assert "not announced" in box.why
+        sender.publish(topics.IMAGE, image(0))
+        assert next(bus.receive(topics.IMAGE)).frame == 0
+        sender.end_all()
+        assert list(bus.receive(topics.IMAGE)) == []
+        bus.see_off()

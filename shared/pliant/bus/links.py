@@ -22,7 +22,7 @@ DATA, END = 0, 1
 NOTHING, IF_OLD, NOW = 0, 1, 2
 """What a reader asks its sender to send again."""
 
-_ENVELOPE = struct.Struct("<QB")  # sequence number, kind
+ENVELOPE = struct.Struct("<QQB")  # sequence number, incarnation of the sender, kind
 _CREDIT = struct.Struct("<QQQB")  # incarnation, taken, safe, what is asked for
 
 
@@ -31,7 +31,7 @@ class Shared:
     """What the links of one bus share.
 
     changed: the lock, and who waits for something to change.     wake: rouses the keeper.
-    is_known: whether a service has been announced with this incarnation.
+    incarnation: our own.    is_known: whether a service has been announced with an incarnation.
     arrivals: messages that have come, over all topics.
     """
 
@@ -39,6 +39,7 @@ class Shared:
     prefix: str
     changed: threading.Condition
     wake: threading.Event
+    incarnation: int
     is_known: Callable[[str, int], bool]
     arrivals: int = 0
 
@@ -76,14 +77,17 @@ class InLink:
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         attachment, size, shared = sample.attachment, len(sample.payload), self._shared
-        if attachment is None or len(attachment) != _ENVELOPE.size:
+        if attachment is None or len(attachment) != ENVELOPE.size:
             self._refuse("no envelope")
             return
-        sequence, kind = _ENVELOPE.unpack(attachment.to_bytes())
+        sequence, incarnation, kind = ENVELOPE.unpack(attachment.to_bytes())
         if kind not in (DATA, END) or size > self.topic.max_bytes:
             self._refuse(f"kind {kind}, {size} bytes")
             return
         with shared.changed:
+            if not shared.is_known(self.sender, incarnation):
+                self.box.refuse("of a start of its sender that was not announced")
+                return
             known_gap = self.box.gap
             if not self.box.is_next(sequence):
                 if self.box.gap and not known_gap:
@@ -150,7 +154,7 @@ class OutLink:
                 self._put(message)
 
     def _put(self, message: Numbered) -> None:
-        attachment = _ENVELOPE.pack(message.sequence, message.kind)
+        attachment = ENVELOPE.pack(message.sequence, self._shared.incarnation, message.kind)
         self._publisher.put(message.payload, attachment=attachment)
 
     def _on_credit(self, sample: zenoh.Sample) -> None:

@@ -109,7 +109,12 @@ class ZenohBus:
         self.stop_requested = False
         """Whether somebody has asked the session to end (``pliant stop``)."""
         shared = Shared(
-            self._session, self._prefix, self._changed, self._wake, self._peers.is_known
+            self._session,
+            self._prefix,
+            self._changed,
+            self._wake,
+            self._peers.incarnation,
+            self._peers.is_known,
         )
         self._outputs = {
             topic.key: OutLink(shared, topic, readers, window=window, windows=windows or {})
