@@ -36,9 +36,10 @@ def run(
     victims: Callable[[Status, Fleet], Sequence[str]] = lambda status, fleet: (),
     *,
     resume: bool = False,
+    settings: Sequence[str] = (),
 ) -> dict[str, str]:
     """One run in which the victims of each status are killed; returns the result files."""
-    config = load_config(overrides=["bus.checkpoint_frames=6"])
+    config = load_config(overrides=["bus.checkpoint_frames=6", *settings])
     if not resume:
         prepare(output, config_yaml(config))
     fleet: Fleet | None = None
@@ -162,7 +163,7 @@ def run_attacked(output: Path, recording: Path, each: int) -> dict[str, str]:
             threading.Thread(target=hold).start()
         return ()
 
-    found = run(output, hold_and_attack)
+    found = run(output, hold_and_attack, settings=["bus.window=4"])  # so it is not done yet
     assert attackers
     attackers[0].join()
     assert not failures, failures
