@@ -10,6 +10,8 @@ import numpy as np
 from pliant.bus.health import health_key
 from pliant.bus.links import ENVELOPE
 from pliant.bus.session import open_session
+from pliant.errors import MessageError
+from pliant.messages import codec
 from pliant.messages.topics import TOPICS, by_key, status
 from pliant.recording.reader import Recording
 from pliant_services.processes import inputs_of, readers_of
@@ -41,11 +43,10 @@ def messages(
     key: str, true: Mapping[str, bytes], random: np.random.Generator, announced: int
 ) -> Iterator[tuple[bytes, bytes | None]]:
     """Payloads and envelopes without end.  announced: which start of its sender the others know."""
-    topic, every = by_key(key), {other: by_key(other) for other in true}
-    message = topic.message if topic is not None else None
-    # What fits a topic, and has the next number and a sender that is known, is believed.
-    wrong = [true[k] for k, other in every.items() if other and other.message is not message]
-    fitting = [true[k] for k, other in every.items() if other and other.message is message]
+    # What fits a topic, has the next number and a sender that is known, is believed.
+    others = [data for topic, data in true.items() if topic != key]
+    fitting = [data for data in others if _fits(key, data)]
+    wrong = [data for data in others if not _fits(key, data)]
     old = b"\x81\xa5frame\x00"  # of before most fields
     future = b"\x82\xa5frame\x00\xa7version\xcd\xff\xff"
     huge = b"\xff" * 8
@@ -59,7 +60,8 @@ def messages(
             envelope = ENVELOPE.pack(sequence, announced, kind)
             stranger = ENVELOPE.pack(sequence, int(random.integers(2**63)), kind)
             yield random.bytes(int(random.integers(0, 300))), envelope
-            yield wrong[int(random.integers(len(wrong)))], envelope
+            if wrong:
+                yield wrong[int(random.integers(len(wrong)))], envelope
             yield old, envelope
             yield future, envelope
             for data in fitting:
@@ -74,6 +76,17 @@ def messages(
         yield random.bytes(25), None  # as long as a credit
         yield struct.pack("<QQQB", 2**63, 0, 0, 2), None  # of a start that was not announced
         yield b"", random.bytes(int(random.integers(0, 20)))
+
+
+def _fits(key: str, data: bytes) -> bool:
+    topic = by_key(key)
+    if topic is None:
+        return False
+    try:
+        codec.decode(topic.message, data)
+    except MessageError:
+        return False
+    return True
 
 
 def attack(
