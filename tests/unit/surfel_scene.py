@@ -68,10 +68,10 @@ def waves(width: int = 160, height: int = 120) -> F32:
     return (125.0 + image + 15.0 * np.sin(0.12 * (u + v))).astype(np.float32)
 
 
-def level_of(image: F32, focal: float = 200.0) -> Level:
+def level_of(image: F32, focal: float = 200.0, side: int = 23, stride: int = 1) -> Level:
     height, width = image.shape
     middle = 0.5 * (width - 1), 0.5 * (height - 1)
-    return make_level(np.ascontiguousarray(image), focal, focal, *middle)
+    return make_level(np.ascontiguousarray(image), focal, focal, *middle, side, stride)
 
 
 def slanted_surfels(count: int = 1, seed: int = 0) -> F64:

@@ -80,7 +80,7 @@ def problem(seed: int = 0, count: int = 12) -> dict[str, object]:
     parameters = SurfelParameters(camera="moving")
     tracker = SurfelTracker(parameters)
     level, poses = level_of(waves()), slanted_surfels(count, seed)
-    templates = make_templates(poses, level, 23, 1e6, 0.5, EVERYWHERE, np.inf)
+    templates = make_templates(poses, level, 1e6, 0.5, EVERYWHERE, np.inf)
     rng = np.random.default_rng(seed)
     poses[:, X : X + 3] += 0.002 * rng.standard_normal((count, 3))
     work, limits = make_workspace(23), tracker._limits(fine=True)

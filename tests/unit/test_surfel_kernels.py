@@ -160,10 +160,21 @@ def test_jacobians_by_finite_differences(model: int, seed: int, light: int) -> N
     np.testing.assert_allclose(g[:n], J.T @ r, rtol=1e-3, atol=1e-4 * np.abs(g).max())
 
 
+def test_a_sparse_level_has_every_second_sample_of_a_dense_one() -> None:
+    pose, image, h = slanted_surfels(seed=5)[0], waves(), np.zeros(9)
+    samples: list[F32] = []
+    for side, stride in ((25, 1), (13, 2)):
+        level, grid = level_of(image, side=side, stride=stride), make_grid(side)
+        assert homography(pose, level, h)
+        assert sample_patch(h, level, grid, HIGH)
+        samples.append(grid.values.reshape(side, side))
+    np.testing.assert_allclose(samples[1], samples[0][::2, ::2], atol=1e-2)
+
+
 def texture_and_moved() -> tuple[F32, Templates, F64]:
     """An image, the texture of a surfel in it, and that surfel a little beside, lit otherwise."""
     image, poses = waves(), slanted_surfels(seed=5)
-    templates = make_templates(poses, level_of(image), SIDE, HIGH, 0.5, EVERYWHERE, np.inf)
+    templates = make_templates(poses, level_of(image, side=SIDE), HIGH, 0.5, EVERYWHERE, np.inf)
     moved = poses[0].copy()
     moved[X] += 0.02
     moved[GAIN], moved[BIAS] = 1.1, 2.0
@@ -218,7 +229,7 @@ def test_sums_against_numpy(blend: float) -> None:
 def normal_matrix(model: int, omega: float) -> tuple[F64, F64]:
     image, poses = waves(), slanted_surfels(seed=6)
     level, n = level_of(image), motion.parameter_count(model)
-    templates = make_templates(poses, level, 23, HIGH, 0.5, EVERYWHERE, np.inf)
+    templates = make_templates(poses, level, HIGH, 0.5, EVERYWHERE, np.inf)
     mix = np.zeros((FEATURES, motion.MOST_PARAMETERS))
     motion.mixing(poses[0], level, model, mix)
     H, g = np.zeros((motion.MOST_PARAMETERS,) * 2), np.zeros(motion.MOST_PARAMETERS)

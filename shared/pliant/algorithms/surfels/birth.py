@@ -71,7 +71,7 @@ def find_births(
     )
     poses = place(corners[:, :2], depth, camera, p)
     templates = [
-        make_templates(poses, each, p.patch_px, p.highlight, p.min_template, depth, p.max_off_plane)
+        make_templates(poses, each, p.highlight, p.min_template, depth, p.max_off_plane)
         for each in pyramid
     ]
     rows = np.flatnonzero(templates[0].usable)[: max(count, 0)]
@@ -113,15 +113,14 @@ def place(points_px: F64, depth: F64, camera: PinholeCamera, p: SurfelParameters
 
 
 def make_templates(
-    poses: F64, level: Level, side: int, highlight: float, min_share: float, depth: F64,
-    max_off_plane: float,
+    poses: F64, level: Level, highlight: float, min_share: float, depth: F64, max_off_plane: float
 ) -> Templates:  # fmt: skip
     """Textures on the surfels' own grids at one level, and their derivatives along the grid.
 
     depth: (H, W) metres of the full-size image.  What is not of the surfel's own plane takes no
     part: a background that stays where it is would hold the patch, or tear it along the ray.
     """
-    n = len(poses)
+    n, side = len(poses), level.side
     templates = Templates(
         np.zeros((n, TEMPLATE_IMAGES, padded(side)), np.float32),
         np.zeros(n),

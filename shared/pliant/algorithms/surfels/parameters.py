@@ -78,7 +78,7 @@ class SurfelParameters(Parameters):
         default=3, ge=1, description="Steps of all surfels together at full size."
     )
     coarse_together_steps: int = Field(
-        default=2, ge=0, description="The same at each coarser level."
+        default=2, ge=0, description="The same at half the size, with a camera that stands still."
     )
 
     depth_from: Literal["sensor", "map", "flat"] = Field(
@@ -112,6 +112,13 @@ class SurfelParameters(Parameters):
         ge=7,
         le=63,
         description="Side of a surfel's patch, px of each pyramid level, odd.",
+    )
+    sparse_stride_px: int = Field(
+        default=2,
+        ge=1,
+        le=4,
+        description="Distance of a patch's samples at every second level, from the second on, px "
+        "of the level; at the others it is one pixel.",
     )
     levels: int = Field(default=4, ge=1, le=6, description="Levels of the pyramid.")
     spacing_px: int = Field(

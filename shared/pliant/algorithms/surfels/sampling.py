@@ -48,12 +48,19 @@ class Level(NamedTuple):
     cy: float
     step_u: float  # distance of neighbouring grid points, normalised coordinates
     step_v: float
+    side: int  # samples along an edge of a patch
 
 
-def make_level(pixels: F32, fx: float, fy: float, cx: float, cy: float) -> Level:
-    """A level of (H, W) grey levels from 0 to 255, with intrinsics in its own pixels."""
+def make_level(
+    pixels: F32, fx: float, fy: float, cx: float, cy: float, side: int, stride: int = 1
+) -> Level:
+    """A level of (H, W) grey levels from 0 to 255, with intrinsics in its own pixels.
+
+    side, stride: a patch has side x side samples, ``stride`` pixels apart.
+    """
     height, width = pixels.shape
-    return Level(pixels, pack(pixels), width, height, fx, fy, cx, cy, 1.0 / fx, 1.0 / fy)
+    steps = stride / fx, stride / fy
+    return Level(pixels, pack(pixels), width, height, fx, fy, cx, cy, *steps, side)
 
 
 @kernel

@@ -8,7 +8,7 @@ from pliant.algorithms.geometry import inverse
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.surfels import judge
 from pliant.algorithms.surfels.again import look_again
-from pliant.algorithms.surfels.align import Limits, align_all, make_workspace
+from pliant.algorithms.surfels.align import Limits, Workspace, align_all, make_workspace
 from pliant.algorithms.surfels.birth import find_births
 from pliant.algorithms.surfels.joint import Equilibrium, align_jointly, align_rigid, register
 from pliant.algorithms.surfels.motion import ILLUMINATION, MODELS
@@ -23,6 +23,8 @@ from pliant.algorithms.surfels.together import Hold, align_together
 
 _FOUND_AGAIN_ZNCC = 0.9
 """A surfel that was missing must fit better than one that was followed: chance has had tries."""
+_TOGETHER_LEVELS = 2
+"""Levels, the finest, at which surfels with neighbours move as one before a static camera."""
 _BLENDS = {"template": (0.0, 0.0), "both": (0.5, 1.0), "frame": (1.0, 1.0)}
 """Share of the frame in the derivatives of a patch, at the coarse scales of a static camera and
 otherwise: with a moving camera the mean finds fewer surfels again after a jump."""
@@ -36,7 +38,7 @@ class SurfelTracker:
 
     def __init__(self, parameters: SurfelParameters) -> None:
         self._parameters = parameters
-        self._work = make_workspace(parameters.patch_px)
+        self._works: list[Workspace] = []
         self._table = SurfelTable()
         self._camera: PinholeCamera | None = None
         self._T_world_camera: F64 = np.eye(4)
@@ -114,7 +116,10 @@ class SurfelTracker:
                 f"got {image.dtype} {image.shape}"
             )
         levels = usable_levels(camera.width, camera.height, p.patch_px, p.levels)
-        return make_pyramid(image, camera, levels)
+        pyramid = make_pyramid(image, camera, levels, p.patch_px, p.sparse_stride_px)
+        if len(self._works) != len(pyramid):
+            self._works = [make_workspace(level.side) for level in pyramid]
+        return pyramid
 
     def _goals(self, prediction: F64 | None, levels: int) -> F64 | None:
         """Predicted pixels at the coarsest level."""
@@ -131,18 +136,19 @@ class SurfelTracker:
         if goals is not None:
             templates, limits = self._table.templates, self._limits(fine=False)
             if templates:
-                start_at(poses, active, goals, level, templates[-1], limits, self._work)
+                start_at(poses, active, goals, level, templates[-1], limits, self._works[-1])
 
     def _align(self, pyramid: list[Level], poses: F64, active: U8, timer: StageTimer) -> BoolArray:
         """Coarse to fine: the solution of a scale is the guess of the next (section VI-A2)."""
         together = len(self._table.edges.ends) > 0
         start, torn, rest = poses.copy(), np.zeros(len(poses), np.bool_), no_rest(len(poses))
-        for number in range(len(pyramid) - 1, -1, -1):
+        coarsest = len(pyramid) - 1
+        for number in range(coarsest, -1, -1):
             level = pyramid[number]
-            # Alone each finds its place in the image; at full size depth would go astray.
-            if number > 0 or not together or len(pyramid) == 1:
+            # Alone each finds its place in the image; close to it depth would go astray.
+            if number == coarsest or number >= _TOGETHER_LEVELS or not together:
                 self._align_alone(number, level, poses, active, rest, timer)
-            if together:
+            if together and number < _TOGETHER_LEVELS:
                 torn = self._hold_together(number, level, poses, start, active, rest, timer)
         return torn
 
@@ -151,7 +157,7 @@ class SurfelTracker:
     ) -> None:
         templates, limits = self._table.templates[number], self._limits(fine=number == 0)
         with timer(f"alone, level {number}"):
-            align_all(poses, active, rest, level, templates, limits, self._work)
+            align_all(poses, active, rest, level, templates, limits, self._works[number])
 
     def _hold_together(
         self,
@@ -169,7 +175,8 @@ class SurfelTracker:
         with timer(f"together, level {number}"):
             return align_together(
                 poses, start, active, self._table.edges, rest, level,
-                self._table.templates[number], self._limits(fine=number == 0), self._work, hold,
+                self._table.templates[number], self._limits(fine=number == 0), self._works[number],
+                hold,
             )  # fmt: skip
 
     def _align_with_camera(
@@ -200,8 +207,9 @@ class SurfelTracker:
                 short = limits._replace(min_step_px=share * limits.min_step_px)
                 with timer(f"camera alone, level {number}"):
                     T_camera_world = align_rigid(
-                        poses, followed, T_camera_world, level, templates, short, self._work
-                    )
+                        poses, followed, T_camera_world, level, templates, short,
+                        self._works[number],
+                    )  # fmt: skip
             if p.camera == "static_map":
                 continue
             if number == coarsest:
@@ -210,7 +218,7 @@ class SurfelTracker:
                 with timer(f"camera and surfels, level {number}"):
                     T_camera_world = align_jointly(
                         poses, followed, T_camera_world, equilibrium, level, templates, limits,
-                        self._work,
+                        self._works[number],
                     )  # fmt: skip
                 continue
             # What was missing is looked for, too, but says nothing of the camera.
@@ -235,7 +243,7 @@ class SurfelTracker:
         """Keep what was found; what was not stays where it was last good."""
         table, p = self._table, self._parameters
         verdicts, templates, limits = table.verdicts, table.templates[0], self._limits(fine=True)
-        judge.judge_all(poses, active, level, templates, limits, self._work, verdicts)
+        judge.judge_all(poses, active, level, templates, limits, self._works[0], verdicts)
         if len(table.edges.ends) and p.camera != "static_map":
             unlike = (verdicts[:, judge.CORRELATION] < p.min_zncc) & (
                 verdicts[:, judge.FRONT] > 0.0
@@ -243,10 +251,10 @@ class SurfelTracker:
             again = (active > 0) & (unlike | torn) & (verdicts[:, judge.INSIDE] >= p.min_visible)
             again = again.astype(np.uint8)
             look_again(
-                poses, again, table.edges, level, templates, limits, self._work,
+                poses, again, table.edges, level, templates, limits, self._works[0],
                 omega_e=p.omega_e, strain=p.strain,
             )  # fmt: skip
-            judge.judge_all(poses, again, level, templates, limits, self._work, verdicts)
+            judge.judge_all(poses, again, level, templates, limits, self._works[0], verdicts)
             torn = torn & (again == 0)
         wanted = np.where(table.missing > 0, max(p.min_zncc, _FOUND_AGAIN_ZNCC), p.min_zncc)
         state = np.full(len(table), SurfelState.TRACKED, np.uint8)
@@ -292,7 +300,7 @@ class SurfelTracker:
         rows = (table.born == self._frame).astype(np.uint8)
         judge.judge_all(
             move_poses(table.poses, inverse(self._T_world_camera)), rows, pyramid[0],
-            table.templates[0], self._limits(fine=True), self._work, table.verdicts,
+            table.templates[0], self._limits(fine=True), self._works[0], table.verdicts,
         )  # fmt: skip
 
     def _limits(self, *, fine: bool) -> Limits:
