@@ -5,7 +5,6 @@ On images of 752x480 that is as small as PNG, in a quarter of its time and less:
 """
 
 import struct
-from functools import cache
 
 import msgpack
 import numpy as np
@@ -13,6 +12,7 @@ import zstandard
 
 from pliant.algorithms.arrays import U8
 from pliant.errors import MessageError
+from pliant.messages.zstd import compress
 
 CODE = 1
 """Of the msgpack extension."""
@@ -21,11 +21,6 @@ _HEADER = struct.Struct("<QQ")  # bytes when unpacked, bytes of a row (0: they a
 _LEVEL = 1
 _LEAST_BYTES = 1024  # below that there is nothing to gain
 _WORTH = 0.95  # share that must remain at most: what is compressed already stays as it is
-
-
-@cache
-def _compressor() -> zstandard.ZstdCompressor:
-    return zstandard.ZstdCompressor(level=_LEVEL)
 
 
 def pack(pixels: U8, rows: int) -> msgpack.ExtType | None:
@@ -39,7 +34,7 @@ def pack(pixels: U8, rows: int) -> msgpack.ExtType | None:
         differences = table.copy()
         np.subtract(table[1:], table[:-1], out=differences[1:])  # modulo 256
         pixels = differences.reshape(-1)
-    packed = _compressor().compress(pixels.data)
+    packed = compress(pixels.data, _LEVEL)
     if len(packed) > _WORTH * size:
         return None
     return msgpack.ExtType(CODE, _HEADER.pack(size, row) + packed)
