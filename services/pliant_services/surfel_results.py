@@ -2,7 +2,7 @@
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -73,8 +73,7 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
     """
     recording = output / RECORDING_NAME
     run, counts = read_run(recording), _Counts()
-    stamps: list[int] = []
-    poses: list[F64] = []
+    followed: list[tuple[int, F64]] = []
     try:
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=output) as name:
             folder = Path(name)
@@ -84,15 +83,9 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
                     assert isinstance(surfels, Surfels)
                     _count(counts, surfels, recorded.log_time_ns)
                     _add(npz, surfels)
-                    if not surfels.missing and not surfels.lost:
-                        stamps.append(surfels.stamp_ns)
-                        poses.append(surfels.T_world_camera)
-            T_world_camera = np.array(poses).reshape(-1, 4, 4)
-            trajectory = Trajectory(
-                stamps_ns=np.array(stamps, np.int64), T_world_camera=T_world_camera
-            )
-            write_tum(folder / TRAJECTORY_NAME, trajectory)
-            report = _report(run, counts, len(poses))
+                    followed += _followed(surfels)
+            write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
+            report = _report(run, counts, len(followed))
             text = json.dumps(report, indent=1) + "\n"
             (folder / REPORT_NAME).write_text(text, encoding="utf-8")
             for path in sorted(folder.iterdir()):
@@ -102,6 +95,24 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
             f"{output}: cannot write the results ({error.strerror}); the recording is kept"
         ) from None
     return report
+
+
+def surfel_trajectory(recording: Path) -> Trajectory:
+    """The camera's pose of every frame whose surfels were followed."""
+    return _trajectory([f for surfels in recorded_surfels(recording) for f in _followed(surfels)])
+
+
+def _followed(surfels: Surfels) -> list[tuple[int, F64]]:
+    """Time and pose of a frame, none where it has no pixels or all surfels were lost."""
+    lost = surfels.missing or surfels.lost
+    return [] if lost else [(surfels.stamp_ns, surfels.T_world_camera)]
+
+
+def _trajectory(followed: list[tuple[int, F64]]) -> Trajectory:
+    return Trajectory(
+        stamps_ns=np.array([stamp_ns for stamp_ns, _ in followed], np.int64),
+        T_world_camera=np.array([pose for _, pose in followed]).reshape(-1, 4, 4),
+    )
 
 
 def surfel_summary(report: dict[str, Any]) -> list[str]:
@@ -161,9 +172,12 @@ def _count(counts: _Counts, surfels: Surfels, arrival_ns: int) -> None:
     }
 
 
-def _is_metric(run: Run) -> bool:
-    """Depth maps of a sensor are; a map of one camera has a scale of its own."""
-    return config_of(run.recorded.metadata, []).surfels.depth_from == "sensor"
+def is_metric(metadata: Mapping[str, Mapping[str, str]]) -> bool:
+    """Depth maps of a sensor are; a map of one camera has a scale of its own.
+
+    metadata: of the recording.
+    """
+    return config_of(metadata, []).surfels.depth_from == "sensor"
 
 
 def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
@@ -196,6 +210,6 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         "alive_per_frame": counts.alive,
         "surfels_per_frame": counts.listed,
         "last_states": counts.last_states,
-        "scale_is_metric": bool(counts.segments) and _is_metric(run),
+        "scale_is_metric": bool(counts.segments) and is_metric(run.recorded.metadata),
         **process_figures(run, frames),
     }

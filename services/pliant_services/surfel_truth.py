@@ -17,10 +17,12 @@ from pliant.datasets.builtin_deforming import SURFACES_NAME
 from pliant.datasets.depth import DepthRectifier
 from pliant.errors import ResultError
 from pliant.evaluation.exact_surfels import ExactSurfels, format_exact
+from pliant.evaluation.later_surfels import LaterSurfels, format_later, scaled, true_scale
 from pliant.evaluation.surface_truth import SurfaceTruth
 from pliant.evaluation.surfel_truth import SurfelTruth, format_surfels, mean_rows
+from pliant.recording.reader import Recording
 from pliant_services.results import RECORDING_NAME
-from pliant_services.surfel_results import recorded_surfels
+from pliant_services.surfel_results import is_metric, recorded_surfels
 
 
 def surfels_against_truth(result: Path, source: str, figures: dict[str, Any]) -> Iterator[str]:
@@ -58,14 +60,19 @@ def surfels_against_truth(result: Path, source: str, figures: dict[str, Any]) ->
 def _against_surfaces(result: Path, folder: Path, figures: dict[str, Any]) -> str:
     dataset = open_source(str(folder))
     truth = SurfaceTruth(folder, Rectifier(dataset.calibration).camera)
-    judge = ExactSurfels(truth)
+    judge, later = ExactSurfels(truth), LaterSurfels(truth)
+    # Where the scale is arbitrary, that of the first surfels is given, once for the whole run.
+    scale = 1.0 if is_metric(Recording(result / RECORDING_NAME).metadata()) else None
     for surfels in recorded_surfels(result / RECORDING_NAME):
         if surfels.frame >= len(truth):
             raise ResultError(
                 f"{result}: has more frames than {folder}: name the sequence that it was made of"
             )
-        if not surfels.missing:
-            judge.add(surfels.frame, surfels)
+        if surfels.missing or (scale is None and not len(surfels.ids)):
+            continue
+        scale = scale or true_scale(surfels.frame, surfels, truth)
+        judge.add(surfels.frame, scaled(surfels, scale))
+        later.add(surfels.frame, scaled(surfels, scale))
     if not judge.rows:
         raise ResultError(_nothing(result))
     false, true, _ = judge.curve()
@@ -73,11 +80,14 @@ def _against_surfaces(result: Path, folder: Path, figures: dict[str, Any]) -> st
     figures["surfels"] = {
         "frames": [asdict(row) for row in judge.rows],
         "summary": judge.summary(),
+        "scale": scale,
+        "later": later.summary(),
         "sheets": {name: {"count": n, "rmse": e} for name, (n, e) in judge.by_sheet().items()},
         "sizes_mm": [{"from": a, "to": b, "rmse": e} for a, b, e in judge.by_size()],
         "roc": {"false_positive": false[kept].tolist(), "true_positive": true[kept].tolist()},
     }
-    return format_exact(judge, moving_camera=truth.moving_camera)
+    text = format_exact(judge, moving_camera=truth.moving_camera)
+    return f"{text}\n{format_later(later)}" if later.summary()["births"] else text
 
 
 def _nothing(result: Path) -> str:

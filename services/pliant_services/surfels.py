@@ -4,7 +4,7 @@ in   camera/stream    once
      camera/image     every frame
      camera/depth     every frame: empty, or a depth map: the first one starts the surfels
      tracks/extrema   every frame, where tracking runs: where surfels may have gone
-     map/update, map/keyframe   every frame, where bundle adjustment runs: a depth to start from
+     map/update, map/keyframe   every frame, where bundle adjustment runs: depths for births
 out  surfels/state    one per frame: all surfels, and the camera; empty without pixels
 """
 
@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.surfels import SurfelFrame, SurfelState, SurfelTracker, predict
+from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.surfels import SurfelFrame, SurfelState, SurfelTracker, agree, predict
 from pliant.algorithms.tracks import FrameTracks
 from pliant.bus.base import Bus, join, receive, receive_one, resume
 from pliant.config import Config
@@ -23,7 +23,7 @@ from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.depth import DepthRectifier
 from pliant.errors import ConfigError
-from pliant.map_depth import MapDepth
+from pliant.map_depth import MapDepth, MapView
 from pliant.messages import topics
 from pliant.messages.types import (
     WORLD_FRAME_ID,
@@ -59,7 +59,9 @@ class _Heard:
 
 @dataclass
 class _State:
-    """map_depth: until surfels start on our own map.    tracks, points_px: of the last frame."""
+    """map_depth: as long as surfels are born on our own map.    tracks, points_px: of the last
+    frame.    ratio, segment: units of the surfels by one of the map, and the segment of the map,
+    when surfels were last born on it."""
 
     stream: CameraStream
     tracker: SurfelTracker
@@ -67,6 +69,8 @@ class _State:
     started: bool
     tracks: FrameTracks | None
     points_px: F32
+    ratio: float = 1.0
+    segment: int = -1
 
 
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
@@ -85,7 +89,8 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     for heard in _hear(bus):
         image, missing = heard.image, heard.image.missing
         frame, metres, note = SurfelFrame.empty(), None, ""
-        if heard.depth.data and not missing:
+        view = _look_at_map(state, heard, config)
+        if heard.depth.data and not missing and config.surfels.depth_from == "sensor":
             try:
                 metres = rectifier.rectify(image.frame, heard.depth.data)
             except BrokenFrame as error:
@@ -93,9 +98,12 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         if not missing and state.started:
             with monitor.stage("track"):
                 frame = state.tracker.track(image.grey, _prediction(state, heard, config), metres)
+            if view is not None:
+                with monitor.stage("births"):
+                    frame, note = _add(state, image.grey, frame, view, config)
         elif not missing:
             with monitor.stage("start"):
-                frame, missing = _start(state, heard, metres, config)
+                frame, missing = _start(state, heard, metres, view, config)
         if not heard.image.missing:
             state.tracks, state.points_px = heard.tracks, frame.points_px
         message = Surfels.of(image, frame, frame_id=WORLD_FRAME_ID, missing=missing, note=note)
@@ -141,20 +149,49 @@ def _prediction(state: _State, heard: _Heard, config: Config) -> F64 | None:
     return predict(state.points_px, state.tracks, heard.tracks)
 
 
+def _look_at_map(state: _State, heard: _Heard, config: Config) -> MapView | None:
+    """What our own map shows in this frame.  Every frame tells of the map, pixels or not."""
+    if state.map_depth is None or heard.update is None or heard.keyframe is None:
+        return None
+    p = config.surfels
+    max_sigma = p.map_birth_sigma if state.started else p.map_sigma
+    return state.map_depth.take(heard.update, heard.keyframe, heard.frame, max_sigma=max_sigma)
+
+
 def _start(
-    state: _State, heard: _Heard, metres: F64 | None, config: Config
+    state: _State, heard: _Heard, metres: F64 | None, view: MapView | None, config: Config
 ) -> tuple[SurfelFrame, str]:
     """Surfels where there is depth for this frame, and else what is waited for."""
     image, T_world_camera, missing = heard.image.grey, None, WAITING
     if config.surfels.depth_from == "flat":
         metres = np.full(image.shape, _FLAT_DEPTH)
-    elif state.map_depth is not None and heard.update and heard.keyframe:
+    elif view is not None:
         # From here on world and scale are those of the map as it is now, whatever it learns later.
-        found = state.map_depth.take(heard.update, heard.keyframe, heard.frame)
-        metres, T_world_camera = found or (None, None)
+        metres, T_world_camera, state.segment = view.depth, view.T_world_camera, view.segment
+    elif state.map_depth is not None:
         missing = f"{WAITING} from the map: {state.map_depth.problem}"
     if metres is None:
         return SurfelFrame.empty(), missing
     frame = state.tracker.start(image, metres, state.stream.camera, T_world_camera)
-    state.started, state.map_depth = True, None
+    state.started = True
+    if not config.surfels.map_births:
+        state.map_depth = None
     return frame, ""
+
+
+def _add(
+    state: _State, image: U8, frame: SurfelFrame, view: MapView, config: Config
+) -> tuple[SurfelFrame, str]:
+    """More surfels on a later keyframe of our own map, and else why there are none."""
+    if not frame.lost:
+        found = agree(view.depth, frame, config.surfels)
+        if found.depth is None:
+            return frame, f"no surfels are born on the map: {found.problem}"
+        state.ratio, state.segment = found.ratio, view.segment
+        return state.tracker.add(image, found.depth), ""
+    # Nobody is left to compare with.  For the same map the last ratio holds, another starts anew.
+    if view.segment != state.segment:
+        state.ratio, state.segment = 1.0, view.segment
+    T_world_camera = view.T_world_camera.copy()
+    T_world_camera[:3, 3] *= state.ratio
+    return state.tracker.add(image, state.ratio * view.depth, T_world_camera), ""

@@ -33,6 +33,12 @@ class IngestParameters(Parameters):
         description="Depth maps for surfels: the first one alone, or those of all frames, from "
         "which new surfels are born, too.",
     )
+    mapping_lag_s: float = Field(
+        default=0.4,
+        ge=0.0,
+        description="Live mode: a frame is mapped while those that wait for bundle adjustment came "
+        "less than this before it, or none of them is to be mapped; it passes over the others.",
+    )
 
 
 class BusParameters(Parameters):
@@ -43,6 +49,16 @@ class BusParameters(Parameters):
         ge=1,
         le=4096,
         description="Messages of one topic on the way to its slowest reader; bounds memory.",
+    )
+    lag_messages: int = Field(
+        default=128,
+        ge=1,
+        le=4096,
+        description="Messages of one topic on the way to bundle adjustment, with those that it "
+        "passes over in live mode; beyond, the others wait for it.",
+    )
+    lag_mib: int = Field(
+        default=160, ge=1, le=65536, description="And no more MiB than this; bounds memory."
     )
     patience_s: float = Field(
         default=60.0,

@@ -4,6 +4,8 @@ DSDT takes its first depth from a stereo pair or a sensor.  One camera alone has
 adjustment, as long as the scene holds nearly still: what moves meanwhile has no certain depth.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pliant.algorithms.arrays import F64
@@ -17,8 +19,20 @@ from pliant.algorithms.surfels import SurfelParameters
 from pliant.map_history import CurrentMap
 
 
+@dataclass(frozen=True)
+class MapView:
+    """What a keyframe of our own map shows, in units and world of the map as it is then.
+
+    depth: (H, W) along the optical axis, 0 where nothing is known.    segment: of the map.
+    """
+
+    depth: F64
+    T_world_camera: F64  # (4, 4)
+    segment: int
+
+
 class MapDepth:
-    """Waits for a keyframe that knows enough depths.  A function of what it is told.
+    """Waits for keyframes that know enough depths.  A function of what it is told.
 
     problem: why the last frame is none, "" where it is one.
     """
@@ -30,12 +44,11 @@ class MapDepth:
         self.problem = ""
 
     def take(
-        self, update: MapDelta, keyframes: KeyframeDelta, frame: int
-    ) -> tuple[F64, F64] | None:
-        """Take in what a frame tells of the map.
+        self, update: MapDelta, keyframes: KeyframeDelta, frame: int, *, max_sigma: float
+    ) -> MapView | None:
+        """Take in what a frame tells of the map: the keyframe that it became, if it is such one.
 
-        Returns (depth, T_world_camera) where the frame became a keyframe to start on: (H, W) along
-        the optical axis in units of the map, 0 where nothing is known, and (4, 4).
+        max_sigma: of a depth that counts as certain, as a share of it.
         """
         self._map.take(update, frame)
         if update.state != TRACKING:
@@ -47,7 +60,7 @@ class MapDepth:
             return None
         if keyframes.new < 0:
             return None
-        points = self._certain(keyframes)
+        points = self._certain(keyframes, max_sigma)
         if len(points.ids) < self._parameters.map_points:
             self.problem = (
                 f"{len(points.ids)} points of certain depth, {self._parameters.map_points} needed: "
@@ -61,9 +74,9 @@ class MapDepth:
             self.problem = "its points make no surface"
             return None
         self.problem = ""
-        return found.depths.astype(np.float64), T_world_camera
+        return MapView(found.depths.astype(np.float64), T_world_camera, update.segment)
 
-    def _certain(self, keyframes: KeyframeDelta) -> SeenPoints:
+    def _certain(self, keyframes: KeyframeDelta, max_sigma: float) -> SeenPoints:
         """What the new keyframe observes, without points whose depth is uncertain."""
         bounds = np.concatenate([[0], np.cumsum(keyframes.counts)])
         row = int(np.flatnonzero(keyframes.keyframe_ids == keyframes.new)[0])
@@ -71,7 +84,7 @@ class MapDepth:
         rows, points = self._map.points_of(keyframes.point_ids[told])
         sigmas = np.asarray(points.sigmas, np.float32)
         noise_px = SurfaceParameters().noise_px
-        good = np.flatnonzero(sigmas * noise_px < self._parameters.map_sigma)
+        good = np.flatnonzero(sigmas * noise_px < max_sigma)
         return SeenPoints(
             ids=points.ids[good],
             points_px=keyframes.points_px[told][rows][good],

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from restarting import Restarted, Stopping
 
 from pliant.algorithms.surfels import SurfelState
 from pliant.bus.replay_bus import ReplayBus
@@ -12,7 +13,6 @@ from pliant.datasets import open_source
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import Depth, Header, Image, Surfels
-from pliant.state import load_state, save_state
 from pliant_services import ingest, surfels
 from pliant_services.monitor import SilentMonitor
 
@@ -107,30 +107,6 @@ def test_a_black_frame_loses_no_surfel_and_leaves_no_nan(
     for message in followed:
         for name in ("positions", "tangents", "zncc", "sigma", "points_px", "gains", "biases"):
             assert np.isfinite(getattr(message, name)).all()
-
-
-class Stopping(ReplayBus):
-    """Keeps the state after a frame, as a service's checkpoint does."""
-
-    def __init__(self, inputs: Messages, frame: int) -> None:
-        super().__init__(inputs)
-        self._frame = frame
-        self.state = b""
-
-    def checkpoint(self, frame: int, state: object) -> None:
-        if frame == self._frame:
-            self.state = save_state(state)
-
-
-class Restarted(ReplayBus):
-    """Goes on from such a state."""
-
-    def __init__(self, inputs: Messages, state: bytes) -> None:
-        super().__init__(inputs)
-        self._state = state
-
-    def restore(self) -> object:
-        return load_state(self._state)
 
 
 def test_a_service_that_is_started_again_goes_on_with_the_same_bytes(

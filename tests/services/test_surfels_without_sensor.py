@@ -1,11 +1,14 @@
 """Surfels that start on our own map, or on a plane, and that are told where tracks went."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from restarting import Restarted, Stopping
 
-from pliant.algorithms.arrays import F64
+from pliant.algorithms.arrays import F64, BoolArray
+from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.surfels import SurfelState
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, load_config
@@ -13,13 +16,24 @@ from pliant.datasets import open_source
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.depth import DepthRectifier
 from pliant.errors import ConfigError
+from pliant.map_history import CurrentMap
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
-from pliant.messages.types import CameraStream, Depth, Extrema, Header, Image, Keyframe, Surfels
+from pliant.messages.types import (
+    CameraStream,
+    Depth,
+    Extrema,
+    Header,
+    Image,
+    Keyframe,
+    MapUpdate,
+    Surfels,
+)
 from pliant_services import bundle_adjustment, ingest, surfels, tracking
 from pliant_services.monitor import SilentMonitor
 from pliant_services.processes import BY_NAME
 
+SOURCE = "built-in:breathing?amplitude=0&travel=0.25&width=320"
 FRAMES = 25
 ALONE = BY_NAME["surfels"].inputs
 OPTIONAL = BY_NAME["surfels"].optional
@@ -28,14 +42,15 @@ FROM_MAP = (
     "surfels.depth_from=map", "surfels.camera=moving", "surfels.max_surfels=60",
     "surfels.map_keyframes=3", "surfels.map_points=40", "surfels.map_sigma=0.03",
 )  # fmt: skip
+LATER = (*FROM_MAP, "surfels.max_surfels=250", "surfels.map_birth_sigma=0.03")
 
 
 @pytest.fixture(scope="module")
 def everything() -> Messages:
-    """What all services of a fleet make of a rigid scene."""
+    """What all services of a fleet make of a rigid scene that comes into view."""
     config, monitor = load_config(), SilentMonitor()
     source = ReplayBus({})
-    dataset = open_source(f"built-in:tiny?frames={FRAMES}", depth="all")
+    dataset = open_source(f"{SOURCE}&frames={FRAMES}", depth="all")
     ingest.run(source, config, monitor, dataset, stopping=lambda: False)
     made = dict(source.outputs)
     for name, service in (("tracking", tracking), ("bundle_adjustment", bundle_adjustment)):
@@ -81,9 +96,159 @@ def test_surfels_start_on_a_keyframe_of_our_own_map(everything: Messages) -> Non
     assert np.count_nonzero(followed[-1].state == SurfelState.TRACKED) > 0.5 * len(first.ids)
 
 
+def born_later(followed: list[Surfels]) -> dict[int, Surfels]:
+    """Frames after the start in which surfels were born."""
+    started = [m for m in followed if not m.missing]
+    return {m.frame: m for m in started[1:] if (m.age == 0).any()}
+
+
+def shares_of_truth(made: Messages, message: Surfels, rows: BoolArray) -> F64:
+    """True depth by the depth of surfels at their pixels."""
+    T = message.T_world_camera
+    depth = ((message.positions[rows] - T[:3, 3]) @ T[:3, :3])[:, 2]
+    column, row = np.rint(message.points_px[rows]).astype(int).T
+    return true_depth(made, message.frame)[row, column] / depth
+
+
+def with_map(made: Messages, after: int, change: Callable[[F64, F64], F64]) -> Messages:
+    """From a frame on each update tells of the whole map, with points (N, 3) moved by ``change``.
+
+    change: is given the points and T_world_camera of the keyframe that was new last.
+    """
+    known, updates, new = CurrentMap(), list[Header](), -1
+    for update, keyframe in zip(made[topics.MAP_UPDATE], made[topics.KEYFRAME], strict=True):
+        assert isinstance(update, MapUpdate)
+        assert isinstance(keyframe, Keyframe)
+        known.take(update, update.frame)
+        new = keyframe.new if keyframe.new >= 0 else new
+        if update.frame <= after:
+            updates.append(update)
+            continue
+        points = known.points()
+        T = pose_to_matrix(known.keyframes[new].pose_world_camera)
+        poses = np.array([k.pose_world_camera for k in known.keyframes.values()])
+        poses[:, :3] = change(poses[:, :3], T)
+        keyframes = known.keyframes.values()
+        updates.append(
+            replace(
+                update,
+                keyframe_ids=np.array(list(known.keyframes), np.int64),
+                keyframe_frames=np.array([k.frame for k in keyframes], np.int64),
+                keyframe_segments=np.array([k.segment for k in keyframes], np.int32),
+                keyframe_poses=poses,
+                point_ids=points.ids,
+                point_segments=points.segments,
+                points_world=change(points.positions, T),
+                point_colours=points.colours,
+                point_keyframes=points.keyframes,
+                point_parallax_rad=points.parallax_rad,
+                point_sigmas=points.sigmas,
+            )
+        )
+    return {**made, topics.MAP_UPDATE: updates}
+
+
+def test_surfels_are_born_later_on_our_own_map(everything: Messages) -> None:
+    made = without_depth(everything)
+    followed = follow(load_config(None, LATER), made, *OPTIONAL)
+    births = born_later(followed)
+    keyframes = [m for m in everything[topics.KEYFRAME] if isinstance(m, Keyframe)]
+    assert births
+    assert set(births) <= {m.frame for m in keyframes if m.new >= 0}
+    start = next(m for m in followed if not m.missing)
+    scale = np.median(shares_of_truth(everything, start, np.ones(len(start.ids), np.bool_)))
+    shares = [shares_of_truth(everything, m, m.age == 0) for m in births.values()]
+    assert sum(map(len, shares)) >= 10
+    assert np.median(np.abs(np.concatenate(shares) / scale - 1.0)) < 0.02
+    # They are followed from then on.
+    frame, born = min(births.items())
+    later = next(m for m in followed if m.frame == frame + 2)
+    mine = np.isin(later.ids, born.ids[born.age == 0])
+    assert (later.state[mine] == SurfelState.TRACKED).mean() > 0.7
+    none = follow(load_config(None, [*LATER, "surfels.map_births=false"]), made, *OPTIONAL)
+    assert not born_later(none)
+
+
+def test_a_map_of_another_scale_is_brought_to_that_of_the_surfels(everything: Messages) -> None:
+    """A world half as large, from the frame after the start on, makes the same surfels."""
+    config, made = load_config(None, LATER), without_depth(everything)
+    followed = follow(config, made, *OPTIONAL)
+    start = next(m.frame for m in followed if not m.missing)
+    halved = follow(config, with_map(made, start, lambda points, _: 0.5 * points), *OPTIONAL)
+    assert born_later(followed).keys() == born_later(halved).keys() != set()
+    for one, other in zip(followed, halved, strict=True):
+        np.testing.assert_array_equal(one.ids, other.ids)
+        np.testing.assert_allclose(one.positions, other.positions, rtol=1e-3, atol=1e-3)
+
+
+def test_nothing_is_born_on_a_map_that_surfels_do_not_agree_with(everything: Messages) -> None:
+    """Points lie on the rays of the keyframe, and the nearer the further to the right."""
+
+    def bent(points: F64, T: F64) -> F64:
+        rays = points - T[:3, 3]
+        in_camera = rays @ T[:3, :3]
+        with np.errstate(all="ignore"):
+            along = np.nan_to_num(in_camera[:, :1] / in_camera[:, 2:])
+        return T[:3, 3] + rays * (1.0 + 0.5 * np.clip(along, -0.8, 0.8))
+
+    config, made = load_config(None, LATER), without_depth(everything)
+    followed = follow(config, made, *OPTIONAL)
+    start = next(m.frame for m in followed if not m.missing)
+    wrong = follow(config, with_map(made, start, bent), *OPTIONAL)
+    assert born_later(followed)
+    assert not born_later(wrong)
+    assert any("agree with it" in m.note for m in wrong)
+    assert wrong[-1].ids.tolist() == wrong[start].ids.tolist()
+
+
+def test_after_a_loss_surfels_start_again_on_our_own_map(everything: Messages) -> None:
+    """At the scale they had, from where the map says that the camera is."""
+    config, made = load_config(None, LATER), without_depth(everything)
+    images, followed = list(made[topics.IMAGE]), follow(config, made, *OPTIONAL)
+    again = min(born_later(followed))
+    image = images[again]
+    assert isinstance(image, Image)
+    # The image is another one to the surfels, and not to the map.
+    images[again] = replace(image, grey=np.ascontiguousarray(image.grey[::-1, ::-1]))
+    after = follow(config, {**made, topics.IMAGE: images}, *OPTIONAL)[again]
+    assert not after.lost
+    assert after.segment == 1
+    assert (after.age == 0).all()
+    # The world is that of the start, as far as the map still knows it.
+    known = CurrentMap()
+    for update in made[topics.MAP_UPDATE][: again + 1]:
+        assert isinstance(update, MapUpdate)
+        known.take(update, update.frame)
+    pose = next(
+        pose_to_matrix(k.pose_world_camera) for k in known.keyframes.values() if k.frame == again
+    )
+    np.testing.assert_array_equal(after.T_world_camera[:3, :3], pose[:3, :3])
+    np.testing.assert_allclose(after.T_world_camera[:3, 3], pose[:3, 3], atol=0.01)
+    depths = [
+        np.median(((m.positions - m.T_world_camera[:3, 3]) @ m.T_world_camera[:3, :3])[:, 2])
+        for m in (followed[again], after)
+    ]
+    assert depths[1] == pytest.approx(depths[0], rel=0.1)
+
+
+def test_a_service_that_is_started_again_knows_the_map(everything: Messages) -> None:
+    config, made = load_config(None, LATER), without_depth(everything)
+    inputs = {topic: made[topic] for topic in (*ALONE, *OPTIONAL)}
+    whole = follow(config, made, *OPTIONAL)
+    before = min(born_later(whole)) - 1
+    kept = Stopping(inputs, before)
+    surfels.run(kept, config, SilentMonitor())
+    rest = {t: m if t == topics.STREAM else m[before + 1 :] for t, m in inputs.items()}
+    continued = Restarted({**rest, topics.STREAM: []}, kept.state)
+    surfels.run(continued, config, SilentMonitor())
+    made_then = continued.outputs[topics.SURFELS]
+    assert [codec.encode(m) for m in made_then] == [codec.encode(m) for m in whole[before + 1 :]]
+
+
 def test_the_same_again(everything: Messages) -> None:
-    config = load_config(None, FROM_MAP)
+    config = load_config(None, LATER)
     once, again = (follow(config, everything, *OPTIONAL) for _ in range(2))
+    assert born_later(once)
     assert [codec.encode(m) for m in once] == [codec.encode(m) for m in again]
 
 

@@ -12,6 +12,7 @@ from pliant.datasets import Rectifier, open_source
 from pliant.datasets.builtin import builtin_folder
 from pliant.errors import DatasetError
 from pliant.evaluation.exact_surfels import ExactSurfels, format_exact
+from pliant.evaluation.later_surfels import LaterSurfels, format_later, scaled, true_scale
 from pliant.evaluation.surface_truth import MaterialPoints, SurfaceTruth
 
 FRAMES = 25
@@ -208,3 +209,44 @@ def test_what_is_covered_is_not_visible(cache: Path) -> None:
     assert truth.visible(on_tool, 18).all()
     hidden = ~truth.visible(points, 18, 2.0)
     assert 1 <= hidden.sum() < 0.5 * len(hidden)
+
+
+def test_surfels_born_later_are_judged_by_their_own_points(breathing: SurfaceTruth) -> None:
+    """Those of frame 9 are 0.5 % too far along their rays when they are born, 2 % in frame 20."""
+    later = LaterSurfels(breathing)
+    start, T_first = world_of(breathing, 0)
+    n = len(start)
+    first = surfels_at(breathing, start, T_first, np.zeros(n), np.ones(n))
+    later.add(0, first)
+    assert later.summary()["births"] == 0
+    to_world, new = inverse(breathing.T_world_camera[0]), pixels()[::2] + 3.0
+    points = breathing.at_pixels(9, new)
+    lengths = []
+    for frame, share in ((9, 0.005), (20, 0.02)):
+        old, T = world_of(breathing, frame)
+        exact = transform(inverse(T), transform(to_world, breathing.positions(points, frame)))
+        lengths.append(np.sqrt(np.mean(np.sum((exact / exact[:, 2:]) ** 2, axis=1))))
+        found = np.concatenate([old, transform(T, exact * (1.0 + share))])
+        m = len(found)
+        ages = np.where(np.arange(m) < n, frame, frame - 9).astype(np.int32)
+        surfels = surfels_at(breathing, found, T, np.zeros(m), np.ones(m))
+        later.add(frame, replace(surfels, age=ages))
+    figures = later.summary()
+    assert (figures["births"], figures["alive"]) == (len(new), len(new))
+    assert figures["at_birth"] == pytest.approx(0.005 * lengths[0], rel=1e-3)
+    assert figures["in_camera"] == pytest.approx(0.02 * lengths[1], rel=1e-3)
+    assert figures["whole"] == pytest.approx(0.02 * lengths[1], rel=1e-3)
+    assert "born later" in format_later(later)
+
+
+def test_a_scale_that_is_arbitrary_is_found_and_given(breathing: SurfaceTruth) -> None:
+    start, T_first = world_of(breathing, 0)
+    n = len(start)
+    metric = surfels_at(breathing, start, T_first, np.zeros(n), np.ones(n))
+    half = scaled(metric, 0.5)
+    assert true_scale(0, half, breathing) == pytest.approx(2.0, rel=1e-6)
+    np.testing.assert_allclose(scaled(half, 2.0).positions, metric.positions)
+    np.testing.assert_allclose(scaled(half, 2.0).T_world_camera, metric.T_world_camera)
+    judge = ExactSurfels(breathing)
+    judge.add(0, scaled(half, true_scale(0, half, breathing)))
+    assert judge.rows[0].rmse < 1e-6

@@ -215,6 +215,24 @@ def test_a_short_gap_is_bridged():
     assert len({segment for _, _, segment in told.poses.values()}) <= 2
 
 
+def test_frames_that_are_passed_over_get_no_pose_and_the_next_one_goes_on():
+    """Also where the map starts, and with tracks that begin and end between."""
+    poses = sideways(60)
+    mapper, told = Mapper(CAMERA, PARAMETERS, 0), Told()
+    for frame, tracks in enumerate(Scene.box().frames(poses)):
+        if frame % 3 == 0:
+            told.apply(mapper.process(frame, tracks, None, None))
+            continue
+        delta = mapper.skip(frame, "no time")
+        assert (delta.reason, delta.inliers, len(delta.pose_frames)) == ("no time", 0, 0)
+        told.apply(delta)
+    told.apply(mapper.finish())
+    assert sorted(told.poses) == list(range(0, 60, 3))
+    error, _ = trajectory_error(told, poses)
+    assert error < 2e-3
+    assert LOST not in told.states
+
+
 def test_a_frame_without_pixels_leaves_the_state_as_it_was():
     mapper = Mapper(CAMERA, PARAMETERS, 0)
     assert mapper.skip(0).state == WAITING

@@ -45,6 +45,16 @@ def leaf_kernel(function: _Function) -> _Function:
     return _compile(function, fastmath=_FAST, _nrt=False)
 
 
+def inner_kernel(function: _Function) -> _Function:
+    """Compile as ``leaf_kernel`` does, and put the code into every kernel that calls it.
+
+    A call passes five to seven words for every array: with the two dozen arrays of a level and its
+    scratch that takes as long as a small patch.  Loops that are to be vectorised stay calls: among
+    many arrays LLVM no longer proves that they are apart.
+    """
+    return _compile(function, fastmath=_FAST, _nrt=False, forceinline=True)
+
+
 def _compile(function: _Function, **options: Any) -> _Function:
     keep_copies_apart()
     dispatcher: Any = numba.njit(**_OPTIONS, **options)(function)

@@ -195,6 +195,7 @@ def _render_beside(plan: _Plan, folder: Path, progress: Progress | None) -> None
 
 
 def _render_into(plan: _Plan, folder: Path, progress: Progress) -> None:
+    progress("rendering", 0, 1)  # kernels may have to be compiled before the first texture
     plan.render(folder, progress)
     text = json.dumps(plan.description(), sort_keys=True, indent=1)
     (folder / "scene.json").write_text(text + "\n")

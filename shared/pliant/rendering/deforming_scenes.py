@@ -98,6 +98,13 @@ class BreathingOptions(DeformingOptions):
     seconds: float = Field(
         default=4.0, ge=1.0, le=60.0, description="How long it is, and the way of the camera."
     )
+    travel: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=0.25,
+        description="The camera goes so far to one side, to the other and back, metres: a third "
+        "of the first view is 0.25.",
+    )
 
 
 class BoardOptions(DeformingOptions):
@@ -229,6 +236,7 @@ def _breathing(options: DeformingOptions, _tracks: F64 | None) -> DeformingScene
     points = rng.uniform(-1.0, 1.0, (2, stations, 3)) * np.array(
         [[[0.09, 0.07, 0.06]], [[0.07, 0.05, 0.0]]]
     )
+    points[:, :, 0] += options.travel * np.sin(np.linspace(0.0, _TAU, stations))
     targets = points[1] + np.array([0.0, 0.0, _DEPTH_M])
     path = SplinePath(
         [(float(a), float(b), float(c)) for a, b, c in points[0]],

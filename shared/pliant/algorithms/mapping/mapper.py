@@ -95,16 +95,17 @@ class Mapper:
         self._add_pose(self._map, frame, hanging, T_world_camera, inliers)
         return self._tell(TRACKING, "", inliers)
 
-    def skip(self, frame: int) -> MapDelta:
-        """Pass over a frame without pixels (dropped or broken): it gets no pose.
+    def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
+        """Pass over a frame, without pixels (dropped or broken) or without time: it gets no pose.
 
         Whether the camera is lost is for frames with pixels to decide: the state stays as it was.
+        The tracks that live on are taken up again by the next frame.
         """
         if self._map is None:
             state = WAITING
         else:
             state = LOST if self._lost_frames else TRACKING
-        return self._tell(state, "the frame has no pixels", 0)
+        return self._tell(state, reason, 0)
 
     @property
     def point_count(self) -> int:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
-from pliant.algorithms.kernel import leaf_kernel
+from pliant.algorithms.kernel import inner_kernel, leaf_kernel
 from pliant.algorithms.surfels import motion
 from pliant.algorithms.surfels.damped import copy, factorise, solve
 from pliant.algorithms.surfels.rest import Rest, add_rest, rest_cost
@@ -70,7 +70,7 @@ class Workspace(NamedTuple):
     H: F64
     photometric: F64  # H without the energy of deformation
     L: F64
-    scale: F64
+    inverse: F64  # of the pivots of L
     g: F64
     step: F64
     pose: F64
@@ -88,7 +88,7 @@ def make_workspace(side: int) -> Workspace:
     )  # fmt: skip
 
 
-@leaf_kernel
+@inner_kernel
 def evaluate(
     pose: F64, level: Level, images: F32, mean: float, limits: Limits, work: Workspace, sums: F64
 ) -> tuple[float, int]:
@@ -105,7 +105,7 @@ def evaluate(
     )
 
 
-@leaf_kernel
+@inner_kernel
 def curvature(
     pose: F64, images: F32, mean: float, template_matrix: F64, limits: Limits, work: Workspace,
     matrix: F64,
@@ -137,7 +137,7 @@ def patch_step_px(before: F64, after: F64, half: float) -> float:
     return farthest
 
 
-@leaf_kernel
+@inner_kernel
 def align(
     pose: F64, level: Level, images: F32, mean: float, count: float, template_matrix: F64,
     point: F64, weight: F64, limits: Limits, work: Workspace,
@@ -173,9 +173,9 @@ def align(
             motion.add_deformation_energy(pose, limits.model, limits.omega_i, work.H, work.g)
             add_rest(pose, point, weight, work.H, work.g)
         bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
-        if not factorise(work.H, n, n - 2, bound, work.L, work.scale):
+        if not factorise(work.H, n, n - 2, bound, work.L, work.inverse):
             return cost, iteration + 1
-        solve(work.L, work.scale, n, work.g, work.step)
+        solve(work.L, work.inverse, n, work.g, work.step)
         motion.apply_step(pose, work.step, limits.model, candidate)
         candidate[GAIN] = max(candidate[GAIN], _MIN_GAIN)
         next_cost, _ = evaluate(candidate, level, images, mean, limits, work, next_sums)

@@ -18,6 +18,9 @@ _STILL_SHARE = 0.02
 """A level is done when no more than this share of the surfels still moves."""
 _RIDGE = 1e-9
 _REGISTER_STEPS = 3
+_REGISTERED = 1e-6
+"""A step that turns the camera, and moves it relative to the depth, by less than this is the last:
+a thousandth of a pixel."""
 _NONE: F64 = np.zeros((0, FEATURES, FEATURES))
 
 
@@ -114,7 +117,11 @@ def register(poses: F64, active: U8, T_camera_world: F64, equilibrium: Equilibri
     for _ in range(_REGISTER_STEPS):
         points, weights = equilibrium.seen_from(T_camera_world)
         kernels.register_system(poses, active, points, weights, M, v)
-        T_camera_world = se3_exp(_solve(M, v, 0.0)) @ T_camera_world
+        zeta = _solve(M, v, 0.0)
+        T_camera_world = se3_exp(zeta) @ T_camera_world
+        depth = float(np.abs(points[:, 2]).mean())
+        if np.abs(zeta[:3]).max() < _REGISTERED * depth and np.abs(zeta[3:]).max() < _REGISTERED:
+            break
     return T_camera_world
 
 

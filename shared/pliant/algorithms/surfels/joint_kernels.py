@@ -164,15 +164,15 @@ def joint_system(
                 WG[r, c] = W[r, 0] * G[0, c] + W[r, 1] * G[1, c] + W[r, 2] * G[2, c]
             for c in range(3):
                 work.H[r, c] += W[r, c]
-        if not factorise(work.H, n, n - 2, damping[s], work.L, work.scale):
+        if not factorise(work.H, n, n - 2, damping[s], work.L, work.inverse):
             continue
         for k in range(n):
             rhs[k] = work.g[k] + (we[k] if k < 3 else 0.0)
-        solve(work.L, work.scale, n, rhs, own[s])
+        solve(work.L, work.inverse, n, rhs, own[s])
         for c in range(6):
             for k in range(n):
                 rhs[k] = -WG[k, c] if k < 3 else 0.0
-            solve(work.L, work.scale, n, rhs, work.step)
+            solve(work.L, work.inverse, n, rhs, work.step)
             for k in range(n):
                 follow[s, k, c] = work.step[k]
         for r in range(6):
@@ -193,13 +193,12 @@ def _equilibrium_rows(x: F64, G: F64) -> None:
     G[2, 3], G[2, 4] = x[1], -x[0]
 
 
-@fast_kernel
+@leaf_kernel
 def register_system(poses: F64, active: U8, equilibrium: F64, weights: F64, M: F64, v: F64) -> None:
     """Add up M zeta = v of a camera that fits surfels which stay where they are.
 
     equilibrium: (N, 3), weights: (N, 3, 3) of a ``Rest``.  M: (6, 6), v: (6,), overwritten.
     """
-    G, WG, e = np.zeros((3, 6)), np.zeros((3, 6)), np.zeros(3)
     M[:] = 0.0
     v[:] = 0.0
     for s in range(len(poses)):
@@ -207,15 +206,38 @@ def register_system(poses: F64, active: U8, equilibrium: F64, weights: F64, M: F
             continue
         W = weights[s]
         # W turns with the camera, too: so a step is about where the surfel is, not where it rests.
-        _equilibrium_rows(poses[s, X : X + 3], G)
-        for r in range(3):
-            e[r] = poses[s, X + r] - equilibrium[s, r]
-            for c in range(6):
-                WG[r, c] = W[r, 0] * G[0, c] + W[r, 1] * G[1, c] + W[r, 2] * G[2, c]
-        for r in range(6):
-            v[r] += e[0] * WG[0, r] + e[1] * WG[1, r] + e[2] * WG[2, r]
-            for c in range(6):
-                M[r, c] += G[0, r] * WG[0, c] + G[1, r] * WG[1, c] + G[2, r] * WG[2, c]
+        x, y, z = poses[s, X], poses[s, X + 1], poses[s, X + 2]
+        p, q, r = x - equilibrium[s, 0], y - equilibrium[s, 1], z - equilibrium[s, 2]
+        a = W[0, 0] * p + W[0, 1] * q + W[0, 2] * r
+        b = W[1, 0] * p + W[1, 1] * q + W[1, 2] * r
+        c = W[2, 0] * p + W[2, 1] * q + W[2, 2] * r
+        v[0] += a
+        v[1] += b
+        v[2] += c
+        v[3] += y * c - z * b
+        v[4] += z * a - x * c
+        v[5] += x * b - y * a
+        for k in range(3):
+            # W is symmetric: its columns are its rows, and turned by [x]x they make the rest.
+            a, b, c = W[k, 0], W[k, 1], W[k, 2]
+            M[k, 0] += a
+            M[k, 1] += b
+            M[k, 2] += c
+            M[3, k] += y * c - z * b
+            M[4, k] += z * a - x * c
+            M[5, k] += x * b - y * a
+        for k in range(3):
+            k1, k2 = (k + 1) % 3, (k + 2) % 3
+            x1, x2 = poses[s, X + k1], poses[s, X + k2]
+            a = x1 * W[k2, 0] - x2 * W[k1, 0]
+            b = x1 * W[k2, 1] - x2 * W[k1, 1]
+            c = x1 * W[k2, 2] - x2 * W[k1, 2]
+            M[3 + k, 3] += c * y - b * z
+            M[3 + k, 4] += a * z - c * x
+            M[3 + k, 5] += b * x - a * y
+    for k in range(3):
+        for m in range(3):
+            M[k, 3 + m] = M[3 + m, k]
 
 
 @leaf_kernel

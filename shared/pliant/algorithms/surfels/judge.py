@@ -66,8 +66,8 @@ def judge_all(
         work.g[:] = 0.0
         motion.add_deformation_energy(pose, limits.model, limits.omega_i, work.H, work.g)
         noise = max(squares / seen, _MIN_NOISE * _MIN_NOISE)
-        if factorise(work.H, parameters, 0, 0.0, work.L, work.scale):
-            trace = inverse_diagonal(work.L, work.scale, parameters, 3, work.step)
+        if factorise(work.H, parameters, 0, 0.0, work.L, work.inverse):
+            trace = inverse_diagonal(work.L, work.inverse, parameters, 3, work.step)
             verdict[SIGMA] = min(math.sqrt(noise * trace), _MAX_SIGMA)
 
 

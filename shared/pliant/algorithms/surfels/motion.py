@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.kernel import leaf_kernel
+from pliant.algorithms.kernel import inner_kernel, leaf_kernel
 from pliant.algorithms.surfels.sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, Level, X
 from pliant.algorithms.surfels.sums import FEATURES
 
@@ -31,7 +31,7 @@ _GAIN_BIT, _BIAS_BIT = 1, 2
 _MIN_STRETCH, _MAX_STRETCH = 0.2, 5.0
 
 
-@leaf_kernel
+@inner_kernel
 def parameter_count(model: int) -> int:
     """Parameters of a step: 6, those of F, gain and bias."""
     return RIGID + model + 2
@@ -96,7 +96,7 @@ def mixing(pose: F64, level: Level, model: int, out: F64, light: int = 3) -> Non
         out[9, gain + 1] = 1.0
 
 
-@leaf_kernel
+@inner_kernel
 def _turn(
     out: F64,
     column: int,
@@ -119,18 +119,41 @@ def hessian(matrix: F64, share: float, mix: F64, parameters: int, scratch: F64, 
 
     share: of the texture that is seen.  scratch: (FEATURES, MOST_PARAMETERS).
     """
+    gain = parameters - 2
     for row in range(FEATURES):
-        for column in range(parameters):
-            total = 0.0
-            for k in range(FEATURES):
-                total += matrix[row, k] * mix[k, column]
-            scratch[row, column] = share * total
-    for row in range(parameters):
-        for column in range(row + 1):
-            total = 0.0
-            for k in range(FEATURES):
-                total += mix[k, row] * scratch[k, column]
-            H[row, column] = H[column, row] = total
+        m, out = matrix[row], scratch[row]
+        for k in range(3):
+            out[k] = share * _shifted(m[0], m[1], m[2], m[5], mix, k)
+        for k in range(3, gain):
+            out[k] = share * _turned(m[2], m[3], m[4], m[5], m[6], m[7], mix, k)
+        out[gain] = share * (m[8] * mix[8, gain] + m[9] * mix[9, gain])
+        out[gain + 1] = share * m[9] * mix[9, gain + 1]
+    s = scratch
+    for c in range(parameters):
+        for row in range(min(c + 1, 3)):
+            H[c, row] = H[row, c] = _shifted(s[0, c], s[1, c], s[2, c], s[5, c], mix, row)
+        for row in range(3, min(c + 1, gain)):
+            H[c, row] = H[row, c] = _turned(
+                s[2, c], s[3, c], s[4, c], s[5, c], s[6, c], s[7, c], mix, row
+            )
+        if c >= gain:
+            H[c, gain] = H[gain, c] = s[8, c] * mix[8, gain] + s[9, c] * mix[9, gain]
+    H[gain + 1, gain + 1] = s[9, gain + 1] * mix[9, gain + 1]
+
+
+@inner_kernel
+def _shifted(f0: float, f1: float, f2: float, f5: float, mix: F64, column: int) -> float:
+    """Product with a column of ``mixing`` that shifts the centre: its other rows are zero."""
+    return f0 * mix[0, column] + f1 * mix[1, column] + f2 * mix[2, column] + f5 * mix[5, column]
+
+
+@inner_kernel
+def _turned(
+    f2: float, f3: float, f4: float, f5: float, f6: float, f7: float, mix: F64, column: int
+) -> float:
+    """Product with a column of ``mixing`` that turns or deforms the patch."""
+    left = f2 * mix[2, column] + f3 * mix[3, column] + f4 * mix[4, column]
+    return left + f5 * mix[5, column] + f6 * mix[6, column] + f7 * mix[7, column]
 
 
 @leaf_kernel

@@ -99,6 +99,28 @@ class SurfelParameters(Parameters):
     map_points: int = Field(
         default=200, ge=3, description="Such points in the keyframe on which surfels start."
     )
+    map_births: bool = Field(
+        default=True,
+        description="Surfels are born later, too, on keyframes of our own map that they agree "
+        "with; no: only those of the start.",
+    )
+    map_birth_sigma: float = Field(
+        default=0.005,
+        gt=0.0,
+        description="As map_sigma, for those births: new surface has been seen for a short while.",
+    )
+    map_surfels: int = Field(
+        default=30,
+        ge=1,
+        description="Surfels that agree with a later keyframe's depth, so that others are born on "
+        "it; and half of those that it shows.",
+    )
+    map_disagreement: float = Field(
+        default=0.02,
+        gt=0.0,
+        description="A surfel disagrees whose depth is off the keyframe's by more than this share, "
+        "after the median.  Nothing is born where most surfels do.",
+    )
     prediction: Literal["auto", "none", "tracks"] = Field(
         default="auto",
         description="tracks: each surfel starts where the extrema about it went, and else where "
@@ -188,14 +210,14 @@ class SurfelParameters(Parameters):
         default=1.0, ge=0.0, description="lambda is at least this in the first steps of a level."
     )
     damped_steps: int = Field(
-        default=2, ge=0, description="How many accepted steps of a level are the first ones."
+        default=1, ge=0, description="How many accepted steps of a level are the first ones."
     )
     start_lambda: float = Field(
         default=0.01, gt=0.0, description="lambda that a level starts with."
     )
     lambda_down: float = Field(default=10.0, gt=1.0, description="Divides lambda after a success.")
     lambda_up: float = Field(default=4.0, gt=1.0, description="Multiplies lambda after a failure.")
-    coarse_iterations: int = Field(default=8, ge=1, description="Most steps, but at full size.")
+    coarse_iterations: int = Field(default=6, ge=1, description="Most steps, but at full size.")
     fine_iterations: int = Field(default=10, ge=1, description="Most steps at full size.")
     coarse_step_px: float = Field(
         default=0.05, gt=0.0, description="A step that moves no corner farther ends a level, px."

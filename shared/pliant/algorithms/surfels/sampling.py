@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U32, U64
-from pliant.algorithms.kernel import kernel, leaf_kernel
+from pliant.algorithms.kernel import inner_kernel, kernel, leaf_kernel
 
 X, A, B, F, GAIN, BIAS, POSE_FLOATS = 0, 3, 6, 9, 12, 13, 14
 """Where the parts of a surfel's row begin, and its length."""
@@ -112,7 +112,7 @@ def make_grid(side: int) -> Grid:
     return Grid(side, i.ravel().copy(), j.ravel().copy(), x, y, above, quads, values)
 
 
-@leaf_kernel
+@inner_kernel
 def homography(pose: F64, level: Level, out: F64) -> bool:
     """The 9 numbers, row by row, that map the grid (i, j, 1) to homogeneous pixels.
 
@@ -133,7 +133,7 @@ def homography(pose: F64, level: Level, out: F64) -> bool:
     return out[8] > 0.0 and largest < _LARGEST
 
 
-@leaf_kernel
+@inner_kernel
 def sample_patch(h: F64, level: Level, grid: Grid, highlight: float) -> bool:
     """Fill ``grid.values`` with bilinear grey levels; INVALID outside and above ``highlight``.
 
@@ -146,10 +146,27 @@ def sample_patch(h: F64, level: Level, grid: Grid, highlight: float) -> bool:
         return False
     # Just short of the last pixel, so that the pixel to the right is there as well.
     right, bottom = np.float32(level.width - 1.001), np.float32(level.height - 1.001)
+    # The upper two pixels of a sample, then the lower two.
+    halves = grid.quads.view(np.uint32)
     _coordinates(h, grid.i, grid.j, grid.x, grid.y)
+    if _wholly_inside(grid.x, grid.y, grid.side, right, bottom):
+        _pixels_inside(grid.x, grid.y, np.uint32(level.width), grid.above)
+        _load(level.quads, grid.above, grid.quads)
+        _interpolate_inside(grid.x, grid.y, halves, np.float32(highlight), grid.values)
+        return True
     _pixels(grid.x, grid.y, right, bottom, np.uint32(level.width), grid.above)
     _load(level.quads, grid.above, grid.quads)
-    _interpolate(grid.x, grid.y, right, bottom, grid.quads, np.float32(highlight), grid.values)
+    _interpolate(grid.x, grid.y, right, bottom, halves, np.float32(highlight), grid.values)
+    return True
+
+
+@inner_kernel
+def _wholly_inside(x: F32, y: F32, side: int, right: np.float32, bottom: np.float32) -> bool:
+    """Whether the corners lie in the image: in front of the camera a square stays convex."""
+    zero, last = np.float32(0.0), side * side - 1
+    for k in (0, side - 1, last - side + 1, last):
+        if not ((x[k] >= zero) & (y[k] >= zero) & (x[k] < right) & (y[k] < bottom)):
+            return False
     return True
 
 
@@ -186,12 +203,17 @@ def _load(quads: U64, index: U32, out: U64) -> None:
 
 
 @leaf_kernel
+def _pixels_inside(x: F32, y: F32, width: np.uint32, out: U32) -> None:
+    for k in range(len(out)):
+        out[k] = np.uint32(np.int32(y[k])) * width + np.uint32(np.int32(x[k]))
+
+
+@leaf_kernel
 def _interpolate(
-    x: F32, y: F32, right: np.float32, bottom: np.float32, quads: U64, highlight: np.float32,
+    x: F32, y: F32, right: np.float32, bottom: np.float32, halves: U32, highlight: np.float32,
     out: F32,
 ) -> None:  # fmt: skip
-    zero, outside, mask = np.float32(0.0), np.float32(INVALID), np.uint64(0xFFFF)
-    unit = np.float32(1.0 / _ONE)
+    zero, outside = np.float32(0.0), np.float32(INVALID)
     for k in range(len(out)):
         u, v = x[k], y[k]
         inside = (u > -MARGIN) & (v > -MARGIN) & (u < right + MARGIN) & (v < bottom + MARGIN)
@@ -199,12 +221,24 @@ def _interpolate(
         v = v if v > zero else zero
         u = u if u < right else right
         v = v if v < bottom else bottom
-        across, down = u - np.float32(np.int32(u)), v - np.float32(np.int32(v))
-        quad = quads[k]
-        p = np.float32(np.int32(quad & mask))
-        q = np.float32(np.int32((quad >> np.uint64(16)) & mask))
-        r = np.float32(np.int32((quad >> np.uint64(32)) & mask))
-        s = np.float32(np.int32(quad >> np.uint64(48)))
-        top = p + across * (q - p)
-        value = unit * (top + down * (r + across * (s - r) - top))
+        value = _mixed(halves[2 * k], halves[2 * k + 1], u, v)
         out[k] = value if inside & (value <= highlight) else outside
+
+
+@leaf_kernel
+def _interpolate_inside(x: F32, y: F32, halves: U32, highlight: np.float32, out: F32) -> None:
+    outside = np.float32(INVALID)
+    for k in range(len(out)):
+        value = _mixed(halves[2 * k], halves[2 * k + 1], x[k], y[k])
+        out[k] = value if value <= highlight else outside
+
+
+@inner_kernel
+def _mixed(upper: np.uint32, lower: np.uint32, u: np.float32, v: np.float32) -> np.float32:
+    """Bilinear grey level of two rows of two packed pixels."""
+    mask, shift = np.uint32(0xFFFF), np.uint32(16)
+    across, down = u - np.float32(np.int32(u)), v - np.float32(np.int32(v))
+    p, q = np.float32(np.int32(upper & mask)), np.float32(np.int32(upper >> shift))
+    r, s = np.float32(np.int32(lower & mask)), np.float32(np.int32(lower >> shift))
+    top = p + across * (q - p)
+    return np.float32(1.0 / _ONE) * (top + down * (r + across * (s - r) - top))

@@ -24,7 +24,7 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.kernel import leaf_kernel
+from pliant.algorithms.kernel import inner_kernel, leaf_kernel
 from pliant.algorithms.surfels.sampling import Grid
 
 FEATURES = 10
@@ -50,13 +50,13 @@ def make_features(side: int) -> F32:
     return features
 
 
-@leaf_kernel
+@inner_kernel
 def first_inner(grid: Grid) -> int:
     """Where in the grid of a patch, one sample wider on each side, its first sample stands."""
     return grid.side + 1
 
 
-@leaf_kernel
+@inner_kernel
 def photometric_sums(
     images: F32, grid: Grid, mean: float, gain: float, bias: float, tau: float, blend: float,
     out: F64,
@@ -66,8 +66,10 @@ def photometric_sums(
     images: (TEMPLATE_IMAGES, n) of the texture.  blend: share of the frame in the derivatives; the
     rest are the texture's.  out: (FEATURES,).  Returns (cost DN^2, samples not saturated).
     """
+    # Where none of it is asked for, the texture's derivatives need not come out of memory.
+    u, v = (images[1], images[2]) if blend < 1.0 else (images[0], images[0])
     return _sums(
-        grid.i, grid.j, grid.values, grid.side, images[0], images[1], images[2],
+        grid.i, grid.j, grid.values, grid.side, images[0], u, v,
         np.float32(mean), np.float32(gain), np.float32(bias), np.float32(tau), np.float32(blend),
         out,
     )  # fmt: skip

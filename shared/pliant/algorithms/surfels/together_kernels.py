@@ -78,22 +78,22 @@ def _reduce(
 ) -> None:  # fmt: skip
     n = motion.parameter_count(limits.model)
     m = n - _RIGID
-    H, g, rhs, x = work.H, work.g, work.step, work.scale[m:]
+    H, g, rhs, x = work.H, work.g, work.step, work.inverse[m:]
     motion.mixing(pose, level, limits.model, work.mix, limits.light)
     motion.hessian(matrix, 1.0, work.mix, n, work.product, H)
     motion.gradient(sums, work.mix, n, g)
     motion.add_deformation_energy(pose, limits.model, limits.omega_i, H, g)
-    if not factorise(H[_RIGID:n, _RIGID:n], m, 0, 0.0, work.L, work.scale):
+    if not factorise(H[_RIGID:n, _RIGID:n], m, 0, 0.0, work.L, work.inverse):
         return
     for k in range(m):
         rhs[k] = -g[_RIGID + k]
-    solve(work.L, work.scale, m, rhs, x)
+    solve(work.L, work.inverse, m, rhs, x)
     for k in range(m):
         inner[k] = x[k]
     for c in range(_RIGID):
         for k in range(m):
             rhs[k] = -H[_RIGID + k, c]
-        solve(work.L, work.scale, m, rhs, x)
+        solve(work.L, work.inverse, m, rhs, x)
         for k in range(m):
             follow[k, c] = x[k]
     for r in range(_RIGID):

@@ -25,6 +25,8 @@ _FOUND_AGAIN_ZNCC = 0.9
 """A surfel that was missing must fit better than one that was followed: chance has had tries."""
 _TOGETHER_LEVELS = 2
 """Levels, the finest, at which surfels with neighbours move as one before a static camera."""
+_RIGID_SURFELS = 150
+"""So many surfels say where the camera is before each of them is looked for."""
 _BLENDS = {"template": (0.0, 0.0), "both": (0.5, 1.0), "frame": (1.0, 1.0)}
 """Share of the frame in the derivatives of a patch, at the coarse scales of a static camera and
 otherwise: with a moving camera the mean finds fewer surfels again after a jump."""
@@ -92,6 +94,20 @@ class SurfelTracker:
         if depth is not None:
             with timer("births"):
                 self._give_birth(pyramid, _checked_depth(depth, self._camera))
+        return self._result()
+
+    def add(self, image: U8, depth: F64, T_world_camera: F64 | None = None) -> SurfelFrame:
+        """Give birth to more surfels in the frame that was tracked last, where there is room.
+
+        image: (H, W) uint8 of that frame.  depth: (H, W) in units of the surfels.  T_world_camera:
+        (4, 4), where the camera is when tracking is lost: surfels start anew from there.  Raises
+        ValueError before ``start``, and for arrays of another size.
+        """
+        if self._camera is None:
+            raise ValueError("add() before start(): surfels need a depth map to begin with")
+        if self._lost and T_world_camera is not None:
+            self._T_world_camera = T_world_camera.copy()
+        self._give_birth(self._pyramid(image), _checked_depth(depth, self._camera))
         return self._result()
 
     def set_equilibrium(self, ids: I64, positions: F64, covariances: F64) -> None:
@@ -205,9 +221,11 @@ class SurfelTracker:
                 # Turn and shift are nearly the same in the image: a last camera takes short steps.
                 share = 0.1 if p.camera == "static_map" else 1.0
                 short = limits._replace(min_step_px=share * limits.min_step_px)
+                whole = p.camera == "static_map"
+                guides = followed if whole else _spread(followed * templates.usable)
                 with timer(f"camera alone, level {number}"):
                     T_camera_world = align_rigid(
-                        poses, followed, T_camera_world, level, templates, short,
+                        poses, guides, T_camera_world, level, templates, short,
                         self._works[number],
                     )  # fmt: skip
             if p.camera == "static_map":
@@ -351,6 +369,14 @@ class SurfelTracker:
             born=table.born.copy(),
             tried=table.tried.copy(),
         )
+
+
+def _spread(rows: U8) -> U8:
+    """Of the rows that are 1 every so many, ``_RIGID_SURFELS`` or up to twice as many."""
+    chosen = np.flatnonzero(rows)
+    out = np.zeros_like(rows)
+    out[chosen[:: max(1, len(chosen) // _RIGID_SURFELS)]] = 1
+    return out
 
 
 def _checked_depth(depth: F64, camera: PinholeCamera) -> F64:
