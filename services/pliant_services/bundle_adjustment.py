@@ -1,7 +1,8 @@
 """Bundle adjustment: where the camera is and what it sees, from tracks alone.
 
 in   camera/stream    once
-     camera/image     every frame: colours, and patches for re-acquisition
+     camera/image     every frame: colours, and patches for re-acquisition; in live mode, whether
+                      to pass over the frame
      tracks/extrema   every frame
 out  map/update       one per frame: pose, points, keyframes, corrections of earlier poses
      map/final        one, after the last frame: the last corrections
@@ -26,6 +27,7 @@ from pliant.messages.types import (
     Keyframe,
     MapUpdate,
 )
+from pliant_services.keeping_up import REASON
 from pliant_services.link_images import receive_images
 from pliant_services.monitor import Monitor
 
@@ -43,15 +45,17 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     # waiting: images of the frames from which a map may yet start, by frame number.
     last, mapper, waiting = resume(bus, start)
     extrema = receive(bus, topics.EXTREMA, Extrema)
-    for image, tracks in join(receive_images(bus), extrema):
+    for image, tracks in join(receive_images(bus, mapped_only=True), extrema):
         if tracks.missing:
             delta = mapper.skip(tracks.frame)
+        elif image.unmapped:
+            delta = mapper.skip(tracks.frame, REASON)
         else:
             colour = image.colour if image.colour.size else None
             delta = mapper.process(tracks.frame, tracks, image.grey, colour, monitor.stage)
         bus.publish(topics.MAP_UPDATE, _update(tracks, delta))
         bus.publish(topics.KEYFRAME, _keyframe(image, mapper, delta, waiting))
-        if delta.state == WAITING and not tracks.missing:
+        if delta.state == WAITING and not (tracks.missing or image.unmapped):
             waiting[tracks.frame] = _jpeg(image)
             if len(waiting) > config.bundle_adjustment.start.max_frames:
                 del waiting[min(waiting)]

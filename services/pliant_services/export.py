@@ -1,6 +1,8 @@
 """Behind ``pliant export``: what a result folder becomes for other programs and for the eye."""
 
+import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,13 +21,14 @@ from pliant.map_history import MapHistory, Points
 from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Extrema, MapUpdate
+from pliant.recording.parts import parts_in
 from pliant.recording.reader import Recording
 from pliant.trajectory import Trajectory
 from pliant_services import export_models
 from pliant_services.export_models import camera_of, rectified_images
 from pliant_services.export_surface import overlay_pictures, surfaces
 from pliant_services.results import RECORDING_NAME, read_run
-from pliant_services.surfel_results import has_surfels
+from pliant_services.surfel_results import has_surfels, surfel_trajectory
 
 _OVERVIEW_FRAMES = 40
 _OVERVIEW_WIDTH = 960
@@ -60,7 +63,7 @@ def export_result(
         raise ResultError(f"--every: {to} has no such option, surface has")
     if not result.exists():
         raise ResultError(f"{result}: no such result folder or recording")
-    folder = result if result.is_dir() else None
+    folder = result if result.is_dir() and not parts_in(result) else None
     recording = Recording(result / RECORDING_NAME if folder is not None else result)
     name, write = EXPORTS[to]
     path = output or (result / name if folder is not None else _beside(result, name))
@@ -68,11 +71,25 @@ def export_result(
         raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
     if path.exists() and path.samefile(recording.files[0]):
         raise ResultError(f"{path}: is the recording itself: choose another --output")
-    if every is not None:
-        surfaces(recording, path, folder, every)
-    else:
-        write(recording, path, folder)
+    fresh = not path.exists()
+    try:
+        if every is not None:
+            surfaces(recording, path, folder, every)
+        else:
+            write(recording, path, folder)
+    except BaseException:  # Ctrl-C, too: half an export is none
+        if fresh:
+            _remove(path)
+        raise
     return path
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def _beside(recording: Path, name: str) -> Path:
@@ -158,13 +175,20 @@ def _poses(write: Callable[[Path, Trajectory], None]) -> Export:
     """Writes the final poses of the longest segment in one of the formats of trajectories."""
 
     def export(recording: Recording, path: Path, folder: Path | None) -> None:
-        history = read_run(recording.path).history
-        longest = history.longest_segment()
-        write(
-            path, history.trajectory({f: p for f, p in history.final().items() if p[0] == longest})
-        )
+        poses = _final_poses(recording)
+        if not len(poses.stamps_ns):
+            raise ResultError(f"{recording.path}: the run has no poses to export")
+        write(path, poses)
 
     return export
+
+
+def _final_poses(recording: Recording) -> Trajectory:
+    if has_surfels(recording.path):
+        return surfel_trajectory(recording.path)
+    history = read_run(recording.path).history
+    longest = history.longest_segment()
+    return history.trajectory({f: p for f, p in history.final().items() if p[0] == longest})
 
 
 def _frames_per_second(recording: Recording, topic: Topic = topics.EXTREMA) -> float:

@@ -106,6 +106,8 @@ def ply(recording: Recording, path: Path, folder: Path | None) -> None:
     history = read_run(recording.path).history
     points = history.points()
     points = points.select(points.segments == history.longest_segment())
+    if not len(points):
+        raise ResultError(f"{recording.path}: the run has no map to export")
     colours = np.asarray(points.colours, np.uint8).reshape(-1, 3)
     write_ply(path, np.asarray(points.positions, np.float32), colours)
 

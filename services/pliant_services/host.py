@@ -97,6 +97,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
             **observer_windows(config, options.fleet),
             **(checkpoint_windows(config, options.fleet) if restartable else {}),
         },
+        lags=lags(config, options.fleet),
         packed=packed_topics(config.bus),
         disturb=random_delays(options.delays_ms),
         identity=options.identity,
@@ -126,13 +127,19 @@ def observer_windows(config: Config, fleet: Sequence[str]) -> dict[str, Window]:
     return {name: window for name in fleet if processes.BY_NAME[name].observer}
 
 
+def lags(config: Config, fleet: Sequence[str]) -> dict[str, Window]:
+    """How far behind services may be with frames that bundle adjustment passes over, by name."""
+    lag = Window(config.bus.lag_messages, config.bus.lag_mib << 20)
+    return {name: lag for name in fleet if processes.BY_NAME[name].may_lag}
+
+
 def checkpoint_windows(config: Config, fleet: Sequence[str]) -> dict[str, Window]:
     """The windows of those services that may ask for all since their last usable checkpoint.
 
-    What is on the way, two intervals for each stage down to the disk (one checkpoint may be passed
-    over while another is written), and what comes while each stage tells the one before it: the
-    rate of 60 frames/s for two of its ticks of a second.  With less the others would wait for
-    checkpoints that need more frames.
+    What is on the way, also to one further down that lags, two intervals for each stage down to the
+    disk (one checkpoint may be passed over while another is written), and what comes while each
+    stage tells the one before it: the rate of 60 frames/s for two of its ticks of a second.  With
+    less the others would wait for checkpoints that need more frames.
     """
 
     def stages(name: str) -> int:
@@ -144,7 +151,9 @@ def checkpoint_windows(config: Config, fleet: Sequence[str]) -> dict[str, Window
     bus = config.bus
 
     def window(depth: int) -> Window:
-        kept = 2 * bus.window + 2 * bus.checkpoint_frames * depth + _TOLD_MESSAGES * (depth + 1)
+        lag = max((lag.messages for lag in lags(config, fleet).values()), default=0)
+        on_the_way = 2 * bus.window + lag
+        kept = on_the_way + 2 * bus.checkpoint_frames * depth + _TOLD_MESSAGES * (depth + 1)
         return Window(kept, sys.maxsize)
 
     return {

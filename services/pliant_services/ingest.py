@@ -4,13 +4,16 @@ in   an image folder, a video, a camera, a built-in sequence
 out  camera/stream   once: the camera
      camera/source   every frame: its bytes as they came
      camera/image    every frame: rectified; empty where it was dropped or does not decode; over a
-                     link as ``link_images`` says
+                     link as ``link_images`` says; who passes over it, as ``keeping_up`` says
      camera/depth    every frame: the bytes of its depth map, where it has one that somebody wants
 """
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +25,7 @@ from pliant.datasets.rectifier import Rectifier
 from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import topics
 from pliant.messages.types import CAMERA_FRAME_ID, CameraStream, Depth, Header, Image, SourceImage
+from pliant_services.keeping_up import MappingPace, images_that_wait, readers_that_may_lag
 from pliant_services.link_images import Sender
 from pliant_services.monitor import Monitor
 
@@ -36,16 +40,18 @@ def run(
 
     Raises SourceLostError where the source fails after its first frame; what came before is sent.
     """
-    live = dataset.is_live if config.ingest.mode == "auto" else config.ingest.mode == "live"
+    live = plays_live(dataset, config)
     rectifier = Rectifier(dataset.calibration)
     link = Sender(config.bus, dataset.calibration)
 
-    def start() -> tuple[int, int, int]:
+    def start() -> tuple[Any, ...]:
         bus.publish(topics.STREAM, _stream(dataset, rectifier, live=live))
         bus.end(topics.STREAM)  # its readers wait for its end before the first frame
-        return 0, 0, 0
+        # One less than there is credit for: the tracks of a frame are taken after its image.
+        return 0, 0, 0, (deque[int](maxlen=config.bus.window - 1),)
 
-    begin, dropped, broken = resume(bus, start)
+    begin, dropped, broken, kept = resume(bus, start)
+    pace = MappingPace(*kept)
     image: Image | None = None
     try:
         for source in newest(dataset, stopping) if live else every(dataset, stopping):
@@ -54,22 +60,34 @@ def run(
             with monitor.stage("rectify"):
                 source, made_from = link.source(source)
                 image = rectified(source, rectifier)
+            if live and pace.passes_over(image, images_that_wait(bus), config.ingest.mapping_lag_s):
+                image = replace(image, unmapped=True)
             dropped += source.dropped
             broken += bool(image.missing) and not source.dropped
-            bus.publish(topics.SOURCE, _source_message(source, made_from))
-            bus.publish(topics.IMAGE, link.image(image, source))
-            bus.publish(topics.DEPTH, _depth_message(source))
-            monitor.report(image, dropped=dropped, broken=broken)
-            bus.checkpoint(image.frame, (image.frame + 1, dropped, broken))
+            bus.publish(topics.SOURCE, _source_message(source, made_from, image.unmapped))
+            may_lag = readers_that_may_lag(image)
+            bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)
+            bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
+            monitor.report(image, dropped=dropped, broken=broken, unmapped=pace.passed)
+            kept = tuple(vars(pace).values())
+            bus.checkpoint(image.frame, (image.frame + 1, dropped, broken, kept))
     except DatasetError as error:
         if image is None:
             raise
-        monitor.report(image, note=str(error), dropped=dropped, broken=broken)
+        monitor.report(image, note=str(error), dropped=dropped, broken=broken, unmapped=pace.passed)
         raise SourceLostError(str(error)) from None
 
 
-def rectified(source: SourceFrame, rectifier: Rectifier) -> Image:
-    """The image that everybody works on: a pure function, so that a replay makes the same."""
+def plays_live(dataset: Dataset, config: Config) -> bool:
+    """Whether the newest frame wins, and others are passed over."""
+    return dataset.is_live if config.ingest.mode == "auto" else config.ingest.mode == "live"
+
+
+def rectified(source: SourceFrame, rectifier: Rectifier, *, unmapped: bool = False) -> Image:
+    """The image that everybody works on: a pure function, so that a replay makes the same.
+
+    unmapped: as it was decided on and recorded.
+    """
     if source.dropped:
         return _without_pixels(source, DROPPED)
     try:
@@ -83,6 +101,7 @@ def rectified(source: SourceFrame, rectifier: Rectifier) -> Image:
         frame_id=header.frame_id,
         grey=grey,
         colour=colour if colour is not None else np.zeros((0, 0, 3), np.uint8),
+        unmapped=unmapped,
     )
 
 
@@ -170,7 +189,7 @@ def _header(source: SourceFrame) -> Header:
     return Header(frame=source.index, stamp_ns=source.stamp_ns, frame_id=CAMERA_FRAME_ID)
 
 
-def _source_message(source: SourceFrame, made_from: str) -> SourceImage:
+def _source_message(source: SourceFrame, made_from: str, unmapped: bool) -> SourceImage:
     return SourceImage(
         frame=source.index,
         stamp_ns=source.stamp_ns,
@@ -180,6 +199,7 @@ def _source_message(source: SourceFrame, made_from: str) -> SourceImage:
         height=source.height,
         data=source.data,
         made_from=made_from,
+        unmapped=unmapped,
     )
 
 

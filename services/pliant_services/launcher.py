@@ -103,7 +103,7 @@ class Fleet:
             self._children.append(self._spawn(name))  # one by one: a Ctrl-C leaves none behind
         deadline = time.monotonic() + READY_TIMEOUT_S
         while not self._ready >= set(self._services):
-            self._raise_if_died()
+            self.raise_if_died()
             if time.monotonic() > deadline:
                 missing = sorted(set(self._services) - self._ready)
                 raise BusError(f"{', '.join(missing)} did not come up in {READY_TIMEOUT_S:.0f} s")
@@ -185,7 +185,7 @@ class Fleet:
         """
         over = all(child.process.poll() is not None for child in self._children)
         if self._state is None or self._gave_up:
-            self._raise_if_died()
+            self.raise_if_died()
             return over
         if all(c.process.poll() == 0 for c in self._children if BY_NAME[c.name].observer):
             return over  # all is on the disk: whoever dies now is not missed
@@ -209,7 +209,8 @@ class Fleet:
         child.close()
         self._children[index] = self._spawn(child.name)
 
-    def _raise_if_died(self) -> None:
+    def raise_if_died(self) -> None:
+        """Raise ServiceDiedError where a service has failed."""
         if not any(child.failed for child in self._children):
             return
         # One death makes others complain that it went away: name the one that did not say so.

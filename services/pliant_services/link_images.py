@@ -67,13 +67,15 @@ class Sender:
         )
 
 
-def receive_images(bus: Bus) -> Iterator[Image]:
+def receive_images(bus: Bus, *, mapped_only: bool = False) -> Iterator[Image]:
     """Every ``camera/image`` with its pixels, however it came.
 
+    mapped_only: those that bundle adjustment passes over come as they are, perhaps without.
     Raises MessageError for one that no sender of ours makes.
     """
     for image in receive(bus, topics.IMAGE, Image):
-        yield whole(image) if image.jpeg else image
+        unused = mapped_only and image.unmapped
+        yield whole(image) if image.jpeg and not unused else image
 
 
 def whole(image: Image) -> Image:

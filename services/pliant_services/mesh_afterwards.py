@@ -16,7 +16,7 @@ from pliant.recording.reader import Recording
 from pliant.recording.summary import Summary, summarise
 from pliant.recording.writer import RecordingWriter
 from pliant_services.child import Child
-from pliant_services.host import ONE_THREAD, one_thread_each
+from pliant_services.host import ONE_THREAD, end_with_launcher, one_thread_each
 from pliant_services.launcher import MOST_DEATHS, ServiceDiedError
 from pliant_services.processes import BY_NAME
 from pliant_services.replay import recorded_config, run_on
@@ -37,7 +37,7 @@ def add_mesh(output: Path) -> None:
             return
         process = subprocess.Popen(
             [sys.executable, "-m", __name__, str(output)],
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             env={**os.environ, **ONE_THREAD},
@@ -82,6 +82,7 @@ def _can_be_meshed(summary: Summary) -> bool:
 
 
 if __name__ == "__main__":
+    end_with_launcher()
     try:
         mesh_into_recording(Path(sys.argv[1]))
     except PliantError as error:

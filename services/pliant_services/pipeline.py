@@ -23,16 +23,17 @@ from pliant.datasets.rectifier import Rectifier
 from pliant.errors import PliantError, ResultError
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.recording import parts
+from pliant.recording.restart import mend
 from pliant_services import warm_up
-from pliant_services.ingest import DROPPED
+from pliant_services.ingest import DROPPED, plays_live
 from pliant_services.launcher import Fleet
 from pliant_services.mesh_afterwards import add_mesh
 from pliant_services.mesh_check import WITH_MESH, choose_profile
 from pliant_services.mesh_results import FILES as MESH_FILES
-from pliant_services.processes import PROFILES, deformable_fleet, reads_depth
+from pliant_services.processes import PROFILES, deformable_fleet, inputs_of, reads_depth
 from pliant_services.progress import Progress
 from pliant_services.results import CONFIG_NAME, RECORDING_NAME, write_results
-from pliant_services.spectators import announced, viewer
+from pliant_services.spectators import announced, check_viewer, viewer
 from pliant_services.surfel_results import FILES as SURFEL_FILES
 from pliant_services.surfel_results import (
     SURFELS_NAME,
@@ -43,7 +44,7 @@ from pliant_services.surfel_results import (
 
 STATE_FOLDER = "state"
 """Checkpoints of the services, while a run goes on that may be started again."""
-DONE, FAILED, INCOMPLETE, INTERRUPTED = 0, 1, 3, 130
+DONE, INCOMPLETE, INTERRUPTED = 0, 3, 130
 
 _OUTPUT_FILES = (
     "trajectory.txt",
@@ -91,6 +92,8 @@ def run_pipeline(request: RunRequest) -> int:
         profile = _DEFORMABLE if (output / STATE_FOLDER / "surfels").is_dir() else profile
     else:
         check_output(output, force=request.force)
+    if request.view or request.save:
+        check_viewer(output, web=request.view == "web", save=request.save, force=request.force)
     if is_builtin(request.source):
         builtin_folder(request.source, progress=_say_rendering)
     dataset = open_source(
@@ -110,14 +113,24 @@ def run_pipeline(request: RunRequest) -> int:
         if profile == WITH_MESH:
             check_voxel_sizes(Rectifier(dataset.calibration).camera, config.meshing.tsdf)
     mesh_afterwards = state is not None and profile == WITH_MESH
-    fleet = Fleet(
-        PROFILES["points" if mesh_afterwards else profile],
-        log_folder=output / "logs",
-        on_status=progress.on_status,
-        port=request.port,
-        state=state,
-    )
-    interrupted, failure = _go_through(request, config, output, fleet, progress)
+    services = PROFILES["points" if mesh_afterwards else profile]
+    if request.resume and _has_ended(output, services, config):
+        progress.say("the run had come to its end already: what follows from it is written again")
+        interrupted, failure = False, None
+    else:
+        if request.resume and plays_live(dataset, config):
+            raise ResultError(
+                f"{output} was recorded live, and what was passed over then would be others now: "
+                f"`pliant run {output / RECORDING_NAME} --output ...` works on what was recorded"
+            )
+        fleet = Fleet(
+            services,
+            log_folder=output / "logs",
+            on_status=progress.on_status,
+            port=request.port,
+            state=state,
+        )
+        interrupted, failure = _go_through(request, config, output, fleet, progress)
     if failure is None and mesh_afterwards:
         progress.say("meshing what was recorded ...")
         try:
@@ -136,7 +149,7 @@ def _go_through(
 ) -> tuple[bool, PliantError | None]:
     """Start the services and wait for their end: whether it was Ctrl-C, and what went wrong."""
     try:
-        warm_up.compile_kernels(progress.say)
+        warm_up.compile_kernels(progress.say)  # whatever ends it, an earlier result is as it was
         if not request.resume:
             prepare(output, config_yaml(config))
         looking_on = (
@@ -144,14 +157,15 @@ def _go_through(
             if request.view or request.save
             else nullcontext()
         )
-        with announced(output, fleet.endpoint, fleet.session), looking_on, progress:
-            fleet.start(lambda name: service_arguments(name, request, output))
-            progress.say(f"services are up; look on: pliant view {output}")
-            return _wait(fleet, progress), None
-    except KeyboardInterrupt:
-        return True, None
-    except PliantError as error:
-        return False, error
+        try:
+            with announced(output, fleet.endpoint, fleet.session), looking_on, progress:
+                fleet.start(lambda name: service_arguments(name, request, output))
+                progress.say(f"services are up; look on: pliant view {output}")
+                return _wait(fleet, progress), None
+        except KeyboardInterrupt:
+            return True, None
+        except PliantError as error:
+            return False, error
     finally:
         fleet.close()
 
@@ -167,6 +181,13 @@ def resumed_config(output: Path, request: RunRequest) -> Config:
             "--resume takes the configuration of its run: leave --config, --set, --seed"
         )
     return load_config(output / CONFIG_NAME)
+
+
+def _has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
+    """Whether all that the services had to say was recorded, and nobody is to be started again."""
+    _, ended = mend(output / RECORDING_NAME)
+    recorded = inputs_of("recorder", services, images=config.recorder.images)
+    return ended >= {topic.key for topic in recorded}
 
 
 def _wait(fleet: Fleet, progress: Progress) -> bool:
@@ -200,7 +221,7 @@ def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> 
     if not parts.exists(output / RECORDING_NAME):
         if failure is not None:
             raise failure
-        return INTERRUPTED if interrupted else FAILED
+        raise KeyboardInterrupt if interrupted else ResultError(f"{output}: nothing was recorded")
     try:
         report = write_outputs(output)
     except PliantError:
@@ -210,11 +231,20 @@ def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> 
     with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
         for line in summary(report):
             print(line)
-        files = [*_files(report), *(n for n in MESH_FILES if (output / n).exists()), RECORDING_NAME]
-        print(f"results in {output}/: {', '.join(files)}")
+        files = [*_files(report), *(n for n in MESH_FILES if (output / n).exists())]
+        print(f"results in {output}/: {', '.join(files)}, {_recording_in(output)}")
     if failure is not None:
         raise failure
     return INTERRUPTED if interrupted else grade(report)
+
+
+def _recording_in(output: Path) -> str:
+    """The recording of a result folder by its name there: a file, or a folder of parts."""
+    path = output / RECORDING_NAME
+    if path.is_file():
+        return path.name
+    count = len(parts.parts_of(path))
+    return f"{parts.folder_of_parts(path).name}/ ({count} {'part' if count == 1 else 'parts'})"
 
 
 def grade(report: dict[str, Any]) -> int:
@@ -273,6 +303,9 @@ def _faults(report: dict[str, Any]) -> list[str]:
     dropped = len(report["frames_without_pixels"]) - len(broken)
     if dropped:
         lines.append(f"{dropped} images dropped to keep up (live mode)")
+    passed_over = len(report.get("frames_passed_over", ()))
+    if passed_over:
+        lines.append(f"{passed_over} images tracked, but not mapped, to keep up (live mode)")
     if broken:
         first = broken[0].removeprefix("broken: ")
         lines.append(f"{len(broken)} broken {'image' if len(broken) == 1 else 'images'}: {first}")

@@ -17,7 +17,7 @@ from pliant.messages.topics import Topic
 from pliant.recording.playback import Playback
 from pliant.recording.reader import Recording
 from pliant_services.host import observer_windows
-from pliant_services.player import Played, play, senders
+from pliant_services.player import Played, chosen_topics, play, senders
 from pliant_services.processes import BY_NAME, inputs_of, outputs_of
 from pliant_services.replay import config_of
 
@@ -46,6 +46,8 @@ def run_play(request: PlayRequest) -> int:
     playback = Playback(request.recording)
     config = config_of(Recording(request.recording).metadata(), [])
     required, left_out = _required(playback, request.readers)
+    if request.end_s is not None and request.end_s <= request.start_s:
+        raise RecordingError(f"--end {request.end_s:g} is not after --start {request.start_s:g}")
     what = Played(
         start_s=request.start_s,
         end_s=request.end_s,
@@ -55,6 +57,7 @@ def run_play(request: PlayRequest) -> int:
         readers=required,
         left_out=left_out,
     )
+    chosen_topics(playback, what)
     fleet = [*sorted(set(senders(playback.topics).values()) & BY_NAME.keys()), *request.readers]
     with ExitStack() as stack:
         endpoints = list(request.connect)

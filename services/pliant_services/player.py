@@ -169,6 +169,7 @@ class _Images:
             self._rectifier = Rectifier(calibration_from_yaml(decoded.calibration))
         if not isinstance(decoded, SourceImage) or self._rectifier is None:
             return 0
-        image = rectified(recorded_frame(decoded), self._rectifier)
+        frame = recorded_frame(decoded)
+        image = rectified(frame, self._rectifier, unmapped=decoded.unmapped)
         buses[topics.IMAGE.key].publish(topics.IMAGE, image)
         return 1

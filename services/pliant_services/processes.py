@@ -15,6 +15,7 @@ class Process:
     optional: topics that it reads besides where a service of the fleet publishes them.
     observer: it reads every logged topic of the others, and nobody reads it.
     niceness: how much it gives way where processors are few; others do not wait for what it makes.
+    may_lag: it may be further behind than others with frames that bundle adjustment passes over.
     """
 
     name: str
@@ -24,6 +25,7 @@ class Process:
     optional: tuple[Topic, ...] = ()
     observer: bool = False
     niceness: int = 0
+    may_lag: bool = False
 
 
 PROCESSES: tuple[Process, ...] = (
@@ -43,6 +45,7 @@ PROCESSES: tuple[Process, ...] = (
         "pliant_services.bundle_adjustment",
         inputs=(topics.STREAM, topics.IMAGE, topics.EXTREMA),
         outputs=(topics.MAP_UPDATE, topics.MAP_FINAL, topics.KEYFRAME, topics.KEYFRAME_FINAL),
+        may_lag=True,
     ),
     Process(
         "meshing",
@@ -63,6 +66,7 @@ PROCESSES: tuple[Process, ...] = (
         inputs=(topics.STREAM, topics.IMAGE, topics.DEPTH),
         optional=(topics.EXTREMA, topics.MAP_UPDATE, topics.KEYFRAME),
         outputs=(topics.SURFELS,),
+        may_lag=True,  # with a map: it reads an update for every frame
     ),
     # Senders keep what it has not taken, some seconds' worth, and wait for it beyond.
     Process("recorder", "pliant_services.recorder", observer=True, niceness=5),

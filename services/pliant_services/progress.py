@@ -61,6 +61,7 @@ class Progress:
                 f"{counters.get('tracks', 0):.0f} tracks, {counters.get('inliers', 0):.0f} mapped, "
                 f"{counters.get('points', 0):.0f} points"
             )
+            unmapped = counters.get("unmapped", 0)
             dropped = counters.get("dropped", 0) + counters.get("broken", 0)
             self._bar.update(
                 self._task,
@@ -69,6 +70,7 @@ class Progress:
                 rate=f"{task.speed:.1f} fps" if task.speed else "",
                 detail=detail
                 + (f", {dropped:.0f} dropped" if dropped else "")
+                + (f", {unmapped:.0f} not mapped" if unmapped else "")
                 + (f" ({self._note})" if self._note else ""),
             )
 

@@ -74,14 +74,50 @@ def _flat(content: Mapping[str, object], prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{key}={flow.removesuffix('...' + chr(10)).strip()}"
 
 
-def require_images(summary: Summary, services: Sequence[Process]) -> None:
-    """Raise RecordingError where services need images that were left out of the recording."""
-    needing = [p.name for p in services if topics.IMAGE in p.inputs]
-    if needing and topics.SOURCE.key not in summary.topics:
+def require_inputs(summary: Summary, services: Sequence[Process]) -> None:
+    """Raise RecordingError where the recording lacks what services read of every frame."""
+    needing = _lacking(summary, services, topics.IMAGE)
+    if needing:
         raise RecordingError(
             f"{' and '.join(needing)} cannot be replayed: the recording is without "
             f"{topics.SOURCE.key} (made with --no-images?)"
         )
+    made = _made_by(services)
+    needed = {t: None for p in services for t in p.inputs if t.per_frame or t == topics.STREAM}
+    for topic in [topic for topic in needed if topic not in made]:
+        needing = _lacking(summary, services, topic)
+        if needing:
+            raise RecordingError(
+                f"{' and '.join(needing)} cannot be replayed: the recording is without {topic.key} "
+                "(cut off early, or one part of several? their folder replays as a whole)"
+            )
+
+
+def _made_by(services: Sequence[Process]) -> tuple[Topic, ...]:
+    """What services publish: in a replay of several it is made again, and not read."""
+    return tuple(topic for process in services for topic in process.outputs)
+
+
+def _lacking(summary: Summary, services: Sequence[Process], topic: Topic) -> list[str]:
+    """Names of the services that read a topic, if the recording has nothing of it."""
+    there = _recorded_as(topic).key in summary.topics
+    return [] if there else [p.name for p in services if topic in p.inputs]
+
+
+def _recorded_as(topic: Topic) -> Topic:
+    """Rectified images are not recorded; they are made again from the source's."""
+    return topics.SOURCE if topic == topics.IMAGE else topic
+
+
+def gaps(summary: Summary, services: Sequence[Process]) -> list[str]:
+    """What is known to be missing of what the services read, for people."""
+    read = {t for p in services for t in (*p.inputs, *p.optional)}.difference(_made_by(services))
+    missing = {(key := _recorded_as(t).key): summary.missing_of(key) for t in read}
+    return [
+        f"{key} lacks {count} of its messages: what is made of the others is not what the run made"
+        for key, count in sorted(missing.items())
+        if count
+    ]
 
 
 class Replay:
@@ -94,8 +130,7 @@ class Replay:
         self._summary = summary
         self._services = services
         self._config = config
-        made = [topic for process in services for topic in process.outputs]
-        self.made: tuple[Topic, ...] = tuple(made)
+        self.made = _made_by(services)
         self.affected = affected(services)
         """Keys of the topics that are not taken over: they would be out of date."""
 
@@ -133,7 +168,7 @@ class Replay:
     def _frames(self) -> int:
         """Frames that every recorded input has."""
         wanted = {t for p in self._services for t in self._inputs_of(p) if t.per_frame}
-        keys = {topics.SOURCE.key} | {t.key for t in wanted if t.logged and t not in self.made}
+        keys = {_recorded_as(topic).key for topic in wanted if topic not in self.made}
         found = self._summary.topics
         return min((found[key].messages if key in found else 0) for key in keys)
 
@@ -147,7 +182,7 @@ class Replay:
             raise RecordingError("the recording has no camera: it stopped before its first frame")
         for source in self._recorded.decoded(topics.SOURCE):
             assert isinstance(source, SourceImage)
-            yield rectified(recorded_frame(source), rectifier)
+            yield rectified(recorded_frame(source), rectifier, unmapped=source.unmapped)
 
     def _copy(self, writer: RecordingWriter, failed: Event) -> None:
         """What the services do not touch: it makes the new recording one that can be replayed."""

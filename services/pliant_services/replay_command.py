@@ -1,5 +1,6 @@
 """Behind ``pliant replay``: from a result folder to a new one, and whether they agree."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +9,7 @@ from pliant.config import config_yaml
 from pliant.errors import RecordingError, ResultError
 from pliant.messages import topics
 from pliant.messages.topics import Topic
-from pliant.recording.compare import compare
+from pliant.recording.compare import check_tolerances, compare
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
 from pliant_services.host import one_thread_each
@@ -21,10 +22,11 @@ from pliant_services.pipeline import (
 )
 from pliant_services.replay import (
     Replay,
+    gaps,
     recorded_config,
     recorded_services,
     replayable,
-    require_images,
+    require_inputs,
 )
 from pliant_services.replay_processes import run_as_processes
 from pliant_services.results import RECORDING_NAME
@@ -62,7 +64,9 @@ def run_replay(request: ReplayRequest) -> int:
         )
     config = recorded_config(recorded, request.overrides)
     folder = request.recording.resolve().parent
-    require_images(recorded, services)
+    require_inputs(recorded, services)
+    replay = Replay(request.recording, recorded, services, config)
+    check_tolerances(replay.made, request.tolerances)
     output = request.output or folder.with_name(f"{folder.name}_replay")
     check_output(output, force=request.force)
     if output.resolve() == folder:
@@ -74,7 +78,8 @@ def run_replay(request: ReplayRequest) -> int:
         "services": ",".join(s.name for s in services),
     }
     made = output / RECORDING_NAME
-    replay = Replay(request.recording, recorded, services, config)
+    for line in gaps(recorded, services):
+        print(line, file=sys.stderr)
     if request.processes:
         run_as_processes(request.recording, services, config, output, metadata)
     else:

@@ -19,6 +19,7 @@ from pliant.messages import topics
 from pliant.messages.types import CameraStream, Extrema, MapUpdate, MeshPiece, Status, StreamEnd
 from pliant.recording.reader import Recording
 from pliant.recording.summary import Summary
+from pliant_services.keeping_up import REASON
 from pliant_services.mesh_results import mesh_report, write_meshes
 
 RECORDING_NAME = "recording.mcap"
@@ -40,6 +41,7 @@ class Run:
     stream: CameraStream | None = None
     tracks: dict[int, int] = field(default_factory=dict[int, int])
     missing: dict[int, str] = field(default_factory=dict[int, str])
+    passed_over: list[int] = field(default_factory=list[int])
     inliers: dict[int, int] = field(default_factory=dict[int, int])
     map_points: dict[int, int] = field(default_factory=dict[int, int])
     seconds: dict[str, dict[str, list[float]]] = field(
@@ -88,6 +90,8 @@ def read_run(path: Path) -> Run:
                 run.calibration_correction = message.calibration_correction
             else:
                 run.inliers[message.frame] = message.inliers
+                if message.reason == REASON:
+                    run.passed_over.append(message.frame)
                 run.arrivals_ns.append(recorded.log_time_ns)
         elif isinstance(message, MeshPiece):
             run.mesh.append(message)
@@ -183,7 +187,8 @@ def _report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
     segments.sort(key=lambda s: s["first_frame"])
     reasons = {frame: reason for frame, (_, reason) in sorted(history.states.items()) if reason}
     # That a frame is broken says nothing about why there is no map, unless all of them are.
-    telling = [reason for frame, reason in reasons.items() if frame not in run.missing]
+    silent = {*run.missing, *run.passed_over}
+    telling = [reason for frame, reason in reasons.items() if frame not in silent]
     telling = telling or list(reasons.values())
     return {
         "source": run.stream.source if run.stream else "",
@@ -198,6 +203,7 @@ def _report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "segments": segments,
         "last_reason": telling[-1] if telling else "",
         "frames_without_pixels": {str(f): why for f, why in sorted(run.missing.items())},
+        "frames_passed_over": run.passed_over,
         "keyframes": len(history.keyframes),
         "points": len(history.points()),
         "points_well_observed": _well_observed(run, final),

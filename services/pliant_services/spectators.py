@@ -5,11 +5,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 from pliant.errors import ResultError
 from pliant_services.launcher import Fleet
-from pliant_services.viewing import SESSION_NAME
+from pliant_services.viewing import SESSION_NAME, place
 
 _START_S = 30.0  # a viewer imports Rerun, and may wait for a busy machine
 _WAIT_S = 120.0  # services compile before they are up
@@ -28,6 +29,19 @@ def announced(output: Path, endpoint: str, session: str) -> Iterator[None]:
         file.unlink(missing_ok=True)
 
 
+def check_viewer(output: Path, *, web: bool, save: Path | None, force: bool) -> None:
+    """Raise ResultError where a run's viewer could not start: before an earlier result is touched.
+
+    output: the result folder, which need not be there yet.
+    """
+    place(web=web, save=save, force=force)
+    folder = save.resolve().parent if save is not None else output.resolve()
+    if not folder.is_dir() and folder != output.resolve():
+        raise ResultError(f"{save}: there is no such folder: choose another --save")
+    if find_spec("rerun") is None:
+        raise ResultError("Rerun is not installed: pip install 'pliant[view]'")
+
+
 @contextmanager
 def viewer(fleet: Fleet, *, web: bool, save: Path | None) -> Iterator[None]:
     """A ``pliant view`` of its own that is there before the first frame.
@@ -41,7 +55,8 @@ def viewer(fleet: Fleet, *, web: bool, save: Path | None) -> Iterator[None]:
         *(["--web"] if web else []),
         *(["--save", str(save), "--force"] if save is not None else []),
     ]
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    # In a session of its own: Ctrl-C is for the launcher, and the viewer sees the run to its end.
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
     try:
         waited = 0.0
         while not fleet.wait_for_viewer(0.2):

@@ -11,6 +11,7 @@ from pliant.bus.base import Bus, receive_one, resume
 from pliant.config import Config
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Extrema
+from pliant_services.keeping_up import readers_that_may_lag
 from pliant_services.link_images import receive_images
 from pliant_services.monitor import Monitor
 
@@ -28,6 +29,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
             tracks = FrameTracks.empty()
         else:
             tracks = tracker.track(image.grey, monitor.stage)
-        bus.publish(topics.EXTREMA, Extrema.of(image, tracks, missing=image.missing))
+        extrema = Extrema.of(image, tracks, missing=image.missing)
+        bus.publish(topics.EXTREMA, extrema, may_lag=readers_that_may_lag(image))
         monitor.report(image, tracks=len(tracks.ids), maxima=len(tracks.maxima))
         bus.checkpoint(image.frame, tracker)

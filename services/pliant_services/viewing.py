@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from pliant.bus.session import Identity, open_session
-from pliant.errors import MessageError, ResultError
+from pliant.errors import MessageError, PliantError, ResultError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic, by_key
 from pliant.messages.types import StreamEnd
@@ -55,7 +55,7 @@ def run_view(request: ViewRequest) -> None:
     """Show it.  Raises PliantError."""
     # Whatever ends us: Rerun's server goes with us.
     signal.signal(signal.SIGTERM, _leave)
-    where = _where(request)
+    where = place(web=request.web, save=request.save, force=request.force)
     endpoints, session = request.endpoints, request.session
     if not endpoints and request.source is not None and request.source.is_dir():
         endpoints, session = running_session(request.source)
@@ -76,6 +76,10 @@ def run_view(request: ViewRequest) -> None:
         if request.web:
             canvas.send()
             _stay()
+    except PliantError:
+        if request.save is not None:  # nothing came to be seen: the next try shall find no file
+            request.save.unlink(missing_ok=True)
+        raise
     finally:
         if not canvas.is_watched:
             print("the window of Rerun is closed, or could not open", file=sys.stderr)
@@ -229,14 +233,15 @@ def _recording(source: Path | None) -> Recording | None:
     return recording
 
 
-def _where(request: ViewRequest) -> Where:
-    if request.web and request.save is not None:
+def place(*, web: bool, save: Path | None, force: bool) -> Where:
+    """Where a view goes.  Raises ResultError where it cannot."""
+    if web and save is not None:
         raise ResultError("--web and --save contradict each other: give one")
-    if request.save is not None:
-        if request.save.exists() and not request.force:
-            raise ResultError(f"{request.save} exists: choose another --save, or --force")
-        return request.save
-    if request.web:
+    if save is not None:
+        if save.exists() and not force:
+            raise ResultError(f"{save} exists: choose another --save, or --force")
+        return save
+    if web:
         return "web"
     if (
         not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -22,27 +22,46 @@ def compile_kernels(say: Callable[[str], None]) -> None:
         return
     say("compiling kernels (once, about a minute) ...")
     # In processes of their own: the launcher stays small, a crash of the compiler is one line.
-    compilers = {service: _start_compiler(service) for service in COMPILED}
+    compilers = {service: start_compiler(service) for service in COMPILED}
     try:
         for number, (service, compiler) in enumerate(compilers.items(), start=1):
-            _, errors = compiler.communicate()
-            if compiler.returncode != 0:
+            assert compiler.stderr is not None
+            errors = compiler.stderr.read()
+            if compiler.wait() != 0:
                 words = errors.strip() or f"the compiler ended with code {compiler.returncode}"
                 raise PliantError(f"compiling the kernels of {service} failed:\n{words}")
             say(f"compiled {service} ({number} of {len(compilers)})")
     finally:
         for compiler in compilers.values():
-            compiler.kill()
-            compiler.wait()
+            end_compiler(compiler)
     with suppress(OSError):  # without the stamp the next run checks once more, that is all
         stamp.parent.mkdir(parents=True, exist_ok=True)
         stamp.touch()
 
 
-def _start_compiler(service: str) -> subprocess.Popen[str]:
-    code = f"from pliant_services.warm_up import load_kernels; load_kernels({service!r})"
-    command = [sys.executable, "-c", code]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def start_compiler(service: str) -> subprocess.Popen[str]:
+    """Compile the kernels of a service in a process that ends with this one, whatever kills it."""
+    code = (
+        "from pliant_services.host import end_with_launcher; end_with_launcher(); "
+        f"from pliant_services.warm_up import load_kernels; load_kernels({service!r})"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C reaches the launcher alone
+    )
+
+
+def end_compiler(compiler: subprocess.Popen[str]) -> None:
+    """Kill a compiler if it still works, and let go of its pipes."""
+    compiler.kill()
+    compiler.wait()
+    for pipe in (compiler.stdin, compiler.stderr):
+        if pipe is not None:
+            pipe.close()
 
 
 def load_kernels(service: str) -> None:
@@ -82,5 +101,6 @@ def _fingerprint() -> str:
     root = Path(pliant.__file__).parent
     for path in sorted(root.rglob("*.py")):
         digest.update(f"{path.relative_to(root)} {path.stat().st_mtime_ns}".encode())
-    digest.update(f"{root} {sys.version} {numba.__version__} {llvm.get_host_cpu_name()}".encode())
+    where = f"{root} {numba.config.CACHE_DIR}"  # type: ignore[attr-defined]
+    digest.update(f"{where} {sys.version} {numba.__version__} {llvm.get_host_cpu_name()}".encode())
     return digest.hexdigest()[:24]

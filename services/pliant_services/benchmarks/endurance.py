@@ -40,7 +40,7 @@ def measure(source: str, frames: int, minutes: float) -> Iterator[str]:
             done = status.frame + 1
 
     with tempfile.TemporaryDirectory(prefix="pliant-endurance-") as folder:
-        endless = _forth_and_back(builtin_folder(source), Path(folder) / "source", frames)
+        endless = forth_and_back(builtin_folder(source), Path(folder) / "source", frames, _FPS)
         request, output = RunRequest(source=str(endless)), Path(folder) / "output"
         prepare(output, config_yaml(config))
         fleet = Fleet(SERVICES, log_folder=output / "logs", on_status=on_status)
@@ -67,7 +67,7 @@ def measure(source: str, frames: int, minutes: float) -> Iterator[str]:
     yield markdown(heading, [_row(name, np.array(seen)) for name, seen in samples.items()])
 
 
-def _forth_and_back(folder: Path, made: Path, frames: int) -> Path:
+def forth_and_back(folder: Path, made: Path, frames: int, fps: float) -> Path:
     """A folder with so many frames: those of another one, again and again."""
     made.mkdir()
     for name in ("images", "calib.yaml"):
@@ -76,7 +76,7 @@ def _forth_and_back(folder: Path, made: Path, frames: int) -> Path:
     once = [line.split()[1] for line in lines if not line.startswith("#")]
     period = once + once[-2:0:-1]
     names = (period * math.ceil(frames / len(period)))[:frames]
-    rows = (f"{number / _FPS:.9f} {name}\n" for number, name in enumerate(names))
+    rows = (f"{number / fps:.9f} {name}\n" for number, name in enumerate(names))
     (made / "rgb.txt").write_text("".join(rows))
     return made
 

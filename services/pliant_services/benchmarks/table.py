@@ -5,5 +5,14 @@ from collections.abc import Iterable, Sequence
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return "\n".join([markdown_header(header), *map(markdown_row, rows)])
+
+
+def markdown_header(header: Sequence[str]) -> str:
+    """The first two lines of a table whose rows follow one by one."""
+    return "\n".join(markdown_row(line) for line in (header, ["---"] * len(header)))
+
+
+def markdown_row(row: Sequence[str]) -> str:
+    """One line of a table."""
+    return "| " + " | ".join(row) + " |"

@@ -14,7 +14,7 @@ from statistics import median
 from pliant.config import config_yaml, load_config
 from pliant.messages.types import Status
 from pliant_services import warm_up
-from pliant_services.benchmarks.table import markdown
+from pliant_services.benchmarks.table import markdown, markdown_header, markdown_row
 from pliant_services.launcher import Fleet
 from pliant_services.pipeline import STATE_FOLDER, RunRequest, prepare, service_arguments
 from pliant_services.processes import PROFILES
@@ -26,8 +26,8 @@ FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply
 
 def losses(source: str, runs: int) -> Iterator[str]:
     """Run a source again and again at full speed: the recorder's books, and whether bytes agree."""
-    rows: list[tuple[str, ...]] = []
     first: dict[str, bytes] = {}
+    yield markdown_header(("run", "messages", "lost", "twice", "the same bytes"))
     for number in range(runs):
         with tempfile.TemporaryDirectory() as folder:
             output = Path(folder)
@@ -35,7 +35,7 @@ def losses(source: str, runs: int) -> Iterator[str]:
             books = write_results(output)["recorder"]
             files = {name: (output / name).read_bytes() for name in FILES}
         first = first or files
-        rows.append(
+        yield markdown_row(
             (
                 str(number + 1),
                 str(sum(books["messages"].values())),
@@ -44,7 +44,6 @@ def losses(source: str, runs: int) -> Iterator[str]:
                 "yes" if files == first else "NO",
             )
         )
-    yield markdown(("run", "messages", "lost", "twice", "the same bytes"), rows)
 
 
 def recording_cost(source: str, runs: int) -> Iterator[str]:
@@ -66,15 +65,14 @@ def kills(source: str, count: int, seed: int) -> Iterator[str]:
     chance = random.Random(seed)
     services = SERVICES
     expected = _files_of_a_run(source, services, None)
-    rows: list[tuple[str, ...]] = []
+    yield markdown_header(("killed", "times", "byte-identical results"))
     for victims in (*((name,) for name in services), services):
         same = 0
         for _ in range(count):
             moment = chance.random()
             same += _files_of_a_run(source, services, (moment, victims)) == expected
         name = victims[0] if len(victims) == 1 else "all at once"
-        rows.append((name, str(count), f"{same} of {count}"))
-    yield markdown(("killed", "times", "byte-identical results"), rows)
+        yield markdown_row((name, str(count), f"{same} of {count}"))
 
 
 def _files_of_a_run(

@@ -69,13 +69,15 @@ def _run() -> int:
         command = getattr(getattr(error, "ctx", None), "command_path", "pliant")
         text = error.format_message().replace("Value error, ", "").rstrip(".")
         return _say(f"{text} (see {command} --help)", error.exit_code)
-    except (KeyboardInterrupt, typer.Abort):
-        return _INTERRUPTED
+    except (KeyboardInterrupt, typer.Abort):  # not all versions of Typer hand it on
+        code = _INTERRUPTED
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         where = f"{error.filename}" if error.filename else "the output"
         return _say(f"cannot write {where}: {error.strerror}; free some space")
+    if code == _INTERRUPTED:
+        return _say("interrupted", _INTERRUPTED)
     return code if isinstance(code, int) else 0
 
 

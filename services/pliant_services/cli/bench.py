@@ -275,6 +275,23 @@ def endurance(
     _print(measure(source, frames, minutes))
 
 
+@app.command("slow-mapping")
+def slow_mapping(
+    source: Annotated[str, typer.Argument(help="built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(min=40, help="Of the source, forth and back.")] = 1200,
+    fps: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 30.0,
+    slowdown: Annotated[float, typer.Option(min=1.0, help="Of bundle adjustment.")] = 10.0,
+    overrides: Overrides = None,
+) -> None:
+    """Live mode before, while and after bundle adjustment is slow: what tracking keeps of its rate.
+
+    pliant bench slow-mapping built-in:room --fps 10 --frames 400
+    """
+    from pliant_services.benchmarks.slow_mapping import measure
+
+    _print(measure(source, frames, fps, slowdown, overrides or []))
+
+
 @app.command()
 def ablation(sources: Sources) -> None:
     """What each addition to the paper is worth.

@@ -30,5 +30,6 @@ def info(
 
 def recording_file(path: Path) -> Path:
     """The recording of a result folder, or the file or folder of parts itself."""
-    parts = path.is_dir() and any(path.glob("part_*.mcap"))
-    return path / "recording.mcap" if path.is_dir() and not parts else path
+    from pliant.recording.parts import parts_in
+
+    return path / "recording.mcap" if path.is_dir() and not parts_in(path) else path

@@ -25,7 +25,8 @@ def recover(
     from pliant_services.cli.info import recording_file
 
     damaged = recording_file(recording)
-    whole = output or damaged.with_name(f"{damaged.stem}_recovered{damaged.suffix}")
+    suffix = damaged.suffix or ".mcap"  # a folder of parts becomes one file
+    whole = output or damaged.with_name(f"{damaged.stem}_recovered{suffix}")
     if whole.exists() and (not force or (damaged.exists() and whole.samefile(damaged))):
         raise RecordingError(f"{whole} exists: choose another --output")
     recovery = make_whole(damaged, whole)

@@ -62,6 +62,14 @@ def replay(
 
     file = recording_file(recording)
     if services or output or force or overrides or check or tolerance or processes:
+        playing = {
+            "--rate": rate != "1", "--start": start, "--end": end is not None, "--topics": topics,
+            "--readers": readers, "--loop": loop, "--connect": connect, "--port": port,
+        }  # fmt: skip
+        for option in [name for name, given in playing.items() if given]:
+            raise typer.BadParameter(f"{option} is for playing, not for running services again")
+        if tolerance and not check:
+            raise typer.BadParameter("--tolerance needs --check")
         from pliant_services.replay_command import ReplayRequest, run_replay
 
         again = ReplayRequest(

@@ -50,8 +50,18 @@ class Bus(Protocol):
         """
         ...
 
-    def publish(self, topic: Topic, message: Header) -> None:
-        """Send one message.  Blocks while a required reader is a whole window behind."""
+    def untaken(self, topic: Topic, reader: str) -> int:
+        """How many messages of a topic its reader has yet to take; 0 where it reads none.
+
+        Only what live mode may pass over may depend on it: it is a matter of timing.
+        """
+        ...
+
+    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
+        """Send one message.  Blocks while a required reader is a whole window behind.
+
+        may_lag: readers that may be further behind with it: it takes no room in their window.
+        """
         ...
 
     def end(self, topic: Topic) -> None:

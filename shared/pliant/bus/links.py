@@ -5,7 +5,7 @@ Callbacks run in Zenoh's threads: under the bus's lock they append and notify, a
 
 import struct
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import zenoh
@@ -125,9 +125,10 @@ class OutLink:
         *,
         window: int,
         windows: Mapping[str, Window],
+        lags: Mapping[str, Window],
     ) -> None:
         self.topic = topic
-        self.box = Outbox(topic.key, readers, window=window, windows=windows)
+        self.box = Outbox(topic.key, readers, window=window, windows=windows, lags=lags)
         self.ended = False
         self.sent_at_tick = 0
         self._sending = threading.Lock()
@@ -136,11 +137,11 @@ class OutLink:
         key = f"{shared.prefix}/credit/{topic.key}/*"
         self._held = shared.session.declare_subscriber(key, _directly(self._on_credit))
 
-    def send(self, kind: int, payload: bytes) -> None:
+    def send(self, kind: int, payload: bytes, may_lag: Collection[str]) -> None:
         """Number a message, keep it, and send it."""
         with self._sending:
             with self._shared.changed:
-                message = self.box.add(kind, payload)  # before its credit can be here
+                message = self.box.add(kind, payload, may_lag)  # before its credit is here
             self._put(message)
 
     def send_again(self) -> None:

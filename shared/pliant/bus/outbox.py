@@ -1,15 +1,17 @@
 """One topic's outgoing messages: numbers, credit, and what must be kept to be sent again.
 
 A reader tells two counts.  ``taken``: messages that it has taken in; the sender never has more than
-a window of messages on the way to the slowest reader.  ``safe``: messages that it will never ask
-for again, whatever happens to it; what comes after is kept here.  A reader that remembers nothing
-beyond its own process says safe = taken; one that restarts from a checkpoint says the position of
-that checkpoint; the recorder says what is on its disk.  A state machine: no socket, no clock.
+a window of messages on the way to the slowest reader, beside those with which it may lag.
+``safe``: messages that it will never ask for again, whatever happens to it; what comes after is
+kept here.  A reader that remembers nothing beyond its own process says safe = taken; one that
+restarts from a checkpoint says the position of that checkpoint; the recorder says what is on its
+disk.  A state machine: no socket, no clock.
 """
 
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from pliant.bus.base import Window
 from pliant.errors import BusError
@@ -17,11 +19,15 @@ from pliant.errors import BusError
 
 @dataclass
 class Reader:
-    """What a required reader has told.  incarnation: which start of it; -1 before it spoke."""
+    """What a required reader has told.  incarnation: which start of it; -1 before it spoke.
+
+    light: numbers of the messages that take no room in its window, of those that it may ask for.
+    """
 
     incarnation: int = -1
     taken: int = 0
     safe: int = 0
+    light: deque[int] = field(default_factory=deque[int])
 
 
 @dataclass(frozen=True)
@@ -44,9 +50,11 @@ class Outbox:
         *,
         window: int,
         windows: Mapping[str, Window] | None = None,
+        lags: Mapping[str, Window] | None = None,
     ) -> None:
         """window: messages on the way to a reader.  windows: of readers that make safe seldom,
-        by name, what is kept for each of them.
+        by name, what is kept for each of them.  lags: of readers with messages that take no room
+        in the window, what may be on the way to them with these.
         """
         self.topic = topic
         self.readers = {name: Reader() for name in readers}
@@ -56,13 +64,17 @@ class Outbox:
         self._bytes = 0  # of all messages so far
         self._window = window
         self._windows = {name: w for name, w in (windows or {}).items() if name in self.readers}
+        self._lags = {name: lag for name, lag in (lags or {}).items() if name in self.readers}
         self._kept: deque[Numbered] = deque()
         self.asking: set[str] = set()
         """Readers that want something sent again."""
 
-    def add(self, kind: int, payload: bytes) -> Numbered:
+    def add(self, kind: int, payload: bytes, may_lag: Collection[str] = ()) -> Numbered:
         """Number a message and keep it."""
         message = Numbered(self.sent, kind, payload, self._bytes)
+        for name in self._lags:
+            if name in may_lag:
+                self.readers[name].light.append(message.sequence)
         self.sent += 1
         self._bytes += len(payload)
         if self.readers:
@@ -87,6 +99,8 @@ class Outbox:
         else:
             reader.taken = max(reader.taken, taken)
             reader.safe = max(reader.safe, min(safe, reader.taken))
+        while reader.light and reader.light[0] < reader.safe:
+            reader.light.popleft()
         floor = self.safe()
         while self._kept and self._kept[0].sequence < floor:
             self._kept.popleft()
@@ -104,10 +118,17 @@ class Outbox:
         """Whether every required reader has told its counts."""
         return all(reader.incarnation >= 0 for reader in self.readers.values())
 
-    def has_room(self, size: int = 0) -> bool:
+    def has_room(self, size: int = 0, may_lag: Collection[str] = ()) -> bool:
         """Whether one more message, of so many bytes, may be sent."""
-        if self.on_the_way() >= self._window:
-            return False
+        for name, reader in self.readers.items():
+            behind = self.untaken(name)
+            if name in may_lag and name in self._lags:
+                lag = self._lags[name]
+                full = behind > 0 and self._bytes_from(reader.taken) + size > lag.size
+                if full or behind >= max(lag.messages, self._window):
+                    return False
+            elif behind - self._light(reader) >= self._window:
+                return False
         for name, window in self._windows.items():
             waiting = self.sent - self.readers[name].safe
             if waiting >= window.messages:
@@ -121,6 +142,15 @@ class Outbox:
         if not self._kept:
             return 0
         return self._bytes - self._kept[max(0, sequence - self._kept[0].sequence)].before
+
+    def untaken(self, name: str) -> int:
+        """Messages that a reader has not taken; 0 for who reads none."""
+        reader = self.readers.get(name)
+        return 0 if reader is None else max(0, self.sent - reader.taken)
+
+    def _light(self, reader: Reader) -> int:
+        """How many of those take no room in its window."""
+        return len(reader.light) - bisect_left(reader.light, reader.taken)
 
     def on_the_way(self) -> int:
         """Messages that the slowest required reader has not taken."""

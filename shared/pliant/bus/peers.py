@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pliant import __version__
 from pliant.errors import BusError, SessionOverError
 
-WIRE_VERSION = 3
+WIRE_VERSION = 4
 """Of envelopes and credits; services of different ones refuse each other."""
 
 _TOKEN = re.compile(r"/ready/([^/]+)/(\d{1,20})/(\d{1,9})/([^/]{1,40})$")

@@ -75,7 +75,11 @@ class ReplayBus:
         """Note how many messages the observer has vouched for."""
         self.acknowledged = self._given
 
-    def publish(self, topic: Topic, message: Header) -> None:
+    def untaken(self, topic: Topic, reader: str) -> int:
+        """None: there is time for everything."""
+        return 0
+
+    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
         """Keep the message.  Raises ValueError after the topic's end, as no reader would see it."""
         if topic in self.ended:
             raise ValueError(f"{topic.key} was published after its end")

@@ -64,6 +64,7 @@ class ZenohBus:
         checkpoints: Checkpoints | None = None,
         keeps_books: bool = False,
         windows: Mapping[str, Window] | None = None,
+        lags: Mapping[str, Window] | None = None,
         packed: Collection[Topic] = (),
         disturb: Callable[[], None] | None = None,
         identity: Identity | None = None,
@@ -80,6 +81,7 @@ class ZenohBus:
         checkpoints: where our state is kept; ``restore`` must come before the first message then.
         keeps_books: we know ourselves what we have; ``start_from`` must come first then.
         windows: what is kept for readers that acknowledge seldom, by name.
+        lags: of readers that may be further behind with some messages, by name, how far.
         packed: topics whose pixels are made smaller, for a link.
         disturb: called before each message goes out or is taken; for tests, which delay there.
         identity: our certificate, for endpoints such as tls/host:7447.
@@ -88,7 +90,10 @@ class ZenohBus:
         Raises BusError when no endpoint answers.
         """
         self._patience_s = patience_s
-        self._tell_every = max(1, window // 4)
+        lags = lags or {}
+        own_lag = lags[service].messages if service in lags else 0
+        # Who may lag is waited for by what it has told: it tells all.
+        self._tell_every = 1 if own_lag else max(1, window // 4)
         self._checkpoints = checkpoints
         self._packed = frozenset(packed)
         self._disturb = disturb or (lambda: None)
@@ -117,11 +122,13 @@ class ZenohBus:
             self._peers.is_known,
         )
         self._outputs = {
-            topic.key: OutLink(shared, topic, readers, window=window, windows=windows or {})
+            topic.key: OutLink(
+                shared, topic, readers, window=window, windows=windows or {}, lags=lags
+            )
             for topic, readers in outputs.items()
         }
         self._inputs = {
-            topic.key: InLink(shared, topic, sender, reader=service, limit=2 * window)
+            topic.key: InLink(shared, topic, sender, reader=service, limit=2 * window + own_lag)
             for topic, sender in inputs.items()
         }
         # Subscribed before announced: whoever sees the token may send at once.
@@ -155,9 +162,16 @@ class ZenohBus:
 
     # -- sending -------------------------------------------------------------------------------
 
-    def publish(self, topic: Topic, message: Header) -> None:
+    def untaken(self, topic: Topic, reader: str) -> int:
+        """How many messages of the topic the reader has yet to take, by what it told last."""
+        with self._changed:
+            return self._outputs[topic.key].box.untaken(reader)
+
+    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
         """Send one message, once every required reader is within the window.
 
+        may_lag: readers in whose window it takes no room, where ``lags`` names them; with it no
+        more than that is on the way to them.
         Raises MessageError where the message is larger than its topic's readers take.
         """
         payload = codec.encode(message, packed=topic in self._packed)
@@ -166,7 +180,7 @@ class ZenohBus:
                 f"{topic.key}: frame {message.frame} takes {len(payload)} bytes, more than the "
                 f"{topic.max_bytes} allowed"
             )
-        self.publish_encoded(topic, payload)
+        self._send(self._outputs[topic.key], DATA, payload, may_lag)
 
     def publish_encoded(self, topic: Topic, payload: bytes) -> None:
         """Send a message that is encoded already, as a recording has it."""
@@ -215,12 +229,14 @@ class ZenohBus:
                     return
                 self._changed.wait(_TICK_S)  # the keeper tells our counts again meanwhile
 
-    def _send(self, output: OutLink, kind: int, payload: bytes) -> None:
+    def _send(
+        self, output: OutLink, kind: int, payload: bytes, may_lag: Collection[str] = ()
+    ) -> None:
         if output.ended:
             raise ValueError(f"{output.topic.key} was published after its end")
         self._disturb()
-        self._wait_for_readers(output, lambda: output.box.has_room(len(payload)))
-        output.send(kind, payload)
+        self._wait_for_readers(output, lambda: output.box.has_room(len(payload), may_lag))
+        output.send(kind, payload, may_lag)
 
     def _wait_for_readers(self, output: OutLink, enough: Callable[[], bool]) -> None:
         readers = output.box.readers.keys()
@@ -255,7 +271,7 @@ class ZenohBus:
             assert received is not None
             if self._checkpoints is None:
                 entry.safe = entry.box.taken
-            self._tell(entry)
+            self._tell_now_and_then(entry, received)
             if received.is_end:
                 return
             assert received.message is not None
@@ -282,9 +298,7 @@ class ZenohBus:
             received = self._take(entries, timeout_s, views=True)
             if received is not None:
                 entry = self._inputs[received.topic.key]
-                # Each credit wakes the router and the sender: now and then is enough.
-                if received.is_end or entry.box.taken - entry.told >= self._tell_every:
-                    self._tell(entry)
+                self._tell_now_and_then(entry, received)
                 if received.is_end:
                     entries = [entry for entry in entries if entry.topic is not received.topic]
             yield received
@@ -481,6 +495,12 @@ class ZenohBus:
                 entry.arrived = False
         if ask or tick or greeting:
             self._tell(entry, ask)
+
+    def _tell_now_and_then(self, entry: InLink, received: Received) -> None:
+        # Each credit wakes the router and the sender, while the service waits: for most, a
+        # quarter of the window at a time is enough.
+        if received.is_end or entry.box.taken - entry.told >= self._tell_every:
+            self._tell(entry)
 
     def _tell(self, entry: InLink, ask: int = NOTHING) -> None:
         if self._restored:  # before that, what we took is not ours

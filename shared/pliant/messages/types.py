@@ -87,6 +87,7 @@ class SourceImage(Header):
     """A frame as it came: ``encoding`` says how ``data`` is read.  Empty where it was dropped.
 
     made_from: "" as it came; else what it was before it became a JPEG for a link, and the quality.
+    unmapped: as in ``Image``, so that a replay does what the run did.
     """
 
     encoding: str
@@ -94,6 +95,7 @@ class SourceImage(Header):
     height: int
     data: Annotated[bytes, Rows("height")]
     made_from: str = ""
+    unmapped: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +116,7 @@ class Image(Header):
     missing: "" or why there are no pixels ("dropped", "broken: ..."); both arrays are empty then.
     jpeg, calibration: over a link, instead of pixels, what they are made from: the source's JPEG
     and its camera as YAML; ``pliant_services.link_images`` makes them.
+    unmapped: bundle adjustment passes over this frame, as it is behind (live mode).
     """
 
     grey: Annotated[U8, Shape("H", "W")]
@@ -121,6 +124,7 @@ class Image(Header):
     missing: str = ""
     jpeg: bytes = b""
     calibration: str = ""
+    unmapped: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,12 +37,17 @@ def compare(
     RecordingError for a tolerance of a field that no message has.
     """
     allowed = dict(tolerances or {})
-    known = {field.name for topic in topics for field in fields(topic.message)}
-    unknown = sorted(allowed.keys() - known)
-    if unknown:
-        raise RecordingError(f"no field {unknown[0]}: choose from {', '.join(sorted(known))}")
+    check_tolerances(topics, allowed)
     found = [d for topic in topics for d in _compare_topic(recorded, made, topic, allowed)]
     return sorted(found, key=lambda d: ("count", "order", "field").index(d.kind))
+
+
+def check_tolerances(topics: Sequence[Topic], tolerances: Mapping[str, float]) -> None:
+    """Raise RecordingError for a tolerance of a field that no message of the topics has."""
+    known = {field.name for topic in topics for field in fields(topic.message)}
+    unknown = sorted(tolerances.keys() - known)
+    if unknown:
+        raise RecordingError(f"no field {unknown[0]}: choose from {', '.join(sorted(known))}")
 
 
 def _compare_topic(

@@ -1,5 +1,6 @@
 """Recordings in one file or in several: a folder of parts counts as one recording."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -9,6 +10,7 @@ from pliant.messages.topics import Topic
 from pliant.recording.writer import RecordingWriter
 
 PART = "part_{:05d}.mcap"
+_PART = re.compile(r"part_\d{5,}\.mcap")  # and not what somebody recovered or exported of one
 PART_RECORD = "part"
 """Name of the metadata record that numbers a part."""
 
@@ -27,10 +29,15 @@ def parts_of(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     if path.is_dir():
-        own = sorted(path.glob("part_*.mcap"))
-        return own or parts_of(path / "recording.mcap")
+        return parts_in(path) or parts_of(path / "recording.mcap")
     folder = folder_of_parts(path)
-    return sorted(folder.glob("part_*.mcap")) if folder != path and folder.is_dir() else []
+    return parts_in(folder) if folder != path else []
+
+
+def parts_in(folder: Path) -> list[Path]:
+    """The parts that lie in this very folder, in order; empty where there are none."""
+    found = folder.glob("part_*.mcap") if folder.is_dir() else ()
+    return sorted(part for part in found if _PART.fullmatch(part.name))
 
 
 def exists(path: Path) -> bool:
@@ -41,10 +48,8 @@ def exists(path: Path) -> bool:
 def remove(path: Path) -> None:
     """Delete a recording, in one file or in parts.  Nothing else is touched."""
     path.unlink(missing_ok=True)
-    folder = folder_of_parts(path)
-    if folder.is_dir():
-        for part in folder.glob("part_*.mcap"):
-            part.unlink()
+    for part in parts_in(folder_of_parts(path)):
+        part.unlink()
 
 
 class RollingWriter:

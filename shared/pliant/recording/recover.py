@@ -6,6 +6,7 @@ from pathlib import Path
 from mcap.records import Attachment, Metadata
 
 from pliant.errors import MessageError, RecordingError
+from pliant.messages import topics
 from pliant.recording.parts import PART_RECORD
 from pliant.recording.reader import Recorded, Recording
 from pliant.recording.scan import Damage
@@ -17,7 +18,8 @@ RECOVERED = "recovered"
 
 @dataclass
 class Recovery:
-    """What was kept.  ``unchecked``: those of the messages that no checksum vouched for."""
+    """What was kept, ends of topics not counted.  ``unchecked``: those of the messages that no
+    checksum vouched for."""
 
     messages: int = 0
     unchecked: int = 0
@@ -79,8 +81,9 @@ def _keep(writer: RecordingWriter, message: Recorded, recovery: Recovery) -> Non
         log_time_ns=message.log_time_ns,
         publish_time_ns=message.publish_time_ns,
     )
-    recovery.messages += 1
-    recovery.unchecked += not message.checked
+    if message.topic is not topics.STREAM_END:
+        recovery.messages += 1
+        recovery.unchecked += not message.checked
 
 
 def _note(

@@ -74,6 +74,10 @@ class Summary:
         """Messages that are known to be missing, over all topics."""
         return sum(topic.missing for topic in self.topics.values())
 
+    def missing_of(self, key: str) -> int:
+        """Messages that are known to be missing of one topic."""
+        return self.topics[key].missing if key in self.topics else 0
+
     @property
     def repeated(self) -> int:
         """Messages that are there more than once, over all topics."""

@@ -14,7 +14,6 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    ChunkIndex,
     Header,
     Metadata,
     MetadataIndex,
@@ -28,7 +27,7 @@ from pliant.messages.topics import Topic
 from pliant.recording import layout
 from pliant.recording.layout import CHUNK_BYTES
 from pliant.recording.open_chunk import OpenChunk, as_bytes
-from pliant.recording.summary_section import closing
+from pliant.recording.summary_section import ChunkIndexes, closing
 
 _AT_ONCE = 1024
 """Parts that the system takes in one call (IOV_MAX)."""
@@ -51,7 +50,7 @@ class RecordingWriter:
         self._schemas: list[Schema] = []
         self._counts: dict[str, int] = {}
         self._open: dict[str, OpenChunk] = {}
-        self._chunks: list[ChunkIndex] = []
+        self._chunks = ChunkIndexes()
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._broken = False
@@ -185,7 +184,7 @@ class RecordingWriter:
             self._put(*parts)
         except OSError as error:
             raise self._failed(error) from None
-        self._chunks.append(index)
+        self._chunks.add(index)
 
     def _put(self, *parts: bytes) -> None:
         """Write all of it: a raw file may take a part at a time."""
