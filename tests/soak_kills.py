@@ -211,8 +211,9 @@ def router_killed(
             router.kill()
             router.wait()
         running_still = any(service.poll() is None for service in services)
-        stack.enter_context(_router(endpoint))
+        another = stack.enter_context(_router(endpoint))
         codes = [service.wait(TIMEOUT_S) for service in services]
+        another.terminate()  # nobody tells it that a session is over that ended without it
     return running_still, digests(folder) if codes == [0] * len(codes) else {}
 
 

@@ -5,7 +5,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "system"))
@@ -17,12 +17,14 @@ from test_faults import run, run_attacked
 from pliant_services.access import NAMES
 from pliant_services.benchmarks import latency
 from pliant_services.certificates import make_certificates
-from pliant_services.launcher import ServiceDiedError
+from pliant_services.launcher import Fleet, ServiceDiedError
+from pliant_services.pipeline import RunRequest
 
 CUTS_S = (5.0, 30.0, 60.0)
 STOP_S = 60.0
 FAULT_FRAME = 10
 HOSTILE = 100_000  # on each key
+LONG = RunRequest(source="built-in:room")  # a few frames go on every ten seconds of the attack
 IMAGES = 1000
 Row = tuple[str, bool, str]
 
@@ -76,25 +78,40 @@ def _row(
     return name, not differing and bool(waits), "; ".join(waits)
 
 
-def hostile_rows(undisturbed: dict[str, str]) -> Iterator[Row]:
+def hostile_rows(_: dict[str, str]) -> Iterator[Row]:
     """So many messages of nobody on each key, and the lines that the logs have of them."""
     with tempfile.TemporaryDirectory(prefix="pliant-soak-") as folder:
         first, second = Path(folder) / "first", Path(folder) / "second"
         for output in (first, second):
             output.mkdir()
-        run(first)
-        ended, found = "", dict[str, str]()
+        expected = run(first, request=LONG)
+        ended, found, resident = "", dict[str, str](), dict[str, list[int]]()
+
+        def watch(fleet: Fleet) -> None:
+            for name, pid in fleet.pids.items():
+                with suppress(OSError):  # who has done its part leaves
+                    resident.setdefault(name, []).append(resident_mib(pid))
+
+        start = time.monotonic()
         try:
-            found = run_attacked(second, first / "recording.mcap", HOSTILE)
+            found = run_attacked(second, first / "recording.mcap", HOSTILE, LONG, watch)
         except ServiceDiedError as error:
             ended = f"; the run ended: {error}"
+        spent_s = time.monotonic() - start
         logs = sorted((second / "logs").glob("*.log"))
         lines = ", ".join(f"{log.stem} {len(log.read_text().splitlines())}" for log in logs)
+    grown = ", ".join(f"{name} {mib[0]} to {mib[-1]}" for name, mib in resident.items() if mib)
     yield (
         f"{HOSTILE} messages of nobody on each key",
-        found == undisturbed,
-        f"lines: {lines}{ended}",
+        found == expected,
+        f"{spent_s:.0f} s; lines of the logs: {lines}; MiB during the attack: {grown}{ended}",
     )
+
+
+def resident_mib(pid: int) -> int:
+    """Resident memory of a process."""
+    words = Path(f"/proc/{pid}/status").read_text().split()
+    return int(words[words.index("VmRSS:") + 1]) >> 10
 
 
 def latency_rows() -> Iterator[Sequence[str]]:

@@ -9,10 +9,12 @@ import pytest
 from pliant.config import config_yaml, load_config
 from pliant.errors import ConfigError, RecordingError
 from pliant.messages import topics
-from pliant.messages.types import SourceImage
+from pliant.messages.topics import Topic, by_key
+from pliant.messages.types import SourceImage, StreamEnd
 from pliant.recording.compare import compare
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
+from pliant.recording.writer import RecordingWriter
 from pliant_services.replay import recorded_config, replayable
 from pliant_services.replay_command import DIFFERENT, SAME, ReplayRequest, run_replay
 
@@ -140,3 +142,46 @@ def test_a_recording_cut_off_is_recovered_and_then_replays(
 def test_what_cannot_be_replayed_is_one_line(result: Path, tmp_path: Path) -> None:
     assert_one_line(pliant("replay", tmp_path / "none.mcap"), "no such recording")
     assert_one_line(pliant("replay", result, "--output", result), "exists")
+    assert_one_line(pliant("replay", result, "--check", "--loop"), "--loop is for playing", 2)
+
+
+def without(result: Path, output: Path, *left_out: Topic, frame: int | None = None) -> Path:
+    """A copy of a recording that lacks topics, or one frame of them."""
+    whole = Recording(result / "recording.mcap")
+    output.mkdir()
+    with RecordingWriter(output / "recording.mcap", whole.metadata()) as writer:
+        for message in whole.messages():
+            about = message.topic
+            if about == topics.STREAM_END and frame is None:
+                end = message.decode()
+                assert isinstance(end, StreamEnd)
+                about = by_key(end.topic)
+            if about not in left_out or frame not in (None, message.sequence):
+                writer.write(
+                    message.topic,
+                    message.data,
+                    sequence=message.sequence,
+                    log_time_ns=message.log_time_ns,
+                    publish_time_ns=message.publish_time_ns,
+                )
+    return output
+
+
+def test_what_reads_no_images_is_replayed_without_them(result: Path, tmp_path: Path) -> None:
+    if "mesh/final" not in summarise(result).topics:
+        pytest.skip("no mesh was made here")
+    small = without(result, tmp_path / "small", topics.SOURCE, topics.DEPTH)
+    assert replay(small, tmp_path / "again", "meshing") == SAME
+    with pytest.raises(RecordingError, match="--no-images"):
+        replay(small, tmp_path / "never", "tracking")
+
+
+def test_what_is_missing_of_the_inputs_is_said(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gap = without(result, tmp_path / "gap", topics.SOURCE, frame=5)
+    assert replay(gap, tmp_path / "again", "tracking") == DIFFERENT
+    assert "camera/source lacks 1 of its messages" in capsys.readouterr().err
+    part = without(result, tmp_path / "part", topics.STREAM)
+    with pytest.raises(RecordingError, match=r"without camera/stream .*one part of several"):
+        replay(part, tmp_path / "never", "tracking")

@@ -10,11 +10,16 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from pliant.bus.replay_bus import ReplayBus
+from pliant.config import Config
 from pliant.datasets import open_source
 from pliant.errors import ResultError
 from pliant.export.ply import read_ply
 from pliant.export.tum import read_tum
+from pliant.messages import topics
+from pliant.messages.types import CameraStream
 from pliant.viewers.point_blocks import BLOCK_POINTS, PointBlocks
+from pliant_services import recorder
 from pliant_services.export import export_result
 
 FRAMES = 40
@@ -172,6 +177,23 @@ def test_wrong_requests_are_one_line(result: Path, tmp_path: Path) -> None:
     for kind in ("foxglove", "rerun", "colmap", "images"):
         with pytest.raises(ResultError, match="cannot be"):
             export_result(result, kind, there / "below")
+    parts = tmp_path / "recording"
+    parts.mkdir()
+    (parts / "part_00000.mcap").symlink_to(result / "recording.mcap")
+    assert export_result(parts, "tum", None) == tmp_path / "recording_trajectory_tum.txt"
+
+
+@pytest.mark.parametrize("kind", ["tum", "kitti", "euroc", "ply", "colmap", "images"])
+def test_what_is_not_there_is_one_line_and_no_file(kind: str, tmp_path: Path) -> None:
+    camera = "model: pinhole\nwidth: 4\nheight: 2\nfx: 1\nfy: 1\ncx: 0\ncy: 0\n"
+    stream = CameraStream(
+        frame=0, stamp_ns=0, frame_id="", source="", mode="lossless", frames=0,
+        calibration=camera, width=4, height=2, fx=1.0, fy=1.0, cx=0.0, cy=0.0,
+    )  # fmt: skip
+    recorder.run(ReplayBus({topics.STREAM: [stream]}), Config(), tmp_path / "recording.mcap", {})
+    with pytest.raises(ResultError, match=r"has no|to export"):
+        export_result(tmp_path, kind, tmp_path / "made")
+    assert not (tmp_path / "made").exists()
 
 
 def test_points_that_were_missed_are_right_after_the_next_snapshot() -> None:

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -79,8 +79,8 @@ class SlowBus(ReplayBus):
         super().__init__({})
         self._on_image = on_image
 
-    def publish(self, topic: Topic, message: Header) -> None:
-        super().publish(topic, message)
+    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
+        super().publish(topic, message, may_lag=may_lag)
         if topic is topics.IMAGE:
             self._on_image(message.frame)
 
@@ -118,7 +118,7 @@ def test_lossless_publishes_every_frame_and_its_bytes_as_they_came() -> None:
         np.testing.assert_array_equal(image.grey, grey)
     sources = bus.outputs[topics.SOURCE]
     assert [s.data for s in sources if isinstance(s, SourceImage)] == data
-    assert monitor.counters == {"dropped": 0, "broken": 0}
+    assert monitor.counters == {"dropped": 0, "broken": 0, "unmapped": 0}
     assert monitor.frames == list(range(5))
 
 
@@ -126,9 +126,9 @@ def test_the_camera_comes_first_and_its_topic_is_closed_before_the_first_frame()
     order: list[str] = []
 
     class Bus(ReplayBus):
-        def publish(self, topic: Topic, message: Header) -> None:
+        def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
             order.append(topic.key)
-            super().publish(topic, message)
+            super().publish(topic, message, may_lag=may_lag)
 
         def end(self, topic: Topic) -> None:
             order.append(f"end of {topic.key}")
@@ -167,7 +167,7 @@ def test_a_broken_frame_keeps_its_number_and_says_what_is_wrong(kind: str, mode:
     assert images[1].missing.startswith("broken: frame 1: ")
     assert text in images[1].missing
     assert images[1].grey.size == 0
-    assert monitor.counters == {"dropped": 0, "broken": 1}
+    assert monitor.counters == {"dropped": 0, "broken": 1, "unmapped": 0}
 
 
 def test_live_passes_over_what_a_slow_reader_has_no_time_for() -> None:
@@ -188,7 +188,7 @@ def test_live_passes_over_what_a_slow_reader_has_no_time_for() -> None:
     dataset = FakeDataset([png(i) for i in range(11)], is_live=True, before=before)
     images, monitor, bus = run(dataset, SlowBus(on_image))
     assert [image.missing for image in images] == ["", *["dropped"] * 9, ""]
-    assert monitor.counters == {"dropped": 9, "broken": 0}
+    assert monitor.counters == {"dropped": 9, "broken": 0, "unmapped": 0}
     sources = [s for s in bus.outputs[topics.SOURCE] if isinstance(s, SourceImage)]
     assert [len(s.data) > 0 for s in sources] == [True, *[False] * 9, True]
     (stream,) = bus.outputs[topics.STREAM]

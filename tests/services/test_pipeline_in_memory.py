@@ -1,5 +1,7 @@
 """Each service alone on the in-memory bus: one message a frame, and the same bytes every time."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from pliant.map_history import MapHistory
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Extrema, Header, Image, Keyframe, MapUpdate
-from pliant_services import bundle_adjustment, ingest, tracking
+from pliant_services import bundle_adjustment, ingest, keeping_up, tracking
 from pliant_services.monitor import SilentMonitor
 from pliant_services.processes import BY_NAME
 
@@ -194,6 +196,26 @@ def test_a_frame_without_pixels_gets_empty_messages_and_loses_nothing(
     assert isinstance(last, MapUpdate)
     assert last.state == TRACKING
     assert last.segment == 0
+
+
+def test_frames_that_mapping_passes_over_are_tracked_all_the_same(
+    config: Config, ingested: dict[Topic, list[Header]], tracked: list[Header]
+) -> None:
+    images = list(ingested[topics.IMAGE])
+    over = {*range(1, 12, 2), 18, 19, 20}
+    for frame in over:
+        images[frame] = replace(images[frame], unmapped=True)  # type: ignore[call-arg]
+    inputs = {**ingested, topics.IMAGE: images}
+    tracks = track(config, inputs)
+    assert wire(tracks) == wire(tracked)
+    outputs = adjust(config, inputs, tracks)
+    updates = [m for m in outputs[topics.MAP_UPDATE] if isinstance(m, MapUpdate)]
+    assert [m.frame for m in updates] == list(range(FRAMES))
+    assert {m.frame for m in updates if m.reason == keeping_up.REASON} == over
+    posed = {frame for m in updates for frame in m.pose_frames.tolist()}
+    assert posed == set(range(FRAMES)) - over
+    assert updates[-1].state == TRACKING
+    assert updates[-1].segment == 0
 
 
 def test_a_video_of_nothing_starts_no_map_and_says_why(

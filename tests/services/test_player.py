@@ -146,6 +146,11 @@ def test_a_rate_is_a_share_of_the_pace_of_capture() -> None:
     assert unbounded.wait_until(10**18)
 
 
+def test_an_end_before_the_start_is_one_line(path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"--end 0.5 is not after --start 1"):
+        run_play(PlayRequest(recording=path, start_s=1.0, end_s=0.5))
+
+
 def test_an_unknown_reader_is_one_line(path: Path) -> None:
     with pytest.raises(RecordingError, match="choose from bundle_adjustment"):
         run_play(PlayRequest(recording=path, readers=["nobody"]))

@@ -111,6 +111,9 @@ def test_a_part_ends_after_its_time(tmp_path: Path) -> None:
             writer.write(topics.SOURCE, data, sequence=n, log_time_ns=400 * n, publish_time_ns=0)
     counts = [len(list(Recording(part).messages())) for part in parts_of(tmp_path / "a.mcap")]
     assert counts == [3, 3, 3, 1]
+    part = parts_of(tmp_path / "a.mcap")[1]
+    assert recover(part, part.with_stem(f"{part.stem}_recovered")).messages == 3
+    assert len(parts_of(tmp_path / "a")) == 4  # what was recovered of a part is none
 
 
 def test_calibration_and_configuration_are_attached(tmp_path: Path) -> None:

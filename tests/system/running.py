@@ -74,13 +74,16 @@ class Running:
 
 
 @contextmanager
-def running(*arguments: object, env: dict[str, str] | None = None) -> Generator[Running]:
+def running(
+    *arguments: object, env: dict[str, str] | None = None, start_new_session: bool = False
+) -> Generator[Running]:
     process = subprocess.Popen(
         command("run", *arguments),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, **(env or {})},
+        start_new_session=start_new_session,
     )
     try:
         yield Running(process)

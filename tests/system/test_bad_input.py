@@ -244,17 +244,6 @@ def test_services_end_when_their_launcher_is_killed(tmp_path: Path) -> None:
     assert Recording(folder / "recording.mcap").metadata()["config"]
 
 
-def test_ctrl_c_while_kernels_compile_leaves_nothing(tmp_path: Path) -> None:
-    source = write_sequence(tmp_path / "source", IMAGES)
-    environment = {"PLIANT_CACHE_DIR": str(tmp_path / "cache")}
-    with running(source, "--output", tmp_path / "result", env=environment) as run:
-        run.wait_for("compiling")
-        run.send(signal.SIGINT)
-        code, output, errors = run.finish()
-    assert (code, output, errors) == (130, "", "")
-    assert not (tmp_path / "result").exists()
-
-
 @pytest.fixture
 def fleet(tmp_path: Path) -> Generator[Fleet]:
     fleet = Fleet(PROFILES["points"], log_folder=tmp_path, on_status=lambda _: None)

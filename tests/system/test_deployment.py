@@ -258,6 +258,34 @@ def test_surfels_in_containers_are_those_of_the_host_and_are_replayed(
 
 @pytest.mark.docker
 @pytest.mark.slow
+@only_in_soak
+@pytest.mark.parametrize("form", list(COMPOSES))
+def test_the_one_command_builds_both_images_and_ends_with_results_and_mesh(
+    image: None, form: str, tmp_path: Path
+) -> None:
+    """``up --build``, and ``start`` after a ``docker kill``."""
+    here = tmp_path / "host"
+    assert pliant("run", SOURCE, "--output", here).returncode == 0
+    name = f"pliant-test-{uuid.uuid4().hex[:8]}"
+    compose = DEPLOY / "compose.yaml"
+    with session(name, tmp_path / "results", compose, form=form, PLIANT_IMAGE=name) as running:
+        running.compose("up", "--build", "--detach")
+        followed = Followed(running.port, "session")
+        followed.wait_for("bundle_adjustment", 8)
+        running.compose("kill", "tracking")
+        running.compose("start", "tracking")
+        followed.close()
+        for service in ("router", *PROFILES["points"], "mesher"):
+            running.wait(service)
+        there = running.results / "session"
+        assert results_of(there) == results_of(here)
+        for mesh in ("mesh.ply", "mesh_coarse.ply"):
+            made = running.results / "session_mesh" / mesh
+            assert made.read_bytes() == (here / mesh).read_bytes()
+
+
+@pytest.mark.docker
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "machines",
     [

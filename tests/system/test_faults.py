@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from hostile import attack, samples
-from running import TINY, digests
+from running import TINY, assert_one_line, digests, pliant
 
 from pliant.config import config_yaml, load_config
 from pliant.messages.types import Status
@@ -37,6 +37,7 @@ def run(
     *,
     resume: bool = False,
     settings: Sequence[str] = (),
+    request: RunRequest = REQUEST,
 ) -> dict[str, str]:
     """One run in which the victims of each status are killed; returns the result files."""
     config = load_config(overrides=["bus.checkpoint_frames=6", *settings])
@@ -56,7 +57,7 @@ def run(
         state=output / STATE_FOLDER,
     )
     try:
-        fleet.start(lambda name: service_arguments(name, REQUEST, output))
+        fleet.start(lambda name: service_arguments(name, request, output))
         fleet.wait()
     finally:
         fleet.close()
@@ -121,6 +122,22 @@ def test_a_power_cut_and_resume(tmp_path: Path, undisturbed: dict[str, str]) -> 
     assert run(tmp_path, resume=True) == undisturbed
 
 
+def test_a_live_run_is_not_resumed_but_its_recording_is_a_source(
+    tmp_path: Path, tiny_run: Path
+) -> None:
+    """Other frames would be passed over, which some services saw already and others did not."""
+    whole = (tiny_run / "recording.mcap").read_bytes()
+    (tmp_path / "state").mkdir()
+    (tmp_path / "recording.mcap").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "config.yaml").write_text(config_yaml(load_config(overrides=["ingest.mode=live"])))
+    refused = pliant("run", TINY, "--resume", "--output", tmp_path)
+    assert_one_line(refused, "was recorded live")
+    said = refused.stderr[refused.stderr.index("`pliant run ") + 1 :].split()[1:3]
+    again = pliant(*said, "--output", tmp_path / "again", "--set", "meshing.enabled=false")
+    assert again.returncode == 3, again.stderr  # as incomplete as the recording
+    assert "frames at" in again.stdout
+
+
 def test_messages_that_no_service_sends_are_counted_told_and_change_nothing(
     tmp_path: Path, undisturbed: dict[str, str], tiny_run: Path
 ) -> None:
@@ -133,10 +150,17 @@ def test_messages_that_no_service_sends_are_counted_told_and_change_nothing(
     assert "credit of camera/image" in (tmp_path / "logs" / "ingest.log").read_text()
 
 
-def run_attacked(output: Path, recording: Path, each: int) -> dict[str, str]:
+def run_attacked(
+    output: Path,
+    recording: Path,
+    each: int,
+    request: RunRequest = REQUEST,
+    watch: Callable[[Fleet], None] = lambda fleet: None,
+) -> dict[str, str]:
     """A run that meets so many hostile messages on every key; returns the result files.
 
     Its source is held up meanwhile, not for so long at a time that it would be taken for dead.
+    watch: called now and then as long as messages come.
     """
     attackers: list[threading.Thread] = []
     failures: list[Exception] = []
@@ -155,6 +179,7 @@ def run_attacked(output: Path, recording: Path, each: int) -> dict[str, str]:
                 while attackers[0].is_alive():
                     os.kill(source, signal.SIGSTOP)
                     attackers[0].join(_HELD_S)
+                    watch(fleet)
                     os.kill(source, signal.SIGCONT)
                     attackers[0].join(_LET_GO_S)
 
@@ -163,7 +188,8 @@ def run_attacked(output: Path, recording: Path, each: int) -> dict[str, str]:
             threading.Thread(target=hold).start()
         return ()
 
-    found = run(output, hold_and_attack, settings=["bus.window=4"])  # so it is not done yet
+    narrow = ["bus.window=4"]  # so it is not done yet
+    found = run(output, hold_and_attack, settings=narrow, request=request)
     assert attackers
     attackers[0].join()
     assert not failures, failures

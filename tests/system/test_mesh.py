@@ -58,14 +58,23 @@ def test_a_mesher_that_is_killed_fuses_again_and_the_mesh_is_that_of_an_ordinary
         while not (meshers := children(run.process.pid, "mesh_afterwards")):
             assert run.process.poll() is None
         os.kill(meshers[0], signal.SIGKILL)
-        code, _, errors = run.finish()
+        code, written, errors = run.finish()
     assert code == 0, errors
+    parts = len(list((output / "recording").iterdir()))
+    assert written.endswith(f", recording/ ({parts} parts)\n")
     assert digests(output) == digests(result)
     for name in ("mesh.ply", "mesh_coarse.ply", "mesh.png"):
         assert (output / name).read_bytes() == (result / name).read_bytes(), name
     assert pliant("info", output).returncode == 0
     meshes = [json.loads((of / "report.json").read_text())["mesh"] for of in (output, result)]
     assert meshes[0] == meshes[1]
+    # A power cut after the end, before the state was cleared away.
+    (output / "state").mkdir()
+    again = pliant("run", TINY, "--resume", "--output", output)
+    assert again.returncode == 0, again.stderr
+    assert "had come to its end" in again.stderr
+    assert digests(output) == digests(result)
+    assert not (output / "state").exists()
 
 
 def test_the_mesh_is_made_again_with_other_parameters(result: Path, tmp_path: Path) -> None:

@@ -1,20 +1,23 @@
 """``pliant run`` with real processes on free ports."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
-from running import TINY, UP, assert_one_line, pliant, running
+from running import TINY, UP, assert_one_line, children, has_ended, pliant, running
 
 from pliant.bus.session import CONNECT_TIMEOUT_S, free_endpoint, open_router
 from pliant.messages import topics
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
+from pliant_services.warm_up import COMPILED
 
 pytestmark = pytest.mark.system
 
@@ -74,13 +77,20 @@ def test_evaluation_of_a_run(result: Path) -> None:
 
 
 def test_ctrl_c_ends_the_stream_and_keeps_what_was_done(tmp_path: Path) -> None:
+    """Also where the whole group gets it, as from a terminal: a viewer sees the run to its end."""
     folder = tmp_path / "stopped"
+    save = ("--save", tmp_path / "run.rrd") if find_spec("rerun") else ()
     # Live at the pace of its stamps, so that the run is still going on when the signal comes.
-    with running(TINY, "--output", folder, "--mode", "live") as run:
+    with running(
+        *(TINY, "--output", folder, "--mode", "live"), *save, start_new_session=True
+    ) as run:
         run.wait_for(UP)
-        run.send(signal.SIGINT)
+        os.killpg(run.process.pid, signal.SIGINT)
         code, output, errors = run.finish()
     assert code == 130, errors
+    assert errors.endswith("pliant: interrupted\n")
+    assert errors.count("interrupted") == 1
+    assert not save or str(save[1]) in output  # said by a viewer that was done
     report = json.loads((folder / "report.json").read_text())
     recorded = [m.sequence for m in Recording(folder / "recording.mcap").messages(topics.EXTREMA)]
     assert len(recorded) == report["frames"]
@@ -130,3 +140,28 @@ def test_a_service_that_cannot_reach_its_peers_says_so_within_ten_seconds(tmp_pa
     done = pliant("service", "tracking", "--connect", unused)
     assert_one_line(done, "cannot reach")
     assert CONNECT_TIMEOUT_S < 8.0  # and two for Python and Zenoh to start: no clock under load
+
+
+def test_ctrl_c_while_kernels_are_compiled(result: Path, tmp_path: Path) -> None:
+    """It reaches the compilers, too, as a terminal's does; an earlier result stays as it is."""
+    before = {path.name: path.read_bytes() for path in result.iterdir() if path.is_file()}
+    with running(
+        *(TINY, "--output", result, "--force"),
+        env={"NUMBA_CACHE_DIR": str(tmp_path)},
+        start_new_session=True,
+    ) as run:
+        run.wait_for("compiling")
+        os.killpg(run.process.pid, signal.SIGINT)
+        code, output, errors = run.finish()
+    assert (code, output, errors) == (130, "", "pliant: interrupted\n")
+    assert before == {path.name: path.read_bytes() for path in result.iterdir() if path.is_file()}
+
+
+def test_compilers_end_with_a_launcher_that_was_killed(tmp_path: Path) -> None:
+    with running(TINY, "--output", tmp_path / "run", env={"NUMBA_CACHE_DIR": str(tmp_path)}) as run:
+        run.wait_for("compiling")
+        compilers: list[int] = []
+        while len(compilers) < len(COMPILED):
+            compilers = children(run.process.pid, "load_kernels")
+        run.send(signal.SIGKILL)
+        assert all(has_ended(pid, 30.0) for pid in compilers)

@@ -107,6 +107,11 @@ def test_the_surface_is_a_mesh_for_every_other_frame(result: Path, tmp_path: Pat
     assert np.ptp(mesh.colours) > 50  # of the image
 
 
+def test_its_poses_are_exported(result: Path, tmp_path: Path) -> None:
+    exported = export_result(result, "tum", tmp_path / "poses.txt")
+    assert exported.read_bytes() == (result / "trajectory.txt").read_bytes()
+
+
 def test_the_overlay_shows_how_each_surfel_fares(result: Path, tmp_path: Path) -> None:
     done = pliant("export", result, "--to", "overlay", "--output", tmp_path / "surfels.avi")
     assert done.returncode == 0, done.stderr

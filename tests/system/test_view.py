@@ -12,6 +12,8 @@ from pliant.errors import ResultError
 from pliant.viewers.rerun import RerunCanvas
 from pliant.viewers.rerun_program import listens
 from pliant_services.benchmarks.viewer_cost import run_with
+from pliant_services.pipeline import RunRequest, run_pipeline
+from pliant_services.spectators import check_viewer
 
 pytestmark = pytest.mark.system
 
@@ -62,12 +64,33 @@ def test_wrong_requests_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyP
         ((tmp_path, "--save", there, "--web"), "contradict"),
         ((tmp_path,), "there is no display"),
         (("--connect", "tcp/127.0.0.1:9", "--save", tmp_path / "x.rrd"), "--session"),
+        (("--connect", "a", "--session", "b", "--save", tmp_path / "x.rrd"), "not an endpoint"),
     ):
         done = pliant("view", *arguments)
         assert done.returncode == 1
         assert says in done.stderr
         assert done.stderr.count("\n") == 1, done.stderr
     assert there.read_text() == "mine"
+    assert not (tmp_path / "x.rrd").exists()
+
+
+def test_a_viewer_that_cannot_start_leaves_an_earlier_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rerun")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    output = tmp_path / "result"
+    there = tmp_path / "there.rrd"
+    there.write_text("mine")
+    check_viewer(output, web=False, save=output / "run.rrd", force=False)
+    for save, says in ((None, "no display"), (tmp_path / "a" / "b.rrd", "no such folder")):
+        with pytest.raises(ResultError, match=says):
+            check_viewer(output, web=False, save=save, force=True)
+    with pytest.raises(ResultError, match="--force"):
+        run_pipeline(RunRequest(source="built-in:tiny", output=output, save=there))
+    assert there.read_text() == "mine"
+    assert not output.exists()
 
 
 def test_a_taken_port_is_one_line() -> None:

@@ -135,6 +135,40 @@ def test_a_reader_that_makes_safe_seldom_bounds_messages_and_bytes() -> None:
     assert outbox.has_room(1000)  # nothing is kept: larger than the window may pass alone
 
 
+def test_messages_with_which_a_reader_may_lag_take_no_room_in_its_window() -> None:
+    lags = {"slow": Window(messages=6, size=50)}
+    outbox = Outbox("t", ["slow", "fast"], window=2, lags=lags)
+    for _ in range(2):
+        outbox.add(0, b"x")
+    assert not outbox.has_room(1)
+    assert not outbox.has_room(1, ["slow"])  # the other one has no room
+    outbox.credit("fast", 1, 2, 2)
+    assert outbox.untaken("slow") == 2
+    for sent in range(2, 6):
+        assert not outbox.has_room(1)
+        assert outbox.has_room(1, ["slow"])
+        outbox.add(0, b"x", ["slow"])
+        outbox.credit("fast", 1, sent + 1, sent + 1)
+    assert not outbox.has_room(1, ["slow"])  # six are on the way
+    outbox.credit("slow", 1, 2, 0)
+    assert outbox.has_room(46, ["slow"])
+    assert not outbox.has_room(47, ["slow"])  # four bytes are on the way
+    outbox.add(0, b"x")
+    assert outbox.has_room(1)  # one of those in the window
+    outbox.credit("fast", 1, 7, 7)
+    outbox.add(0, b"x")
+    outbox.credit("fast", 1, 8, 8)
+    assert not outbox.has_room(1)
+    outbox.credit("slow", 2, 0, 0)  # it starts anew, and lags with the same messages
+    assert outbox.untaken("slow") == 8
+    assert not outbox.has_room(1)
+    outbox.credit("slow", 2, 3, 3)
+    assert not outbox.has_room(1)
+    outbox.credit("slow", 2, 7, 7)
+    assert outbox.has_room(1)
+    assert outbox.untaken("nobody") == 0
+
+
 def test_versions_that_do_not_fit_are_both_named() -> None:
     peers = Peers("tracking", incarnation=5)
     peers.on_token("pliant/s/ready/ingest/3/99/9.9.9", alive=True, now=0.0)

@@ -1,0 +1,189 @@
+"""Live mode: which frames a slow bundle adjustment passes over, and that nobody waits for it."""
+
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pliant.algorithms.tracks import FrameTracks
+from pliant.bus.base import join, receive, receive_one
+from pliant.bus.session import free_endpoint, open_router
+from pliant.bus.zenoh_bus import ZenohBus
+from pliant.config import Config, load_config
+from pliant.datasets.base import SourceFrame
+from pliant.datasets.calibration import Calibration
+from pliant.messages import topics
+from pliant.messages.topics import Topic
+from pliant.messages.types import CameraStream, Extrema, Image
+from pliant.state import load_state, save_state
+from pliant_services import ingest
+from pliant_services.host import lags
+from pliant_services.keeping_up import MappingPace, readers_that_may_lag
+from pliant_services.link_images import receive_images
+from pliant_services.monitor import SilentMonitor
+
+FLEET = ("ingest", "tracking", "bundle_adjustment")
+LAG_S = 0.1
+STEP_NS = 40_000_000  # the third image after one is late
+MAPPED = 3
+PATIENCE_S = 30.0
+CALIBRATION = Calibration(model="pinhole", width=24, height=16, fx=20.0, fy=20.0, cx=12.0, cy=8.0)
+IMAGE = Image(
+    frame=0,
+    stamp_ns=0,
+    frame_id="camera",
+    grey=np.zeros((2, 2), np.uint8),
+    colour=np.zeros((0, 0, 3), np.uint8),
+)
+
+
+def decide(pace: MappingPace, begin: int, waiting: Sequence[int], missing: str = "") -> str:
+    """m where a frame is to be mapped, when so many of those before it wait."""
+    decisions = ""
+    for frame, wait in enumerate(waiting, begin):
+        image = replace(IMAGE, frame=frame, stamp_ns=frame * STEP_NS, missing=missing)
+        decisions += "-" if pace.passes_over(image, wait, LAG_S) else "m"
+    return decisions
+
+
+def test_frames_are_mapped_while_what_waits_is_young_or_none_is_to_be_mapped() -> None:
+    pace = MappingPace(deque(maxlen=16))
+    assert decide(pace, 0, [0, 1, 2, 3, 4, 5]) == "mmm---"
+    assert decide(pace, 6, [4, 5]) == "--"  # the third of them waits
+    assert decide(pace, 8, [5, 1, 2, 3]) == "mmm-"  # none waits that is to be mapped
+    assert decide(pace, 12, [0] * 5) == "mmmmm"
+    assert decide(pace, 17, [16, 17]) == "--"  # of what came long ago no stamp is kept
+    assert pace.passed == 3 + 2 + 1 + 2
+
+
+def test_no_more_wait_to_be_mapped_than_there_is_credit_for() -> None:
+    assert decide(MappingPace(deque(maxlen=2)), 0, [0, 1, 2, 3]) == "mm--"
+
+
+def test_frames_without_pixels_are_not_to_be_mapped_and_not_counted() -> None:
+    pace = MappingPace(deque(maxlen=16))
+    assert decide(pace, 0, [0, 1, 2, 3, 4], missing="dropped") == "mmmmm"
+    assert (pace.last, pace.passed) == (-1, 0)
+    assert decide(pace, 5, [5, 6]) == "m-"
+
+
+def test_who_is_started_again_decides_as_before() -> None:
+    pace = MappingPace(deque(maxlen=16))
+    decide(pace, 0, range(5))
+    again = MappingPace(*load_state(save_state(tuple(vars(pace).values()))))
+    assert decide(again, 5, [5, 2, 6]) == decide(pace, 5, [5, 2, 6]) == "-m-"
+    assert again == pace
+
+
+@dataclass
+class Camera:
+    """Gives a frame when it is told to.  All are the same JPEG."""
+
+    frames: int
+    due: threading.Semaphore
+    name: str = "camera"
+    is_live: bool = True
+    frame_count: int | None = None
+    ground_truth_path: Path | None = None
+    calibration: Calibration = CALIBRATION
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        jpeg = cv2.imencode(".jpg", np.zeros((16, 24), np.uint8))[1].tobytes()
+        for index in range(self.frames):
+            assert self.due.acquire(timeout=PATIENCE_S)
+            yield SourceFrame(index=index, stamp_ns=index * STEP_NS, encoding="jpeg", data=jpeg)
+
+
+def bus_of(endpoint: str, service: str, config: Config, **how: object) -> ZenohBus:
+    return ZenohBus(
+        endpoints=[endpoint],
+        session="test",
+        service=service,
+        inputs=how.get("inputs", {}),  # type: ignore[arg-type]
+        outputs=how.get("outputs", {}),  # type: ignore[arg-type]
+        window=config.bus.window,
+        lags=lags(config, FLEET),
+    )
+
+
+@pytest.mark.parametrize(
+    ("link_images", "lag_s"),
+    [("raw", LAG_S), ("jpeg", LAG_S), ("raw", 1e9)],
+    ids=["late", "late, over a link", "as many as there is credit for"],
+)
+def test_tracking_goes_on_while_bundle_adjustment_stands_still(
+    link_images: str, lag_s: float
+) -> None:
+    """It has taken an image, and not its tracks.  Far more than a window of frames come.
+
+    The camera gives the next image when tracking has sent the tracks of the last one.
+    """
+    frames, window = 40, 4
+    settings = [f"bus.window={window}", f"ingest.mapping_lag_s={lag_s}"]
+    config = load_config(overrides=[*settings, f"bus.link_images={link_images}"])
+    due = threading.Semaphore(1)
+    failures: list[BaseException] = []
+    tracked: list[Image] = []
+    all_tracked = threading.Event()
+    endpoint = free_endpoint()
+    router = open_router(endpoint)
+    images = {topics.STREAM: "ingest", topics.IMAGE: "ingest"}
+    tracks = {topics.EXTREMA: "tracking"}
+
+    def send() -> None:
+        outputs: dict[Topic, Sequence[str]] = dict.fromkeys(images, FLEET[1:])
+        outputs |= {topics.SOURCE: (), topics.DEPTH: ()}
+        try:
+            with bus_of(endpoint, "ingest", config, outputs=outputs) as bus:
+                ingest.run(bus, config, SilentMonitor(), Camera(frames, due), lambda: False)
+                bus.end_all()
+        except BaseException as error:
+            failures.append(error)
+
+    def track(bus: ZenohBus) -> None:
+        receive_one(bus, topics.STREAM, CameraStream)
+        for image in receive_images(bus):
+            extrema = Extrema.of(image, FrameTracks.empty())
+            bus.publish(topics.EXTREMA, extrema, may_lag=readers_that_may_lag(image))
+            tracked.append(image)
+            due.release()
+        all_tracked.set()
+        bus.end_all()  # which waits for credit
+
+    outputs = dict.fromkeys(tracks, FLEET[2:])
+    with (
+        bus_of(endpoint, "tracking", config, inputs=images, outputs=outputs) as fast,
+        bus_of(endpoint, "bundle_adjustment", config, inputs=images | tracks) as slow,
+    ):
+        sender = threading.Thread(target=send, daemon=True)
+        tracker = threading.Thread(target=track, args=(fast,), daemon=True)
+        sender.start()
+        receive_one(slow, topics.STREAM, CameraStream)
+        taken = receive_images(slow, mapped_only=True)
+        first = next(taken)
+        tracker.start()
+        all_tracked.wait(PATIENCE_S)
+        assert [image.frame for image in tracked] == list(range(frames))
+        assert all(image.grey.shape == (16, 24) for image in tracked)
+        mapped = [image.frame for image in tracked if not image.unmapped]
+        assert mapped == list(range(len(mapped)))
+        assert MAPPED <= len(mapped) <= window
+        rest = join(chain([first], taken), receive(slow, topics.EXTREMA, Extrema))
+        assert [image.unmapped for image, _ in rest] == [image.unmapped for image in tracked]
+        tracker.join(PATIENCE_S)
+    sender.join(PATIENCE_S)
+    router.close()
+    assert not failures, failures
+
+
+def test_frames_without_pixels_take_no_room_either() -> None:
+    assert not readers_that_may_lag(IMAGE)
+    assert "bundle_adjustment" in readers_that_may_lag(replace(IMAGE, unmapped=True))
+    assert "bundle_adjustment" in readers_that_may_lag(replace(IMAGE, missing="dropped"))
+    assert "tracking" not in readers_that_may_lag(replace(IMAGE, unmapped=True))

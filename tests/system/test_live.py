@@ -1,0 +1,77 @@
+"""Live mode with a bundle adjustment that stands still for a time: tracking goes on without it."""
+
+import os
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+from running import TINY, pliant
+
+from pliant.config import config_yaml, load_config
+from pliant.datasets.builtin import builtin_folder
+from pliant.messages import topics
+from pliant.messages.types import Extrema, MapUpdate, SourceImage, Status
+from pliant.recording.reader import Recording
+from pliant_services import warm_up
+from pliant_services.benchmarks.endurance import forth_and_back
+from pliant_services.keeping_up import REASON
+from pliant_services.launcher import Fleet
+from pliant_services.pipeline import RunRequest, prepare, service_arguments, summary
+from pliant_services.processes import PROFILES
+from pliant_services.results import RECORDING_NAME, write_results
+
+pytestmark = pytest.mark.system
+
+FRAMES, FPS = 40, 10.0  # slow enough for tracking on a busy machine
+PATIENCE_S = 120.0
+WINDOW = 4
+STOP_FRAME, GO_FRAME = 10, 34
+"""Bundle adjustment stands still from the one until tracking has told of the other."""
+
+
+def test_tracking_goes_on_and_the_run_can_be_replayed(tmp_path: Path) -> None:
+    warm_up.compile_kernels(print)
+    output = tmp_path / "run"
+    config = load_config(overrides=["ingest.mode=live", f"bus.window={WINDOW}"])
+    source = forth_and_back(builtin_folder(TINY), tmp_path / "source", FRAMES, FPS)
+    request = RunRequest(source=str(source))
+    prepare(output, config_yaml(config))
+    stood_still: list[bool] = []
+
+    def on_status(status: Status) -> None:
+        if not stood_still and status.service == "tracking" and status.frame >= STOP_FRAME:
+            os.kill(fleet.pids["bundle_adjustment"], signal.SIGSTOP)
+            stood_still.append(True)
+        elif len(stood_still) == 1 and status.service == "tracking" and status.frame >= GO_FRAME:
+            os.kill(fleet.pids["bundle_adjustment"], signal.SIGCONT)
+            stood_still.append(False)
+
+    fleet = Fleet(PROFILES["points"], log_folder=output / "logs", on_status=on_status)
+
+    def end() -> None:
+        os.kill(fleet.pids["bundle_adjustment"], signal.SIGKILL)  # tracking waits for it
+
+    patience = threading.Timer(PATIENCE_S, end)
+    try:
+        fleet.start(lambda name: service_arguments(name, request, output))
+        patience.start()
+        fleet.wait()
+    finally:
+        patience.cancel()
+        fleet.close()
+    assert stood_still == [True, False]
+    report = write_results(output)
+    recording = Recording(output / RECORDING_NAME)
+    sources = [m for m in recording.decoded(topics.SOURCE) if isinstance(m, SourceImage)]
+    tracks = [m for m in recording.decoded(topics.EXTREMA) if isinstance(m, Extrema)]
+    updates = [m for m in recording.decoded(topics.MAP_UPDATE) if isinstance(m, MapUpdate)]
+    over = [m.frame for m in sources if m.unmapped]
+    assert [m.frame for m in tracks] == [m.frame for m in updates] == list(range(FRAMES))
+    assert all(len(tracks[frame].ids) > 100 for frame in over)
+    assert [m.frame for m in updates if m.reason == REASON] == over == report["frames_passed_over"]
+    assert len([frame for frame in over if STOP_FRAME < frame <= GO_FRAME]) > WINDOW
+    assert any(f"{len(over)} images tracked, but not mapped" in line for line in summary(report))
+    again = ("replay", output / RECORDING_NAME, "--services", "tracking,bundle_adjustment")
+    done = pliant(*again, "--output", tmp_path / "again", "--check")
+    assert done.returncode == 0, done.stderr
