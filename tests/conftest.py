@@ -1,6 +1,11 @@
 """Fixtures of all tests."""
 
 import os
+import signal
+import subprocess
+import threading
+from collections.abc import Generator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -11,6 +16,35 @@ SHARED_DATA = ROOT.parent / "shared" / "data"
 # As the launcher does for its services: results must not depend on threads.
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(name, "1")
+
+PATIENCE_S = 600.0  # the longest test takes a minute and a half
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol() -> Generator[None, object, object]:
+    """A test whose processes wait for each other fails, rather than hold up all that follow.
+
+    What it waits for is killed.  One that waits for its own threads ends all: faulthandler_timeout.
+    """
+    watch = threading.Timer(PATIENCE_S, kill_descendants)
+    watch.daemon = True
+    watch.start()
+    try:
+        return (yield)
+    finally:
+        watch.cancel()
+
+
+def kill_descendants() -> None:
+    """Kill the processes that this one has started, and those that they have."""
+    listed = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True)
+    parents = {int(pid): int(parent) for pid, parent in map(str.split, listed.stdout.splitlines())}
+    family = {os.getpid()}
+    while more := {pid for pid, parent in parents.items() if parent in family} - family:
+        family |= more
+    for pid in family - {os.getpid()}:
+        with suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, signal.SIGKILL)
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,8 @@ from pliant_services.results import CONFIG_NAME, RECORDING_NAME
 
 _MARK = "over"
 _LOOK_S = 0.5
+_SAY_S = 3.0
+_SAY_AGAIN_S = 0.05
 
 
 def run_alone(name: str, config: Config, options: ServiceOptions, *, results: bool) -> int:
@@ -48,9 +50,21 @@ def run_alone(name: str, config: Config, options: ServiceOptions, *, results: bo
     else:
         print(f"{name}: its part of the session is done", file=sys.stderr)
     if recorded is not None:
-        with open_session(options.endpoints, options.identity) as connection:
-            connection.put(f"pliant/{options.session}/{OVER_KEY}", b"")
+        _say_over(options)
     return code
+
+
+def _say_over(options: ServiceOptions) -> None:
+    """Tell everybody that the session is over.
+
+    Again and again until the router has left, as it may listen already but not yet take anything
+    in; one that stays does not answer, so for some seconds at most.
+    """
+    with open_session(options.endpoints, options.identity) as connection:
+        enough = time.monotonic() + _SAY_S
+        while connection.info.routers_zid() and time.monotonic() < enough:
+            connection.put(f"pliant/{options.session}/{OVER_KEY}", b"")
+            time.sleep(_SAY_AGAIN_S)
 
 
 def wait_until_over(state: Path) -> None:

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,10 +19,17 @@ REFERENCE = Path(__file__).parents[1] / "data" / "reference" / "reference.mcap"
 PLIANT = [sys.executable, "-m", "pliant_services.cli"]
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*PLIANT, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+class Part(subprocess.Popen[str]):
+    """A part of a session; it does not outlive a test that fails."""
+
+    def __exit__(self, error_type: type[BaseException] | None, *rest: Any) -> None:
+        if error_type is not None:
+            self.kill()
+        super().__exit__(error_type, *rest)
+
+
+def start(*arguments: str) -> Part:
+    return Part([*PLIANT, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 def call(*arguments: str) -> subprocess.CompletedProcess[str]:
