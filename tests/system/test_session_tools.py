@@ -130,8 +130,17 @@ def test_a_recording_is_replayed_to_a_viewer_elsewhere(endpoint: str, tmp_path: 
             assert seen.returncode == 0, seen.stderr
         finally:
             player.terminate()
-            player.communicate()
+            assert "interrupted" in player.communicate(timeout=60)[0]
+    assert player.returncode == 130
     assert (tmp_path / "seen.rrd").stat().st_size > 10_000
+
+
+def test_an_interrupted_command_does_not_wait_for_what_zenoh_left_behind() -> None:
+    code = (
+        "import threading; from pliant_services import cli; cli._run = lambda: 130; "
+        "threading.Thread(target=threading.Event().wait).start(); cli.main()"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 130
 
 
 def test_a_hop_is_measured() -> None:

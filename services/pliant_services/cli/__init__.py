@@ -52,6 +52,10 @@ def run_and_exit() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more to flush
         if error.errno != errno.EPIPE:  # `| head` has seen enough
             code = _say(f"cannot write the output: {error.strerror}; free some space")
+    if code == _INTERRUPTED:
+        # All is closed, but a Zenoh session that was just being opened or closed leaves threads
+        # behind for which the interpreter would wait for ever.
+        os._exit(code)
     sys.exit(code)
 
 
