@@ -75,7 +75,7 @@ def _count_blocks(camera_index: I32, point_index: I32, column: I64, cameras: int
     seen = np.zeros((cameras, column.size // BLOCK + 1), np.uint8)
     for k in range(camera_index.size):
         seen[camera_index[k], column[point_index[k]] // BLOCK] = 1
-    return seen.sum()
+    return int(seen.sum())
 
 
 def build_packed_layout(problem: AnyProblem) -> PackedLayout:
