@@ -19,6 +19,7 @@ _HEADINGS = (
 )
 
 
+_SAY_AGAIN_S = 0.5
 _SILENT = "told nothing: stopped, or its host cut off"
 
 
@@ -142,9 +143,15 @@ def stop_session(
         with changed:
             if not changed.wait_for(lambda: here, timeout=3.0):
                 raise BusError(f"no session {session} on {', '.join(endpoints)}")
-        connection.put(f"pliant/{session}/{STOP_KEY}", b"")
+        enough = time.monotonic() + patience_s
         with changed:
-            changed.wait_for(lambda: not here, timeout=patience_s)
+            # Again and again: the source may still be on its way up, and does not listen yet.
+            while here:
+                connection.put(f"pliant/{session}/{STOP_KEY}", b"")
+                left_s = enough - time.monotonic()
+                if left_s <= 0.0:
+                    break
+                changed.wait(min(left_s, _SAY_AGAIN_S))
             left = sorted(set(here.values()))
         subscriber.undeclare()  # type: ignore[no-untyped-call]
     return left

@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
+from pliant.bus.peers import token_key
 from pliant.bus.session import free_endpoint, open_router, open_session
-from pliant.bus.zenoh_bus import OVER_KEY
+from pliant.bus.zenoh_bus import OVER_KEY, STOP_KEY
 from pliant.config import load_config
-from pliant_services import session_end
+from pliant_services import fleet_status, session_end
 from pliant_services.host import ServiceOptions
 
 
@@ -20,6 +21,7 @@ class Told:
         self._connection = connection
         self._sent = sent
         self.info = connection.info
+        self.liveliness = connection.liveliness
 
     def put(self, key: str, data: bytes) -> None:
         self._connection.put(key, data)
@@ -66,3 +68,28 @@ def test_a_router_that_does_not_yet_listen_to_all_hears_that_the_session_is_over
     router.close()
     recorder.join()
     assert codes == [session_end.DONE]
+
+
+def test_a_source_that_is_still_coming_up_hears_that_it_is_to_stop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sent, heard = threading.Event(), threading.Event()
+    monkeypatch.setattr(
+        fleet_status, "open_session", lambda *arguments: Told(open_session(*arguments), sent)
+    )
+    endpoint = free_endpoint()
+    router = open_router(endpoint)
+    token = router.liveliness().declare_token(f"pliant/lab/{token_key('tracking', 1)}")
+    left: list[list[str]] = []
+    stop = threading.Thread(
+        target=lambda: left.append(fleet_status.stop_session([endpoint], "lab", 30.0))
+    )
+    stop.start()
+    assert sent.wait(30)
+    held = router.declare_subscriber(f"pliant/lab/{STOP_KEY}", lambda _: heard.set())
+    assert heard.wait(30)
+    token.undeclare()
+    stop.join()
+    held.undeclare()
+    router.close()
+    assert left == [[]]
