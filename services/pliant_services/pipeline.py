@@ -131,7 +131,7 @@ def run_pipeline(request: RunRequest) -> int:
             state=state,
         )
         interrupted, failure = _go_through(request, config, output, fleet, progress)
-    if failure is None and mesh_afterwards:
+    if failure is None and mesh_afterwards and parts.exists(output / RECORDING_NAME):
         progress.say("meshing what was recorded ...")
         try:
             add_mesh(output)

@@ -21,7 +21,7 @@ from pliant.messages.types import (
 )
 from pliant.recording.writer import RecordingWriter
 from pliant_services import pipeline
-from pliant_services.pipeline import DONE, INCOMPLETE, summary
+from pliant_services.pipeline import DONE, INCOMPLETE, RunRequest, run_pipeline, summary
 from pliant_services.results import write_results
 
 REASON = "too few tracks: 0 of 100"
@@ -105,3 +105,14 @@ def test_a_video_that_is_cut_off_is_noticed(
 ) -> None:
     lines = record(tmp_path, [""] * 4, announced=announced, complete=complete)
     assert ("the source ended early: 4 of 10 frames came; is the file cut off?" in lines) is said
+
+
+def test_a_run_that_was_interrupted_before_it_recorded_has_nothing_to_mesh(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "_go_through", lambda *_: (True, None))
+    monkeypatch.setattr(pipeline, "choose_profile", lambda _: (pipeline.WITH_MESH, ""))
+    monkeypatch.setattr(pipeline, "Fleet", lambda *_, **options: None)
+    source = "built-in:tiny?frames=8"
+    with pytest.raises(KeyboardInterrupt):
+        run_pipeline(RunRequest(source=source, output=tmp_path / "run", on_crash="restart"))
