@@ -103,6 +103,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
         identity=options.identity,
         on_fault=lambda line: print(line, file=sys.stderr, flush=True),
         on_tick=options.alive.touch if options.alive is not None else None,
+        interrupted=interrupted,
     ) as bus:
         if interrupted is not None:
             arguments["stopping"] = lambda: interrupted() or bus.stop_requested
@@ -213,10 +214,15 @@ def end_with_launcher() -> None:
 
 
 def stop_on_signal() -> Callable[[], bool]:
-    """Let SIGINT and SIGTERM end a source after the frame at hand instead of in the middle."""
+    """Let SIGINT and SIGTERM end a source after the frame at hand instead of in the middle.
+
+    A second one does not wait for that frame, which a reader may hold up.
+    """
     stopped = threading.Event()
 
     def on_signal(*_: object) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt
         stopped.set()
 
     if threading.current_thread() is threading.main_thread():

@@ -1,5 +1,6 @@
 """The ingest on a bus without processes: every frame has its message, whatever happens to it."""
 
+import signal
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -19,6 +20,7 @@ from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Depth, Header, Image, SourceImage
 from pliant_services import ingest
+from pliant_services.host import stop_on_signal
 from pliant_services.monitor import SilentMonitor
 
 WIDTH, HEIGHT = 24, 16
@@ -240,6 +242,20 @@ def test_stopping_ends_after_the_frame_at_hand(is_live: bool) -> None:
     dataset = FakeDataset([png(i) for i in range(9)], is_live=is_live, before=before)
     images, _, _ = run(dataset, SlowBus(on_image), stopping=lambda: len(taken) >= 3)
     assert [image.frame for image in images] == [0, 1, 2]
+
+
+def test_a_second_ctrl_c_does_not_wait_for_the_frame_at_hand() -> None:
+    kinds = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(kind) for kind in kinds]
+    try:
+        stopping = stop_on_signal()
+        signal.raise_signal(signal.SIGTERM)
+        assert stopping()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        for kind, handler in zip(kinds, before, strict=True):
+            signal.signal(kind, handler)
 
 
 @pytest.mark.parametrize("mode", ["lossless", "live"])

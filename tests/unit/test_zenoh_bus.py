@@ -234,6 +234,20 @@ def test_a_reader_that_died_before_another_came_does_not_stop_the_other(endpoint
             bus._outputs.clear()  # nothing more to wait for
 
 
+def test_who_was_interrupted_does_not_wait_for_readers_that_never_came(endpoint: str) -> None:
+    bus = ZenohBus(
+        endpoints=[endpoint],
+        session="test",
+        service="ingest",
+        inputs={},
+        outputs={topics.IMAGE: ("tracking",)},
+        window=WINDOW,
+        interrupted=lambda: True,
+    )
+    with pytest.raises(KeyboardInterrupt), bus:
+        bus.publish(topics.IMAGE, image(0))
+
+
 def test_a_sender_that_ignores_credit_fills_no_memory(endpoint: str) -> None:
     with reader(endpoint) as bus:
         rude = bus._session.declare_publisher(f"pliant/test/{topics.IMAGE.key}")

@@ -70,6 +70,7 @@ class ZenohBus:
         identity: Identity | None = None,
         on_tick: Callable[[], None] | None = None,
         on_fault: Callable[[str], None] | None = None,
+        interrupted: Callable[[], bool] | None = None,
     ) -> None:
         """Connect, subscribe to the inputs, and announce that we are ready.
 
@@ -87,6 +88,8 @@ class ZenohBus:
         identity: our certificate, for endpoints such as tls/host:7447.
         on_tick: called once a second, as long as we are well.
         on_fault: told what was passed over, in a line a second at most.
+        interrupted: whether Ctrl-C has come where it raises nothing; asked while readers are not
+        here yet, for whom we would wait for ever.
         Raises BusError when no endpoint answers.
         """
         self._patience_s = patience_s
@@ -99,6 +102,7 @@ class ZenohBus:
         self._disturb = disturb or (lambda: None)
         self._on_tick = on_tick or (lambda: None)
         self._on_fault = on_fault
+        self._interrupted = interrupted or (lambda: False)
         self._fault_log = FaultLog(service)
         self._changed = threading.Condition()
         self._wake = threading.Event()
@@ -135,10 +139,10 @@ class ZenohBus:
         liveliness = self._session.liveliness()
         tokens, own = f"{shared.prefix}/ready/**", token_key(service, self._peers.incarnation)
         self._held: list[Any] = [  # they live as long as we do
-            liveliness.declare_subscriber(tokens, self._on_token, history=True),
-            liveliness.declare_token(f"{shared.prefix}/{own}"),
             self._session.declare_subscriber(f"{shared.prefix}/{STOP_KEY}", self._on_stop),
             self._session.declare_subscriber(f"{shared.prefix}/{OVER_KEY}", self._on_over),
+            liveliness.declare_subscriber(tokens, self._on_token, history=True),
+            liveliness.declare_token(f"{shared.prefix}/{own}"),
         ]
         self._keeper = threading.Thread(target=self._keep, daemon=True)
         self._keeper.start()
@@ -256,6 +260,10 @@ class ZenohBus:
                     )
                 whom = self._peers.absent(readers) or output.box.slowest()
                 self._waiting.begin(f"{whom} to take {output.topic.key}", time.monotonic())
+                # Those who are there already are seen within a tick.
+                waits_long = time.monotonic() - self._waiting.since >= _TICK_S
+                if not here and waits_long and self._interrupted():
+                    raise KeyboardInterrupt
                 self._changed.wait(_TICK_S)
 
     # -- receiving -----------------------------------------------------------------------------
