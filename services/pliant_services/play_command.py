@@ -171,10 +171,10 @@ def _keys(pace: Pace) -> Generator[Pace]:
                 take_keys(pace, sys.stdin.read(1))
 
     watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
     try:
         tty.setcbreak(descriptor)
         _say("space pauses, q ends")
-        watcher.start()
         yield pace
     finally:
         over.set()

@@ -15,6 +15,7 @@ from pliant_services.viewing import SESSION_NAME, place
 _START_S = 30.0  # a viewer imports Rerun, and may wait for a busy machine
 _WAIT_S = 120.0  # services compile before they are up
 _LAST_WORDS_S = 20.0
+_LEAVE_S = 5.0
 
 
 @contextmanager
@@ -69,4 +70,7 @@ def viewer(fleet: Fleet, *, web: bool, save: Path | None) -> Iterator[None]:
     finally:
         if process.poll() is None:
             process.terminate()
+            with suppress(subprocess.TimeoutExpired):  # one that is stopped would never leave
+                process.wait(_LEAVE_S)
+            process.kill()
             process.wait()

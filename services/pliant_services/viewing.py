@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import sys
 import threading
 import time
@@ -53,8 +52,6 @@ class ViewRequest:
 
 def run_view(request: ViewRequest) -> None:
     """Show it.  Raises PliantError."""
-    # Whatever ends us: Rerun's server goes with us.
-    signal.signal(signal.SIGTERM, _leave)
     where = place(web=request.web, save=request.save, force=request.force)
     endpoints, session = request.endpoints, request.session
     if not endpoints and request.source is not None and request.source.is_dir():
@@ -66,9 +63,9 @@ def run_view(request: ViewRequest) -> None:
     recording = None if endpoints else _recording(request.source)
     name = session or (request.source.stem if request.source else "pliant")
     canvas = RerunCanvas(where, name=name, web_port=request.web_port)
-    if canvas.address:
-        print(f"open {canvas.address} in a browser", flush=True)
     try:
+        if canvas.address:
+            print(f"open {canvas.address} in a browser", flush=True)
         if endpoints:
             follow(endpoints, session, canvas, request.patience_s, request.identity)
         elif recording is not None and request.source is not None:
@@ -86,10 +83,6 @@ def run_view(request: ViewRequest) -> None:
         canvas.close()
     if request.save is not None:
         print(request.save)
-
-
-def _leave(number: int, _: object) -> None:
-    sys.exit(128 + number)
 
 
 def running_session(result: Path) -> tuple[list[str], str]:

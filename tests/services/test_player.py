@@ -1,5 +1,8 @@
 """A recording on the bus: who reads it sees the run that was recorded."""
 
+import os
+import pty
+import termios
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +19,7 @@ from pliant.errors import RecordingError
 from pliant.messages import codec, topics
 from pliant.messages.types import Image
 from pliant.recording.playback import Playback
-from pliant_services import ingest, recorder
+from pliant_services import ingest, play_command, recorder
 from pliant_services.monitor import SilentMonitor
 from pliant_services.play_command import Pace, PlayRequest, run_play, take_keys
 from pliant_services.player import Played, chosen_topics, play
@@ -133,6 +136,22 @@ def test_a_pause_stops_time_and_q_ends() -> None:
     assert results == [True]
     take_keys(pace, "xq")
     assert not pace.wait_until(0)
+
+
+def test_ctrl_c_at_the_very_start_leaves_the_terminal_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupt(line: str) -> None:
+        raise KeyboardInterrupt
+
+    terminal, inside = pty.openpty()
+    before = termios.tcgetattr(inside)
+    with os.fdopen(terminal), os.fdopen(inside) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        monkeypatch.setattr(play_command, "_say", interrupt)
+        with pytest.raises(KeyboardInterrupt), play_command._keys(Pace(1.0)):
+            pass
+        assert termios.tcgetattr(inside) == before
 
 
 def test_a_rate_is_a_share_of_the_pace_of_capture() -> None:

@@ -143,6 +143,41 @@ def test_an_interrupted_command_does_not_wait_for_what_zenoh_left_behind() -> No
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 130
 
 
+@pytest.mark.parametrize("moment", ["told", "over"])
+@pytest.mark.parametrize("kind", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_one_more_interruption_changes_neither_the_words_nor_the_code(
+    kind: str, moment: str
+) -> None:
+    """One that comes while the first is told, and one that comes when all is done."""
+    code = (
+        "import atexit, os, signal; from pliant_services import cli\n"
+        "from pliant_services.cli import commands\n"
+        f"once_more = lambda: os.kill(os.getpid(), signal.{kind})\n"
+        "def app(**options): raise KeyboardInterrupt\n"
+        "say = cli._say\n"
+        "def say_interrupted(*words): once_more(); return say(*words)\n"
+    )
+    if moment == "told":
+        code += "cli.app, cli._say = app, say_interrupted\n"
+    else:
+        code += "cli.app = lambda **options: 0; atexit.register(once_more)\n"
+    code += "cli.main()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    expected = (130, "pliant: interrupted\n") if moment == "told" else (0, "")
+    assert (done.returncode, done.stderr) == expected
+
+
+def test_what_a_signal_ends_without_a_word_does_not_wait_either() -> None:
+    code = (
+        "import sys, threading; from pliant_services import cli\n"
+        "from pliant_services.cli import commands\n"
+        "cli.app = lambda **options: sys.exit(143)\n"
+        "threading.Thread(target=threading.Event().wait).start(); cli.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60)
+    assert (done.returncode, done.stderr) == (143, b"")
+
+
 def test_a_hop_is_measured() -> None:
     images, p50, p99 = hop(free_endpoint(), images=60)
     assert images == "60"

@@ -1,17 +1,21 @@
 """`pliant view` and `pliant run --save`, on a machine without a display."""
 
+import signal
 import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from pliant.bus.session import free_endpoint
 from pliant.errors import ResultError
 from pliant.viewers.rerun import RerunCanvas
-from pliant.viewers.rerun_program import listens
+from pliant.viewers.rerun_program import RerunProgram, listens
+from pliant_services import spectators
 from pliant_services.benchmarks.viewer_cost import run_with
+from pliant_services.launcher import Fleet
 from pliant_services.pipeline import RunRequest, run_pipeline
 from pliant_services.spectators import check_viewer
 
@@ -116,6 +120,52 @@ def test_rerun_listens_on_this_machine_alone_and_leaves_with_us() -> None:
     finally:
         canvas.close()
     assert not any(listens(port) for port in (grpc_port, web_port))
+
+
+def test_ctrl_c_while_rerun_comes_up_leaves_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[int] = []
+
+    def interrupt(_: object, ports: object) -> None:
+        raise KeyboardInterrupt
+
+    def close(program: RerunProgram) -> None:
+        program._process.kill()
+        ended.append(program._process.wait())
+
+    monkeypatch.setattr(RerunProgram, "_wait_until_up", interrupt)
+    monkeypatch.setattr(RerunProgram, "close", close)
+    with pytest.raises(KeyboardInterrupt):
+        RerunProgram([int(free_endpoint().rsplit(":", 1)[1])], ["--serve-web"])
+    assert len(ended) == 1
+
+
+def test_a_viewer_that_was_stopped_for_good_is_not_awaited(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """SIGTERM is nothing to it."""
+
+    class Looking:
+        endpoint, session = "tcp/127.0.0.1:1", "run"
+
+        def wait_for_viewer(self, _: float) -> bool:
+            return True
+
+    viewers: list[subprocess.Popen[bytes]] = []
+
+    def start(*_: object, **options: Any) -> subprocess.Popen[bytes]:
+        viewers.append(begin([sys.executable, "-c", "input()"], stdin=subprocess.PIPE))
+        viewers[0].send_signal(signal.SIGSTOP)
+        return viewers[0]
+
+    begin = subprocess.Popen
+    monkeypatch.setattr(spectators.subprocess, "Popen", start)
+    for name in ("_LAST_WORDS_S", "_LEAVE_S"):
+        monkeypatch.setattr(spectators, name, 0.0)
+    with spectators.viewer(cast(Fleet, Looking()), web=False, save=None):
+        pass
+    assert viewers[0].returncode == -signal.SIGKILL
+    assert viewers[0].stdin is not None
+    viewers[0].stdin.close()
 
 
 def test_a_viewer_that_is_stopped_for_good_changes_nothing() -> None:

@@ -27,6 +27,7 @@ app = typer.Typer(
 
 
 _FAILED, _USAGE, _INCOMPLETE, _INTERRUPTED = 1, 2, 3, 130
+_INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Typer carries its own copy of click, or uses click itself, depending on its version.
 _UsageError = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
@@ -34,13 +35,15 @@ _UsageError = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "Click
 def main() -> None:
     """The command ``pliant``."""
     # A container stops by SIGTERM and a terminal that closes sends SIGHUP: both are a Ctrl-C.
-    for kind in (signal.SIGTERM, signal.SIGHUP):
+    for kind in _INTERRUPTIONS:
         if signal.getsignal(kind) == signal.SIG_DFL:  # not under nohup
             signal.signal(kind, signal.default_int_handler)
     try:
         run_and_exit()
+    except KeyboardInterrupt:  # one more, just before it was ignored
+        os._exit(_INTERRUPTED)
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # one more must not change the exit code
+        _take_no_more()
 
 
 def run_and_exit() -> None:
@@ -52,7 +55,7 @@ def run_and_exit() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more to flush
         if error.errno != errno.EPIPE:  # `| head` has seen enough
             code = _say(f"cannot write the output: {error.strerror}; free some space")
-    if code == _INTERRUPTED:
+    if code >= _INTERRUPTED:
         # All is closed, but a Zenoh session that was just being opened or closed leaves threads
         # behind for which the interpreter would wait for ever.
         os._exit(code)
@@ -74,7 +77,10 @@ def _run() -> int:
         text = error.format_message().replace("Value error, ", "").rstrip(".")
         return _say(f"{text} (see {command} --help)", error.exit_code)
     except (KeyboardInterrupt, typer.Abort):  # not all versions of Typer hand it on
+        _take_no_more()
         code = _INTERRUPTED
+    except SystemExit as end:  # of a signal
+        return end.code if isinstance(end.code, int) else _FAILED
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
@@ -83,6 +89,12 @@ def _run() -> int:
     if code == _INTERRUPTED:
         return _say("interrupted", _INTERRUPTED)
     return code if isinstance(code, int) else 0
+
+
+def _take_no_more() -> None:
+    """Ignore further interruptions: they must change neither the last line nor the exit code."""
+    for kind in _INTERRUPTIONS:
+        signal.signal(kind, signal.SIG_IGN)
 
 
 def _say(line: str, code: int = _FAILED) -> int:

@@ -1,5 +1,7 @@
 """``pliant view``: look at a run, while it goes on or afterwards."""
 
+import signal
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -33,6 +35,9 @@ def view(
 
     pliant view --connect tcp/127.0.0.1:7447 --session run-1234
     """
+    if patience > 0.0:
+        # The viewer of a run, which ends us and says itself that it was interrupted.
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     from pliant_services.access import OPERATOR
     from pliant_services.viewing import ViewRequest, run_view
 

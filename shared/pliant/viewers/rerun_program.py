@@ -39,10 +39,16 @@ class RerunProgram:
             stderr=subprocess.DEVNULL,
             start_new_session=True,  # a window stays when we leave, and Ctrl-C is not for it
         )
+        try:
+            self._wait_until_up(ports)
+        except BaseException:  # also Ctrl-C: nobody else would end it
+            self.close()
+            raise
+
+    def _wait_until_up(self, ports: Sequence[int]) -> None:
         deadline = time.monotonic() + _UP_S
         while not all(listens(port) for port in ports):
             if self._process.poll() is not None or time.monotonic() > deadline:
-                self.close()
                 raise ResultError(
                     "Rerun does not come up: `python -m rerun` says why; --save FILE.rrd needs "
                     "no viewer"
