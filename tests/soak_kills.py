@@ -12,7 +12,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -49,17 +49,24 @@ POWER_CUT, ROUTER = "all and the launcher, then --resume", "router"
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of run.  told: the service whose frames are waited for."""
+    """A kind of run.  told: the service whose frames are waited for.  each: kills in every run."""
 
     arguments: Sequence[str]
     services: Sequence[str]
     files: Sequence[str]
     frames: int
     told: str
+    each: int = 1
 
+
+Moments = Sequence[tuple[int, float]]
+"""Frames, rising, and how long after each of them somebody is killed."""
 
 POINTS = Kind((TINY, "--set", "meshing.enabled=false"), PROFILES["points"], FILES, 40,
               "bundle_adjustment")  # fmt: skip
+ROOM = Kind(("built-in:room", "--set", "meshing.enabled=false"), PROFILES["points"], FILES, 300,
+            "bundle_adjustment", each=5)  # fmt: skip
+ROOM_ONCE = replace(ROOM, each=1)
 MESH = Kind((TINY,), ("meshing",), (*FILES, *MESHES), 40, "meshing")
 SURFELS = Kind(
     ("built-in:tiny?frames=20", "--profile", "deformable", "--set", "surfels.max_surfels=300"),
@@ -98,40 +105,46 @@ def rows(victims: Sequence[tuple[Kind, str]], kills: int, seed: int) -> Iterator
     with tempfile.TemporaryDirectory(prefix="pliant-soak-") as name:
         expected: dict[str, dict[str, str]] = {}
         for kind, victim in victims:
-            if kind.told not in expected:
-                expected[kind.told] = undisturbed(kind, Path(name) / kind.told)
-            yield _tally(kind, victim, kills, seed, expected[kind.told])
+            source = kind.arguments[0] + kind.told
+            if source not in expected:
+                expected[source] = undisturbed(kind, Path(name) / f"{len(expected)}")
+            yield _tally(kind, victim, kills, seed, expected[source])
 
 
 def _tally(kind: Kind, victim: str, kills: int, seed: int, expected: dict[str, str]) -> Tally:
     tally, random = Tally(victim), np.random.default_rng(seed)
     for _ in range(2 * kills):  # a run may be over before it is killed
-        if tally.kills == kills:
+        if tally.kills >= kills:
             break
-        frame = int(random.integers(0, kind.frames - 1))
-        later = float(random.uniform(0.0, LATER_S))
+        moments = sorted(
+            (int(random.integers(0, kind.frames - 1)), float(random.uniform(0.0, LATER_S)))
+            for _ in range(kind.each)
+        )
         with tempfile.TemporaryDirectory(prefix="pliant-soak-") as folder:
-            killed, found = _RUNS.get(victim, one_killed)(kind, victim, Path(folder), frame, later)
+            killed, found = _RUNS.get(victim, ones_killed)(kind, victim, Path(folder), moments)
         differing = [file for file in expected if found.get(file) != expected[file]]
         tally.kills += killed
-        tally.same += killed and not differing
+        tally.same += killed if not differing else 0
         tally.differing += differing
         words = "the same bytes" if not differing else f"DIFFERS: {', '.join(differing)}"
-        print(f"{victim} killed at frame {frame} + {later:.3f} s ({killed}): {words}",
-              file=sys.stderr)  # fmt: skip
+        when = ", ".join(f"{frame} + {later:.3f} s" for frame, later in moments)
+        print(f"{victim} killed at frame {when} ({killed}): {words}", file=sys.stderr)
     return tally
 
 
-def one_killed(
-    kind: Kind, victim: str, folder: Path, frame: int, later: float
-) -> tuple[bool, dict[str, str]]:
-    """A run in which a service, or all at once, are killed; whether they ran, and the results."""
+def ones_killed(
+    kind: Kind, victim: str, folder: Path, moments: Moments
+) -> tuple[int, dict[str, str]]:
+    """A run in which a service, or all at once, are killed; how often they ran, and the results."""
     names = kind.services if victim == "all at once" else (victim,)
     output = folder / "run"
+    killed = 0
     with running(*kind.arguments, *SETTINGS, "--output", output) as run:
-        with Told(run, output, kind.told, frame):
-            threading.Event().wait(later)
-            killed = _kill(services_of(run.process.pid), names)
+        with told_by(run, output, kind.told) as told:
+            for frame, later in moments:
+                told.wait_for(frame)
+                threading.Event().wait(later)
+                killed += _kill(services_of(run.process.pid), names)
         code, _, errors = run.finish()
     if code != 0:
         print(errors, file=sys.stderr)
@@ -140,9 +153,10 @@ def one_killed(
 
 
 def mesher_killed(
-    kind: Kind, victim: str, folder: Path, frame: int, later: float
-) -> tuple[bool, dict[str, str]]:
-    """A run whose mesher is killed: it begins when the others have ended.  frame: decides when."""
+    kind: Kind, victim: str, folder: Path, moments: Moments
+) -> tuple[int, dict[str, str]]:
+    """A run whose mesher is killed: it begins when the others have ended.  The frame says when."""
+    ((frame, later),) = moments
     output = folder / "run"
     with running(*kind.arguments, *SETTINGS, "--output", output) as run:
         run.wait_for("meshing what was recorded")
@@ -157,12 +171,14 @@ def mesher_killed(
 
 
 def power_cut(
-    kind: Kind, victim: str, folder: Path, frame: int, later: float
-) -> tuple[bool, dict[str, str]]:
+    kind: Kind, victim: str, folder: Path, moments: Moments
+) -> tuple[int, dict[str, str]]:
     """Everything is killed at once, the launcher, too; then the run is taken up again."""
+    ((frame, later),) = moments
     output = folder / "run"
     with running(*kind.arguments, *SETTINGS, "--output", output) as run:
-        with Told(run, output, kind.told, frame):
+        with told_by(run, output, kind.told) as told:
+            told.wait_for(frame)
             threading.Event().wait(later)
             services = services_of(run.process.pid)
             run.process.kill()
@@ -184,16 +200,17 @@ def power_cut(
 
 
 def router_killed(
-    kind: Kind, victim: str, folder: Path, frame: int, later: float
-) -> tuple[bool, dict[str, str]]:
+    kind: Kind, victim: str, folder: Path, moments: Moments
+) -> tuple[int, dict[str, str]]:
     """A session in parts whose router dies and returns; and its results."""
+    ((frame, later),) = moments
     endpoint = free_endpoint()
     config = folder / "config.yaml"
     config.write_text("bus: {checkpoint_frames: 6}\n")
     common = ["--connect", endpoint, "--session", "soak", "--state", folder / "state"]
     common += ["--config", config]
     extra: dict[str, list[object]] = {
-        "ingest": ["--source", TINY],
+        "ingest": ["--source", kind.arguments[0]],
         "recorder": ["--output", folder / "recording.mcap", "--results"],
     }
     with ExitStack() as stack:
@@ -217,7 +234,7 @@ def router_killed(
     return running_still, digests(folder) if codes == [0] * len(codes) else {}
 
 
-_RUNS: dict[str, Callable[[Kind, str, Path, int, float], tuple[bool, dict[str, str]]]] = {
+_RUNS: dict[str, Callable[[Kind, str, Path, Moments], tuple[int, dict[str, str]]]] = {
     "meshing": mesher_killed,
     POWER_CUT: power_cut,
     ROUTER: router_killed,
@@ -253,20 +270,11 @@ class Followed:
         self._session.close()
 
 
-class Told:
-    """``with``: a run that has told of a frame of a service."""
-
-    def __init__(self, run: Running, output: Path, service: str, frame: int) -> None:
-        run.wait_for("services are up")
-        where = json.loads((output / SESSION_NAME).read_text())
-        self._followed = Followed(where["endpoint"], where["session"], service)
-        self._frame = frame
-
-    def __enter__(self) -> None:
-        self._followed.wait_for(self._frame)
-
-    def __exit__(self, *_: object) -> None:
-        self._followed.__exit__()
+def told_by(run: Running, output: Path, service: str) -> Followed:
+    """What a service of a run tells."""
+    run.wait_for("services are up")
+    where = json.loads((output / SESSION_NAME).read_text())
+    return Followed(where["endpoint"], where["session"], service)
 
 
 def _kill(pids: dict[str, int], names: Sequence[str]) -> bool:
