@@ -5,7 +5,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import pytest
 
@@ -139,10 +139,9 @@ def test_ctrl_c_while_rerun_comes_up_leaves_no_server(monkeypatch: pytest.Monkey
     assert len(ended) == 1
 
 
-def test_a_viewer_that_was_stopped_for_good_is_not_awaited(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """SIGTERM is nothing to it."""
+def test_a_viewer_that_does_not_leave_is_not_awaited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that is stopped: SIGTERM is nothing to it."""
+    code = "import signal as s; s.signal(s.SIGTERM, s.SIG_IGN); print(flush=True); input()"
 
     class Looking:
         endpoint, session = "tcp/127.0.0.1:1", "run"
@@ -150,22 +149,17 @@ def test_a_viewer_that_was_stopped_for_good_is_not_awaited(
         def wait_for_viewer(self, _: float) -> bool:
             return True
 
-    viewers: list[subprocess.Popen[bytes]] = []
-
-    def start(*_: object, **options: Any) -> subprocess.Popen[bytes]:
-        viewers.append(begin([sys.executable, "-c", "input()"], stdin=subprocess.PIPE))
-        viewers[0].send_signal(signal.SIGSTOP)
-        return viewers[0]
-
-    begin = subprocess.Popen
-    monkeypatch.setattr(spectators.subprocess, "Popen", start)
-    for name in ("_LAST_WORDS_S", "_LEAVE_S"):
-        monkeypatch.setattr(spectators, name, 0.0)
-    with spectators.viewer(cast(Fleet, Looking()), web=False, save=None):
-        pass
-    assert viewers[0].returncode == -signal.SIGKILL
-    assert viewers[0].stdin is not None
-    viewers[0].stdin.close()
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as stubborn:
+        assert stubborn.stdout is not None
+        stubborn.stdout.readline()  # from here on it does not listen
+        monkeypatch.setattr(spectators.subprocess, "Popen", lambda *_, **options: stubborn)
+        for name in ("_LAST_WORDS_S", "_LEAVE_S"):
+            monkeypatch.setattr(spectators, name, 0.0)
+        with spectators.viewer(cast(Fleet, Looking()), web=False, save=None):
+            pass
+    assert stubborn.returncode == -signal.SIGKILL
 
 
 def test_a_viewer_that_is_stopped_for_good_changes_nothing() -> None:
