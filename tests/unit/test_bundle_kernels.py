@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from bundle_scene import cost, dense_normal_equations, make_scene, move, residuals
 
-from pliant.algorithms.bundle import BundleParameters, point_information
+from pliant.algorithms.bundle import BundleParameters
 from pliant.algorithms.bundle.camera_step import move_camera, solve_camera
 from pliant.algorithms.bundle.cost import float32_limits, limits_of, squared_residuals, total_cost
 from pliant.algorithms.bundle.layout import BLOCK, build_layout
@@ -154,14 +154,3 @@ def test_layout_groups_points_and_pads_them():
     k = 17
     m, n = problem.camera_index[k], layout.column[problem.point_index[k]]
     assert (layout.u[m, n], layout.v[m, n]) == tuple(problem.points_px[k])
-
-
-@pytest.mark.parametrize("distortion", LENSES)
-def test_point_information_agrees_with_finite_differences(distortion):
-    problem = make_scene(points=20, noise_px=1.0, distortion=distortion, visible=0.8).problem
-    parameters = BundleParameters(kernel_sigma_px=8.0)
-    H, _ = dense_normal_equations(problem, parameters)
-    found = point_information(problem, parameters)
-    for n in range(20):
-        at = slice(30 + 3 * n, 33 + 3 * n)
-        np.testing.assert_allclose(found[n], H[at, at], rtol=1e-5, atol=1e-6 * H[at, at].max())

@@ -54,11 +54,9 @@ def solve_calibrating(
     its readout fills the frame interval; None: there is none, and the readout stays 0.
     Returns the result, whose costs include the prior, and (4,) the correction (s, k1, k2, readout):
     the observations follow ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx + readout flow``.  k1 and k2
-    of the problem's intrinsics are the start and centre of the prior.  Raises ValueError for a
-    problem with a prior on its cameras, or whose cameras differ in their lenses.
+    of the problem's intrinsics are the start and centre of the prior.  Raises ValueError for
+    cameras that differ in their lenses.
     """
-    if problem.prior is not None:
-        raise ValueError("a prior on cameras and an unknown calibration do not go together")
     lens = problem.intrinsics[:, 4:]
     if len(lens) == 0 or (lens != lens[0]).any():
         raise ValueError("an unknown calibration must be that of all cameras")

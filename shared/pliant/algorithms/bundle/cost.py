@@ -47,7 +47,7 @@ def float32_limits(parameters: BundleParameters) -> Limits:
 
 
 def total_cost(layout: Layout, cameras: F64, points: F64, parameters: BundleParameters) -> float:
-    """``0.5 sum w rho(r^2)`` in px^2, without a prior."""
+    """``0.5 sum w rho(r^2)`` in px^2."""
     return float(
         _total_cost(
             cameras, layout.pinholes, layout.lenses, points, layout.u, layout.v, layout.w,

@@ -19,13 +19,12 @@ def damped_iterations(
     step: Callable[[_State, float], _State | None],
     parameters: BundleParameters,
     on_iteration: OnIteration | None = None,
-    polish: Callable[[_State], _State] | None = None,
     foretold: Callable[[_State], float] | None = None,
 ) -> tuple[_State, list[float], bool]:
     """Iterate until the cost settles: (state, cost curve, converged).
 
     step: the state after one step of the given damping, None where there is none; it is taken only
-    if it does not raise the cost.     polish: follows a step while it lowers the cost.
+    if it does not raise the cost.
     foretold: by how much the step to a state should have lowered the cost, by the linearisation it
     came from.  Damping then falls by the share that came true (Nielsen 1999); without, to a tenth.
     """
@@ -40,15 +39,6 @@ def damped_iterations(
             state, cost = trial, new_cost
             share = 0.1 if foretold is None else _share_kept(decrease, foretold(state))
             damping, growth = max(damping * share, MIN_DAMPING), 2.0
-            if polish is not None:
-                trial = polish(state)
-                new_cost = cost_of(trial)
-                if new_cost < cost:
-                    decrease += cost - new_cost
-                    state, cost = trial, new_cost
-                else:
-                    # float32 noise at the optimum: from there on there is nothing to polish.
-                    polish = None
         else:
             damping, growth = damping * growth, growth * 2.0
         costs.append(cost)

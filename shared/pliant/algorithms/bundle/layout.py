@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
-from pliant.algorithms.bundle.problem import AnyProblem, BundleProblem, CameraPrior
+from pliant.algorithms.bundle.problem import AnyProblem, BundleProblem
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.kernel import kernel
 
@@ -40,7 +40,6 @@ class Unknowns:
     points: F64
     movable: U8
     free: I32
-    prior: CameraPrior | None
 
 
 @dataclass(kw_only=True)
@@ -101,7 +100,7 @@ def unknowns_of(problem: AnyProblem, column: I64, usable: BoolArray, P: int) -> 
     points = np.zeros((3, P))
     _shift(problem.points_world, usable, column, origin, points)
     movable = np.zeros(P, np.uint8)
-    movable[column] = usable if problem.fixed_points is None else usable & ~problem.fixed_points
+    movable[column] = usable
     free = np.full(M, -1, np.int32)
     moving = np.flatnonzero(~problem.fixed_cameras)
     free[moving] = np.arange(len(moving), dtype=np.int32)
@@ -116,7 +115,7 @@ def unknowns_of(problem: AnyProblem, column: I64, usable: BoolArray, P: int) -> 
     return Unknowns(
         column=column, cameras=cameras, pinholes=pinholes, lenses=lenses,
         pinholes32=pinholes.astype(np.float32), lenses32=lenses.astype(np.float32),
-        origin=origin, points=points, movable=movable, free=free, prior=problem.prior,
+        origin=origin, points=points, movable=movable, free=free,
     )  # fmt: skip
 
 

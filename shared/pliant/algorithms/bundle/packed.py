@@ -18,7 +18,6 @@ from pliant.algorithms.bundle.packed_kernels import (
     substitute,
 )
 from pliant.algorithms.bundle.packed_layout import PackedLayout, build_packed_layout, list_seen
-from pliant.algorithms.bundle.prior import add_prior, prior_cost
 from pliant.algorithms.bundle.problem import (
     AnyProblem,
     BundleParameters,
@@ -98,7 +97,7 @@ class PackedSystem:
             layout.points_seen, layout.place, layout.u, layout.v, layout.w, self.limits, records,
             normal,
         )  # fmt: skip
-        return Linearised(cameras, points, cost + prior_cost(layout, cameras), records, normal)
+        return Linearised(cameras, points, cost, records, normal)
 
     def step(self, state: Linearised, damping: float) -> Linearised | None:
         """The state after one damped Gauss-Newton step; None where it has no solution."""
@@ -126,7 +125,6 @@ class PackedSystem:
         )  # fmt: skip
         S, gradient = _in_rows(blocks, F), np.zeros(6 * F)
         diagonal = add_cameras(S, gradient, state.normal[moving])
-        add_prior(layout, state.cameras, moving, S, gradient)
         solution = solve_reduced(S, b.reshape(-1) + gradient, damping * diagonal)
         if solution is None:
             return None, 0.0

@@ -36,12 +36,6 @@ class BundleParameters(Parameters):
     max_sweeps: int = Field(
         default=4, ge=0, description="Most sweeps of the subspace solver on its own"
     )
-    sweeps_before: int = Field(
-        default=2, ge=0, description="Sweeps of the combination before its first Schur iteration"
-    )
-    sweeps_between: int = Field(
-        default=2, ge=0, description="Sweeps of the combination after each Schur iteration"
-    )
     min_relative_decrease: float = Field(
         default=1e-5,
         ge=0.0,
@@ -60,27 +54,6 @@ class BundleParameters(Parameters):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraPrior:
-    """A Gaussian on the poses of the cameras, for instance what marginalisation left behind.
-
-    It adds ``0.5 d^T H d + g^T d`` to the cost, where d (6M,) stacks, camera by camera,
-    ``(rho, theta)`` with ``T_camera_world = (exp(theta), rho) * T_camera_world_linearised``:
-    rotation vector theta in radians and translation rho, both in the camera's frame.
-
-    T_world_camera: poses at which H and g were taken.   H: px^2 per unit^2, symmetric.
-    """
-
-    T_world_camera: Annotated[F64, Shape("M", 4, 4)]
-    H: Annotated[F64, Shape("K", "K")]
-    g: Annotated[F64, Shape("K")]
-
-    def __post_init__(self) -> None:
-        check_arrays(self)
-        if len(self.g) != 6 * len(self.T_world_camera):
-            raise ValueError(f"g: expected 6 numbers a camera, got {len(self.g)}")
-
-
-@dataclass(frozen=True, kw_only=True)
 class BundleProblem:
     """Cameras, points and a list of observations (VITAMIN-E Eq. 6).
 
@@ -91,9 +64,7 @@ class BundleProblem:
     intrinsics: fx, fy, cx, cy in px, and the radial distortion k1, k2 (0 for rectified images):
         ``u = fx (1 + k1 r^2 + k2 r^4) x + cx`` with x, y on the plane z = 1.
     fixed_cameras: cameras that do not move.  At least one, or the gauge is left to the damping.
-    fixed_points: points that do not move; None: all may.
     weights: factors of the observations' cost terms, 0 leaves one out; None: all 1.
-    prior: a Gaussian on the cameras, or None.
     """
 
     T_world_camera: Annotated[F64, Shape("M", 4, 4)]
@@ -103,15 +74,16 @@ class BundleProblem:
     points_px: Annotated[F32, Shape("O", 2)]
     intrinsics: Annotated[F64, Shape("M", 6)]
     fixed_cameras: Annotated[BoolArray, Shape("M")]
-    fixed_points: BoolArray | None = None
     weights: F32 | None = None
-    prior: CameraPrior | None = None
 
     def __post_init__(self) -> None:
         check_arrays(self)
-        _check_optional("fixed_points", self.fixed_points, np.bool_, (len(self.points_world),))
-        _check_optional("weights", self.weights, np.float32, (len(self.camera_index),))
-        _check_prior(self.prior, len(self.T_world_camera))
+        weights = self.weights
+        if weights is not None and (weights.dtype, weights.shape) != (
+            np.dtype(np.float32),
+            self.camera_index.shape,
+        ):
+            raise ValueError(f"weights: one float32 an observation, got {weights.dtype}")
         if len(self.camera_index):
             if self.camera_index.min() < 0 or self.camera_index.max() >= len(self.T_world_camera):
                 raise ValueError("camera_index: out of range")
@@ -136,13 +108,9 @@ class BundleWindow:
     weights: Annotated[F32, Shape("M", "N")]
     intrinsics: Annotated[F64, Shape("M", 6)]
     fixed_cameras: Annotated[BoolArray, Shape("M")]
-    fixed_points: BoolArray | None = None
-    prior: CameraPrior | None = None
 
     def __post_init__(self) -> None:
         check_arrays(self)
-        _check_optional("fixed_points", self.fixed_points, np.bool_, (len(self.points_world),))
-        _check_prior(self.prior, len(self.T_world_camera))
 
 
 AnyProblem: TypeAlias = BundleProblem | BundleWindow
@@ -153,7 +121,7 @@ class BundleResult:
     """The adjusted cameras and points.
 
     T_world_camera (M, 4, 4), points_world (N, 3): fixed ones are returned unchanged.
-    initial_cost, final_cost: ``0.5 sum w rho(r^2)`` in px^2 before and after (the prior included).
+    initial_cost, final_cost: ``0.5 sum w rho(r^2)`` in px^2 before and after.
     iterations: sweeps and Levenberg-Marquardt iterations that were tried.
     costs: the cost at the start and after each iteration.
     converged: the decrease became small, as opposed to the iterations running out.
@@ -175,16 +143,3 @@ class BundleResult:
 def shared_intrinsics(camera: PinholeCamera, count: int) -> F64:
     """(count, 6) rows ``fx, fy, cx, cy, 0, 0``: one camera without distortion for all frames."""
     return np.tile(np.array([camera.fx, camera.fy, camera.cx, camera.cy, 0.0, 0.0]), (count, 1))
-
-
-def _check_optional(
-    name: str, value: F32 | BoolArray | None, dtype: type, shape: tuple[int, ...]
-) -> None:
-    if value is not None and (value.dtype != dtype or value.shape != shape):
-        expected = np.dtype(dtype)
-        raise ValueError(f"{name}: expected {expected} {shape}, got {value.dtype} {value.shape}")
-
-
-def _check_prior(prior: CameraPrior | None, cameras: int) -> None:
-    if prior is not None and len(prior.T_world_camera) != cameras:
-        raise ValueError(f"prior: expected {cameras} cameras, got {len(prior.T_world_camera)}")

@@ -77,7 +77,7 @@ def _one_camera(
         column=np.arange(N), u=table[0], v=table[1], w=table[2], seen=seen, cameras=cameras,
         pinholes=pinholes, lenses=np.zeros(0), pinholes32=pinholes.astype(np.float32),
         lenses32=np.zeros(0, np.float32), origin=origin, points=points,
-        movable=np.zeros(P, np.uint8), free=np.zeros(1, np.int32), prior=None,
+        movable=np.zeros(P, np.uint8), free=np.zeros(1, np.int32),
     )  # fmt: skip
 
 
@@ -120,7 +120,6 @@ def refine_points(
     problem = dataclasses.replace(
         problem,
         fixed_cameras=np.ones(len(problem.T_world_camera), np.bool_),
-        prior=None,
     )
     layout = build_layout(problem)
     cameras32 = layout.cameras.astype(np.float32)

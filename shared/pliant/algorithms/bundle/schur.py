@@ -9,12 +9,10 @@ from pliant.algorithms.bundle.damped import damped_iterations
 from pliant.algorithms.bundle.layout import Layout, build_layout
 from pliant.algorithms.bundle.packed import solve_packed
 from pliant.algorithms.bundle.packed_layout import is_sparse
-from pliant.algorithms.bundle.prior import add_prior, prior_cost
 from pliant.algorithms.bundle.problem import AnyProblem, BundleParameters, BundleResult
 from pliant.algorithms.bundle.reduced import add_cameras, solve_reduced
 from pliant.algorithms.bundle.result import OnIteration, make_result
 from pliant.algorithms.bundle.schur_kernels import back_substitute, reduced_system
-from pliant.algorithms.bundle.subspace import subspace_sweeps
 
 
 def solve_schur(
@@ -42,26 +40,16 @@ def schur_iterations(
     points: F64,
     parameters: BundleParameters,
     on_iteration: OnIteration | None = None,
-    sweeps: int = 0,
 ) -> tuple[F64, F64, list[float], bool]:
-    """The iterations alone: (cameras, points, cost curve, converged).
-
-    sweeps: subspace sweeps after each step that was taken.
-    """
+    """The iterations alone: (cameras, points, cost curve, converged)."""
     (cameras, points), costs, converged = damped_iterations(
         (cameras, points),
-        lambda state: full_cost(layout, *state, parameters),
+        lambda state: total_cost(layout, *state, parameters),
         lambda state, damping: _step(layout, *state, parameters, damping),
         parameters,
         on_iteration,
-        (lambda state: subspace_sweeps(layout, *state, parameters, sweeps)[:2]) if sweeps else None,
     )
     return cameras, points, costs, converged
-
-
-def full_cost(layout: Layout, cameras: F64, points: F64, parameters: BundleParameters) -> float:
-    """The cost in px^2 with the prior."""
-    return total_cost(layout, cameras, points, parameters) + prior_cost(layout, cameras)
 
 
 def _step(
@@ -103,7 +91,6 @@ def camera_steps(
         layout.u, layout.v, layout.w, layout.seen, limits_of(parameters), damping, S, b, normal,
     )  # fmt: skip
     diagonal = add_cameras(S, b, normal[moving])
-    add_prior(layout, cameras, moving, S, b)
     solution = solve_reduced(S, b, damping * diagonal)
     if solution is None:
         return None

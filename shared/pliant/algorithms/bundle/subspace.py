@@ -23,7 +23,7 @@ def solve_subspace(
     """Sweep until ``max_sweeps`` or until a sweep lowers the cost by too little.
 
     The work is done in float32 around the mean of the cameras; steps add up in float64.  Meant
-    for a window that is nearly converged: from a bad start use ``solve``.  A prior is not obeyed.
+    for a window that is nearly converged: from a bad start use ``solve_schur``.
     """
     layout = build_layout(problem)
     cameras, points, costs, converged = subspace_sweeps(

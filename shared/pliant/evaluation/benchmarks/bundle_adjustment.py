@@ -18,7 +18,6 @@ from pliant.algorithms.bundle import (
     BundleParameters,
     BundleProblem,
     BundleResult,
-    solve,
     solve_schur,
     solve_subspace,
     warm_up,
@@ -176,7 +175,7 @@ def _methods() -> list[tuple[str, Callable[..., BundleResult]]]:
         many = parameters.model_copy(update={"max_sweeps": SWEEPS})
         return solve_subspace(problem, many, on_iteration)
 
-    return [("subspace", sweeps), ("Schur LM", solve_schur), ("combination", solve)]
+    return [("subspace", sweeps), ("Schur LM", solve_schur)]
 
 
 def _measure(
