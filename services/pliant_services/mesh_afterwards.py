@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from pliant.errors import PliantError
-from pliant.recording.parts import PART, PART_RECORD, folder_of_parts, parts_of
+from pliant.recording.parts import PART, PART_RECORD, folder_of_parts, following_number
 from pliant.recording.reader import Recording
 from pliant.recording.summary import Summary, summarise
 from pliant.recording.writer import RecordingWriter
@@ -63,7 +63,7 @@ def mesh_into_recording(output: Path) -> None:
     path = output / RECORDING_NAME
     recording, summary = Recording(path), summarise(path)
     folder = folder_of_parts(path)
-    number = len(parts_of(folder))
+    number = following_number(folder)
     config = recorded_config(summary, ())
     inputs = {topic: recording.decoded(topic) for topic in _MESHING.inputs}
     with RecordingWriter(

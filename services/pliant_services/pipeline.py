@@ -23,7 +23,7 @@ from pliant.datasets.rectifier import Rectifier
 from pliant.errors import PliantError, ResultError
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.recording import parts
-from pliant.recording.restart import mend
+from pliant.recording.recover import mend
 from pliant_services import warm_up
 from pliant_services.ingest import DROPPED, plays_live
 from pliant_services.launcher import Fleet

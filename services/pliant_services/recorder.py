@@ -15,7 +15,7 @@ from pliant.config import Config, RecorderParameters, config_yaml
 from pliant.messages import codec, topics
 from pliant.messages.types import CameraStream
 from pliant.recording.parts import RollingWriter
-from pliant.recording.restart import mend
+from pliant.recording.recover import mend
 
 
 def run(

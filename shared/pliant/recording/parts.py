@@ -37,7 +37,17 @@ def parts_of(path: Path) -> list[Path]:
 def parts_in(folder: Path) -> list[Path]:
     """The parts that lie in this very folder, in order; empty where there are none."""
     found = folder.glob("part_*.mcap") if folder.is_dir() else ()
-    return sorted(part for part in found if _PART.fullmatch(part.name))
+    return sorted((part for part in found if _PART.fullmatch(part.name)), key=number_of)
+
+
+def following_number(folder: Path) -> int:
+    """The number of the next part: behind the highest, also where one was taken away."""
+    return max(map(number_of, parts_in(folder)), default=-1) + 1
+
+
+def number_of(part: Path) -> int:
+    """The number in the name of a part."""
+    return int(part.stem.removeprefix("part_"))
 
 
 def exists(path: Path) -> bool:
@@ -76,7 +86,7 @@ class RollingWriter:
         self._roll_ns = roll_ns
         self._attached: dict[str, tuple[str, bytes]] = {}
         self._in_parts = bool(roll_bytes or roll_ns or append)
-        self._number = len(parts_of(folder_of_parts(path))) if append else 0
+        self._number = following_number(folder_of_parts(path)) if append else 0
         self._first_ns: int | None = None
         if self._in_parts:
             try:
@@ -131,7 +141,7 @@ class RollingWriter:
             return RecordingWriter(self._path, self._metadata)
         path = folder_of_parts(self._path) / PART.format(self._number)
         writer = RecordingWriter(
-            path, {**self._metadata, PART_RECORD: {"number": str(self._number)}}
+            path, {**self._metadata, PART_RECORD: {"number": str(self._number)}}, replace=False
         )
         for name, (media_type, data) in self._attached.items():
             writer.attach(name, media_type, data)

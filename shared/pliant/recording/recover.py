@@ -1,15 +1,23 @@
-"""Makes a clean, indexed recording of one that was cut off or damaged: ``pliant recover``."""
+"""Makes a clean, indexed recording of one that was cut off or damaged.
 
+``pliant recover`` keeps all that it can; a recorder that is started again what it can vouch for.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from mcap.records import Attachment, Metadata
 
 from pliant.errors import MessageError, RecordingError
 from pliant.messages import topics
-from pliant.recording.parts import PART_RECORD
+from pliant.messages.types import StreamEnd
+from pliant.recording.index import Index
+from pliant.recording.parts import PART_RECORD, folder_of_parts, number_of, parts_in
 from pliant.recording.reader import Recorded, Recording
-from pliant.recording.scan import Damage
+from pliant.recording.scan import Damage, NothingReadableError
+from pliant.recording.summary import summarise
 from pliant.recording.writer import RecordingWriter
 
 RECOVERED = "recovered"
@@ -26,11 +34,21 @@ class Recovery:
     damage: list[Damage] = field(default_factory=list[Damage])
 
 
-def recover(damaged: Path, output: Path) -> Recovery:
+def decodes(message: Recorded) -> bool:
+    """Whether a checksum vouches for a message or, in a chunk that was cut off, it decodes."""
+    if not message.checked:
+        try:
+            message.decode()
+        except MessageError:
+            return False  # zeros after a power cut, or half a message
+    return True
+
+
+def recover(damaged: Path, output: Path, *, keep: Callable[[Recorded], bool] = decodes) -> Recovery:
     """Copy everything that is intact into a new recording, which appears whole or not at all.
 
-    Chunks count by their checksums.  Of a chunk that was cut off, messages are kept up to the first
-    that does not decode.  Raises RecordingError where nothing can be read or written.
+    Chunks count by their checksums, and of them the messages that ``keep`` says.  Raises
+    RecordingError where nothing can be read or written.
     """
     partial = output.with_name(output.name + ".partial")
     recovery = Recovery()
@@ -50,11 +68,10 @@ def recover(damaged: Path, output: Path) -> Recovery:
         with RecordingWriter(partial, metadata) as writer:
             for held in attachments.values():
                 writer.attach(held.name, held.media_type, held.data)
-            if waiting is not None:
-                _keep(writer, waiting, recovery)
-            for item in items:
+            for item in chain([waiting] if waiting else [], items):
                 if isinstance(item, Recorded):
-                    _keep(writer, item, recovery)
+                    if keep(item):
+                        _keep(writer, item, recovery)
                 elif not isinstance(item, Attachment):
                     _note(item, {}, recovery, {})
                 elif item.name not in attachments:
@@ -69,11 +86,6 @@ def recover(damaged: Path, output: Path) -> Recovery:
 
 
 def _keep(writer: RecordingWriter, message: Recorded, recovery: Recovery) -> None:
-    if not message.checked:
-        try:
-            message.decode()
-        except MessageError:
-            return  # zeros after a power cut, or half a message
     writer.write(
         message.topic,
         message.data,
@@ -98,3 +110,80 @@ def _note(
         attachments[item.name] = item
     elif isinstance(item, Damage):
         recovery.damage.append(item)
+
+
+def mend(path: Path) -> tuple[dict[str, int], set[str]]:
+    """Close the part that was cut off; return the messages there are of each topic, and its end.
+
+    For a recorder that is started again.  What is counted is on the disk, without a gap, under a
+    checksum: what else a power cut left of the last part is dropped, for its senders, who were not
+    told that it is safe, have it still.  Earlier parts were put on the disk when they were closed,
+    and are not read again.  A last part of which nothing is readable is set aside.  An end counts
+    as a message of its topic.  ``path``: of the recording, whose parts lie beside it.
+
+    Raises RecordingError where a part cannot be read or written.
+    """
+    books = _Books()
+    files = parts_in(folder_of_parts(path))
+    for file in files[:-1]:
+        books.take_up(file)
+    for last in files[-1:]:
+        books.from_the_beginning = [*map(number_of, files)] == [*range(len(files))]
+        try:
+            summary = summarise(last)
+            if not summary.has_index or summary.damage:
+                recover(last, last, keep=books.take)
+            else:
+                books.take_up(last)
+        except NothingReadableError:
+            last.rename(last.with_name(last.name + ".unreadable"))
+    return books.counts, books.ended
+
+
+@dataclass
+class _Books:
+    """Messages there are of each topic, by key.
+
+    from_the_beginning: a topic that is not here has none yet; else they may have been taken away.
+    """
+
+    counts: dict[str, int] = field(default_factory=dict[str, int])
+    ended: set[str] = field(default_factory=set[str])
+    from_the_beginning: bool = True
+
+    def take(self, message: Recorded) -> bool:
+        """Count a message, if it is the next of its topic and a checksum vouches for it."""
+        key = self._key(message)
+        following = self.counts.get(key, 0 if self.from_the_beginning else message.sequence)
+        if not message.checked or message.sequence != following:
+            return False
+        self._count(key, message)
+        return True
+
+    def take_up(self, file: Path) -> None:
+        """Count what the last chunks of a closed part say; one that is damaged is mended first."""
+        try:
+            self._count_last(Index(file))
+        except RecordingError:
+            recover(file, file)
+            self._count_last(Index(file))
+
+    def _count_last(self, index: Index) -> None:
+        for topic in index.topics:
+            chunks = index.with_topic(topic)
+            of_interest = chunks if topic is topics.STREAM_END else chunks[-1:]
+            for message in index.messages([topic], chunks=of_interest):
+                self._count(self._key(message), message)
+
+    def _count(self, key: str, message: Recorded) -> None:
+        self.counts[key] = max(self.counts.get(key, 0), message.sequence + 1)
+        if message.topic is topics.STREAM_END:
+            self.ended.add(key)
+
+    def _key(self, message: Recorded) -> str:
+        """The topic that a message belongs to; of an end, the one that it closes."""
+        if message.topic is not topics.STREAM_END or not message.checked:
+            return message.topic.key
+        end = message.decode()
+        assert isinstance(end, StreamEnd)
+        return end.topic

@@ -48,6 +48,10 @@ _EXPANSION = 4096
 _R = TypeVar("_R")
 
 
+class NothingReadableError(RecordingError):
+    """A file in which there is no chunk: it is no recording, or nothing of it is left."""
+
+
 @dataclass(frozen=True)
 class StoredMessage:
     """One message; ``checked`` is False in a chunk that is cut off and so has no checksum."""
@@ -154,7 +158,7 @@ class _Walk:
         if self._read(0, at) != MAGIC:
             at = self._next_chunk(0)
             if at == self._size:
-                raise RecordingError(f"{self._path}: not an MCAP recording")
+                raise NothingReadableError(f"{self._path}: not an MCAP recording")
             yield Damage(0, at, "the beginning of the file")
         while at < self._size:
             if at in self._unwanted:

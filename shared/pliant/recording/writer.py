@@ -39,10 +39,13 @@ class RecordingWriter:
     Topics of one compression share chunks, so a file's order is one within a topic, never across.
     """
 
-    def __init__(self, path: Path, metadata: Mapping[str, Mapping[str, str]]) -> None:
+    def __init__(
+        self, path: Path, metadata: Mapping[str, Mapping[str, str]], *, replace: bool = True
+    ) -> None:
         """Create the file.  ``metadata`` is written first: the resolved config, versions, host.
 
-        Raises RecordingError where the file cannot be created.
+        replace: an earlier file of this name.  Raises RecordingError where the file cannot be
+        created.
         """
         self._path = path
         self._size = 0
@@ -55,7 +58,9 @@ class RecordingWriter:
         self._metadata: list[MetadataIndex] = []
         self._broken = False
         try:
-            self._file = path.open("wb", buffering=0)
+            self._file = path.open("wb" if replace else "xb", buffering=0)
+        except FileExistsError:
+            raise RecordingError(f"{path} exists already: move it elsewhere") from None
         except OSError as error:
             raise self._failed(error) from None
         try:
