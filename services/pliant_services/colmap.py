@@ -13,7 +13,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, pose_to_matrix
-from pliant.algorithms.mapping.maxima_grid import MaximaGrid
+from pliant.algorithms.mapping.reacquisition import MaximaGrid
 from pliant.errors import ResultError
 from pliant.export.colmap import ColmapImage, write_colmap
 from pliant.map_history import MapHistory

@@ -11,8 +11,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
-from pliant.algorithms.keyframe_delta import KeyframeDelta
-from pliant.algorithms.map_delta import TRACKING, MapDelta
+from pliant.algorithms.map_delta import TRACKING, KeyframeDelta, MapDelta
 from pliant.algorithms.meshing import KeyframeSurfaces, SeenPoints
 from pliant.algorithms.meshing.keyframe_surface import SurfaceParameters
 from pliant.algorithms.surfels import SurfelParameters

@@ -4,6 +4,13 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F32, F64
+from pliant.algorithms.image.patch_alignment import align_patch, make_template, patch_tensor
+from pliant.algorithms.image.patch_sums import (
+    BIRTH_FLOATS,
+    BIRTH_MARGIN,
+    BIRTH_SIZE,
+    TEMPLATE_FLOATS,
+)
 from pliant.algorithms.tracking import track_table as table
 from pliant.algorithms.tracking.deformation import (
     WINDOW_SIDE,
@@ -12,13 +19,6 @@ from pliant.algorithms.tracking.deformation import (
     slopes_of_motion,
     turn_templates,
 )
-from pliant.algorithms.tracking.patch_sums import (
-    BIRTH_FLOATS,
-    BIRTH_MARGIN,
-    BIRTH_SIZE,
-    TEMPLATE_FLOATS,
-)
-from pliant.algorithms.tracking.patches import align_patch, make_template, patch_tensor
 
 SIZE = 64
 IDENTITY = np.array([1, 0, 0, 0, 1, 0], np.float32)

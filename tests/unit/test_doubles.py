@@ -5,7 +5,7 @@ import pytest
 
 from pliant.algorithms.arrays import F32, I32
 from pliant.algorithms.tracking import track_table as table
-from pliant.algorithms.tracking.doubles import remove_doubles
+from pliant.algorithms.tracking.upkeep import remove_doubles
 
 HEIGHT, WIDTH = 50, 75
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F32
+from pliant.algorithms.image.downsampling import halve, shrink
 from pliant.algorithms.tracking.climbing import climb
 from pliant.algorithms.tracking.curvature import curvature
 from pliant.algorithms.tracking.local_flow import CELL_PX, flow_at, grid_shape, local_flow
 from pliant.algorithms.tracking.maxima import find_maxima
-from pliant.algorithms.tracking.pyramid import halve, shrink
 
 HEIGHT, WIDTH = 240, 320
 IDENTITY = np.eye(2, 3)

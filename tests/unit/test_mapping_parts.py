@@ -7,15 +7,21 @@ from hypothesis import strategies as st
 from mapping_scene import CAMERA, Scene, looking
 
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.mapping.links import UNLINKED, TrackLinks
+from pliant.algorithms.mapping.covisibility import missing_rows, near_keyframes, rows_of
 from pliant.algorithms.mapping.localisation import locate, refine
-from pliant.algorithms.mapping.map_store import CANDIDATE, FREE, MAPPED, Keyframe, PointRows
-from pliant.algorithms.mapping.maxima_grid import MaximaGrid
-from pliant.algorithms.mapping.neighbours import missing_rows, near_keyframes, rows_of
+from pliant.algorithms.mapping.map_store import (
+    CANDIDATE,
+    FREE,
+    MAPPED,
+    UNLINKED,
+    Keyframe,
+    PointRows,
+    TrackLinks,
+)
+from pliant.algorithms.mapping.observation_table import reprojection_errors, window_errors
 from pliant.algorithms.mapping.parameters import LocalisationParameters, ReacquisitionParameters
 from pliant.algorithms.mapping.patches import cut_patches, sample_colours
-from pliant.algorithms.mapping.reacquisition import reacquire
-from pliant.algorithms.mapping.reprojection import reprojection_errors, window_errors
+from pliant.algorithms.mapping.reacquisition import MaximaGrid, reacquire
 
 
 def test_rows_are_reused_and_ids_never():

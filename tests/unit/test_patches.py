@@ -5,18 +5,18 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.tracking.patch_sums import (
+from pliant.algorithms.image.patch_alignment import (
+    align_patch,
+    make_template,
+    patch_strength,
+    patch_tensor,
+)
+from pliant.algorithms.image.patch_sums import (
     PATCH_PIXELS,
     PATCH_SIZE,
     TEMPLATE_FLOATS,
     WINDOW,
     patch_sums,
-)
-from pliant.algorithms.tracking.patches import (
-    align_patch,
-    make_template,
-    patch_strength,
-    patch_tensor,
 )
 
 SIZE = 48

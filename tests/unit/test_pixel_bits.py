@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pliant.algorithms.tracking.pixel_bits import any_around, get_bit, no_bits, set_bit, set_square
+from pliant.algorithms.tracking.upkeep import any_around, get_bit, no_bits, set_bit, set_square
 
 HEIGHT, WIDTH = 37, 71
 

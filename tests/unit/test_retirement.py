@@ -6,9 +6,9 @@ from test_mapper import Told, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.mapping import Mapper, MappingParameters
+from pliant.algorithms.mapping.covisibility import most_redundant, seen_by_none
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import WindowParameters
-from pliant.algorithms.mapping.retirement import most_redundant, seen_by_none
 from pliant.state import load_state, save_state
 
 

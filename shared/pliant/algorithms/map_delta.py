@@ -1,9 +1,11 @@
-"""What one frame changes in the map: one atomic update, and the only way in which a map is told."""
+"""What one frame changes in the map and in its keyframes' observations: all that is published.
+
+One atomic update a frame."""
 
 from dataclasses import dataclass
 from typing import Annotated
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, U8, Shape
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray, Shape
 
 WAITING, TRACKING, LOST = 0, 1, 2
 """State of the map after a frame: not started, localised, or lost (a new segment must start)."""
@@ -64,3 +66,25 @@ class MapDelta:
     removed_point_ids: Annotated[I64, Shape("R")]
     calibration_correction: tuple[float, ...] = ()
     snapshot: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeyframeDelta:
+    """Observations of keyframes.  Poses and points are told by the MapDelta of the same frame.
+
+    A keyframe is told of twice: when it is new, and when nothing about it will change any more
+    but by the final adjustment, as it has left the window, its segment was lost, or the stream has
+    ended.
+
+    new: id of the keyframe that this frame became; -1 where it became none.
+    keyframe_ids: keyframes whose observations follow.    settled: whether they will not change.
+    counts: observations of each; they follow each other in ``point_ids``, ascending in each.
+    point_ids: points of the map.    points_px: (u, v) where the keyframe sees them.
+    """
+
+    new: int
+    keyframe_ids: Annotated[I64, Shape("K")]
+    settled: Annotated[BoolArray, Shape("K")]
+    counts: Annotated[I32, Shape("K")]
+    point_ids: Annotated[I64, Shape("N")]
+    points_px: Annotated[F32, Shape("N", 2)]

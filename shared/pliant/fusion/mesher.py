@@ -15,8 +15,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
-from pliant.algorithms.keyframe_delta import KeyframeDelta
-from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing import (
     KeyframeSurfaces,
     MeshBlocks,

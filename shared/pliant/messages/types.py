@@ -9,8 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.keyframe_delta import KeyframeDelta
-from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing import MeshBlocks
 from pliant.algorithms.surfels.states import SurfelFrame
 from pliant.algorithms.tracks import FrameTracks

@@ -6,29 +6,37 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.mapping.links import UNLINKED, TrackLinks
-from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, MERGED, Keyframe, PointRows
-from pliant.algorithms.mapping.maxima_grid import MaximaGrid
-from pliant.algorithms.mapping.neighbours import (
+from pliant.algorithms.mapping.covisibility import (
     MAX_MISSES,
+    collect_garbage,
     focus_of,
     missing_rows,
+    most_redundant,
     most_shared,
     near_keyframes,
     rows_of,
+    seen_by_none,
 )
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.patches import cut_patches, sample_colours
-from pliant.algorithms.mapping.reacquisition import Reacquired
-from pliant.algorithms.mapping.retirement import collect_garbage, most_redundant, seen_by_none
-from pliant.algorithms.mapping.rolling_shutter import Path
-from pliant.algorithms.mapping.start import Start, WaitingFrame
-from pliant.algorithms.mapping.tables import (
+from pliant.algorithms.mapping.map_store import (
+    CANDIDATE,
+    MAPPED,
+    MERGED,
+    UNLINKED,
+    Keyframe,
+    PointRows,
+    TrackLinks,
+)
+from pliant.algorithms.mapping.observation_table import (
     columns_in_state,
     count_cameras,
     has_parallax,
     seen_in_state,
 )
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.patches import cut_patches, sample_colours
+from pliant.algorithms.mapping.reacquisition import MaximaGrid, Reacquired
+from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.window import Window
 from pliant.algorithms.tracks import FrameTracks
 from pliant.algorithms.triangulation import triangulate

@@ -12,17 +12,14 @@ import numpy as np
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.keyframe_delta import KeyframeDelta
-from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, MapDelta
+from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap, Observations
-from pliant.algorithms.mapping.changes import Changes
-from pliant.algorithms.mapping.keyframe_report import KeyframeReport
 from pliant.algorithms.mapping.localisation import locate, refine
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
-from pliant.algorithms.mapping.maxima_grid import MaximaGrid
+from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.reacquisition import reacquire
-from pliant.algorithms.mapping.reprojection import reprojection_errors
+from pliant.algorithms.mapping.publication import Changes, KeyframeReport
+from pliant.algorithms.mapping.reacquisition import MaximaGrid, reacquire
 from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.start import Start, WaitingFrame, find_start
 from pliant.algorithms.stages import StageTimer, no_stages

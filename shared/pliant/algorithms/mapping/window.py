@@ -16,10 +16,7 @@ from pliant.algorithms.bundle import (
 )
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.reprojection import window_errors
-from pliant.algorithms.mapping.rolling_shutter import readout_flow
-from pliant.algorithms.mapping.tables import (
+from pliant.algorithms.mapping.observation_table import (
     choose,
     columns_in_state,
     count_cameras,
@@ -27,7 +24,10 @@ from pliant.algorithms.mapping.tables import (
     gather,
     observe,
     seen_in_state,
+    window_errors,
 )
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.rolling_shutter import readout_flow
 from pliant.algorithms.triangulation import spread_of_rays
 
 OUTSIDE = -1

@@ -3,16 +3,17 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32
+from pliant.algorithms.image.patch_sums import (
+    PATCH_SIZE,
+    TEMPLATE_FLOATS,
+    prefetch_template,
+)
+from pliant.algorithms.image.vector_code import prefetch
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.tracking.climbing import climb
 from pliant.algorithms.tracking.curvature import CURVATURE_BORDER
 from pliant.algorithms.tracking.local_flow import flow_at
 from pliant.algorithms.tracking.maxima import subpixel_offset
-from pliant.algorithms.tracking.patch_sums import (
-    PATCH_SIZE,
-    TEMPLATE_FLOATS,
-    prefetch_template,
-)
 from pliant.algorithms.tracking.patch_track import (
     align_track,
     leads_back,
@@ -53,7 +54,6 @@ from pliant.algorithms.tracking.track_table import (
     U,
     V,
 )
-from pliant.algorithms.tracking.vector_code import prefetch
 from pliant.algorithms.tracks import COASTING, EXTREMUM
 
 AHEAD = 3

@@ -8,16 +8,17 @@ over neighbouring cells is exact to about 0.1 % a frame, far better than one pat
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
-from pliant.algorithms.tracking.local_flow import CELL_PX, agree, grid_shape
-from pliant.algorithms.tracking.patch_sums import (
+from pliant.algorithms.image.patch_alignment import make_template, patch_strength, patch_tensor
+from pliant.algorithms.image.patch_sums import (
     BIRTH_FLOATS,
     BIRTH_MARGIN,
     BIRTH_SIZE,
     PATCH_SIZE,
     TEMPLATE_FLOATS,
 )
-from pliant.algorithms.tracking.patches import make_template, patch_strength, patch_tensor
+from pliant.algorithms.image.vector_code import CACHE_LINE_FLOATS, prefetch
+from pliant.algorithms.kernel import fast_kernel, leaf_kernel
+from pliant.algorithms.tracking.local_flow import CELL_PX, agree, grid_shape
 from pliant.algorithms.tracking.track_table import (
     ENERGY,
     LEFT,
@@ -28,7 +29,6 @@ from pliant.algorithms.tracking.track_table import (
     U,
     V,
 )
-from pliant.algorithms.tracking.vector_code import CACHE_LINE_FLOATS, prefetch
 
 WINDOW_SIDE = PATCH_SIZE + 2
 """Of the samples of a patch with the margin of its gradients."""

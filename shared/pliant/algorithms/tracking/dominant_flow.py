@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F32, F64, Shape
+from pliant.algorithms.image.downsampling import shrink
+from pliant.algorithms.image.vector_code import count_bits
 from pliant.algorithms.kernel import fast_kernel
-from pliant.algorithms.tracking.extremum_bits import count_bits
 from pliant.algorithms.tracking.maxima import curvature_and_maxima
-from pliant.algorithms.tracking.pyramid import shrink
 
 SHRINK = 6
 """The paper's subsampling."""

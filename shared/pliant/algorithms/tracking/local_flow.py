@@ -8,14 +8,14 @@ from the patch to the centre of the cell, and mends cells that failed or stand a
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
-from pliant.algorithms.tracking.patch_sums import PATCH_SIZE, TEMPLATE_FLOATS
-from pliant.algorithms.tracking.patches import (
+from pliant.algorithms.image.patch_alignment import (
     align_patch,
     make_template,
     patch_strength,
     patch_tensor,
 )
+from pliant.algorithms.image.patch_sums import PATCH_SIZE, TEMPLATE_FLOATS
+from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 
 CELL_PX = 20
 """Side of a cell of the grid in full-size pixels: 32 x 24 cells at 640x480."""

@@ -7,14 +7,14 @@ sees twice as far.
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32
-from pliant.algorithms.kernel import leaf_kernel
-from pliant.algorithms.tracking.patch_sums import PATCH_SIZE, TEMPLATE_FLOATS
-from pliant.algorithms.tracking.patches import (
+from pliant.algorithms.image.patch_alignment import (
     align_patch,
     make_template,
     patch_strength,
     patch_tensor,
 )
+from pliant.algorithms.image.patch_sums import PATCH_SIZE, TEMPLATE_FLOATS
+from pliant.algorithms.kernel import leaf_kernel
 from pliant.algorithms.tracking.step_limits import (
     BACKWARD_GATE,
     MIN_RESIDUAL,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32, I64
-from pliant.algorithms.tracking.patch_sums import BIRTH_FLOATS, TEMPLATE_FLOATS
+from pliant.algorithms.image.patch_sums import BIRTH_FLOATS, TEMPLATE_FLOATS
 
 U, V = 0, 1
 """Sub-pixel position of the point."""

@@ -3,6 +3,8 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.image.downsampling import halve
+from pliant.algorithms.image.patch_sums import TEMPLATE_FLOATS
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracking import step_limits as step
 from pliant.algorithms.tracking.advance import advance_tracks, scan_order
@@ -18,14 +20,11 @@ from pliant.algorithms.tracking.dominant_flow import (
     fit_affine,
     match_features,
 )
-from pliant.algorithms.tracking.doubles import remove_doubles
 from pliant.algorithms.tracking.local_flow import grid_shape, local_flow
 from pliant.algorithms.tracking.maxima import curvature_and_maxima
 from pliant.algorithms.tracking.parameters import TrackingParameters
-from pliant.algorithms.tracking.patch_sums import TEMPLATE_FLOATS
-from pliant.algorithms.tracking.pyramid import halve
 from pliant.algorithms.tracking.track_table import AGE, KAPPA, STATE, TrackTable, U, V
-from pliant.algorithms.tracking.upkeep import compact, start_tracks
+from pliant.algorithms.tracking.upkeep import compact, remove_doubles, start_tracks
 from pliant.algorithms.tracks import FrameTracks
 
 MAX_BRIEF_DISTANCE_BITS = 64

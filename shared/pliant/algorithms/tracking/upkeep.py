@@ -1,14 +1,14 @@
-"""Keeps the set of tracks in order: the dead go, new extrema take their places."""
+"""Keeps the set of tracks in order: doubles and the dead go, new extrema take their places."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F32, I32, I64
-from pliant.algorithms.kernel import fast_kernel
+from pliant.algorithms.image.patch_alignment import make_template, patch_strength, patch_tensor
+from pliant.algorithms.image.patch_sums import BIRTH_FLOATS, TEMPLATE_FLOATS
+from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.tracking.deformation import keep_birth
-from pliant.algorithms.tracking.patch_sums import BIRTH_FLOATS, TEMPLATE_FLOATS
 from pliant.algorithms.tracking.patch_track import patch_inside, patch_origin, to_octave
-from pliant.algorithms.tracking.patches import make_template, patch_strength, patch_tensor
-from pliant.algorithms.tracking.pixel_bits import get_bit, no_bits, set_bit, set_square
 from pliant.algorithms.tracking.track_table import (
     AGE,
     ALIVE,
@@ -178,3 +178,114 @@ def _strongest_first(maxima: F32) -> I32:
         order[starts[keys[i]]] = i
         starts[keys[i]] += 1
     return order
+
+
+@fast_kernel
+def remove_doubles(count: int, floats: F32, ints: I32, owners: I32) -> None:
+    """Clear ALIVE of tracks within 1 px of an older one.
+
+    owners: (H, W) scratch.  All living tracks lie a pixel or more inside.  Hardly any has another
+    beside it.  A bit for every pixel, which stays in cache as ``owners`` does not, finds those
+    that do; only they are looked at closely.
+    """
+    height, width = owners.shape
+    taken, crowded = no_bits(height, width), no_bits(height, width)
+    found = False
+    for i in range(count):
+        if ints[i, ALIVE] == 0:
+            continue
+        at = _pixel(floats[i], width)
+        if any_around(taken, at, width):
+            found = True
+            for row in range(-1, 2):
+                for column in range(-1, 2):
+                    set_bit(crowded, at + row * width + column)
+        set_bit(taken, at)
+    if found:
+        taken[:] = np.uint64(0)
+        _keep_oldest(count, floats, ints, crowded, taken, owners.reshape(-1), width)
+
+
+@leaf_kernel
+def _keep_oldest(
+    count: int,
+    floats: F32,
+    ints: I32,
+    crowded: NDArray[np.uint64],
+    taken: NDArray[np.uint64],
+    owners: I32,
+    width: int,
+) -> None:
+    """Compare the tracks of crowded pixels with those around.  taken: bits, none of them set."""
+    for i in range(count):
+        at = _pixel(floats[i], width)
+        if ints[i, ALIVE] == 0 or not get_bit(crowded, at):
+            continue
+        for row in range(-1, 2):
+            for column in range(-1, 2):
+                beside = at + row * width + column
+                if not get_bit(taken, beside):
+                    continue
+                other = owners[beside]
+                du = floats[other, U] - floats[i, U]
+                dv = floats[other, V] - floats[i, V]
+                if du * du + dv * dv < np.float32(1.0):
+                    ints[i, ALIVE] = 0
+        if ints[i, ALIVE] == 1:
+            owners[at] = i
+            set_bit(taken, at)
+
+
+@leaf_kernel
+def _pixel(track: F32, width: int) -> int:
+    half = np.float32(0.5)
+    return int(track[V] + half) * width + int(track[U] + half)
+
+
+MAX_REACH = 31
+"""Pixels: a row of a square of bits fits into one word."""
+
+
+@fast_kernel
+def no_bits(height: int, width: int) -> NDArray[np.uint64]:
+    """Bits of an image, by flat pixel in words of 64, and one word more; none is set."""
+    return np.zeros(height * width // 64 + 2, np.uint64)
+
+
+@leaf_kernel
+def get_bit(bits: NDArray[np.uint64], at: int) -> bool:
+    """Whether the bit of a flat pixel is set."""
+    return bool((bits[at >> 6] >> np.uint64(at & 63)) & np.uint64(1))
+
+
+@leaf_kernel
+def set_bit(bits: NDArray[np.uint64], at: int) -> None:
+    """Set the bit of a flat pixel."""
+    bits[at >> 6] |= np.uint64(1) << np.uint64(at & 63)
+
+
+@leaf_kernel
+def any_around(bits: NDArray[np.uint64], at: int, width: int) -> bool:
+    """Whether a bit of a pixel or of its eight neighbours is set."""
+    seen = np.uint64(0)
+    for row in range(-1, 2):
+        first = at + row * width - 1
+        shift = np.uint64(first & 63)
+        # The next word's bits come in from above; shifted twice, as by 64 is undefined.
+        high = (bits[(first >> 6) + 1] << np.uint64(1)) << (np.uint64(63) - shift)
+        seen |= (bits[first >> 6] >> shift) | high
+    return bool(seen & np.uint64(7))
+
+
+@leaf_kernel
+def set_square(
+    bits: NDArray[np.uint64], x: int, y: int, reach: int, height: int, width: int
+) -> None:
+    """Set the pixels of the image within ``reach`` (<= MAX_REACH) of (x, y) in both directions."""
+    first, last = max(x - reach, 0), min(x + reach, width - 1)
+    row_bits = (np.uint64(2) << np.uint64(last - first)) - np.uint64(1)
+    for row in range(max(y - reach, 0), min(y + reach, height - 1) + 1):
+        at = row * width + first
+        shift = np.uint64(at & 63)
+        bits[at >> 6] |= row_bits << shift
+        bits[(at >> 6) + 1] |= (row_bits >> np.uint64(1)) >> (np.uint64(63) - shift)

@@ -10,14 +10,14 @@ from typing import TypeAlias
 import numpy as np
 
 from pliant.algorithms.arrays import F32
-from pliant.algorithms.kernel import leaf_kernel
-from pliant.algorithms.tracking.patch_sums import (
+from pliant.algorithms.image.patch_sums import (
     PATCH_PIXELS,
     PATCH_SIZE,
     patch_sums,
     tensor_sums,
     write_template,
 )
+from pliant.algorithms.kernel import leaf_kernel
 
 TEMPLATE_MARGIN = 1
 """Pixels around a patch that its gradients need when the template is made."""

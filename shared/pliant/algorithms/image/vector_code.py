@@ -56,3 +56,25 @@ def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
         return context.get_dummy_value()
 
     return signature, codegen
+
+
+@cast(Any, intrinsic)
+def first_bit(typing_context: Any, word: Any) -> Any:
+    """Number of the lowest bit that is set in a uint64; 64 of 0."""
+    signature = types.uint64(types.uint64)
+
+    def codegen(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 0))
+
+    return signature, codegen
+
+
+@cast(Any, intrinsic)
+def count_bits(typing_context: Any, word: Any) -> Any:
+    """How many bits of a uint64 are set."""
+    signature = types.uint64(types.uint64)
+
+    def codegen(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return signature, codegen

@@ -12,8 +12,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from pliant.algorithms.arrays import F32
-from pliant.algorithms.kernel import leaf_kernel
-from pliant.algorithms.tracking.vector_code import (
+from pliant.algorithms.image.vector_code import (
     CACHE_LINE_FLOATS,
     call_llvm,
     load,
@@ -21,6 +20,7 @@ from pliant.algorithms.tracking.vector_code import (
     splat,
     vector_type,
 )
+from pliant.algorithms.kernel import leaf_kernel
 
 PATCH_SIZE = 8
 """Side of a patch in pixels: one row is one vector."""

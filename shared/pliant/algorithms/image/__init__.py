@@ -1,0 +1,1 @@
+"""What kernels do with grey levels: smaller images, and small patches that are aligned."""

@@ -1,0 +1,169 @@
+"""Which keyframes look at the same place: what a frame may see, and what the map may forget.
+
+Points are looked for only where they are seen by keyframes of the window and near it, so that the
+work for a frame does not grow with the length of the run.
+
+Nor does the memory of the active map.  Keyframes and the points that only they see have been
+published, and what is published is the product; the active map only keeps what a camera may come
+back to.  Where a place is visited again and again that is one view of it, not one of each visit.
+"""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I32, I64, U8, BoolArray
+from pliant.algorithms.kernel import kernel
+from pliant.algorithms.mapping.map_store import (
+    CANDIDATE,
+    MAPPED,
+    MERGED,
+    Keyframe,
+    PointRows,
+)
+
+MAX_MISSES = 8
+"""Frames in which a point may be looked for in vain before it waits."""
+
+_RETRY_FRAMES = 8
+"""Frames between two searches for a point that waits."""
+
+
+def focus_of(keyframe: Keyframe, points: PointRows) -> F64:
+    """(3,) the point on the axis of a keyframe at the median depth of what it sees, or NaN."""
+    rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
+    centre, axis = keyframe.T_world_camera[:3, 3], keyframe.T_world_camera[:3, 2]
+    if len(rows) == 0:
+        return np.full(3, np.nan)
+    return centre + axis * float(np.median((points.xyz[rows] - centre) @ axis))
+
+
+def near_keyframes(keyframes: list[Keyframe], newest: Keyframe, count: int) -> list[Keyframe]:
+    """At most ``count`` of the keyframes, those that look where the newest does, in their order.
+
+    Nearness: how far the places looked at lie apart, added to half of how far the cameras do.
+    """
+    if len(keyframes) <= count:
+        return keyframes
+    last = keyframes[-1]
+    centre = newest.T_world_camera[:3, 3]
+    depth = 0.0
+    if last.focus is not None:
+        depth = float(np.linalg.norm(last.focus - last.T_world_camera[:3, 3]))
+    focus = centre + newest.T_world_camera[:3, 2] * depth
+    places = np.array([np.zeros(3) if k.focus is None else k.focus for k in keyframes])
+    centres = np.array([k.T_world_camera[:3, 3] for k in keyframes])
+    apart = np.linalg.norm(places - focus, axis=1) + 0.5 * np.linalg.norm(centres - centre, axis=1)
+    order = np.argsort(np.where(np.isfinite(apart), apart, np.inf), kind="stable")[:count]
+    return [keyframes[i] for i in np.sort(order).tolist()]
+
+
+def most_shared(older: list[Keyframe], moving: list[Keyframe], points: PointRows) -> list[Keyframe]:
+    """Older keyframes that share points with the moving ones, those that share most first."""
+    marked = np.zeros(len(points.state), np.bool_)
+    for keyframe in moving:
+        marked[keyframe.rows] = True
+    marked &= points.state == MAPPED
+    shared = [int(marked[keyframe.rows].sum()) for keyframe in older]
+    order = np.argsort(-np.array(shared), kind="stable").tolist()
+    return [older[i] for i in order if shared[i] > 0]
+
+
+def rows_of(keyframes: list[Keyframe], rows: I32, capacity: int) -> I32:
+    """Ascending rows that any of the keyframes observes, and the rows given."""
+    marked = np.zeros(capacity, np.bool_)
+    marked[rows] = True
+    for keyframe in keyframes:
+        marked[keyframe.rows] = True
+    return np.flatnonzero(marked).astype(np.int32)
+
+
+@kernel
+def missing_rows(rows: I32, linked: I32, state: U8, misses: U8, marks: I64, frame: int) -> I32:
+    """Those of the rows that are mapped, are due to be looked for and have no track.
+
+    linked: row of each track, negative where it has none.   marks: (capacity,) written: the last
+    frame in which a row had a track.
+    """
+    for i in range(linked.size):
+        if linked[i] >= 0:
+            marks[linked[i]] = frame
+    wanted = np.empty(rows.size, np.int32)
+    count = 0
+    for i in range(rows.size):
+        row = rows[i]
+        due = misses[row] < MAX_MISSES or (row + frame) % _RETRY_FRAMES == 0
+        if due and state[row] == MAPPED and marks[row] != frame:
+            wanted[count] = row
+            count += 1
+    return wanted[:count].copy()
+
+
+def most_redundant(keyframes: list[Keyframe]) -> int:
+    """Index of the newer one of the two keyframes that look most alike.
+
+    Alike: as in ``near_keyframes``, by the places looked at and half of how far the cameras are
+    apart.  The older one stays: the map as it was first seen drifted least.  At least two.
+    """
+    centres = np.array([k.T_world_camera[:3, 3] for k in keyframes])
+    places = np.array([_place(k) for k in keyframes])
+    return int(_newer_of_nearest(places, centres))
+
+
+def _place(keyframe: Keyframe) -> F64:
+    focus = keyframe.focus
+    if focus is None or not np.isfinite(focus).all():
+        return keyframe.T_world_camera[:3, 3]
+    return focus
+
+
+@kernel
+def _newer_of_nearest(places: F64, centres: F64) -> int:
+    newer, least = 1, np.inf
+    for j in range(1, len(places)):
+        for i in range(j):
+            focus2, centre2 = 0.0, 0.0
+            for k in range(3):
+                focus2 += (places[i, k] - places[j, k]) ** 2
+                centre2 += (centres[i, k] - centres[j, k]) ** 2
+            apart = np.sqrt(focus2) + 0.5 * np.sqrt(centre2)
+            if apart < least:
+                newer, least = j, apart
+    return newer
+
+
+def seen_by_none(rows: I32, keyframes: list[Keyframe], linked: I32, points: PointRows) -> I32:
+    """Those of the rows that are points which no keyframe sees and no living track belongs to.
+
+    linked: row of each track, negative where it has none.
+    """
+    held: BoolArray = np.zeros(len(points.state), np.bool_)
+    for keyframe in keyframes:
+        held[keyframe.rows] = True
+    held[linked[linked >= 0]] = True
+    return rows[~held[rows] & (points.state[rows] == MAPPED)]
+
+
+def collect_garbage(
+    points: PointRows, keyframes: list[Keyframe], linked: I32, segment: int
+) -> None:
+    """Give back the rows of dead candidates and of merged points.
+
+    linked: row of each living track, negative where it has none.    keyframes: of the segment.
+    """
+    used = points.state[: points.count]
+    dead = (used == CANDIDATE) & (points.segment[: points.count] == segment)
+    dead[linked[linked >= 0]] = False
+    merged = used == MERGED
+    gone = np.flatnonzero(dead | merged).astype(np.int32)
+    # A point may have been merged into one that was merged in its turn.
+    while (points.alias[points.alias[gone]] != points.alias[gone]).any():
+        points.alias[gone] = points.alias[points.alias[gone]]
+    first = points.first_keyframe[: points.count]
+    never = np.iinfo(np.int32).max
+    first_dead = int(first[dead].min()) if dead.any() else never
+    first_merged = int(first[merged].min()) if merged.any() else never
+    for keyframe in keyframes:
+        if keyframe.id >= first_merged:
+            keyframe.follow_aliases(points)
+        if keyframe.id >= first_dead:
+            keyframe.keep(~dead[keyframe.rows])
+    points.free(gone)
