@@ -71,19 +71,19 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     with monitor.stage("finish"):
         final = mapper.finish()
     bus.publish(topics.MAP_FINAL, _update(last, final))
-    bus.publish(topics.KEYFRAME_FINAL, Keyframe.of(last, mapper.tell_keyframes()))
+    bus.publish(topics.KEYFRAME_FINAL, Keyframe.of(last, mapper.publish_keyframes()))
     monitor.report(last, points=mapper.point_count)
 
 
 def _keyframe(
     image: Image, mapper: Mapper, update: MapDelta, waiting: dict[int, bytes]
 ) -> Keyframe:
-    """What the frame tells of keyframes.  The images that wait are done with once a map starts."""
-    delta = mapper.tell_keyframes()
+    """What the frame changed in keyframes.  Images that wait are done with once a map starts."""
+    delta = mapper.publish_keyframes()
     if delta.new < 0:
         return Keyframe.of(image, delta)
-    told = zip(update.keyframe_ids.tolist(), update.keyframe_frames.tolist(), strict=True)
-    earlier = [(keyframe, waiting[frame]) for keyframe, frame in told if frame in waiting]
+    moved = zip(update.keyframe_ids.tolist(), update.keyframe_frames.tolist(), strict=True)
+    earlier = [(keyframe, waiting[frame]) for keyframe, frame in moved if frame in waiting]
     waiting.clear()
     return Keyframe.of(
         image,

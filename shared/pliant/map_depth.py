@@ -31,7 +31,7 @@ class MapView:
 
 
 class MapDepth:
-    """Waits for keyframes that know enough depths.  A function of what it is told.
+    """Waits for keyframes that know enough depths.  A function of what it is given.
 
     problem: why the last frame is none, "" where it is one.
     """
@@ -45,7 +45,7 @@ class MapDepth:
     def take(
         self, update: MapDelta, keyframes: KeyframeDelta, frame: int, *, max_sigma: float
     ) -> MapView | None:
-        """Take in what a frame tells of the map: the keyframe that it became, if it is such one.
+        """Take in what a frame changed in the map: the keyframe that it became, if it is such one.
 
         max_sigma: of a depth that counts as certain, as a share of it.
         """
@@ -79,14 +79,14 @@ class MapDepth:
         """What the new keyframe observes, without points whose depth is uncertain."""
         bounds = np.concatenate([[0], np.cumsum(keyframes.counts)])
         row = int(np.flatnonzero(keyframes.keyframe_ids == keyframes.new)[0])
-        told = slice(int(bounds[row]), int(bounds[row + 1]))
-        rows, points = self._map.points_of(keyframes.point_ids[told])
+        published = slice(int(bounds[row]), int(bounds[row + 1]))
+        rows, points = self._map.points_of(keyframes.point_ids[published])
         sigmas = np.asarray(points.sigmas, np.float32)
         noise_px = SurfaceParameters().noise_px
         good = np.flatnonzero(sigmas * noise_px < max_sigma)
         return SeenPoints(
             ids=points.ids[good],
-            points_px=keyframes.points_px[told][rows][good],
+            points_px=keyframes.points_px[published][rows][good],
             points_world=points.positions[good],
             sigmas=sigmas[good],
             keyframes=np.asarray(points.keyframes, np.int32)[good],

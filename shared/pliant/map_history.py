@@ -16,7 +16,7 @@ MIN_INLIERS = 30
 
 @dataclass(frozen=True)
 class FramePose:
-    """A frame's pose relative to its keyframe, as last told."""
+    """A frame's pose relative to its keyframe, as last published."""
 
     segment: int
     keyframe: int
@@ -26,7 +26,7 @@ class FramePose:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A keyframe as last told."""
+    """A keyframe as last published."""
 
     frame: int
     segment: int
@@ -92,7 +92,7 @@ def _grown(array: np.ndarray[Any, Any], size: int) -> np.ndarray[Any, Any]:
 class Points:
     """The map's points.  Arrays as in MapDelta, one row for each point that exists.
 
-    frames: the frame whose update first told of the point, which observed it.
+    frames: the frame whose update first had the point, which observed it.
     """
 
     ids: Any
@@ -113,7 +113,7 @@ class Points:
 
 
 class CurrentMap:
-    """Keyframes and points as last told: what does not grow with time, but with what is seen."""
+    """Keyframes and points as last published: they grow with what is seen, not with time."""
 
     def __init__(self) -> None:
         self.keyframes: dict[int, Keyframe] = {}

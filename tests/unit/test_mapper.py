@@ -13,7 +13,7 @@ from pliant.algorithms.tracks import FrameTracks
 PARAMETERS = MappingParameters()
 
 
-class Told:
+class Published:
     """What a reader of the deltas knows."""
 
     def __init__(self):
@@ -41,19 +41,19 @@ class Told:
 
 
 def run(frames, parameters=PARAMETERS, seed=0):
-    mapper, told, deltas = Mapper(CAMERA, parameters, seed), Told(), []
+    mapper, published, deltas = Mapper(CAMERA, parameters, seed), Published(), []
     for frame, tracks in enumerate(frames):
         deltas.append(mapper.process(frame, tracks, None, None))
-        told.apply(deltas[-1])
+        published.apply(deltas[-1])
     deltas.append(mapper.finish())
-    told.apply(deltas[-1])
-    return told, deltas
+    published.apply(deltas[-1])
+    return published, deltas
 
 
-def trajectory_error(told, poses):
+def trajectory_error(published, poses):
     """Sim(3) RMSE as a share of the path."""
-    frames = sorted(told.poses)
-    estimated = np.array([told.pose(k)[:3, 3] for k in frames])
+    frames = sorted(published.poses)
+    estimated = np.array([published.pose(k)[:3, 3] for k in frames])
     true = np.array([poses[k][:3, 3] for k in frames])
     scale, R, t = align_umeyama(estimated, true, with_scale=True)
     rmse = np.sqrt(((scale * estimated @ R.T + t - true) ** 2).sum(axis=1).mean())
@@ -68,19 +68,19 @@ def flight():
 
 
 def test_every_frame_gets_a_pose_also_before_the_start(flight):
-    _, poses, told, _ = flight
-    assert told.states[0] == WAITING
-    assert told.states[20] == TRACKING
-    assert sorted(told.poses) == list(range(len(poses)))
-    error, _ = trajectory_error(told, poses)
+    _, poses, published, _ = flight
+    assert published.states[0] == WAITING
+    assert published.states[20] == TRACKING
+    assert sorted(published.poses) == list(range(len(poses)))
+    error, _ = trajectory_error(published, poses)
     assert error < 1e-3
 
 
 def test_the_map_is_where_the_scene_is(flight):
-    scene, poses, told, _ = flight
-    _, (scale, R, t) = trajectory_error(told, poses)
-    xyz = np.array([p[0] for p in told.points.values()])
-    keyframes = np.array([p[1] for p in told.points.values()])
+    scene, poses, published, _ = flight
+    _, (scale, R, t) = trajectory_error(published, poses)
+    xyz = np.array([p[0] for p in published.points.values()])
+    keyframes = np.array([p[1] for p in published.points.values()])
     world = scale * xyz[keyframes >= 3] @ R.T + t
     nearest = np.array([np.linalg.norm(scene.points - x, axis=1).min() for x in world])
     depth = np.linalg.norm(world - poses[0][:3, 3], axis=1)
@@ -90,18 +90,18 @@ def test_the_map_is_where_the_scene_is(flight):
 
 
 def test_lost_tracks_come_back_to_their_points(flight):
-    scene, _, told, _ = flight
+    scene, _, published, _ = flight
     # 2 % of the tracks die in every frame; without re-acquisition each becomes another point.
-    assert len(told.points) < 1.3 * len(scene.points)
+    assert len(published.points) < 1.3 * len(scene.points)
 
 
 def test_keyframes_are_the_first_to_tell_their_own_pose(flight):
-    _, _, told, deltas = flight
+    _, _, published, deltas = flight
     known = set()
     for delta in deltas:
         known.update(delta.keyframe_ids.tolist())
         assert set(delta.pose_keyframes.tolist()) <= known
-    assert not np.isnan([p[0] for p in told.points.values()]).any()
+    assert not np.isnan([p[0] for p in published.points.values()]).any()
 
 
 def test_the_same_input_gives_the_same_bytes(flight):
@@ -117,7 +117,7 @@ def test_the_same_input_gives_the_same_bytes(flight):
 
 def test_a_late_reader_catches_up_by_the_snapshots():
     parameters = MappingParameters(snapshot_frames=20)
-    mapper, late = Mapper(CAMERA, parameters, 0), Told()
+    mapper, late = Mapper(CAMERA, parameters, 0), Published()
     poses = sideways(42)
     for frame, tracks in enumerate(Scene.box().frames(poses)):
         delta = mapper.process(frame, tracks, None, None)
@@ -130,32 +130,32 @@ def test_a_late_reader_catches_up_by_the_snapshots():
 
 
 def test_a_still_camera_starts_no_map_and_says_why():
-    told, _ = run(Scene.box().frames([np.eye(4)] * 12))
-    assert set(told.states) == {WAITING}
-    assert "too little parallax" in told.reasons[-2]
-    assert not told.poses
+    published, _ = run(Scene.box().frames([np.eye(4)] * 12))
+    assert set(published.states) == {WAITING}
+    assert "too little parallax" in published.reasons[-2]
+    assert not published.poses
 
 
 def test_a_turning_camera_starts_no_map_and_says_why():
     turning = [looking((0.0, 0.0, 0.0), (0.0, 0.02 * k, 0.0)) for k in range(15)]
-    told, _ = run(Scene.box().frames(turning))
-    assert set(told.states) == {WAITING}
-    assert "pure rotation" in told.reasons[-2]
+    published, _ = run(Scene.box().frames(turning))
+    assert set(published.states) == {WAITING}
+    assert "pure rotation" in published.reasons[-2]
 
 
 def test_too_few_tracks_start_no_map_and_say_why():
-    told, _ = run(Scene.box(60).frames(sideways(8)))
-    assert set(told.states) == {WAITING}
-    assert told.reasons[0] == "too few frames: 1 of 3"
-    assert told.reasons[-2].startswith("too few tracks:")
-    assert told.reasons[-2].endswith("of 100")
+    published, _ = run(Scene.box(60).frames(sideways(8)))
+    assert set(published.states) == {WAITING}
+    assert published.reasons[0] == "too few frames: 1 of 3"
+    assert published.reasons[-2].startswith("too few tracks:")
+    assert published.reasons[-2].endswith("of 100")
 
 
 def test_a_map_starts_after_a_long_rest():
     poses = [np.eye(4)] * 30 + sideways(30)
-    told, _ = run(Scene.box().frames(poses))
-    assert sorted(told.poses) == list(range(60))
-    error, _ = trajectory_error(told, poses)
+    published, _ = run(Scene.box().frames(poses))
+    assert sorted(published.poses) == list(range(60))
+    error, _ = trajectory_error(published, poses)
     assert error < 2e-3
 
 
@@ -175,12 +175,12 @@ def noise_frames(count):
 
 
 def test_noise_and_empty_frames_start_no_map():
-    told, _ = run(noise_frames(15))
-    assert set(told.states) == {WAITING}
-    assert all(told.reasons)
-    told, _ = run([FrameTracks.empty()] * 5)
-    assert set(told.states) == {WAITING}
-    assert "too few tracks: 0 of 100" in told.reasons
+    published, _ = run(noise_frames(15))
+    assert set(published.states) == {WAITING}
+    assert all(published.reasons)
+    published, _ = run([FrameTracks.empty()] * 5)
+    assert set(published.states) == {WAITING}
+    assert "too few tracks: 0 of 100" in published.reasons
 
 
 def test_after_a_loss_a_new_segment_starts():
@@ -196,12 +196,12 @@ def test_after_a_loss_a_new_segment_starts():
         )
         for f in frames[20:]
     ]  # fmt: skip
-    told, _ = run(frames[:20] + dark + after)
-    assert LOST in told.states
-    assert {segment for _, _, segment in told.poses.values()} == {0, 1}
-    assert all(k not in told.poses for k in range(20, 31))
-    assert told.states[-2] == TRACKING
-    lost = told.reasons[told.states.index(LOST)]
+    published, _ = run(frames[:20] + dark + after)
+    assert LOST in published.states
+    assert {segment for _, _, segment in published.poses.values()} == {0, 1}
+    assert all(k not in published.poses for k in range(20, 31))
+    assert published.states[-2] == TRACKING
+    lost = published.reasons[published.states.index(LOST)]
     assert lost.startswith("lost:")
 
 
@@ -209,28 +209,28 @@ def test_a_short_gap_is_bridged():
     poses = sideways(40)
     frames = list(Scene.box().frames(poses))
     frames[25] = FrameTracks.empty()
-    told, _ = run(frames)
-    assert told.states[25] == LOST
-    assert 25 not in told.poses
-    assert len({segment for _, _, segment in told.poses.values()}) <= 2
+    published, _ = run(frames)
+    assert published.states[25] == LOST
+    assert 25 not in published.poses
+    assert len({segment for _, _, segment in published.poses.values()}) <= 2
 
 
 def test_frames_that_are_passed_over_get_no_pose_and_the_next_one_goes_on():
     """Also where the map starts, and with tracks that begin and end between."""
     poses = sideways(60)
-    mapper, told = Mapper(CAMERA, PARAMETERS, 0), Told()
+    mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
     for frame, tracks in enumerate(Scene.box().frames(poses)):
         if frame % 3 == 0:
-            told.apply(mapper.process(frame, tracks, None, None))
+            published.apply(mapper.process(frame, tracks, None, None))
             continue
         delta = mapper.skip(frame, "no time")
         assert (delta.reason, delta.inliers, len(delta.pose_frames)) == ("no time", 0, 0)
-        told.apply(delta)
-    told.apply(mapper.finish())
-    assert sorted(told.poses) == list(range(0, 60, 3))
-    error, _ = trajectory_error(told, poses)
+        published.apply(delta)
+    published.apply(mapper.finish())
+    assert sorted(published.poses) == list(range(0, 60, 3))
+    error, _ = trajectory_error(published, poses)
     assert error < 2e-3
-    assert LOST not in told.states
+    assert LOST not in published.states
 
 
 def test_a_frame_without_pixels_leaves_the_state_as_it_was():

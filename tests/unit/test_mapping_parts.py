@@ -45,7 +45,7 @@ def test_rows_grow_and_keep_what_they_hold():
     more = points.allocate(5000)
     np.testing.assert_array_equal(points.xyz[:10], np.arange(30).reshape(10, 3))
     assert not points.xyz[more].any()
-    assert np.isnan(points.told[more]).all()
+    assert np.isnan(points.published_xyz[more]).all()
     assert (points.alias[more] == more).all()
 
 

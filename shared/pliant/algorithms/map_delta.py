@@ -40,7 +40,7 @@ class MapDelta:
         calibration: a point of the map at (x, y) on the plane z = 1 is seen in the rectified image
         at ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx``, likewise v, and a rolling shutter takes the
         rows of a frame in this share of the frame interval.   () where nothing was estimated.
-    snapshot: every keyframe and point of the active window is told, changed or not.
+    snapshot: every keyframe and point of the active window is in it, changed or not.
     """
 
     state: int
@@ -70,9 +70,9 @@ class MapDelta:
 
 @dataclass(frozen=True, kw_only=True)
 class KeyframeDelta:
-    """Observations of keyframes.  Poses and points are told by the MapDelta of the same frame.
+    """Observations of keyframes.  Poses and points are in the MapDelta of the same frame.
 
-    A keyframe is told of twice: when it is new, and when nothing about it will change any more
+    A keyframe is published twice: when it is new, and when nothing about it will change any more
     but by the final adjustment, as it has left the window, its segment was lost, or the stream has
     ended.
 

@@ -140,7 +140,7 @@ class MapUpdate(Header, MapDelta):
 
 @dataclass(frozen=True, kw_only=True)
 class Keyframe(Header, KeyframeDelta):
-    """What a frame tells of keyframes.
+    """What a frame changed in the observations of keyframes.
 
     jpeg: the rectified image of the new keyframe, colour where the source has it; empty without.
     earlier_ids, earlier_jpegs: keyframes that earlier frames became now that a map starts from

@@ -70,7 +70,7 @@ class ActiveMap:
 
     points: rows shared by all segments.    keyframes: of this segment, oldest first.
     window: those under adjustment.    links: rows of the living tracks.
-    retired: keyframes that left for good.   removed_ids: points removed since the last call of
+    culled: keyframes that it has forgotten.   removed_ids: points removed since the last call of
     ``take_removed``.
     """
 
@@ -87,7 +87,7 @@ class ActiveMap:
         self.camera = camera
         self.parameters = parameters
         self.keyframes: list[Keyframe] = []
-        self.retired = 0
+        self.culled = 0
         self.links = TrackLinks()
         self.window = self._window([], fixed=0, outside=0)
         self._next_keyframe_id = first_keyframe_id
@@ -147,7 +147,7 @@ class ActiveMap:
     def missing(self, frame: int) -> I32:
         """Rows of mapped points without a track that are worth looking for in this frame.
 
-        Points looked for in vain again and again, for instance occluded ones, wait their turn.
+        Points looked for in vain many times, for instance occluded ones, wait their turn.
         """
         points = self.points
         if len(self._marks) < len(points.state):
@@ -166,23 +166,23 @@ class ActiveMap:
         self.points.strikes[rows[lost]] = 0
         self.links.rows[tracks[lost]] = UNLINKED
 
-    def take_over(self, again: Reacquired, tracks: FrameTracks) -> Observations:
+    def take_over(self, reacquired: Reacquired, tracks: FrameTracks) -> Observations:
         """Let tracks at the maxima of points found again belong to those points.
 
         What such a track belonged to merges into the point, where both can be the same.  Returns
         the points found where no track is.
         """
-        self.points.misses[again.visible] = np.minimum(
-            self.points.misses[again.visible], MAX_MISSES - 1
+        self.points.misses[reacquired.visible] = np.minimum(
+            self.points.misses[reacquired.visible], MAX_MISSES - 1
         )
-        self.points.misses[again.visible] += 1
-        self.points.misses[again.rows] = 0
+        self.points.misses[reacquired.visible] += 1
+        self.points.misses[reacquired.rows] = 0
         camera = self.camera
         places = np.column_stack([tracks.points_px, tracks.kappas])
         nearby = MaximaGrid.build(places, camera.width, camera.height)
-        track = nearby.nearest(tracks.maxima[again.maxima, :2], _TRACK_AT_MAXIMUM_PX)
+        track = nearby.nearest(tracks.maxima[reacquired.maxima, :2], _TRACK_AT_MAXIMUM_PX)
         alone = track < 0
-        new = again.rows[~alone]
+        new = reacquired.rows[~alone]
         track = track[~alone]
         former = self.links.rows[track]
         differ = former != new
@@ -193,7 +193,7 @@ class ActiveMap:
         for old, to in zip(former[taken].tolist(), new[taken].tolist(), strict=True):
             if old != UNLINKED:
                 self._merge(old, to)
-        return Observations(rows=again.rows[alone], points_px=again.points_px[alone])
+        return Observations(rows=reacquired.rows[alone], points_px=reacquired.points_px[alone])
 
     def _same_depth(self, a: I32, b: I32) -> BoolArray:
         """Whether points that lie on nearly the same ray are as far from the newest keyframe."""
@@ -226,16 +226,16 @@ class ActiveMap:
         points.first_keyframe[new] = min(points.first_keyframe[old], points.first_keyframe[new])
 
     def _note_removed(self, rows: I32) -> None:
-        """Points go that have been told; nobody knows of the others."""
-        told = np.isfinite(self.points.told[rows, 0])
-        self._removed.append(self.points.ids[rows[told]])
+        """Points go that have been published; nobody knows of the others."""
+        published = np.isfinite(self.points.published_xyz[rows, 0])
+        self._removed.append(self.points.ids[rows[published]])
 
     def take_removed(self) -> I64:
         """Ids of the points removed since the last call."""
         removed, self._removed = self._removed, []
         return np.concatenate([*removed, np.zeros(0, np.int64)])
 
-    def mature(self) -> None:
+    def triangulate(self) -> None:
         """Make points of the candidates whose rays now meet under enough parallax."""
         window, limits = self.window, self.parameters.point
         if window.seen[-1].any():
@@ -292,7 +292,7 @@ class ActiveMap:
         """Adjust the window after a keyframe has come to it."""
         self.collect_garbage()
         self.rebuild_window()
-        self.mature()
+        self.triangulate()
         sizes = self.parameters.window
         self.window.adjust(
             self.camera,
@@ -348,8 +348,8 @@ class ActiveMap:
         for keyframe in outside[-1:]:
             self._leave_window(keyframe)
         if len(self.keyframes) > max(sizes.kept_keyframes, sizes.final_max_keyframes):
-            # Not the one that has just left: it is not told yet.
-            self._retire(self.keyframes.pop(most_redundant(outside[:-1])))
+            # Not the one that has just left: it is not published yet.
+            self._cull(self.keyframes.pop(most_redundant(outside[:-1])))
             outside = self.keyframes[: -sizes.keyframes]
         older = near_keyframes(outside, moving[-1], _NEAR_KEYFRAMES)
         if older:
@@ -357,8 +357,8 @@ class ActiveMap:
         else:
             fixed = []
         chosen = sorted(fixed, key=lambda keyframe: keyframe.id) + moving
-        held = max(len(fixed), min(2, len(moving) - 1))
-        self.window = self._window(chosen, fixed=held, outside=len(fixed))
+        prior = max(len(fixed), min(2, len(moving) - 1))
+        self.window = self._window(chosen, fixed=prior, outside=len(fixed))
         self._nearby = rows_of(older, self.window.rows, len(self.points.state))
 
     def adjust_all(self, path: Path) -> F64:
@@ -378,11 +378,11 @@ class ActiveMap:
         self.window.update_statistics(self.camera)
         return correction
 
-    def _retire(self, keyframe: Keyframe) -> None:
+    def _cull(self, keyframe: Keyframe) -> None:
         """The map forgets a keyframe, and the points that only this one saw."""
-        self.retired += 1
+        self.culled += 1
         rows = seen_by_none(keyframe.rows, self.keyframes, self.links.rows, self.points)
-        self.points.retire(rows)
+        self.points.cull(rows)
 
     def _leave_window(self, keyframe: Keyframe) -> None:
         self.points.base_keyframes[keyframe.rows] += 1
@@ -403,4 +403,4 @@ class ActiveMap:
         # As candidates they may come back while their track lives, and are garbage afterwards.
         self.points.state[gone] = CANDIDATE
         self.points.ids[gone] = -1
-        self.points.told[gone] = np.nan
+        self.points.published_xyz[gone] = np.nan

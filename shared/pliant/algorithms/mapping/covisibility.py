@@ -5,7 +5,7 @@ work for a frame does not grow with the length of the run.
 
 Nor does the memory of the active map.  Keyframes and the points that only they see have been
 published, and what is published is the product; the active map only keeps what a camera may come
-back to.  Where a place is visited again and again that is one view of it, not one of each visit.
+back to.  Where a place is visited many times that is one view of it, not one of each visit.
 """
 
 import numpy as np
@@ -135,11 +135,11 @@ def seen_by_none(rows: I32, keyframes: list[Keyframe], linked: I32, points: Poin
 
     linked: row of each track, negative where it has none.
     """
-    held: BoolArray = np.zeros(len(points.state), np.bool_)
+    kept: BoolArray = np.zeros(len(points.state), np.bool_)
     for keyframe in keyframes:
-        held[keyframe.rows] = True
-    held[linked[linked >= 0]] = True
-    return rows[~held[rows] & (points.state[rows] == MAPPED)]
+        kept[keyframe.rows] = True
+    kept[linked[linked >= 0]] = True
+    return rows[~kept[rows] & (points.state[rows] == MAPPED)]
 
 
 def collect_garbage(

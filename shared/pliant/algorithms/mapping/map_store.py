@@ -10,7 +10,7 @@ from pliant.algorithms.mapping.patches import PATCH
 
 FREE, CANDIDATE, MAPPED, MERGED = 0, 1, 2, 3
 """State of a row: nothing, a track that still lacks parallax, a point of the map, the alias of
-another row until the keyframes have been told."""
+another row until the keyframes have been published."""
 
 
 class PointRows:
@@ -18,8 +18,8 @@ class PointRows:
 
     state: FREE, CANDIDATE, MAPPED or MERGED.    ids: of mapped points, never reused; else -1.
     alias: the row that a MERGED one stands for; itself otherwise.
-    xyz: world position of mapped points.    told: position last published, NaN before.
-    told_keyframes: ``keyframes`` when last published.    segment: of the map.
+    xyz: world position of mapped points.    published_xyz: as last published, NaN before.
+    published_keyframes: ``keyframes`` when last published.    segment: of the map.
     first_keyframe: keyframe id of the first observation.
     keyframes, parallax_rad, sigmas: as MapDelta defines them.
     base_keyframes, base_parallax_rad: what of those is due to keyframes out of the window.
@@ -35,8 +35,8 @@ class PointRows:
         self.alias: I32 = np.zeros(1024, np.int32)
         self.segment: I32 = np.zeros(1024, np.int32)
         self.xyz: F64 = np.zeros((1024, 3))
-        self.told: F64 = np.zeros((1024, 3))
-        self.told_keyframes: I32 = np.zeros(1024, np.int32)
+        self.published_xyz: F64 = np.zeros((1024, 3))
+        self.published_keyframes: I32 = np.zeros(1024, np.int32)
         self.colours: U8 = np.zeros((1024, 3), np.uint8)
         self.first_keyframe: I32 = np.zeros(1024, np.int32)
         self.base_keyframes: I32 = np.zeros(1024, np.int32)
@@ -48,8 +48,8 @@ class PointRows:
         self.strikes: U8 = np.zeros(1024, np.uint8)
         self.misses: U8 = np.zeros(1024, np.uint8)
         self.patches: U8 = np.zeros((1024, PATCH, PATCH), np.uint8)
-        self.retired = 0
-        """Points of the map that were told and are not held any more."""
+        self.culled = 0
+        """Points of the map that were published and are not kept any more."""
         self._free: I32 = np.zeros(0, np.int32)
         self._next_id = 0
 
@@ -71,7 +71,7 @@ class PointRows:
         self.state[rows] = CANDIDATE
         self.ids[rows] = -1
         self.alias[rows] = rows
-        self.told[rows] = np.nan
+        self.published_xyz[rows] = np.nan
         return rows
 
     def free(self, rows: I32) -> None:
@@ -79,15 +79,15 @@ class PointRows:
         self.state[rows] = FREE
         self._free = np.concatenate([self._free, rows])
 
-    def retire(self, rows: I32) -> None:
-        """Give back the rows of points that stay as they were told last."""
-        self.retired += len(rows)
+    def cull(self, rows: I32) -> None:
+        """Give back the rows of points that stay as they were last published."""
+        self.culled += len(rows)
         self.free(rows)
 
-    def retire_all(self) -> None:
+    def cull_all(self) -> None:
         """Give back every row: no segment goes on."""
         used = self.state[: self.count]
-        self.retired += int(np.count_nonzero(used == MAPPED))
+        self.culled += int(np.count_nonzero(used == MAPPED))
         self.free(np.flatnonzero(used != FREE).astype(np.int32))
 
     def promote(self, rows: I32) -> None:
@@ -108,7 +108,7 @@ class Keyframe:
     """A keyframe and what it observed.
 
     rows: (n,) rows of points or candidates, each at most once.    points_px: (n, 2).
-    told: T_world_camera when last published.
+    published_pose: T_world_camera when last published.
     focus: (3,) where it looks: on its axis, at the median depth of its points.  Set when it leaves
     the window; NaN where it sees no point of the map.
     """
@@ -119,7 +119,7 @@ class Keyframe:
     T_world_camera: F64
     rows: I32
     points_px: F32
-    told: F64 | None = None
+    published_pose: F64 | None = None
     focus: F64 | None = None
 
     def keep(self, mask: BoolArray) -> None:

@@ -18,7 +18,7 @@ from pliant.algorithms.mapping.localisation import locate, refine
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.publication import Changes, KeyframeReport
+from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, reacquire
 from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.start import Start, WaitingFrame, find_start
@@ -43,9 +43,9 @@ class Mapper:
         self._generator = np.random.default_rng(seed)
         self._timer: StageTimer = no_stages
         self._points = PointRows()
-        self._changes = Changes()
+        self._changes = MapChanges()
         self._path = Path()
-        self._report = KeyframeReport(self._points)
+        self._keyframe_changes = KeyframeChanges(self._points)
         self._waiting: list[WaitingFrame] = []
         self._map: ActiveMap | None = None
         self._segments = 0
@@ -53,7 +53,7 @@ class Mapper:
         self._recent_poses: list[F64] = []
         self._lost_frames = 0
         self._since_keyframe = 0
-        self._told_frames = 0
+        self._published_frames = 0
 
     def process(
         self,
@@ -71,13 +71,13 @@ class Mapper:
         with self._timer("localisation"):
             located = self._localise(self._map, tracks)
         if located is None:
-            return self._miss(self._map, frame, tracks)
+            return self._lost(self._map, frame, tracks)
         with self._timer("reacquisition"):
             T_world_camera, found = self._reacquire(self._map, frame, located, tracks, grey)
         with self._timer("subspace adjustment"):
             T_world_camera, inliers = self._adjust(self._map, T_world_camera, found, tracks)
         with self._timer("triangulation"):
-            self._map.mature()
+            self._map.triangulate()
         hanging = self._map.keyframes[-1]
         if self._keyframe_is_due(self._map):
             with self._timer("keyframe"):
@@ -90,7 +90,7 @@ class Mapper:
         self._lost_frames = 0
         self._recent_poses = [*self._recent_poses[-1:], T_world_camera]
         self._add_pose(self._map, frame, hanging, T_world_camera, inliers)
-        return self._tell(TRACKING, "", inliers)
+        return self._publish(TRACKING, "", inliers)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
         """Pass over a frame, without pixels (dropped or broken) or without time: it gets no pose.
@@ -102,30 +102,30 @@ class Mapper:
             state = WAITING
         else:
             state = LOST if self._lost_frames else TRACKING
-        return self._tell(state, reason, 0)
+        return self._publish(state, reason, 0)
 
     @property
     def point_count(self) -> int:
         """Points of the map now, of all segments."""
-        return self._points.retired + int(np.count_nonzero(self._points.state == MAPPED))
+        return self._points.culled + int(np.count_nonzero(self._points.state == MAPPED))
 
     def finish(self) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
         if self._map is None:
-            return self._tell(WAITING, "the stream has ended", 0, repeat=True)
+            return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         correction: tuple[float, ...] = ()
         if self._finishes(self._map):
             self._map.collect_garbage()
             found = self._map.adjust_all(self._path)
             if self._parameters.calibration.sigmas.any():
                 correction = tuple(found.tolist())
-        self._report.leave(self._map.keyframes)
-        delta = self._tell(TRACKING, "", 0, repeat=True)
+        self._keyframe_changes.settle(self._map.keyframes)
+        delta = self._publish(TRACKING, "", 0, snapshot=True)
         return dataclasses.replace(delta, calibration_correction=correction)
 
     def _finishes(self, active: ActiveMap) -> bool:
         limits = self._parameters.window
-        few = len(active.keyframes) + active.retired <= limits.final_max_keyframes
+        few = len(active.keyframes) + active.culled <= limits.final_max_keyframes
         return limits.final_adjustment and few
 
     def _add_pose(
@@ -137,12 +137,12 @@ class Mapper:
         else:
             self._path.forget()
 
-    def tell_keyframes(self) -> KeyframeDelta:
-        """What the last frame, or ``finish``, tells of keyframes."""
+    def publish_keyframes(self) -> KeyframeDelta:
+        """What is to be published of keyframes after the last frame, or after ``finish``."""
         if self._map is None:
-            return self._report.tell(None)
-        self._report.leave(self._map.keyframes[: -self._parameters.window.keyframes])
-        return self._report.tell(self._map.keyframes[-1])
+            return self._keyframe_changes.publish(None)
+        self._keyframe_changes.settle(self._map.keyframes[: -self._parameters.window.keyframes])
+        return self._keyframe_changes.publish(self._map.keyframes[-1])
 
     def _wait(
         self, frame: int, tracks: FrameTracks, grey: U8 | None, colour: U8 | None
@@ -154,14 +154,14 @@ class Mapper:
         with self._timer("start"):
             start = find_start(self._waiting, self._camera, self._parameters)
         if isinstance(start, str):
-            return self._tell(WAITING, start, 0)
+            return self._publish(WAITING, start, 0)
         with self._timer("start"):
             inliers = self._begin(start, tracks, grey, colour)
-        return self._tell(TRACKING, "", inliers)
+        return self._publish(TRACKING, "", inliers)
 
     def _begin(self, start: Start, tracks: FrameTracks, grey: U8 | None, colour: U8 | None) -> int:
         """Let the map start, and give poses to the frames that waited, backwards."""
-        self._points.retire_all()  # of earlier segments, which have been told
+        self._points.cull_all()  # of earlier segments, which have been published
         self._map = ActiveMap(
             self._segments, self._points, self._keyframes, self._camera, self._parameters
         )
@@ -221,14 +221,14 @@ class Mapper:
             return None
         return located.T_world_camera
 
-    def _miss(self, active: ActiveMap, frame: int, tracks: FrameTracks) -> MapDelta:
+    def _lost(self, active: ActiveMap, frame: int, tracks: FrameTracks) -> MapDelta:
         """The frame has no pose.  After several such frames the segment is closed."""
         seen = len(active.linked(MAPPED))
         reason = f"lost: the pose of frame {frame} is not supported, {seen} mapped tracks"
         self._lost_frames += 1
-        delta = self._tell(LOST, reason, 0)
+        delta = self._publish(LOST, reason, 0)
         if self._lost_frames > self._parameters.localisation.max_lost_frames:
-            self._report.leave(active.keyframes)
+            self._keyframe_changes.settle(active.keyframes)
             self._keyframes = active.next_keyframe_id
             self._map = None
         return delta
@@ -247,7 +247,7 @@ class Mapper:
         if not self._parameters.reacquisition.enabled:
             return T_world_camera, none
         grid = MaximaGrid.build(tracks.maxima, self._camera.width, self._camera.height)
-        again = reacquire(
+        reacquired = reacquire(
             T_world_camera,
             active.missing(frame),
             points.xyz,
@@ -258,7 +258,7 @@ class Mapper:
             self._camera,
             self._parameters.reacquisition,
         )
-        found = active.take_over(again, tracks)
+        found = active.take_over(reacquired, tracks)
         linked = active.linked(MAPPED)
         rows = np.concatenate([active.links.rows[linked], found.rows])
         points_px = np.concatenate([tracks.points_px[linked], found.points_px])
@@ -303,11 +303,11 @@ class Mapper:
             return True
         return self._since_keyframe >= limits.max_frames and flow > limits.min_flow_px * unit
 
-    def _tell(self, state: int, reason: str, inliers: int, *, repeat: bool = False) -> MapDelta:
-        # Now and then everything active is told again, for those who came late.
+    def _publish(self, state: int, reason: str, inliers: int, snapshot: bool = False) -> MapDelta:
+        # Now and then everything active is published, for those who came late.
         self._timer = no_stages  # the frame is done: nothing of its caller stays with the map
-        self._told_frames += 1
-        repeat = repeat or self._told_frames % self._parameters.snapshot_frames == 0
+        self._published_frames += 1
+        snapshot = snapshot or self._published_frames % self._parameters.snapshot_frames == 0
         active = self._map
         if active is None:
             keyframes: list[Keyframe] = []
@@ -315,11 +315,11 @@ class Mapper:
         else:
             keyframes = active.window.keyframes
             # Between keyframes only points that the frame sees can move or be new.
-            everything = repeat or self._since_keyframe <= 1
+            everything = snapshot or self._since_keyframe <= 1
             rows = active.window.rows if everything else active.window.current_rows()
             centre = active.keyframes[-1].T_world_camera[:3, 3].copy()
             self._changes.remove_points(active.take_removed())
-        return self._changes.tell(
+        return self._changes.publish(
             state=state,
             reason=reason,
             segment=self._segments - 1,
@@ -328,5 +328,5 @@ class Mapper:
             points=self._points,
             rows=rows,
             centre=centre,
-            repeat=repeat,
+            snapshot=snapshot,
         )

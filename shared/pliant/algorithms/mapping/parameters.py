@@ -20,7 +20,7 @@ class StartParameters(Parameters):
         default=120, ge=2, description="Frames kept while waiting; older ones get no pose"
     )
     min_points: int = Field(
-        default=100, ge=30, description="Points that a start must hold after adjustment"
+        default=100, ge=30, description="Points that a start must have after adjustment"
     )
     max_median_error_px: float = Field(
         default=1.0, gt=0.0, description="Largest median reprojection error of a start, px"
@@ -179,5 +179,7 @@ class MappingParameters(Parameters):
     bundle: BundleParameters = BundleParameters(kernel_sigma_px=1.0)
     calibration: CalibrationUncertainty = CalibrationUncertainty()
     snapshot_frames: int = Field(
-        default=100, ge=1, description="Frames after which the active window is told again"
+        default=100,
+        ge=1,
+        description="Frames between two snapshots: everything active, for who came late",
     )

@@ -11,10 +11,10 @@ from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 
 _MOVED_SHARE = 2e-3
-"""Points are told again when they moved by this share of their distance to the camera."""
+"""Points are published again when they moved by this share of their distance to the camera."""
 
 
-class Changes:
+class MapChanges:
     """Collects what one frame changes and makes its MapDelta."""
 
     def __init__(self) -> None:
@@ -28,10 +28,10 @@ class Changes:
         self._poses.append((frame, keyframe.segment, keyframe.id, pose, inliers))
 
     def remove_points(self, ids: I64) -> None:
-        """Points are gone; those that were never told are left out later."""
+        """Points are gone; those that were never published are left out later."""
         self._removed.append(ids)
 
-    def tell(
+    def publish(
         self,
         *,
         state: int,
@@ -42,20 +42,20 @@ class Changes:
         points: PointRows,
         rows: I32,
         centre: F64,
-        repeat: bool,
+        snapshot: bool,
     ) -> MapDelta:
-        """The delta: what differs, of ``keyframes`` and points in ``rows``, from what was told.
+        """What differs, of ``keyframes`` and the points in ``rows``, from what was published.
 
-        centre: (3,) camera position, which says how much a movement matters.  repeat: tell all.
+        centre: (3,) camera position, which says how much a movement matters.  snapshot: all.
         """
         poses, self._poses = sorted(self._poses, key=lambda pose: pose[0]), []
         removed, self._removed = self._removed, []
-        moved = [k for k in keyframes if repeat or _differs(k)]
+        moved = [k for k in keyframes if snapshot or _differs(k)]
         for keyframe in moved:
-            keyframe.told = keyframe.T_world_camera.copy()
-        rows = _untold(
-            rows, points.state, points.xyz, points.told, points.keyframes, points.told_keyframes,
-            centre, repeat,
+            keyframe.published_pose = keyframe.T_world_camera.copy()
+        rows = _unpublished(
+            rows, points.state, points.xyz, points.published_xyz, points.keyframes,
+            points.published_keyframes, centre, snapshot,
         )  # fmt: skip
         return MapDelta(
             state=state,
@@ -80,23 +80,23 @@ class Changes:
             point_keyframes=points.keyframes[rows],
             point_parallax_rad=points.parallax_rad[rows],
             point_sigmas=points.sigmas[rows],
-            snapshot=repeat,
+            snapshot=snapshot,
             removed_point_ids=np.sort(np.concatenate([*removed, np.zeros(0, np.int64)])),
         )
 
 
 @kernel
-def _untold(
+def _unpublished(
     rows: I32,
     state: U8,
     xyz: F64,
-    told: F64,
+    published_xyz: F64,
     keyframes: I32,
-    told_keyframes: I32,
+    published_keyframes: I32,
     centre: F64,
-    repeat: bool,
+    snapshot: bool,
 ) -> I32:
-    """Those of the mapped rows that must be told; they are noted as told."""
+    """Those of the mapped rows that must be published; they are noted as published."""
     chosen = np.empty(rows.size, np.int32)
     count = 0
     for i in range(rows.size):
@@ -106,46 +106,48 @@ def _untold(
         distance2, moved2 = 0.0, 0.0
         for k in range(3):
             distance2 += (xyz[row, k] - centre[k]) ** 2
-            moved2 += (xyz[row, k] - told[row, k]) ** 2
-        # Points never told compare with NaN, which is never small.
+            moved2 += (xyz[row, k] - published_xyz[row, k]) ** 2
+        # Points never published compare with NaN, which is never small.
         still = moved2 <= _MOVED_SHARE * _MOVED_SHARE * distance2
-        if repeat or not still or told_keyframes[row] != keyframes[row]:
+        if snapshot or not still or published_keyframes[row] != keyframes[row]:
             for k in range(3):
-                told[row, k] = xyz[row, k]
-            told_keyframes[row] = keyframes[row]
+                published_xyz[row, k] = xyz[row, k]
+            published_keyframes[row] = keyframes[row]
             chosen[count] = row
             count += 1
     return chosen[:count].copy()
 
 
 def _differs(keyframe: Keyframe) -> bool:
-    return keyframe.told is None or not np.array_equal(keyframe.told, keyframe.T_world_camera)
+    return keyframe.published_pose is None or not np.array_equal(
+        keyframe.published_pose, keyframe.T_world_camera
+    )
 
 
-class KeyframeReport:
-    """Remembers what has been told, and makes each KeyframeDelta."""
+class KeyframeChanges:
+    """Remembers what has been published, and makes each KeyframeDelta."""
 
     def __init__(self, points: PointRows) -> None:
         self._points = points
         self._newest = -1
         self._settled = -1
-        self._leaving: list[Keyframe] = []
+        self._final: list[Keyframe] = []
 
-    def leave(self, keyframes: Sequence[Keyframe]) -> None:
+    def settle(self, keyframes: Sequence[Keyframe]) -> None:
         """These keyframes, in the order of their ids, will not change any more."""
-        self._leaving += [k for k in keyframes if k.id > self._settled]
-        self._settled = max([self._settled, *(keyframe.id for keyframe in self._leaving)])
+        self._final += [k for k in keyframes if k.id > self._settled]
+        self._settled = max([self._settled, *(keyframe.id for keyframe in self._final)])
 
-    def tell(self, newest: Keyframe | None) -> KeyframeDelta:
-        """What has not been told yet.  newest: the last keyframe that was made, if any."""
+    def publish(self, newest: Keyframe | None) -> KeyframeDelta:
+        """What has not been published yet.  newest: the last keyframe that was made, if any."""
         new = -1
-        told = [(keyframe, True) for keyframe in self._leaving]
-        self._leaving = []
+        changed = [(keyframe, True) for keyframe in self._final]
+        self._final = []
         if newest is not None and newest.id > self._newest:
             new = self._newest = newest.id
-            told.append((newest, False))
+            changed.append((newest, False))
         ids, pixels = [np.zeros(0, np.int64)], [np.zeros((0, 2), np.float32)]
-        for keyframe, _ in told:
+        for keyframe, _ in changed:
             mapped = np.flatnonzero(self._points.state[keyframe.rows] == MAPPED)
             point_ids = self._points.ids[keyframe.rows[mapped]]
             order = np.argsort(point_ids)
@@ -153,8 +155,8 @@ class KeyframeReport:
             pixels.append(keyframe.points_px[mapped[order]])
         return KeyframeDelta(
             new=new,
-            keyframe_ids=np.array([keyframe.id for keyframe, _ in told], np.int64),
-            settled=np.array([settled for _, settled in told], np.bool_),
+            keyframe_ids=np.array([keyframe.id for keyframe, _ in changed], np.int64),
+            settled=np.array([settled for _, settled in changed], np.bool_),
             counts=np.array([len(some) for some in ids[1:]], np.int32),
             point_ids=np.concatenate(ids),
             points_px=np.concatenate(pixels),

@@ -1,6 +1,6 @@
 """How a map starts: the frames seen so far become a small reconstruction, or a reason why not.
 
-Every new frame is held against the best earlier one: many shared tracks, and flow that no rotation
+Every new frame is compared with the best earlier one: many shared tracks, and flow that no rotation
 explains.  The essential matrix of the two gives a first structure, frames in between join it by
 their tracks, and all are adjusted together.  Only a start that many points in several frames
 support is accepted, so that slow, rotating or still beginnings merely wait.
@@ -25,7 +25,7 @@ from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.parameters import MappingParameters, StartParameters
 
 _TRIED_REFERENCES = 8
-"""Earlier frames held against a new one."""
+"""Earlier frames compared with a new one."""
 
 _ROTATION_SAMPLE = 400
 """Tracks that decide whether a rotation explains the flow."""

@@ -40,7 +40,7 @@ class Window:
     """Fixed keyframes, then those that move, then the current frame in the last slot.
 
     keyframes: (M,) list, the first ``fixed`` do not move, the first ``outside`` are older than the
-    window and only hold it.
+    window and are its prior.
       rows: (N,) rows seen by any of them.
     columns: (capacity,) column of each row, OUTSIDE where it is not in the window.
     u, v, seen: (M + 1, N).    w: weights of what is seen.    T_world_camera: (M + 1, 4, 4).
@@ -100,8 +100,8 @@ class Window:
             self.rows, self.points.state, MAPPED, self.seen, len(self.keyframes), 1
         )
         problem = self._problem(columns, camera)
-        held = len(self.keyframes) - parameters.window.sweep_keyframes
-        problem.fixed_cameras[: max(held, 0)] = True
+        first = len(self.keyframes) - parameters.window.sweep_keyframes
+        problem.fixed_cameras[: max(first, 0)] = True
         bundle = parameters.bundle.model_copy(update={"max_sweeps": parameters.window.sweeps})
         self._take(columns, solve_subspace(problem, bundle))
         return self.T_world_camera[-1].copy()

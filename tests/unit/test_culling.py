@@ -2,7 +2,7 @@
 
 import numpy as np
 from mapping_scene import CAMERA, Scene, sideways
-from test_mapper import Told, trajectory_error
+from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.mapping import Mapper, MappingParameters
@@ -51,37 +51,37 @@ def test_points_go_that_no_keyframe_and_no_track_sees() -> None:
     kept = [keyframe(1, 0.0, [1, 2], None)]
     gone = seen_by_none(rows, kept, np.array([3, -1], np.int32), points)
     assert gone.tolist() == [0, 4]
-    points.retire(gone)
-    assert points.retired == 2
+    points.cull(gone)
+    assert points.culled == 2
     assert (points.state == MAPPED).sum() == 3
     again = points.allocate(2)
     assert sorted(again.tolist()) == [0, 4]  # no new memory
     points.promote(again)
     assert len(set(points.ids[[0, 1, 2, 3, 4]].tolist())) == 5  # ids are never reused
-    points.retire_all()
-    assert points.retired == 7
+    points.cull_all()
+    assert points.culled == 7
     assert sorted(points.allocate(6).tolist()) == list(range(6))
 
 
 def test_the_active_map_stays_as_it_is_where_the_camera_comes_back() -> None:
-    """The same views again and again: the state is bounded, poses are right, all told stays."""
+    """The same views many times: the state is bounded, poses are right, all published stays."""
     once = sideways(45)
     poses = [*once, *once[-2:0:-1]] * 4
     window = WindowParameters(kept_keyframes=30, final_max_keyframes=10)
-    mapper, told = Mapper(CAMERA, MappingParameters(window=window), 0), Told()
+    mapper, published = Mapper(CAMERA, MappingParameters(window=window), 0), Published()
     rows, keyframes = [], 0
     for frame, tracks in enumerate(Scene.box(death=0.01).frames(poses)):
         delta = mapper.process(frame, tracks, None, None)
-        told.apply(delta)
-        mapper.tell_keyframes()
-        keyframes = len(told.keyframes)
+        published.apply(delta)
+        mapper.publish_keyframes()
+        keyframes = len(published.keyframes)
         active = mapper._map
         assert active is None or len(active.keyframes) <= 30
         rows.append(mapper._points.count)
-    told.apply(mapper.finish())
+    published.apply(mapper.finish())
     assert keyframes > 60  # else nothing had to leave
     assert max(rows[len(rows) // 2 :]) <= 1.05 * max(rows[: len(rows) // 2])
-    assert mapper.point_count == len(told.points)
+    assert mapper.point_count == len(published.points)
     assert len(load_state(save_state(mapper))._map.keyframes) <= 30
-    assert trajectory_error(told, poses)[0] < 1e-3
-    assert set(told.states[10:]) == {TRACKING}
+    assert trajectory_error(published, poses)[0] < 1e-3
+    assert set(published.states[10:]) == {TRACKING}
