@@ -109,7 +109,7 @@ def test_all_at_once(
     assert run(tmp_path, once_at((18, SERVICES))) == undisturbed
 
 
-def test_a_power_cut_and_resume(tmp_path: Path, undisturbed: dict[str, str]) -> None:
+def test_all_with_the_launcher_and_resume(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     def cut(status: Status, fleet: Fleet) -> Sequence[str]:
         if status.service == "bundle_adjustment" and status.frame == 22:
             fleet.give_up()

@@ -5,7 +5,6 @@ will not make those again.  So some are kept, until an older one can never be ne
 whose outputs every reader has safe.
 """
 
-import os
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -16,6 +15,7 @@ from typing import Any
 import msgpack
 
 from pliant.errors import BusError, StateError
+from pliant.files import make_folder, put_in_place
 
 _VERSION = 1
 
@@ -45,7 +45,7 @@ class Checkpoints:
         self._writer: threading.Thread | None = None
         self._failure: OSError | None = None
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             for unfinished in folder.glob("*.part"):
                 unfinished.unlink()
         except OSError as error:
@@ -125,9 +125,7 @@ def _write_whole(path: Path, parts: tuple[Any, ...]) -> None:
     with part.open("wb") as file:
         for data in parts:
             file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    put_in_place(part, path)
 
 
 def _read_place(path: Path) -> Place:

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import TracebackType
 
 from pliant.errors import RecordingError
+from pliant.files import make_folder
 from pliant.messages.topics import Topic
 from pliant.recording.writer import RecordingWriter
 
@@ -90,7 +91,7 @@ class RollingWriter:
         self._first_ns: int | None = None
         if self._in_parts:
             try:
-                folder_of_parts(path).mkdir(exist_ok=True)
+                make_folder(folder_of_parts(path))
             except OSError as error:
                 raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
         self._writer = self._part()

@@ -11,6 +11,7 @@ from pathlib import Path
 from mcap.records import Attachment, Metadata
 
 from pliant.errors import MessageError, RecordingError
+from pliant.files import put_in_place
 from pliant.messages import topics
 from pliant.messages.types import StreamEnd
 from pliant.recording.index import Index
@@ -77,7 +78,7 @@ def recover(damaged: Path, output: Path, *, keep: Callable[[Recorded], bool] = d
                 elif item.name not in attachments:
                     attachments[item.name] = item
                     writer.attach(item.name, item.media_type, item.data)
-        partial.replace(output)
+        put_in_place(partial, output)
     except OSError as error:
         raise RecordingError(f"{output}: cannot be written: {error.strerror}") from None
     finally:
@@ -136,7 +137,7 @@ def mend(path: Path) -> tuple[dict[str, int], set[str]]:
             else:
                 books.take_up(last)
         except NothingReadableError:
-            last.rename(last.with_name(last.name + ".unreadable"))
+            put_in_place(last, last.with_name(last.name + ".unreadable"))
     return books.counts, books.ended
 
 

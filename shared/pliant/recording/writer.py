@@ -22,6 +22,7 @@ from mcap.records import (
 
 from pliant import __version__
 from pliant.errors import RecordingError
+from pliant.files import sync
 from pliant.messages import codec
 from pliant.messages.topics import Topic
 from pliant.recording import layout
@@ -64,6 +65,7 @@ class RecordingWriter:
         except OSError as error:
             raise self._failed(error) from None
         try:
+            sync(path.parent)  # a file that nobody finds is none
             header = Header(profile="pliant", library=f"pliant {__version__}")
             self._put(layout.MAGIC, as_bytes(header))
             for name, content in metadata.items():
