@@ -11,7 +11,7 @@ from pliant.bus.base import Received, Window
 from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.bus.inbox import Inbox
 from pliant.bus.outbox import Numbered, Outbox
-from pliant.bus.peers import WIRE_VERSION, Peers
+from pliant.bus.peers import Peers, token_key
 from pliant.bus.waiting import Waiting
 from pliant.errors import BusError, SessionOverError
 from pliant.messages import topics
@@ -170,17 +170,38 @@ def test_messages_with_which_a_reader_may_lag_take_no_room_in_its_window() -> No
 
 
 def test_versions_that_do_not_fit_are_both_named() -> None:
-    peers = Peers("tracking", incarnation=5)
-    peers.on_token("pliant/s/ready/ingest/3/99/9.9.9", alive=True, now=0.0)
-    with pytest.raises(BusError, match=f"ingest is pliant 9.9.9 .* tracking is {__version__}"):
+    """Also where only the fields of messages are others; the release alone does not decide."""
+    other_fields = token_key("ingest", 3)[:-8] + "01234567"
+    for token in ("ready/ingest/3/99/9.9.9", "ready/ingest/3/99/9.9.9+01234567", other_fields):
+        peers = Peers("tracking", incarnation=5, needed=["ingest"])
+        peers.on_token(f"pliant/s/{token}", alive=True, now=0.0)
+        with pytest.raises(
+            BusError, match=f"ingest is pliant .* tracking is {__version__}"
+        ) as said:
+            peers.raise_if_refused()
+        assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize("stranger", ["ingest/9", "tracking/9", "surfels/9"])
+def test_a_stranger_of_another_version_stops_nobody_and_is_told(stranger: str) -> None:
+    """Neither under a name that is here, nor under our own, nor under one that nobody needs."""
+    peers = Peers("tracking", incarnation=5, needed=["ingest"])
+    for name, number in (("ingest", 3), ("tracking", 5)):
+        peers.on_token(f"pliant/s/{token_key(name, number)}", alive=True, now=0.0)
+    for alive in (True, False):
+        peers.on_token(f"pliant/s/ready/{stranger}/99/9.9.9", alive=alive, now=0.0)
         peers.raise_if_refused()
+    assert peers.missing(["ingest"]) == []
+    assert peers.missing(["surfels"]) == ["surfels"]
+    (line,) = peers.strangers.values()
+    assert "pliant 9.9.9" in line
 
 
 def test_a_service_that_came_back_is_not_gone() -> None:
     peers = Peers("tracking", incarnation=5)
 
     def token(number: int) -> str:
-        return f"pliant/s/ready/ingest/{number}/{WIRE_VERSION}/{__version__}"
+        return f"pliant/s/{token_key('ingest', number)}"
 
     peers.on_token(token(1), alive=True, now=0.0)
     peers.on_token(token(2), alive=True, now=1.0)
@@ -195,9 +216,9 @@ def test_a_service_that_came_back_is_not_gone() -> None:
 
 def test_a_second_service_of_the_same_name_takes_over() -> None:
     peers = Peers("tracking", incarnation=5)
-    peers.on_token(f"pliant/s/ready/tracking/4/{WIRE_VERSION}/x", alive=True, now=0.0)
+    peers.on_token(f"pliant/s/{token_key('tracking', 4)}", alive=True, now=0.0)
     peers.raise_if_refused()
-    peers.on_token(f"pliant/s/ready/tracking/6/{WIRE_VERSION}/x", alive=True, now=0.0)
+    peers.on_token(f"pliant/s/{token_key('tracking', 6)}", alive=True, now=0.0)
     with pytest.raises(BusError, match="took over"):
         peers.raise_if_refused()
 
@@ -225,7 +246,7 @@ def test_the_newest_checkpoint_that_readers_allow_is_used(tmp_path) -> None:
 
 def test_who_was_here_before_us_is_not_awaited_for_ever() -> None:
     peers = Peers("ingest", incarnation=5)
-    peers.on_token(f"pliant/s/ready/tracking/1/{WIRE_VERSION}/0.1.0", alive=True, now=0.0)
+    peers.on_token(f"pliant/s/{token_key('tracking', 1)}", alive=True, now=0.0)
     peers.expect(["tracking", "recorder"], now=1.0)
     assert peers.lost(["tracking", "recorder"], patience_s=60.0, now=60.0) == []
     assert peers.lost(["tracking", "recorder"], patience_s=60.0, now=61.0) == ["recorder"]

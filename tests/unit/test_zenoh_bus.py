@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pliant.bus import health
 from pliant.bus.base import Window
 from pliant.bus.checkpoints import Checkpoints
 from pliant.bus.links import ENVELOPE
@@ -63,9 +64,7 @@ def writer(endpoint: str, *readers: str) -> ZenohBus:
 
 def die(bus: ZenohBus) -> None:
     """End as a killed process does: without a word."""
-    bus._closing = True
-    bus._wake.set()
-    bus._keeper.join()
+    bus._keeper.stop()
     bus._session.close()
 
 
@@ -308,6 +307,42 @@ def _write(endpoint: str, frames: int) -> None:
         for frame in range(frames):
             bus.publish(topics.IMAGE, image(frame))
         bus.end_all()
+
+
+def test_what_the_thread_of_a_bus_fails_of_its_service_raises(endpoint: str) -> None:
+    """Whether it waits to receive or to send: no run hangs on a thread that is gone."""
+
+    def fail() -> None:
+        raise RuntimeError("no such clock")
+
+    def bus(service: str, **topics_of: object) -> ZenohBus:
+        return ZenohBus(
+            endpoints=[endpoint],
+            session="test",
+            service=service,
+            **{"inputs": {}, "outputs": {}, **topics_of},  # type: ignore[arg-type]
+            window=WINDOW,
+            on_tick=fail,
+        )
+
+    with (
+        pytest.raises(RuntimeError, match="no such clock"),
+        bus("recorder", inputs={topics.IMAGE: "ingest"}) as observer,
+    ):
+        assert next(observer.receive_any(timeout_s=PATIENCE_S)) is not None
+    sender = bus("ingest", outputs={topics.IMAGE: ["tracking"]})
+    thread, result = in_thread(lambda: sender.publish(topics.IMAGE, image(0)))
+    thread.join(PATIENCE_S)
+    die(sender)
+    assert [str(error) for error in result] == ["no such clock"]
+
+
+def test_health_is_told_where_the_system_does_not_say_what_memory_is_used(
+    monkeypatch, tmp_path
+) -> None:
+    monkeypatch.setattr(health, "_STATM", tmp_path / "statm")
+    told = health.health_of("tracking", 1, "", {}, {})
+    assert 1.0 < told.memory_mib < 1e6
 
 
 def test_a_credit_of_nobody_is_refused(endpoint: str) -> None:

@@ -4,10 +4,13 @@ Not a topic: no credit, no numbers, never recorded, and nobody's output depends 
 """
 
 import os
+import resource
 import socket
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -22,7 +25,9 @@ from pliant.messages import codec
 from pliant.messages.types import Header
 
 MAX_BYTES = 1 << 16
+_STATM = Path("/proc/self/statm")
 _PAGE_MIB = os.sysconf("SC_PAGE_SIZE") / (1 << 20)
+_PEAK_MIB = 1.0 / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +37,7 @@ class Health(Header):
     stamp_ns: its clock.     waiting_for: what holds it up, "" while it works.
     input_taken, input_waiting: messages by input.     faults: repeated, early and refused ones,
     and refused credits.
+    memory_mib: resident; the most that it ever was where the system does not tell (macOS).
     output_sent, output_behind, output_kept: messages by output: sent, on the way to the slowest
     reader, kept to be sent again.
     """
@@ -78,8 +84,6 @@ def health_of(
     """The health of this process."""
     taken = [box.taken for box in inputs.values()]
     sent = [box.sent for box in outputs.values()]
-    with open("/proc/self/statm", encoding="ascii") as statm:
-        memory_mib = int(statm.read().split()[1]) * _PAGE_MIB
     return Health(
         frame=max(taken or sent, default=0),
         stamp_ns=time.time_ns(),
@@ -89,7 +93,7 @@ def health_of(
         version=__version__,
         incarnation=incarnation,
         waiting_for=waiting_for,
-        memory_mib=memory_mib,
+        memory_mib=_memory_mib(),
         inputs=tuple(inputs),
         input_taken=np.array(taken, np.int64),
         input_waiting=np.array([len(box.waiting) for box in inputs.values()], np.int64),
@@ -100,3 +104,10 @@ def health_of(
         output_behind=np.array([box.on_the_way() for box in outputs.values()], np.int64),
         output_kept=np.array([box.kept() for box in outputs.values()], np.int64),
     )
+
+
+def _memory_mib() -> float:
+    try:
+        return int(_STATM.read_text(encoding="ascii").split()[1]) * _PAGE_MIB
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _PEAK_MIB

@@ -1,26 +1,32 @@
 """Who else is in the session, by the liveliness tokens of its services.
 
-A token says ``ready/<service>/<incarnation>/<wire version>/<release>``.  The incarnation tells one
-start of a service from the next, so that the late end of an old token is not taken for the death
-of the service that has come back.  A state machine: no socket, the time is handed in.
+A token says ``ready/<service>/<incarnation>/<wire version>/<release>+<schema>``.  The incarnation
+tells one start of a service from the next, so that the late end of an old token is not taken for
+the death of the service that has come back.  A state machine: no socket, the time is handed in.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from pliant import __version__
 from pliant.errors import BusError, SessionOverError
+from pliant.messages import codec
+from pliant.messages.topics import TOPICS, status
 
-WIRE_VERSION = 4
+WIRE_VERSION = 5
 """Of envelopes and credits; services of different ones refuse each other."""
+SCHEMA = codec.schema_hash([topic.message for topic in (*TOPICS, status("*"))])
+"""Of what messages hold: with other fields a message would be read, and not say the same."""
 
-_TOKEN = re.compile(r"/ready/([^/]+)/(\d{1,20})/(\d{1,9})/([^/]{1,40})$")
+_MOST_STRANGERS = 16
+
+_TOKEN = re.compile(r"/ready/([^/]+)/(\d{1,20})/(\d{1,9})/([^/]{1,60})$")
 
 
 def token_key(service: str, incarnation: int) -> str:
     """The key of a service's token, without the session's prefix."""
-    return f"ready/{service}/{incarnation}/{WIRE_VERSION}/{__version__}"
+    return f"ready/{service}/{incarnation}/{WIRE_VERSION}/{__version__}+{SCHEMA}"
 
 
 def service_of(key: str) -> str:
@@ -34,22 +40,43 @@ class Peers:
 
     service: str
     incarnation: int
+    needed: Collection[str] = ()
+    """Those that we read from, or that read from us."""
     here: dict[str, set[int]] = field(default_factory=dict[str, set[int]])
     gone_since: dict[str, float] = field(default_factory=dict[str, float])
     met: dict[str, set[int]] = field(default_factory=dict[str, set[int]])
     """Every incarnation that was here, of each service."""
     refusal: str = ""
     """Why this service cannot take part; "" while it can."""
+    failure: Exception | None = None
+    """What a thread of the bus failed of."""
+    strangers: dict[str, str] = field(default_factory=dict[str, str])
+    """What is said of those of another version that nobody here needs, by name: once."""
     over: bool = False
     """Whether the recorder has said that everything is on its disk."""
 
     def on_token(self, key: str, *, alive: bool, now: float) -> str:
         """Take note of a token that appeared or vanished; returns the service it is of, "" where
-        it is none of ours."""
+        it is none of ours.
+
+        One of another version does not take part; where we need it, and have none of ours, neither
+        do we.
+        """
         match = _TOKEN.search(key)
         if match is None:
             return ""
         name, number, wire, version = match.groups()
+        release, _, schema = version.partition("+")
+        if (int(wire), schema) != (WIRE_VERSION, SCHEMA):
+            words = (
+                f"{name} is pliant {release} (wire version {wire}, messages {schema or '-'}), "
+                f"{self.service} is {__version__} (wire version {WIRE_VERSION}, messages {SCHEMA})"
+            )
+            if alive and name in self.needed and not self.here.get(name):
+                self.refusal = f"{words}: run one version everywhere"
+            elif alive and len(self.strangers) < _MOST_STRANGERS:
+                self.strangers.setdefault(name, f"{words}: passed over")
+            return ""
         incarnations = self.here.setdefault(name, set())
         if not alive:
             incarnations.discard(int(number))
@@ -59,11 +86,6 @@ class Peers:
         incarnations.add(int(number))
         self.met.setdefault(name, set()).add(int(number))
         self.gone_since.pop(name, None)
-        if int(wire) != WIRE_VERSION:
-            self.refusal = (
-                f"{name} is pliant {version} (wire version {wire}), {self.service} is "
-                f"{__version__} (wire version {WIRE_VERSION}): run one version everywhere"
-            )
         if name == self.service and int(number) > self.incarnation:
             self.refusal = f"another {name} took over in this session"
         return name
@@ -98,9 +120,15 @@ class Peers:
         gone = self.gone_since
         return sorted(name for name in names if name in gone and now - gone[name] >= patience_s)
 
+    def raise_if_failed(self) -> None:
+        """Raise what a thread of the bus failed of."""
+        if self.failure is not None:
+            raise self.failure
+
     def raise_if_refused(self) -> None:
         """Raise BusError where versions do not fit or a newer one of us is there, SessionOverError
-        where there is nothing to wait for any more."""
+        where there is nothing to wait for any more; and what a thread of the bus failed of."""
+        self.raise_if_failed()
         if self.over:
             raise SessionOverError(f"{self.service}: the session is over")
         if self.refusal:

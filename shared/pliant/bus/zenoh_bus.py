@@ -16,7 +16,7 @@ checkpoint that its readers allow, senders send again what came after, and what 
 time is passed over by those who had it.
 
 Callbacks only append to queues and notify: no Zenoh call is ever made inside one.  A thread of its
-own, the keeper, tells counts once a second and sends again.
+own (``keeper.py``) tells counts once a second and sends again.
 """
 
 import threading
@@ -28,9 +28,8 @@ import zenoh
 
 from pliant.bus.base import Received, Window
 from pliant.bus.checkpoints import Checkpoints, Place
-from pliant.bus.faults import FaultLog
-from pliant.bus.health import health_key, health_of
-from pliant.bus.links import DATA, END, IF_OLD, NOTHING, NOW, InLink, OutLink, Shared, first_arrived
+from pliant.bus.keeper import TICK_S, Keeper
+from pliant.bus.links import DATA, END, InLink, OutLink, Shared, first_arrived
 from pliant.bus.peers import Peers, token_key
 from pliant.bus.session import Identity, open_session
 from pliant.bus.waiting import Waiting
@@ -42,8 +41,6 @@ from pliant.state import load_state, save_state
 
 STOP_KEY = "control/stop"
 OVER_KEY = "control/over"
-_TICK_S = 1.0
-_ASK_AGAIN_S = 0.1  # what was asked for takes a while, and whoever sends nonsense asks for nothing
 _LAST_CREDITS_S = 2.0
 _SEEING_OFF_S = 5.0
 
@@ -100,19 +97,12 @@ class ZenohBus:
         self._checkpoints = checkpoints
         self._packed = frozenset(packed)
         self._disturb = disturb or (lambda: None)
-        self._on_tick = on_tick or (lambda: None)
-        self._on_fault = on_fault
         self._interrupted = interrupted or (lambda: False)
-        self._fault_log = FaultLog(service)
         self._changed = threading.Condition()
         self._wake = threading.Event()
-        self._closing = False
-        self._greeting = False  # somebody came: tell our counts
-        self._restored = checkpoints is None and not keeps_books
-        self._done = False
-        self._place = Place(-1, {}, {})
         self._waiting = Waiting()
-        self._peers = Peers(service, time.time_ns())
+        needed = {name for readers in outputs.values() for name in readers} | set(inputs.values())
+        self._peers = Peers(service, time.time_ns(), needed)
         self._session = open_session(endpoints, identity)
         self._prefix = f"pliant/{session}"
         self.stop_requested = False
@@ -135,6 +125,17 @@ class ZenohBus:
             topic.key: InLink(shared, topic, sender, reader=service, limit=2 * window + own_lag)
             for topic, sender in inputs.items()
         }
+        self._keeper = Keeper(
+            shared,
+            self._peers,
+            self._waiting,
+            self._inputs,
+            self._outputs,
+            checkpoints,
+            restored=checkpoints is None and not keeps_books,
+            on_tick=on_tick or (lambda: None),
+            on_fault=on_fault or (lambda line: None),
+        )
         # Subscribed before announced: whoever sees the token may send at once.
         liveliness = self._session.liveliness()
         tokens, own = f"{shared.prefix}/ready/**", token_key(service, self._peers.incarnation)
@@ -144,7 +145,6 @@ class ZenohBus:
             liveliness.declare_subscriber(tokens, self._on_token, history=True),
             liveliness.declare_token(f"{shared.prefix}/{own}"),
         ]
-        self._keeper = threading.Thread(target=self._keep, daemon=True)
         self._keeper.start()
 
     def __enter__(self) -> "ZenohBus":
@@ -154,12 +154,10 @@ class ZenohBus:
         try:
             if error_type is None:
                 self.flush()
-                self._all_is_safe()
+                self._keeper.all_is_safe()
         finally:
-            self._closing = True
-            self._wake.set()
-            self._keeper.join()
-            self._tell_faults()  # of the last second
+            self._keeper.stop()
+            self._keeper.tell_faults()  # of the last second
             if self._checkpoints is not None:
                 self._checkpoints.close()
             self._session.close()  # type: ignore[no-untyped-call]
@@ -224,14 +222,14 @@ class ZenohBus:
         gone out yet: who leaves at once on a busy machine is taken for dead.
         """
         self.flush()
-        self._all_is_safe()
+        self._keeper.all_is_safe()
         deadline = time.monotonic() + _SEEING_OFF_S
         senders = {entry.sender for entry in self._inputs.values()}
         with self._changed:
             while len(self._peers.missing(senders)) < len(senders):
                 if time.monotonic() >= deadline:
                     return
-                self._changed.wait(_TICK_S)  # the keeper tells our counts again meanwhile
+                self._changed.wait(TICK_S)  # the keeper tells our counts again meanwhile
 
     def _send(
         self, output: OutLink, kind: int, payload: bytes, may_lag: Collection[str] = ()
@@ -261,10 +259,10 @@ class ZenohBus:
                 whom = self._peers.absent(readers) or output.box.slowest()
                 self._waiting.begin(f"{whom} to take {output.topic.key}", time.monotonic())
                 # Those who are there already are seen within a tick.
-                waits_long = time.monotonic() - self._waiting.since >= _TICK_S
+                waits_long = time.monotonic() - self._waiting.since >= TICK_S
                 if not here and waits_long and self._interrupted():
                     raise KeyboardInterrupt
-                self._changed.wait(_TICK_S)
+                self._changed.wait(TICK_S)
 
     # -- receiving -----------------------------------------------------------------------------
 
@@ -318,7 +316,7 @@ class ZenohBus:
             for entry in told:
                 entry.safe = entry.box.taken
         for entry in told:
-            self._tell(entry)
+            self._keeper.tell(entry)
 
     def _take(
         self, entries: Sequence[InLink], timeout_s: float | None = None, *, views: bool = False
@@ -347,6 +345,7 @@ class ZenohBus:
     def _wait_for_message(self, entries: Sequence[InLink], deadline: float | None) -> InLink | None:
         """The input whose message came first; None where none comes in time.  Raises BusError."""
         with self._changed:
+            self._peers.raise_if_failed()
             while not any(entry.box.waiting for entry in entries):
                 self._peers.raise_if_refused()
                 senders = [entry.sender for entry in entries]
@@ -362,7 +361,7 @@ class ZenohBus:
                 whom = self._peers.absent(senders) or ", ".join(dict.fromkeys(senders))
                 what = entries[0].topic.key if len(entries) == 1 else f"{len(entries)} topics"
                 self._waiting.begin(f"{what} from {whom}", now)
-                self._changed.wait(_TICK_S if deadline is None else min(_TICK_S, deadline - now))
+                self._changed.wait(TICK_S if deadline is None else min(TICK_S, deadline - now))
             return first_arrived(entries)
 
     # -- checkpoints ---------------------------------------------------------------------------
@@ -386,8 +385,7 @@ class ZenohBus:
         if place is not None:
             state = load_state(self._checkpoints.restart_from(place))
             self._start_from(place)
-        self._restored = self._greeting = True
-        self._wake.set()
+        self._keeper.begin()
         return state
 
     def start_from(self, taken: Mapping[str, int], ended: Collection[str]) -> None:
@@ -395,8 +393,7 @@ class ZenohBus:
         for key in ended:
             self._inputs[key].ended = True
         self._start_from(Place(-1, taken, {}))
-        self._restored = self._greeting = True
-        self._wake.set()
+        self._keeper.begin()
 
     def checkpoint(self, frame: int, state: Any) -> None:
         """Keep our state as it is after a frame, now and then.  Raises StateError, BusError."""
@@ -417,102 +414,13 @@ class ZenohBus:
                 self._outputs[key].box.start_from(sent)
                 self._outputs[key].ended = key in place.ended
 
-    def _all_is_safe(self) -> None:
-        """We are done: no sender needs to keep anything for us."""
-        self._done = True
-        with self._changed:
-            for entry in self._inputs.values():
-                entry.safe = entry.box.taken
-        for entry in self._inputs.values():
-            self._tell(entry)
-
-    # -- the keeper ----------------------------------------------------------------------------
-
-    def _keep(self) -> None:
-        """Tell our counts, and send again what is asked for, until we leave."""
-        last_tick = time.monotonic()
-        while not self._closing:
-            gap = any(entry.box.gap for entry in self._inputs.values())
-            pause_s = _ASK_AGAIN_S if gap else last_tick + _TICK_S - time.monotonic()
-            self._wake.wait(max(0.0, pause_s))
-            self._wake.clear()
-            tick = time.monotonic() - last_tick >= _TICK_S
-            last_tick = time.monotonic() if tick else last_tick
-            if self._closing:
-                return
-            if tick:
-                self._tell_health()
-                self._on_tick()
-            if not self._restored:
-                continue
-            greeting, self._greeting = self._greeting, False
-            try:
-                self._advance_safe()
-                for entry in self._inputs.values():
-                    self._keep_input(entry, tick=tick, greeting=greeting)
-                for output in self._outputs.values():
-                    output.send_again()
-                    if tick:
-                        output.sent_at_tick = output.box.sent
-            except BusError as error:  # for the service's thread to raise
-                with self._changed:
-                    self._peers.refusal = str(error)
-                    self._changed.notify_all()
-
-    def _tell_health(self) -> None:
-        inputs = {key: entry.box for key, entry in self._inputs.items()}
-        outputs = {key: output.box for key, output in self._outputs.items()}
-        with self._changed:
-            waiting = self._waiting.told(time.monotonic())
-            incarnation = self._peers.incarnation
-            health = health_of(self._peers.service, incarnation, waiting, inputs, outputs)
-        self._tell_faults()
-        self._session.put(f"{self._prefix}/{health_key(health.service)}", codec.encode(health))
-
-    def _tell_faults(self) -> None:
-        inputs = {key: entry.box for key, entry in self._inputs.items()}
-        outputs = {key: output.box for key, output in self._outputs.items()}
-        with self._changed:
-            fault = self._fault_log.line(inputs, outputs)
-        if fault and self._on_fault is not None:
-            self._on_fault(fault)
-
-    def _advance_safe(self) -> None:
-        """What our newest usable checkpoint has taken will not be asked for again."""
-        if self._checkpoints is None or self._done:
-            return
-        with self._changed:
-            safe = {key: output.box.safe() for key, output in self._outputs.items()}
-        place = self._checkpoints.usable(safe)
-        if place is None or place == self._place:
-            return
-        self._place = place
-        with self._changed:
-            for key, taken in place.inputs.items():
-                self._inputs[key].safe = max(self._inputs[key].safe, taken)
-
-    def _keep_input(self, entry: InLink, *, tick: bool, greeting: bool) -> None:
-        with self._changed:
-            ask = NOTHING
-            now = time.monotonic()
-            if entry.box.gap and now - entry.asked_at >= _ASK_AGAIN_S:
-                entry.box.gap, entry.asked_at, ask = False, now, NOW
-            elif tick and entry.wanted and not entry.arrived:
-                ask = IF_OLD
-            if tick:
-                entry.arrived = False
-        if ask or tick or greeting:
-            self._tell(entry, ask)
+    # -- what comes in -------------------------------------------------------------------------
 
     def _tell_now_and_then(self, entry: InLink, received: Received) -> None:
         # Each credit wakes the router and the sender, while the service waits: for most, a
         # quarter of the window at a time is enough.
         if received.is_end or entry.box.taken - entry.told >= self._tell_every:
-            self._tell(entry)
-
-    def _tell(self, entry: InLink, ask: int = NOTHING) -> None:
-        if self._restored:  # before that, what we took is not ours
-            entry.tell(self._peers.incarnation, ask)
+            self._keeper.tell(entry)
 
     def _on_stop(self, _: zenoh.Sample) -> None:
         self.stop_requested = True
@@ -526,6 +434,6 @@ class ZenohBus:
         alive = sample.kind == zenoh.SampleKind.PUT
         with self._changed:
             self._peers.on_token(str(sample.key_expr), alive=alive, now=time.monotonic())
-            self._greeting = self._greeting or alive
-            self._wake.set()
             self._changed.notify_all()
+        if alive:
+            self._keeper.greet()

@@ -9,9 +9,11 @@ For a link between machines images can be packed (``pliant.messages.packing``): 
 ``decode`` is the same.
 """
 
+import hashlib
 import json
 import math
 import sys
+from collections.abc import Iterable
 from dataclasses import MISSING, fields
 from functools import cache
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -134,6 +136,15 @@ def schema(message: type[Header]) -> bytes:
         described[spec.name] = {"dtype": spec.dtype.str, "shape": list(spec.shape)}
     text = {"encoding": "msgpack", "version": SCHEMA_VERSION, "fields": described}
     return json.dumps(text, sort_keys=True).encode()
+
+
+def schema_hash(messages: Iterable[type[Header]]) -> str:
+    """Eight hexadecimal digits of the names, types and shapes of the messages' fields."""
+    lines: list[str] = []
+    for each in messages:
+        lines += [f"{each.__name__}.{name}: {kind}" for name, kind in scalars(each).items()]
+        lines += [f"{each.__name__}.{a.name}: {a.dtype.str} {a.shape}" for a in array_fields(each)]
+    return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()[:8]
 
 
 def _scalar(message: type, name: str, expected: Any, value: Any) -> Any:

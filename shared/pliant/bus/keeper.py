@@ -1,0 +1,167 @@
+"""The keeper of a bus: a thread that tells counts once a second, and sends again what is asked for.
+
+Whatever it fails of, the service's own thread raises at its next word to the bus: nobody waits for
+a thread that is gone.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from pliant.bus.checkpoints import Checkpoints, Place
+from pliant.bus.faults import FaultLog
+from pliant.bus.health import health_key, health_of
+from pliant.bus.links import IF_OLD, NOTHING, NOW, InLink, OutLink, Shared
+from pliant.bus.peers import Peers
+from pliant.bus.waiting import Waiting
+from pliant.messages import codec
+
+TICK_S = 1.0
+_ASK_AGAIN_S = 0.1  # what was asked for takes a while, and whoever sends nonsense asks for nothing
+
+
+@dataclass
+class Keeper:
+    """Speaks for its service beside the service's own thread.
+
+    restored: what the service took is its own; before that nothing is told of it.
+    on_tick: called once a second.     on_fault: told what was passed over, in a line.
+    """
+
+    shared: Shared
+    peers: Peers
+    waiting: Waiting
+    inputs: Mapping[str, InLink]
+    outputs: Mapping[str, OutLink]
+    checkpoints: Checkpoints | None
+    restored: bool
+    on_tick: Callable[[], None]
+    on_fault: Callable[[str], None]
+    _closing: bool = False
+    _greeting: bool = False  # somebody came: tell our counts
+    _done: bool = False
+    _strangers_told: int = 0
+    _place: Place = field(default_factory=lambda: Place(-1, {}, {}))
+
+    def __post_init__(self) -> None:
+        self._fault_log = FaultLog(self.peers.service)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Say nothing more."""
+        self._closing = True
+        self.shared.wake.set()
+        self._thread.join()
+
+    def begin(self) -> None:
+        """The service knows where it goes on: what it takes from now on counts."""
+        self.restored = True
+        self.greet()
+
+    def greet(self) -> None:
+        """Tell our counts, soon."""
+        self._greeting = True
+        self.shared.wake.set()
+
+    def tell(self, entry: InLink, ask: int = NOTHING) -> None:
+        """Tell a sender our counts."""
+        if self.restored:  # before that, what we took is not ours
+            entry.tell(self.shared.incarnation, ask)
+
+    def all_is_safe(self) -> None:
+        """We are done: no sender needs to keep anything for us."""
+        self._done = True
+        with self.shared.changed:
+            for entry in self.inputs.values():
+                entry.safe = entry.box.taken
+        for entry in self.inputs.values():
+            self.tell(entry)
+
+    def tell_faults(self) -> None:
+        """Say what, and who, was passed over since this was called last."""
+        inputs = {key: entry.box for key, entry in self.inputs.items()}
+        outputs = {key: output.box for key, output in self.outputs.items()}
+        with self.shared.changed:
+            faults = [self._fault_log.line(inputs, outputs), *self._strangers()]
+        for fault in filter(None, faults):
+            self.on_fault(fault)
+
+    def _strangers(self) -> list[str]:
+        told, self._strangers_told = self._strangers_told, len(self.peers.strangers)
+        return list(self.peers.strangers.values())[told:]
+
+    def _run(self) -> None:
+        try:
+            self._keep()
+        except Exception as error:  # whatever it is: the service's thread raises it
+            with self.shared.changed:
+                self.peers.failure = error
+                self.shared.changed.notify_all()
+
+    def _keep(self) -> None:
+        wake = self.shared.wake
+        last_tick = time.monotonic()
+        while not self._closing:
+            gap = any(entry.box.gap for entry in self.inputs.values())
+            pause_s = _ASK_AGAIN_S if gap else last_tick + TICK_S - time.monotonic()
+            wake.wait(max(0.0, pause_s))
+            wake.clear()
+            tick = time.monotonic() - last_tick >= TICK_S
+            last_tick = time.monotonic() if tick else last_tick
+            if self._closing:
+                return
+            if tick:
+                self._tell_health()
+                self.on_tick()
+            if not self.restored:
+                continue
+            greeting, self._greeting = self._greeting, False
+            self._advance_safe()
+            for entry in self.inputs.values():
+                self._keep_input(entry, tick=tick, greeting=greeting)
+            for output in self.outputs.values():
+                output.send_again()
+                if tick:
+                    output.sent_at_tick = output.box.sent
+
+    def _tell_health(self) -> None:
+        inputs = {key: entry.box for key, entry in self.inputs.items()}
+        outputs = {key: output.box for key, output in self.outputs.items()}
+        shared = self.shared
+        with shared.changed:
+            waiting = self.waiting.told(time.monotonic())
+            health = health_of(self.peers.service, shared.incarnation, waiting, inputs, outputs)
+        self.tell_faults()
+        shared.session.put(f"{shared.prefix}/{health_key(health.service)}", codec.encode(health))
+
+    def _advance_safe(self) -> None:
+        """What our newest usable checkpoint has taken will not be asked for again."""
+        if self.checkpoints is None or self._done:
+            return
+        with self.shared.changed:
+            safe = {key: output.box.safe() for key, output in self.outputs.items()}
+        place = self.checkpoints.usable(safe)
+        if place is None or place == self._place:
+            return
+        self._place = place
+        with self.shared.changed:
+            for key, taken in place.inputs.items():
+                self.inputs[key].safe = max(self.inputs[key].safe, taken)
+
+    def _keep_input(self, entry: InLink, *, tick: bool, greeting: bool) -> None:
+        with self.shared.changed:
+            ask = NOTHING
+            now = time.monotonic()
+            if entry.box.gap and now - entry.asked_at >= _ASK_AGAIN_S:
+                entry.box.gap, entry.asked_at, ask = False, now, NOW
+            elif tick and entry.wanted and not entry.arrived:
+                ask = IF_OLD
+            if tick:
+                entry.arrived = False
+        if ask or tick or greeting:
+            self.tell(entry, ask)
