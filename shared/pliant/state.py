@@ -1,13 +1,18 @@
 """The state of a service as bytes and back, exactly: what a restarted service goes on from.
 
-A tree of our own objects, containers, numpy arrays and random generators.  Only classes of
-``pliant`` are made again, found by name, so that a file from elsewhere can run no code of its own.
-What is shared stays shared; arrays keep their layout, which decides how a kernel is compiled.
+A tree of our own objects, containers, numpy arrays and random generators.  A file from elsewhere
+can run no code of its own: of the rooms that touch neither files nor sockets, records are made
+again and the classes listed here, without a call of theirs, and none gets an attribute in the place
+of a method.  What is shared stays shared; arrays keep their layout, which decides how a kernel is
+compiled.
+
+A state is for the release that made it: what its objects mean is not told.
 """
 
+import hashlib
 import importlib
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any, cast
 
@@ -15,10 +20,23 @@ import msgpack
 import numpy as np
 from pydantic import BaseModel
 
+from pliant import __version__
 from pliant.errors import StateError
 
-STATE_VERSION = 1
+STATE_VERSION = 2
 
+_ROOMS = (
+    *("pliant.algorithms.", "pliant.messages.types"),
+    *("pliant.map_history", "pliant.map_depth"),
+)
+_CLASSES = {
+    *("ExtremaTracker", "BriefExtractor"),
+    *("Mapper", "ActiveMap", "PointRows", "Window", "Path", "TrackLinks"),
+    *("Changes", "KeyframeReport"),
+    *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
+}
+"""Those that are no records: neither dataclasses, nor named tuples, nor parameters."""
+_FUNCTIONS = {"no_stages"}
 _PLAIN = (type(None), bool, float, str, bytes)
 _LIMIT = 1 << 62
 
@@ -27,20 +45,30 @@ def save_state(root: Any) -> bytes:
     """The bytes of an object and all that it holds.  Raises StateError for what cannot be kept."""
     writer = _Writer()
     top = writer.reference(root)
-    packed = msgpack.packb([STATE_VERSION, top, writer.nodes], use_bin_type=True)
+    header = [STATE_VERSION, __version__, _schema(writer.classes)]
+    packed = msgpack.packb([*header, top, writer.nodes], use_bin_type=True)
     assert isinstance(packed, bytes)
     return packed
 
 
 def load_state(data: bytes) -> Any:
-    """The object in ``data``.  Raises StateError for all that ``save_state`` did not make."""
+    """The object in ``data``.  Raises StateError for all that ``save_state`` did not make, also
+    in another release, or when its records had other fields."""
     try:
-        version, top, nodes = msgpack.unpackb(data, raw=False, strict_map_key=False)
+        version, *content = msgpack.unpackb(data, raw=False, strict_map_key=False)
     except Exception as error:  # msgpack raises many unrelated types on broken bytes
         raise StateError(f"not a saved state: {error}") from None
     if version != STATE_VERSION:
         raise StateError(f"a state of version {version}, this is version {STATE_VERSION}")
     try:
+        release, schema, top, nodes = content
+        if release != __version__:
+            raise StateError(
+                f"a state of pliant {release}, this is {__version__}: go on with that release, or "
+                "start anew"
+            )
+        if schema != _schema(_find(*n[1:3]) for n in nodes if n[0] in ("object", "named", "model")):
+            raise StateError("a state whose records have other fields than here: start anew")
         return _Reader(nodes).value(top)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ImportError) as error:
         raise StateError(f"a broken state: {error}") from None
@@ -51,6 +79,7 @@ class _Writer:
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
+        self.classes: set[type] = set()
         self._numbers: dict[int, int] = {}
         self._held: list[Any] = []  # an id is only unique while its object lives
 
@@ -79,7 +108,7 @@ class _Writer:
             state = value.bit_generator.state
             return ["generator", state["bit_generator"], self.reference(state)]
         if isinstance(value, BaseModel):
-            return ["model", *_name(kind), value.model_dump(mode="json")]
+            return ["model", *self._class(kind), value.model_dump(mode="json")]
         if kind in (list, tuple, deque):
             more = [value.maxlen] if kind is deque else []
             return [kind.__name__, [self.reference(item) for item in value], *more]
@@ -87,11 +116,15 @@ class _Writer:
             pairs = cast("dict[Any, Any]", value).items()
             return ["dict", [[self.reference(k), self.reference(v)] for k, v in pairs]]
         if isinstance(value, tuple):  # a named one
-            return ["named", *_name(kind), [self.reference(item) for item in value]]
+            return ["named", *self._class(kind), [self.reference(item) for item in value]]
         if callable(value) and hasattr(value, "__qualname__"):
             return ["name", *_name(value)]
         attributes = {key: self.reference(item) for key, item in _attributes(value).items()}
-        return ["object", *_name(kind), attributes]
+        return ["object", *self._class(kind), attributes]
+
+    def _class(self, kind: type) -> tuple[str, str]:
+        self.classes.add(kind)
+        return _name(kind)
 
 
 class _Reader:
@@ -120,12 +153,15 @@ class _Reader:
             for key, item in content[0]:
                 table[self.value(key)] = self.value(item)
         elif kind == "object":
-            made[number] = instance = object.__new__(_find(*content[:2]))
+            own = _find(*content[:2])
+            made[number] = instance = object.__new__(own)
             for key, item in content[2].items():
+                if callable(getattr(own, key, None)):
+                    raise ValueError(f"{own.__name__}.{key} is a method")
                 object.__setattr__(instance, key, self.value(item))
         elif kind in ("tuple", "named"):
             items = [self.value(item) for item in content[-1]]
-            made[number] = tuple(items) if kind == "tuple" else _find(*content[:2])(*items)
+            made[number] = tuple(items) if kind == "tuple" else _named(content, items)
         else:
             made[number] = self._leaf(kind, *content)
 
@@ -141,7 +177,8 @@ class _Reader:
             bits.state = self.value(content[1])
             return np.random.Generator(bits)
         if kind == "model":
-            return _find(*content[:2]).model_validate(content[2])
+            parameters: type[BaseModel] = _find(*content[:2])
+            return parameters.model_validate(content[2])
         if kind == "name":
             return _find(*content)
         raise ValueError(f"a node of kind {kind}")
@@ -166,17 +203,52 @@ def _array(kind: Any, shape: list[int], order: Any, writeable: bool, raw: bytes)
     return array
 
 
+def _named(content: Any, items: list[Any]) -> Any:
+    own = _find(*content[:2])
+    if len(items) != len(own._fields):
+        raise ValueError(f"{len(items)} values for {own.__name__}")
+    return tuple.__new__(own, items)
+
+
 def _name(thing: Any) -> tuple[str, str]:
     module, name = str(thing.__module__), str(thing.__qualname__)
-    if not (module.startswith("pliant.") and name.isidentifier()):
-        raise StateError(f"{module}.{name} cannot be kept")
+    if not (module.startswith(_ROOMS) and name.isidentifier() and _is_listed(thing)):
+        raise StateError(f"{module}.{name} cannot be kept: it is no record, and not listed here")
     return module, name
 
 
 def _find(module: str, name: str) -> Any:
-    if not (module.startswith("pliant.") and name.isidentifier()):
-        raise ValueError(f"{module}.{name} is none of ours")
-    return getattr(importlib.import_module(module), name)
+    found = None
+    if module.startswith(_ROOMS) and name.isidentifier():
+        found = getattr(importlib.import_module(module), name)
+    if found is None or getattr(found, "__module__", "") != module or not _is_listed(found):
+        raise ValueError(f"{module}.{name} is none of those that are kept")
+    return found
+
+
+def _is_listed(thing: Any) -> bool:
+    """Whether it is a record, or a class or function listed above."""
+    if not isinstance(thing, type):
+        return getattr(thing, "__qualname__", "") in _FUNCTIONS
+    return (
+        is_dataclass(thing)
+        or (issubclass(thing, tuple) and hasattr(thing, "_fields"))
+        or issubclass(thing, BaseModel)
+        or thing.__name__ in _CLASSES
+    )
+
+
+def _schema(classes: Iterable[Any]) -> str:
+    """Eight hexadecimal digits of the fields that records of these classes have."""
+    lines: set[str] = set()
+    for own in classes:
+        declared = {field.name: field.type for field in fields(own)} if is_dataclass(own) else {}
+        if issubclass(own, BaseModel):
+            declared = {name: info.annotation for name, info in own.model_fields.items()}
+        elif issubclass(own, tuple):
+            declared = own.__annotations__
+        lines |= {f"{own.__module__}.{own.__name__}.{n}: {kind}" for n, kind in declared.items()}
+    return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()[:8]
 
 
 def _attributes(value: Any) -> Mapping[str, Any]:

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pliant import __version__
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping import Mapper, MappingParameters
 from pliant.algorithms.tracking import ExtremaTracker, TrackingParameters
@@ -75,16 +76,62 @@ def test_foreign_classes_are_refused() -> None:
 
     with pytest.raises(StateError, match="cannot be kept"):
         save_state(Own())
-    hostile = [["object", "subprocess", "Popen", {}]]
-    with pytest.raises(StateError, match="none of ours"):
-        load_state(msgpack.packb([STATE_VERSION, [0], hostile]))
+
+
+def crafted(*nodes: list[object], release: str = __version__) -> bytes:
+    """A state of these nodes, with a header that fits."""
+    made = CAMERA if tuple(nodes[0][1:3]) == CAMERA_NAME else None
+    schema = msgpack.unpackb(save_state(made))[2]
+    return msgpack.packb([STATE_VERSION, release, schema, [0], list(nodes)])
+
+
+CAMERA = PinholeCamera(width=4, height=3, fx=1, fy=1, cx=1, cy=1)
+CAMERA_NAME = (PinholeCamera.__module__, "PinholeCamera")
+
+
+@pytest.mark.parametrize(
+    "node",
+    [
+        ["object", "subprocess", "Popen", {}],
+        ["named", "pliant.export.ply", "write_mesh", []],
+        ["named", "pliant.algorithms.camera", "np", []],
+        ["object", "pliant.bus.checkpoints", "Checkpoints", {}],
+        ["name", "pliant.config", "load_config"],
+        ["name", "pliant.algorithms.camera", "dataclass"],
+        ["object", *CAMERA_NAME, {"project": None}],
+    ],
+    ids=lambda node: ".".join(node[1:3]),
+)
+def test_a_crafted_state_makes_and_calls_nothing_that_is_not_listed(node: list[object]) -> None:
+    with pytest.raises(StateError, match=r"none of those|is a method"):
+        load_state(crafted(node))
+
+
+def test_a_crafted_state_cannot_write_a_file(tmp_path) -> None:
+    """By a call of a function of ours in the shape of a named tuple."""
+    path = tmp_path / "written.png"
+    call = ["named", "pliant.export.movie", "write_image", [[1], [2]]]
+    arguments = [
+        ["named", "pliant.config", "Path", [str(path)]],
+        ["array", "|u1", [2, 2, 3], "C", True, bytes(12)],
+    ]
+    with pytest.raises(StateError, match="none of those"):
+        load_state(crafted(call, *arguments))
+    assert not path.exists()
+
+
+def test_a_state_of_another_release_or_of_other_records_is_refused_in_one_line() -> None:
+    with pytest.raises(StateError, match=f"of pliant 9.9.9, this is {__version__}"):
+        load_state(crafted(["list", []], release="9.9.9"))
+    content = msgpack.unpackb(save_state(CAMERA))
+    content[2] = "01234567"
+    with pytest.raises(StateError, match="other fields"):
+        load_state(msgpack.packb(content))
 
 
 @pytest.mark.parametrize("cut", [0, 1, 10, 100])
 def test_broken_bytes_are_one_error(cut: int) -> None:
-    data = save_state(
-        {"a": np.arange(100), "b": PinholeCamera(width=4, height=3, fx=1, fy=1, cx=1, cy=1)}
-    )
+    data = save_state({"a": np.arange(100), "b": CAMERA})
     with pytest.raises(StateError):
         load_state(data[:cut])
 
