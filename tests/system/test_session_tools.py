@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from pliant.bus.session import free_endpoint
-from pliant_services.benchmarks.latency import hop
 from pliant_services.processes import PROFILES
 
 pytestmark = pytest.mark.system
@@ -176,9 +175,3 @@ def test_what_a_signal_ends_without_a_word_does_not_wait_either() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60)
     assert (done.returncode, done.stderr) == (143, b"")
-
-
-def test_a_hop_is_measured() -> None:
-    images, p50, p99 = hop(free_endpoint(), images=60)
-    assert images == "60"
-    assert 0.0 < float(p50) <= float(p99)

@@ -28,8 +28,6 @@ def test_windows_are_what_they_say():
 
 
 def test_ceres_and_all_methods_agree(tmp_path):
-    pytest.importorskip("pyceres")
-    pytest.importorskip("matplotlib")
     problem = small_window(150)
     tight = WINDOW.model_copy(update={"min_relative_decrease": 1e-9})
     rows, comparisons = compare_bundle_adjustment(
@@ -49,7 +47,6 @@ def test_ceres_and_all_methods_agree(tmp_path):
 
 
 def test_ceres_projects_with_distortion_as_we_do():
-    pytest.importorskip("pyceres")
     problem = small_window(60)
     intrinsics = problem.intrinsics.copy()
     intrinsics[:, 4:] = (-0.05, 0.01)
@@ -63,7 +60,6 @@ def test_ceres_projects_with_distortion_as_we_do():
 
 
 def test_scipy_reaches_the_same_cost():
-    pytest.importorskip("scipy")
     problem = small_window(10)
     curve = solve_with_scipy(problem, WINDOW)
     assert curve.costs[1] < curve.costs[0]
