@@ -8,6 +8,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "system"))
 
+from benchmarks import latency
+from benchmarks.table import markdown
 from soak_kills import (
     MESH,
     POINTS,
@@ -22,9 +24,7 @@ from soak_kills import (
 )
 from soak_network import hostile_rows, latency_rows, network_rows
 
-from pliant_services.benchmarks import latency
-from pliant_services.benchmarks.table import markdown
-from pliant_services.warm_up import compile_kernels
+from pliant_services.runtime.kernels import compile_kernels
 
 VICTIMS: dict[str, list[tuple[Kind, str]]] = {
     **{name: [(POINTS, name)] for name in POINTS.services},

@@ -35,10 +35,9 @@ from running import (
 from pliant.bus.session import free_endpoint, open_session
 from pliant.messages import codec, topics
 from pliant.messages.types import Status
-from pliant_services.mesh_results import FILES as MESHES
+from pliant.results.folder import MESH_FILES, SURFELS_NAME
 from pliant_services.processes import PROFILES
-from pliant_services.surfel_results import SURFELS_NAME
-from pliant_services.viewing import SESSION_NAME
+from pliant_services.view.command import SESSION_NAME
 
 TIMEOUT_S = 300.0
 LATER_S = 0.1
@@ -67,7 +66,7 @@ POINTS = Kind((TINY, "--set", "meshing.enabled=false"), PROFILES["points"], FILE
 ROOM = Kind(("built-in:room", "--set", "meshing.enabled=false"), PROFILES["points"], FILES, 300,
             "bundle_adjustment", each=5)  # fmt: skip
 ROOM_ONCE = replace(ROOM, each=1)
-MESH = Kind((TINY,), ("meshing",), (*FILES, *MESHES), 40, "meshing")
+MESH = Kind((TINY,), ("meshing",), (*FILES, *MESH_FILES), 40, "meshing")
 SURFELS = Kind(
     ("built-in:tiny?frames=20", "--profile", "deformable", "--set", "surfels.max_surfels=300"),
     PROFILES["deformable"],

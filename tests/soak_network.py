@@ -11,14 +11,14 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent / "system"))
 
 import pytest
+from benchmarks import latency
 from hosts import THREE, TWO, Hosts, Spread, hosts
 from test_faults import run, run_attacked
 
-from pliant_services.access import NAMES
-from pliant_services.benchmarks import latency
-from pliant_services.certificates import make_certificates
-from pliant_services.launcher import Fleet, ServiceDiedError
-from pliant_services.pipeline import RunRequest
+from pliant_services.run.command import RunRequest
+from pliant_services.runtime.launcher import Fleet, ServiceDiedError
+from pliant_services.security.access import NAMES
+from pliant_services.security.certificates import make_certificates
 
 CUTS_S = (5.0, 30.0, 60.0)
 STOP_S = 60.0

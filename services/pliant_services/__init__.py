@@ -1,1 +1,1 @@
-"""Pliant's processes: one short file each, and the launcher that supervises them."""
+"""Pliant's processes, what hosts them, and the command line."""

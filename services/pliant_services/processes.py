@@ -31,25 +31,25 @@ class Process:
 PROCESSES: tuple[Process, ...] = (
     Process(
         "ingest",
-        "pliant_services.ingest",
+        "pliant_services.nodes.ingest",
         outputs=(topics.STREAM, topics.SOURCE, topics.IMAGE, topics.DEPTH),
     ),
     Process(
         "tracking",
-        "pliant_services.tracking",
+        "pliant_services.nodes.tracking",
         inputs=(topics.STREAM, topics.IMAGE),
         outputs=(topics.EXTREMA,),
     ),
     Process(
         "bundle_adjustment",
-        "pliant_services.bundle_adjustment",
+        "pliant_services.nodes.bundle_adjustment",
         inputs=(topics.STREAM, topics.IMAGE, topics.EXTREMA),
         outputs=(topics.MAP_UPDATE, topics.MAP_FINAL, topics.KEYFRAME, topics.KEYFRAME_FINAL),
         may_lag=True,
     ),
     Process(
         "meshing",
-        "pliant_services.meshing",
+        "pliant_services.nodes.meshing",
         inputs=(
             topics.STREAM,
             topics.MAP_UPDATE,
@@ -62,14 +62,14 @@ PROCESSES: tuple[Process, ...] = (
     ),
     Process(
         "surfels",
-        "pliant_services.surfels",
+        "pliant_services.nodes.surfels",
         inputs=(topics.STREAM, topics.IMAGE, topics.DEPTH),
         optional=(topics.EXTREMA, topics.MAP_UPDATE, topics.KEYFRAME),
         outputs=(topics.SURFELS,),
         may_lag=True,  # with a map: it reads an update for every frame
     ),
     # Senders keep what it has not taken, some seconds' worth, and wait for it beyond.
-    Process("recorder", "pliant_services.recorder", observer=True, niceness=5),
+    Process("recorder", "pliant_services.nodes.recorder", observer=True, niceness=5),
 )
 
 BY_NAME = {process.name: process for process in PROCESSES}

@@ -5,7 +5,7 @@ is frozen and refuses unknown keys, also nested ones.
 """
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +17,7 @@ from pliant.algorithms.meshing import MeshingParameters
 from pliant.algorithms.parameters import Parameters
 from pliant.algorithms.surfels import SurfelParameters
 from pliant.algorithms.tracking import TrackingParameters
-from pliant.errors import ConfigError
+from pliant.errors import ConfigError, RecordingError
 
 
 class IngestParameters(Parameters):
@@ -203,3 +203,24 @@ def _explain(error: ValidationError, file: Path | None) -> str:
     near = difflib.get_close_matches(key, known, n=3)
     hint = f"did you mean {' or '.join(near)}?" if near else "`pliant config` lists the keys"
     return f"{where}unknown key {key}: {hint}"
+
+
+def recorded_config(metadata: Mapping[str, Mapping[str, str]], overrides: Sequence[str]) -> Config:
+    """The configuration in a recording's metadata with ``overrides`` on top."""
+    text = metadata.get("config", {}).get("yaml", "")
+    try:
+        content = yaml.safe_load(text) or {}
+    except yaml.YAMLError:
+        raise RecordingError("the configuration in the recording is damaged") from None
+    if not isinstance(content, dict):
+        raise RecordingError("the configuration in the recording is damaged")
+    return load_config(None, [*_flat(content), *overrides])
+
+
+def _flat(content: Mapping[str, object], prefix: str = "") -> Iterator[str]:
+    for key, value in content.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            flow = yaml.safe_dump(value, default_flow_style=True, width=10**9)
+            yield f"{prefix}{key}={flow.removesuffix('...' + chr(10)).strip()}"

@@ -5,11 +5,11 @@ import json
 from pathlib import Path
 
 import pytest
+import reference
 
 from pliant.messages import codec, topics
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
-from pliant_services import reference
 
 DATA = Path(__file__).parents[1] / "data"
 REFERENCE = DATA / "reference"
@@ -18,7 +18,7 @@ REFERENCE = DATA / "reference"
 def test_the_services_make_of_the_reference_what_they_made() -> None:
     found = reference.check(REFERENCE)
     assert not found, (
-        "; ".join(found) + "\nif this is meant: pliant bench reference --refresh, and say why"
+        "; ".join(found) + "\nif this is meant: scripts/bench reference --refresh, and say why"
     )
 
 
@@ -48,7 +48,7 @@ def test_there_is_a_recording_of_this_version() -> None:
 
 @pytest.mark.parametrize("path", recordings(), ids=lambda path: path.stem)
 def test_recordings_of_every_version_are_read(path: Path) -> None:
-    """Made by ``pliant bench reference --refresh`` when the version is new; never made again."""
+    """Made by ``scripts/bench reference --refresh`` when the version is new; never made again."""
     summary = summarise(path)
     assert summary.complete
     assert not summary.damage

@@ -1,12 +1,12 @@
 """Services alone on a recorded run: the same bytes, or a readable first difference."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
+from running import TINY, assert_one_line, pliant
 
-from pliant.config import config_yaml, load_config
+from pliant.config import config_yaml, load_config, recorded_config
 from pliant.errors import ConfigError, RecordingError
 from pliant.messages import topics
 from pliant.messages.topics import Topic, by_key
@@ -15,11 +15,8 @@ from pliant.recording.compare import compare
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
 from pliant.recording.writer import RecordingWriter
-from pliant_services.replay import recorded_config, replayable
-from pliant_services.replay_command import DIFFERENT, SAME, ReplayRequest, run_replay
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "system"))
-from running import TINY, assert_one_line, pliant
+from pliant_services.replay.command import DIFFERENT, SAME, ReplayRequest, run_replay
+from pliant_services.replay.services import replayable
 
 pytestmark = pytest.mark.system
 
@@ -56,7 +53,9 @@ def test_a_run_over_a_link_with_jpegs_records_them_and_a_replay_makes_the_same_o
     assert {(s.encoding, s.made_from) for s in sources if isinstance(s, SourceImage)} == {
         ("jpeg", "png, quality 80")
     }
-    assert recorded_config(summarise(folder / "recording.mcap"), ()).bus.link_images == "jpeg"
+    assert (
+        recorded_config(summarise(folder / "recording.mcap").metadata, ()).bus.link_images == "jpeg"
+    )
     assert replay(folder, tmp_path / "again", *PIPELINE) == SAME
 
 
@@ -98,11 +97,11 @@ def test_a_changed_parameter_is_named_by_what_it_changes_first(
 
 def test_the_recorded_configuration_is_the_default(result: Path) -> None:
     summary = summarise(result / "recording.mcap")
-    assert recorded_config(summary, []) == load_config(None, ["seed=3"])
-    assert recorded_config(summary, ["seed=4"]).seed == 4
-    assert config_yaml(recorded_config(summary, [])) == summary.metadata["config"]["yaml"]
+    assert recorded_config(summary.metadata, []) == load_config(None, ["seed=3"])
+    assert recorded_config(summary.metadata, ["seed=4"]).seed == 4
+    assert config_yaml(recorded_config(summary.metadata, [])) == summary.metadata["config"]["yaml"]
     with pytest.raises(ConfigError):
-        recorded_config(summary, ["nothing.such=1"])
+        recorded_config(summary.metadata, ["nothing.such=1"])
 
 
 def test_only_services_that_read_can_be_replayed() -> None:

@@ -15,13 +15,13 @@ from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config
 from pliant.datasets import open_source
 from pliant.errors import ResultError
-from pliant.export.ply import read_ply
-from pliant.export.tum import read_tum
+from pliant.export.export import export_result
+from pliant.formats.ply import read_ply
+from pliant.formats.tum import read_tum
 from pliant.messages import topics
 from pliant.messages.types import CameraStream
 from pliant.viewers.point_blocks import BLOCK_POINTS, PointBlocks
-from pliant_services import recorder
-from pliant_services.export import export_result
+from pliant_services.nodes import recorder
 
 FRAMES = 40
 

@@ -19,9 +19,9 @@ from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Depth, Header, Image, SourceImage
-from pliant_services import ingest
-from pliant_services.host import stop_on_signal
-from pliant_services.monitor import SilentMonitor
+from pliant_services.nodes import ingest
+from pliant_services.runtime.host import stop_on_signal
+from pliant_services.runtime.monitor import SilentMonitor
 
 WIDTH, HEIGHT = 24, 16
 STEP_NS = 20_000_000

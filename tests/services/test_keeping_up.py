@@ -22,11 +22,11 @@ from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Extrema, Image
 from pliant.state import load_state, save_state
-from pliant_services import ingest
-from pliant_services.host import lags
-from pliant_services.keeping_up import MappingPace, readers_that_may_lag
-from pliant_services.link_images import receive_images
-from pliant_services.monitor import SilentMonitor
+from pliant_services.nodes import ingest
+from pliant_services.runtime.host import lags
+from pliant_services.runtime.keeping_up import MappingPace, readers_that_may_lag
+from pliant_services.runtime.link_images import receive_images
+from pliant_services.runtime.monitor import SilentMonitor
 
 FLEET = ("ingest", "tracking", "bundle_adjustment")
 LAG_S = 0.1

@@ -16,9 +16,9 @@ from pliant.errors import MessageError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import Header, Image, SourceImage
-from pliant_services import ingest
-from pliant_services.link_images import receive_images, whole
-from pliant_services.monitor import SilentMonitor
+from pliant_services.nodes import ingest
+from pliant_services.runtime.link_images import receive_images, whole
+from pliant_services.runtime.monitor import SilentMonitor
 
 FRAMES = 3
 

@@ -24,8 +24,8 @@ from pliant.messages.types import (
     MeshPiece,
     MeshUpdate,
 )
-from pliant_services import meshing
-from pliant_services.monitor import SilentMonitor
+from pliant_services.nodes import meshing
+from pliant_services.runtime.monitor import SilentMonitor
 
 pytest.importorskip("open3d", reason="meshing needs open3d: pip install 'pliant[mesh]'")
 

@@ -14,10 +14,18 @@ from pliant.datasets import open_source
 from pliant.map_history import MapHistory
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
-from pliant.messages.types import CameraStream, Extrema, Header, Image, Keyframe, MapUpdate
-from pliant_services import bundle_adjustment, ingest, keeping_up, tracking
-from pliant_services.monitor import SilentMonitor
+from pliant.messages.types import (
+    PASSED_OVER,
+    CameraStream,
+    Extrema,
+    Header,
+    Image,
+    Keyframe,
+    MapUpdate,
+)
+from pliant_services.nodes import bundle_adjustment, ingest, tracking
 from pliant_services.processes import BY_NAME
+from pliant_services.runtime.monitor import SilentMonitor
 
 FRAMES = 25
 PROCESS = BY_NAME["bundle_adjustment"]
@@ -211,7 +219,7 @@ def test_frames_that_mapping_passes_over_are_tracked_all_the_same(
     outputs = adjust(config, inputs, tracks)
     updates = [m for m in outputs[topics.MAP_UPDATE] if isinstance(m, MapUpdate)]
     assert [m.frame for m in updates] == list(range(FRAMES))
-    assert {m.frame for m in updates if m.reason == keeping_up.REASON} == over
+    assert {m.frame for m in updates if m.reason == PASSED_OVER} == over
     posed = {frame for m in updates for frame in m.pose_frames.tolist()}
     assert posed == set(range(FRAMES)) - over
     assert updates[-1].state == TRACKING

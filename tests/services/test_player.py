@@ -19,10 +19,11 @@ from pliant.errors import RecordingError
 from pliant.messages import codec, topics
 from pliant.messages.types import Image
 from pliant.recording.playback import Playback
-from pliant_services import ingest, play_command, recorder
-from pliant_services.monitor import SilentMonitor
-from pliant_services.play_command import Pace, PlayRequest, run_play, take_keys
-from pliant_services.player import Played, chosen_topics, play
+from pliant_services.nodes import ingest, recorder
+from pliant_services.replay import play as play_command
+from pliant_services.replay.play import Pace, PlayRequest, run_play, take_keys
+from pliant_services.replay.player import Played, chosen_topics, play
+from pliant_services.runtime.monitor import SilentMonitor
 
 FRAMES = 8
 PATIENCE_S = 60.0

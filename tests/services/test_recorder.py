@@ -17,7 +17,7 @@ from pliant.recording.parts import RollingWriter, parts_of
 from pliant.recording.reader import Recording
 from pliant.recording.recover import recover
 from pliant.recording.summary import summarise
-from pliant_services import recorder
+from pliant_services.nodes import recorder
 
 
 def test_every_message_and_every_end_is_recorded(tmp_path: Path) -> None:

@@ -9,13 +9,14 @@ import pytest
 from pliant.algorithms.map_delta import TRACKING, MapDelta
 from pliant.algorithms.tracks import FrameTracks
 from pliant.evaluation.result import evaluate_result
-from pliant.export.ply import read_ply
-from pliant.export.tum import read_tum
+from pliant.formats.ply import read_ply
+from pliant.formats.tum import read_tum
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Extrema, Header, MapUpdate
 from pliant.recording.writer import RecordingWriter
-from pliant_services.results import RECORDING_NAME, write_results
+from pliant.results.folder import RECORDING_NAME
+from pliant.results.write import write_results
 
 SHORT, LONG = 4, 6  # frames of the first and the second segment
 

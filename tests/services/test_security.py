@@ -13,9 +13,9 @@ from pliant.bus.session import Identity, free_endpoint, open_router, open_sessio
 from pliant.errors import BusError
 from pliant.messages import topics
 from pliant.recording.reader import Recording
-from pliant_services.access import NAMES, OPERATOR, access_control, may_write
-from pliant_services.certificates import make_certificates
-from pliant_services.relay import Relays
+from pliant_services.runtime.relay import Relays
+from pliant_services.security.access import NAMES, OPERATOR, access_control, may_write
+from pliant_services.security.certificates import make_certificates
 
 PATIENCE_S = 20.0
 

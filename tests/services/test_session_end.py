@@ -10,8 +10,9 @@ from pliant.bus.peers import token_key
 from pliant.bus.session import free_endpoint, open_router, open_session
 from pliant.bus.zenoh_bus import OVER_KEY, STOP_KEY
 from pliant.config import load_config
-from pliant_services import fleet_status, session_end
-from pliant_services.host import ServiceOptions
+from pliant_services.runtime import session_end
+from pliant_services.runtime import status as fleet_status
+from pliant_services.runtime.host import ServiceOptions
 
 
 class Told:

@@ -20,9 +20,10 @@ from pliant.messages.types import (
     StreamEnd,
 )
 from pliant.recording.writer import RecordingWriter
-from pliant_services import pipeline
-from pliant_services.pipeline import DONE, INCOMPLETE, RunRequest, run_pipeline, summary
-from pliant_services.results import write_results
+from pliant.results.verdict import DONE, INCOMPLETE, summary
+from pliant.results.write import write_results
+from pliant_services.run import command as pipeline
+from pliant_services.run.command import RunRequest, run_pipeline
 
 REASON = "too few tracks: 0 of 100"
 

@@ -12,9 +12,9 @@ from pliant.config import Config, load_config
 from pliant.datasets import open_source
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
-from pliant.messages.types import Depth, Header, Image, Surfels
-from pliant_services import ingest, surfels
-from pliant_services.monitor import SilentMonitor
+from pliant.messages.types import WAITING_FOR_DEPTH, Depth, Header, Image, Surfels
+from pliant_services.nodes import ingest, surfels
+from pliant_services.runtime.monitor import SilentMonitor
 
 FRAMES = 5
 INPUTS = (topics.STREAM, topics.IMAGE, topics.DEPTH)
@@ -75,7 +75,7 @@ def test_surfels_start_with_the_first_depth_map_that_is_one(
 ) -> None:
     good = depths_of(ingested)[2].data
     followed = follow(config, with_depth(ingested, {1: b"no image", 2: good}))
-    assert [m.missing for m in followed] == [surfels.WAITING] * 2 + [""] * 3
+    assert [m.missing for m in followed] == [WAITING_FOR_DEPTH] * 2 + [""] * 3
     assert followed[1].note.startswith("frame 1: its depth map")
     assert [len(m.ids) for m in followed] == [0, 0, 60, 60, 60]
     assert followed[1].lost

@@ -20,6 +20,7 @@ from pliant.map_history import CurrentMap
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import (
+    WAITING_FOR_DEPTH,
     CameraStream,
     Depth,
     Extrema,
@@ -29,9 +30,9 @@ from pliant.messages.types import (
     MapUpdate,
     Surfels,
 )
-from pliant_services import bundle_adjustment, ingest, surfels, tracking
-from pliant_services.monitor import SilentMonitor
+from pliant_services.nodes import bundle_adjustment, ingest, surfels, tracking
 from pliant_services.processes import BY_NAME
+from pliant_services.runtime.monitor import SilentMonitor
 
 SOURCE = "built-in:breathing?amplitude=0&travel=0.25&width=320"
 FRAMES = 25
@@ -83,7 +84,7 @@ def test_surfels_start_on_a_keyframe_of_our_own_map(everything: Messages) -> Non
     assert [m.frame for m in followed] == list(range(FRAMES))
     first = next(m for m in followed if not m.missing)
     assert 0 < first.frame < FRAMES - 1
-    assert all(m.missing.startswith(surfels.WAITING) for m in followed[: first.frame])
+    assert all(m.missing.startswith(WAITING_FOR_DEPTH) for m in followed[: first.frame])
     keyframes = [m for m in everything[topics.KEYFRAME] if isinstance(m, Keyframe)]
     assert first.frame in [m.frame for m in keyframes if m.new >= 0]
     assert len(first.ids) > 20

@@ -27,8 +27,8 @@ from pliant.bus.session import free_endpoint, open_router
 from pliant.messages import topics
 from pliant.recording.reader import Recording
 from pliant_services import cli
-from pliant_services.launcher import Fleet, ServiceDiedError
 from pliant_services.processes import PROFILES
+from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
 pytestmark = pytest.mark.system
 

@@ -11,7 +11,7 @@ from running import pliant, write_sequence
 from pliant.config import load_config
 from pliant.datasets import open_source
 from pliant.map_history import MapHistory
-from pliant_services.in_process import process
+from pliant.offline import process
 
 pytestmark = pytest.mark.system
 

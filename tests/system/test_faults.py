@@ -12,17 +12,13 @@ from running import TINY, assert_one_line, digests, pliant
 
 from pliant.config import config_yaml, load_config
 from pliant.messages.types import Status
-from pliant_services import launcher, warm_up
-from pliant_services.launcher import Fleet, ServiceDiedError
-from pliant_services.pipeline import (
-    STATE_FOLDER,
-    RunRequest,
-    prepare,
-    resumed_config,
-    service_arguments,
-)
+from pliant.results.folder import STATE_FOLDER, prepare
+from pliant.results.write import write_results
 from pliant_services.processes import PROFILES
-from pliant_services.results import write_results
+from pliant_services.run.command import RunRequest, resumed_config, service_arguments
+from pliant_services.runtime import kernels as warm_up
+from pliant_services.runtime import launcher
+from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
 pytestmark = pytest.mark.system
 

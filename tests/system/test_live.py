@@ -6,20 +6,21 @@ import threading
 from pathlib import Path
 
 import pytest
+from benchmarks.endurance import forth_and_back
 from running import TINY, pliant
 
 from pliant.config import config_yaml, load_config
 from pliant.datasets.builtin import builtin_folder
 from pliant.messages import topics
-from pliant.messages.types import Extrema, MapUpdate, SourceImage, Status
+from pliant.messages.types import PASSED_OVER, Extrema, MapUpdate, SourceImage, Status
 from pliant.recording.reader import Recording
-from pliant_services import warm_up
-from pliant_services.benchmarks.endurance import forth_and_back
-from pliant_services.keeping_up import REASON
-from pliant_services.launcher import Fleet
-from pliant_services.pipeline import RunRequest, prepare, service_arguments, summary
+from pliant.results.folder import RECORDING_NAME, prepare
+from pliant.results.verdict import summary
+from pliant.results.write import write_results
 from pliant_services.processes import PROFILES
-from pliant_services.results import RECORDING_NAME, write_results
+from pliant_services.run.command import RunRequest, service_arguments
+from pliant_services.runtime import kernels as warm_up
+from pliant_services.runtime.launcher import Fleet
 
 pytestmark = pytest.mark.system
 
@@ -69,7 +70,11 @@ def test_tracking_goes_on_and_the_run_can_be_replayed(tmp_path: Path) -> None:
     over = [m.frame for m in sources if m.unmapped]
     assert [m.frame for m in tracks] == [m.frame for m in updates] == list(range(FRAMES))
     assert all(len(tracks[frame].ids) > 100 for frame in over)
-    assert [m.frame for m in updates if m.reason == REASON] == over == report["frames_passed_over"]
+    assert (
+        [m.frame for m in updates if m.reason == PASSED_OVER]
+        == over
+        == report["frames_passed_over"]
+    )
     assert len([frame for frame in over if STOP_FRAME < frame <= GO_FRAME]) > WINDOW
     assert any(f"{len(over)} images tracked, but not mapped" in line for line in summary(report))
     again = ("replay", output / RECORDING_NAME, "--services", "tracking,bundle_adjustment")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from running import TINY, assert_one_line, children, digests, pliant, running
 
-from pliant.export.ply import read_ply
+from pliant.formats.ply import read_ply
 
 pytestmark = pytest.mark.system
 

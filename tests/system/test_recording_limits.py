@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from benchmarks.recorder_kills import measure
 from running import TINY, pliant
 
 from pliant.config import config_yaml, load_config
@@ -13,9 +14,8 @@ from pliant.messages import topics
 from pliant.recording.compare import compare
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
-from pliant_services.benchmarks.recorder_kills import measure
-from pliant_services.launcher import Fleet
-from pliant_services.pipeline import prepare
+from pliant.results.folder import prepare
+from pliant_services.runtime.launcher import Fleet
 
 pytestmark = pytest.mark.system
 

@@ -17,7 +17,7 @@ from pliant.bus.session import CONNECT_TIMEOUT_S, free_endpoint, open_router
 from pliant.messages import topics
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
-from pliant_services.warm_up import COMPILED
+from pliant_services.runtime.kernels import COMPILED
 
 pytestmark = pytest.mark.system
 

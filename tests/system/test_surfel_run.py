@@ -13,8 +13,8 @@ import pytest
 from mcap.reader import make_reader
 from running import assert_one_line, pliant
 
-from pliant.export.ply import read_ply
-from pliant_services.export import export_result
+from pliant.export.export import export_result
+from pliant.formats.ply import read_ply
 
 pytestmark = pytest.mark.system
 

@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import cast
 
 import pytest
+from benchmarks.viewer_cost import run_with
 
 from pliant.bus.session import free_endpoint
 from pliant.errors import ResultError
 from pliant.viewers.rerun import RerunCanvas
 from pliant.viewers.rerun_program import RerunProgram, listens
-from pliant_services import spectators
-from pliant_services.benchmarks.viewer_cost import run_with
-from pliant_services.launcher import Fleet
-from pliant_services.pipeline import RunRequest, run_pipeline
-from pliant_services.spectators import check_viewer
+from pliant_services.run import spectators
+from pliant_services.run.command import RunRequest, run_pipeline
+from pliant_services.run.spectators import check_viewer
+from pliant_services.runtime.launcher import Fleet
 
 pytestmark = pytest.mark.system
 

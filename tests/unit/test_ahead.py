@@ -7,7 +7,7 @@ from itertools import count, islice
 
 import pytest
 
-from pliant_services.ahead import behind, quick_turns, read_ahead
+from pliant_services.replay.ahead import behind, quick_turns, read_ahead
 
 
 def test_all_items_come_in_their_order() -> None:

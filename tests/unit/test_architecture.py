@@ -19,16 +19,24 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cache": set(),
     "files": set(),
     "trajectory": {"algorithms"},
-    "export": {"export", "algorithms", "errors", "trajectory"},
+    "formats": {"formats", "algorithms", "errors", "trajectory"},
+    "pictures": {"pictures", "formats", "algorithms", "errors"},
+    "map_history": {"algorithms", "trajectory"},
+    "config": {"algorithms", "errors"},
     "messages": {"messages", "algorithms", "errors"},
     "bus": {"bus", "messages", "state", "algorithms", "errors", "files"},
     "recording": {"recording", "messages", "algorithms", "errors", "files"},
     "rendering": {"rendering", "algorithms", "errors"},
-    "viewers": {"viewers", "messages", "datasets", "export", "algorithms", "errors"},
+    "viewers": {"viewers", "messages", "datasets", "pictures", "algorithms", "errors"},
     "datasets": {
-        *{"datasets", "rendering", "export", "cache", "algorithms", "errors"},
+        *{"datasets", "rendering", "formats", "cache", "algorithms", "errors"},
         *{"messages", "recording", "trajectory"},  # our own recordings are a source, too
     },
+    "results": {
+        *{"results", "formats", "pictures", "recording", "messages", "algorithms", "errors"},
+        *{"config", "map_history", "trajectory"},
+    },
+    "offline": {"datasets", "messages", "algorithms", "config", "map_history"},
     "fusion": {"fusion", "algorithms", "errors", "map_history"},
 }
 PURE_FORBIDS = {"time", "datetime", "socket", "logging", "os", "pathlib", "random", "threading"}

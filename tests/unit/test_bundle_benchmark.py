@@ -4,15 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-
-from pliant.algorithms.bundle import BundleProblem
-from pliant.evaluation.benchmarks.bundle_adjustment import (
+from benchmarks.bundle_problems import WINDOW, synthetic_window
+from benchmarks.ceres import CostCurve, solve_with_ceres
+from benchmarks.solvers import (
     compare_bundle_adjustment,
     plot_costs,
     solve_with_scipy,
 )
-from pliant.evaluation.benchmarks.bundle_problems import WINDOW, synthetic_window
-from pliant.evaluation.benchmarks.ceres import CostCurve, solve_with_ceres
+
+from pliant.algorithms.bundle import BundleProblem
 
 
 def small_window(points: int) -> BundleProblem:

@@ -1,6 +1,5 @@
 """Depth maps that come with a source: whose frame they are, and metres in rectified pixels."""
 
-import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from running import write_sequence
 
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.rectification import rectified_camera
@@ -18,9 +18,6 @@ from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import Calibration, DepthImages
 from pliant.datasets.depth import DepthRectifier
 from pliant.errors import CalibrationError, DatasetError
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "system"))
-from running import write_sequence
 
 WIDTH, HEIGHT = 32, 24
 

@@ -1,20 +1,17 @@
 """Depth from a rectified stereo pair: of a rendered one exactly, of a real one beside its CT."""
 
 import json
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from running import write_sequence
 
 from pliant.datasets import open_source
 from pliant.datasets.depth import DepthRectifier
 from pliant.datasets.stereo import consistent_disparities
 from pliant.errors import CalibrationError
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "system"))
-from running import write_sequence
 
 LIVER = Path(__file__).parents[3] / "shared" / "data" / "deformable" / "opencas_liver_stereo"
 WIDTH, HEIGHT, FOCAL, BASELINE = 160, 120, 150.0, 0.01

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.map_density import count_distinct, well_observed
 from pliant.algorithms.tracks import FrameTracks
 from pliant.evaluation.criteria import Similarity
-from pliant.evaluation.map_truth import count_distinct, evaluate_map, format_map, well_observed
+from pliant.evaluation.map_truth import evaluate_map, format_map
 from pliant.evaluation.tracks_truth import TracksTruth, format_tracks
 from pliant.evaluation.visible_depth import DepthView
 

@@ -33,7 +33,7 @@ from pliant.evaluation.report import (
     write_json,
 )
 from pliant.evaluation.result import evaluate_result, evaluate_trajectory
-from pliant.export.tum import read_tum, write_tum
+from pliant.formats.tum import read_tum, write_tum
 from pliant.trajectory import Trajectory, associate
 
 FRAME_NS = 33_333_333

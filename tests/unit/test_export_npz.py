@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pliant.errors import ResultError
-from pliant.export.npz import NpzWriter
+from pliant.formats.npz import NpzWriter
 
 
 def write(path: Path) -> None:

@@ -9,14 +9,14 @@ import pytest
 
 from pliant.algorithms.tracks import COASTING, FrameTracks
 from pliant.errors import ResultError
-from pliant.export.movie import beside, write_animation, write_image, write_movie
-from pliant.export.overlay import (
+from pliant.pictures.map import choose_view, height_colours, render_map, write_map_picture
+from pliant.pictures.movie import beside, write_animation, write_image, write_movie
+from pliant.pictures.overlay import (
     OverlayFrame,
     TrackPainter,
     write_overlay_picture,
     write_overlay_video,
 )
-from pliant.export.picture import choose_view, height_colours, render_map, write_map_picture
 
 
 def frame(number: int, *, count: int = 30, width: int = 64, height: int = 48) -> OverlayFrame:

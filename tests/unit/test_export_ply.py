@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pliant.errors import ResultError
-from pliant.export.ply import read_ply, write_ply
+from pliant.formats.ply import read_ply, write_ply
 
 POINTS = np.array([[0, 1, 2], [3, 4, 5], [6, 7, 8.5]], np.float32)
 COLOURS = np.array([[1, 2, 3], [4, 5, 6], [255, 0, 9]], np.uint8)

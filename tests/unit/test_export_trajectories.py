@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from pliant.algorithms.geometry import so3_exp
 from pliant.errors import ResultError
-from pliant.export.euroc import read_euroc, write_euroc
-from pliant.export.kitti import read_kitti, read_kitti_times, write_kitti, write_kitti_times
-from pliant.export.text import format_seconds, parse_nanoseconds, parse_seconds
-from pliant.export.trajectory_files import read_trajectory
-from pliant.export.tum import read_tum, write_tum
+from pliant.formats.euroc import read_euroc, write_euroc
+from pliant.formats.kitti import read_kitti, read_kitti_times, write_kitti, write_kitti_times
+from pliant.formats.text import format_seconds, parse_nanoseconds, parse_seconds
+from pliant.formats.trajectory_files import read_trajectory
+from pliant.formats.tum import read_tum, write_tum
 from pliant.trajectory import Trajectory
 
 GOOD = "1.0 0 0 0 0 0 0 1\n"

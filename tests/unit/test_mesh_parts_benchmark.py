@@ -3,10 +3,10 @@
 import importlib
 
 import pytest
+from benchmarks import mesh_parts
 
 from pliant.fusion import volume
 from pliant.fusion.open3d_import import FusionError
-from pliant_services.benchmarks import mesh_parts
 
 
 def rows(lines: list[str]) -> dict[str, list[str]]:

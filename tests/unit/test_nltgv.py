@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from benchmarks.smoothing_scene import NOISE, Scene, make_scene, rmse
 from scipy.optimize import linprog
 
 from pliant.algorithms.arrays import F32, F64, I32
@@ -15,7 +16,6 @@ from pliant.algorithms.meshing.nltgv import (
 )
 from pliant.algorithms.meshing.nltgv_start import rings
 from pliant.algorithms.meshing.nltgv_steps import choose_sides
-from pliant.evaluation.benchmarks.smoothing_scene import NOISE, Scene, make_scene, rmse
 
 CONVEX = {"edge_sigmas": 0.0, "data_sigmas": 0.0, "reweightings": 1}
 EXACT = {"min_change_sigmas": 0.0, "max_iterations": 40_000}

@@ -9,8 +9,8 @@ from pliant.config import Config
 from pliant.messages import topics
 from pliant_services import processes
 from pliant_services.cli import service as cli_service
-from pliant_services.host import checkpoint_windows
 from pliant_services.processes import PROCESSES, PROFILES
+from pliant_services.runtime.host import checkpoint_windows
 
 
 @pytest.mark.parametrize("profile", sorted(PROFILES))

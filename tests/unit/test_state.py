@@ -11,12 +11,11 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping import Mapper, MappingParameters
 from pliant.algorithms.tracking import ExtremaTracker, TrackingParameters
 from pliant.datasets import open_source
-from pliant.datasets.rectifier import Rectifier
+from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.errors import StateError
 from pliant.messages import codec
 from pliant.messages.types import Extrema, Header, MapUpdate
 from pliant.state import STATE_VERSION, load_state, save_state
-from pliant_services.ingest import rectified
 
 _LEAVES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
 _TREES = st.recursive(
@@ -93,7 +92,7 @@ CAMERA_NAME = (PinholeCamera.__module__, "PinholeCamera")
     "node",
     [
         ["object", "subprocess", "Popen", {}],
-        ["named", "pliant.export.ply", "write_mesh", []],
+        ["named", "pliant.formats.ply", "write_mesh", []],
         ["named", "pliant.algorithms.camera", "np", []],
         ["object", "pliant.bus.checkpoints", "Checkpoints", {}],
         ["name", "pliant.config", "load_config"],
@@ -110,7 +109,7 @@ def test_a_crafted_state_makes_and_calls_nothing_that_is_not_listed(node: list[o
 def test_a_crafted_state_cannot_write_a_file(tmp_path) -> None:
     """By a call of a function of ours in the shape of a named tuple."""
     path = tmp_path / "written.png"
-    call = ["named", "pliant.export.movie", "write_image", [[1], [2]]]
+    call = ["named", "pliant.pictures.movie", "write_image", [[1], [2]]]
     arguments = [
         ["named", "pliant.config", "Path", [str(path)]],
         ["array", "|u1", [2, 2, 3], "C", True, bytes(12)],

@@ -4,12 +4,12 @@ import re
 from pathlib import Path
 
 import pytest
+from benchmarks import surfels
+from benchmarks.surfels import LIMITS, TABLES, measure
 
 from pliant.algorithms.surfels import SurfelParameters
 from pliant.datasets.builtin import parse_builtin
 from pliant.errors import DatasetError
-from pliant_services.benchmarks import surfels
-from pliant_services.benchmarks.surfels import LIMITS, TABLES, measure
 
 
 def lines(sources: list[str], tables: list[str], *, quick: bool = False) -> list[str]:

@@ -1,8 +1,7 @@
 """The benchmark of the surfels' speed."""
 
 import pytest
-
-from pliant_services.benchmarks import surfel_speed
+from benchmarks import surfel_speed
 
 
 def test_every_kind_has_its_row_and_stages(monkeypatch: pytest.MonkeyPatch) -> None:

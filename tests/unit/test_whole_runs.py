@@ -4,8 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-from pliant_services.benchmarks import whole_runs
+from benchmarks import whole_runs
 
 
 def test_a_row_of_losses_follows_each_run(monkeypatch: pytest.MonkeyPatch) -> None:

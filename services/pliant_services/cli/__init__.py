@@ -1,10 +1,12 @@
 """The command line: one small file per command, heavy modules imported inside the command."""
 
 import errno
+import importlib
 import os
 import signal
 import sys
 from contextlib import suppress
+from typing import Any, cast
 
 import typer
 
@@ -29,26 +31,28 @@ app = typer.Typer(
 _FAILED, _USAGE, _INCOMPLETE, _INTERRUPTED = 1, 2, 3, 130
 _INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Typer carries its own copy of click, or uses click itself, depending on its version.
-_UsageError = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+_UsageError: type[typer.BadParameter] = next(
+    cast(Any, c) for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException"
+)
 
 
-def main() -> None:
-    """The command ``pliant``."""
+def main(application: typer.Typer = app) -> None:
+    """The command ``pliant``, or another that ends as it does."""
     # A container stops by SIGTERM and a terminal that closes sends SIGHUP: both are a Ctrl-C.
     for kind in _INTERRUPTIONS:
         if signal.getsignal(kind) == signal.SIG_DFL:  # not under nohup
             signal.signal(kind, signal.default_int_handler)
     try:
-        run_and_exit()
+        run_and_exit(application)
     except KeyboardInterrupt:  # one more, just before it was ignored
         os._exit(_INTERRUPTED)
     finally:
         _take_no_more()
 
 
-def run_and_exit() -> None:
+def run_and_exit(application: typer.Typer) -> None:
     """Run the command line.  Known errors are one line on stderr and an exit code."""
-    code = _run()
+    code = _run(application)
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -62,11 +66,10 @@ def run_and_exit() -> None:
     sys.exit(code)
 
 
-def _run() -> int:
+def _run(application: typer.Typer) -> int:
     try:
-        from pliant_services.cli import commands  # noqa: F401  (registers the commands)
-
-        code = app(standalone_mode=False)
+        importlib.import_module("pliant_services.cli.commands")  # registers them
+        code = application(standalone_mode=False)
     except PliantError as error:
         return _say(str(error), _INCOMPLETE if isinstance(error, SourceLostError) else _FAILED)
     except _UsageError as error:

@@ -19,8 +19,8 @@ def certs(
 
     Give each machine ca.pem and the two files of each service that it runs; ca.key stays here.
     """
-    from pliant_services.access import NAMES
-    from pliant_services.certificates import make_certificates
+    from pliant_services.security.access import NAMES
+    from pliant_services.security.certificates import make_certificates
 
     made = make_certificates(folder, NAMES, ["localhost", "127.0.0.1", *(hosts or [])])
     typer.echo(f"{folder}: made {', '.join(made)}" if made else f"{folder}: everything is there")

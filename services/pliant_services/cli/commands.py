@@ -2,7 +2,6 @@
 
 from pliant_services.cli import (
     app,
-    bench,
     certs,
     config,
     doctor,
@@ -35,6 +34,5 @@ app.command("info")(info.info)
 app.command("recover")(recover.recover)
 app.command("replay")(replay.replay)
 app.command("render")(render.render)
-app.add_typer(bench.app, name="bench")
 app.command("config")(config.config)
 app.command("doctor")(doctor.doctor)

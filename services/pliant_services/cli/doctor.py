@@ -8,7 +8,7 @@ def doctor() -> None:
 
     pliant doctor
     """
-    from pliant_services.diagnosis import diagnose
+    from pliant_services.cli.diagnosis import diagnose
 
     findings = diagnose()
     for finding in findings:

@@ -48,7 +48,7 @@ def evaluate(
 
     pliant eval results/seed-* --groundtruth sequence/groundtruth.txt
     """
-    from pliant_services.evaluate import EvaluationRequest, run_evaluation
+    from pliant.evaluation.evaluate import EvaluationRequest, run_evaluation
 
     request = EvaluationRequest(
         results=results,

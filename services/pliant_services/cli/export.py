@@ -37,6 +37,6 @@ def export(
 
     pliant export recording.mcap --to kitti --output poses.txt
     """
-    from pliant_services.export import export_result
+    from pliant.export.export import export_result
 
     typer.echo(str(export_result(result, to, output, force=force, every=every)))

@@ -30,11 +30,11 @@ def mesh(
     pliant mesh results/room --set meshing.surface.smoothing=none --output results/raw
     """
     from pliant_services.cli.info import recording_file
-    from pliant_services.mesh_command import is_meshed, run_mesh
+    from pliant_services.mesh.command import is_meshed, run_mesh
 
     if when_over:
-        from pliant_services.pipeline import STATE_FOLDER
-        from pliant_services.session_end import wait_until_over
+        from pliant.results.folder import STATE_FOLDER
+        from pliant_services.runtime.session_end import wait_until_over
 
         wait_until_over(recording / STATE_FOLDER)
         if is_meshed(recording, output):

@@ -70,7 +70,7 @@ def replay(
             raise typer.BadParameter(f"{option} is for playing, not for running services again")
         if tolerance and not check:
             raise typer.BadParameter("--tolerance needs --check")
-        from pliant_services.replay_command import ReplayRequest, run_replay
+        from pliant_services.replay.command import ReplayRequest, run_replay
 
         again = ReplayRequest(
             recording=file,
@@ -83,7 +83,7 @@ def replay(
             processes=processes,
         )
         raise typer.Exit(run_replay(again))
-    from pliant_services.play_command import PlayRequest, run_play
+    from pliant_services.replay.play import PlayRequest, run_play
 
     played = PlayRequest(
         recording=file,

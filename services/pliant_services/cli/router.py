@@ -30,12 +30,16 @@ def router(
 
     from pliant.bus.session import Identity, open_router
     from pliant.bus.zenoh_bus import OVER_KEY
-    from pliant_services.access import access_control
-    from pliant_services.relay import Relays
+    from pliant_services.runtime.relay import Relays
+    from pliant_services.security.access import access_control
 
     stopped = threading.Event()
+
+    def on_signal(*_: object) -> None:
+        stopped.set()
+
     for kind in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(kind, lambda *_: stopped.set())
+        signal.signal(kind, on_signal)
     endpoints = listen or ["tcp/127.0.0.1:7447"]
     secure = tls is not None
     session = open_router(
@@ -43,9 +47,12 @@ def router(
         identity=Identity.in_folder(tls, "router") if tls is not None else None,
         access_control=access_control() if secure else None,
     )
-    held = session.declare_subscriber(
-        f"pliant/*/{OVER_KEY}", lambda _: stopped.set() if once else None
-    )
+
+    def on_over(_: object) -> None:
+        if once:
+            stopped.set()
+
+    held = session.declare_subscriber(f"pliant/*/{OVER_KEY}", on_over)
     typer.echo(f"router on {', '.join(endpoints)}", err=True)
     relays = Relays(session)
     stopped.wait()

@@ -92,7 +92,7 @@ def run(
 
     pliant run path/to/tissue --profile deformable --camera moving --depth map
     """
-    from pliant_services.pipeline import RunRequest, run_pipeline
+    from pliant_services.run.command import RunRequest, run_pipeline
 
     sets = [*(overrides or []), *([f"ingest.mode={mode}"] if mode else [])]
     if profile == "rigid" and (camera or depth_frames or depth):

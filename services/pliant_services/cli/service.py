@@ -64,9 +64,9 @@ def service(
     pliant service tracking --connect tcp/host:7447
     """
     from pliant.config import load_config
-    from pliant_services.host import ServiceOptions, end_with_launcher, run_service
     from pliant_services.processes import BY_NAME, PROFILES, reads_depth
-    from pliant_services.session_end import run_alone
+    from pliant_services.runtime.host import ServiceOptions, end_with_launcher, run_service
+    from pliant_services.runtime.session_end import run_alone
 
     if with_launcher:
         end_with_launcher()
@@ -116,7 +116,7 @@ def service(
 def _metadata(file: Path | None, config: "Config") -> dict[str, dict[str, str]]:
     if file is None:
         from pliant.config import config_yaml
-        from pliant_services.pipeline import run_metadata
+        from pliant.results.folder import run_metadata
 
         return run_metadata(config_yaml(config))
     try:

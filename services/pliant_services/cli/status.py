@@ -17,8 +17,8 @@ def status(
 
     pliant status --connect tcp/127.0.0.1:7447
     """
-    from pliant_services.access import OPERATOR
-    from pliant_services.fleet_status import listen, table
+    from pliant_services.runtime.status import listen, table
+    from pliant_services.security.access import OPERATOR
 
     services, silent = listen(connect, session, seconds, identity_in(tls, OPERATOR))
     if not services and not silent:

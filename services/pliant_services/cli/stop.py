@@ -18,8 +18,8 @@ def stop(
     pliant stop --connect tcp/127.0.0.1:7447
     """
     from pliant.errors import BusError
-    from pliant_services.access import OPERATOR
-    from pliant_services.fleet_status import stop_session
+    from pliant_services.runtime.status import stop_session
+    from pliant_services.security.access import OPERATOR
 
     left = stop_session(connect, session, wait, identity_in(tls, OPERATOR))
     if left:

@@ -38,8 +38,8 @@ def view(
     if patience > 0.0:
         # The viewer of a run, which ends us and says itself that it was interrupted.
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-    from pliant_services.access import OPERATOR
-    from pliant_services.viewing import ViewRequest, run_view
+    from pliant_services.security.access import OPERATOR
+    from pliant_services.view.command import ViewRequest, run_view
 
     request = ViewRequest(
         source=source,

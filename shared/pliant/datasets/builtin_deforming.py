@@ -20,7 +20,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.datasets.sequence_files import Progress, render_threads, write_sequence
 from pliant.errors import DatasetError
-from pliant.export.npz import NpzWriter
+from pliant.formats.npz import NpzWriter
 from pliant.rendering.deforming_scenes import (
     DeformingOptions,
     PaperOptions,

@@ -117,7 +117,7 @@ def rigid_plan(name: str, options: SequenceOptions) -> RigidPlan:
 
 
 def _given_path(file: Path) -> tuple[CameraPath, list[int]]:
-    from pliant.export.tum import read_tum
+    from pliant.formats.tum import read_tum
 
     try:
         trajectory = read_tum(file)

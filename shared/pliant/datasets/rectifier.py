@@ -14,6 +14,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.rectification import rectification_maps, rectified_camera, resample
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.calibration import Calibration
+from pliant.messages.types import CAMERA_FRAME_ID, DROPPED, Image
 
 _BAYER = {
     "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
@@ -140,3 +141,35 @@ def _whole(frame: SourceFrame) -> bool:
     if frame.encoding == "png":
         return frame.data.rfind(b"IEND") > 0
     return True
+
+
+def rectified(source: SourceFrame, rectifier: Rectifier, *, unmapped: bool = False) -> Image:
+    """The image that everybody works on: a pure function, so that a replay makes the same.
+
+    unmapped: as it was decided on and recorded.
+    """
+    if source.dropped:
+        return _without_pixels(source, DROPPED)
+    try:
+        grey, colour = rectifier.rectify(source)
+    except BrokenFrame as error:
+        return _without_pixels(source, f"broken: {error}")
+    return Image(
+        frame=source.index,
+        stamp_ns=source.stamp_ns,
+        frame_id=CAMERA_FRAME_ID,
+        grey=grey,
+        colour=colour if colour is not None else np.zeros((0, 0, 3), np.uint8),
+        unmapped=unmapped,
+    )
+
+
+def _without_pixels(source: SourceFrame, why: str) -> Image:
+    return Image(
+        frame=source.index,
+        stamp_ns=source.stamp_ns,
+        frame_id=CAMERA_FRAME_ID,
+        grey=np.zeros((0, 0), np.uint8),
+        colour=np.zeros((0, 0, 3), np.uint8),
+        missing=why,
+    )

@@ -11,7 +11,7 @@ import numpy as np
 from pliant.errors import ResultError
 from pliant.evaluation.criteria import ErrorStatistics, RelativeErrors
 from pliant.evaluation.result import Evaluation, TrajectoryEvaluation
-from pliant.export.text import write_bytes
+from pliant.formats.text import write_bytes
 
 ALIGNMENT = "Sim(3) aligned (scale is not known to a single camera)"
 

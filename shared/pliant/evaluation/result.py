@@ -21,8 +21,8 @@ from pliant.evaluation.criteria import (
     second_pairs,
 )
 from pliant.evaluation.run_report import RunReport, read_run_report
-from pliant.export.trajectory_files import read_trajectory
-from pliant.export.tum import read_tum
+from pliant.formats.trajectory_files import read_trajectory
+from pliant.formats.tum import read_tum
 from pliant.trajectory import (
     MAX_DIFFERENCE_NS,
     Trajectory,

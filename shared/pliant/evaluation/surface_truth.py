@@ -10,7 +10,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.datasets.builtin_deforming import SURFACES_NAME
 from pliant.errors import DatasetError
-from pliant.export.tum import read_tum
+from pliant.formats.tum import read_tum
 from pliant.rendering.sheet_render import look_at_pixels
 from pliant.rendering.sheets import material_positions
 

@@ -1,1 +1,1 @@
-"""Open file formats and pictures: what is written for other tools and for the eye."""
+"""What a result becomes for other programs and for the eye: ``pliant export``."""

@@ -1,86 +1,117 @@
-"""COLMAP's text model: ``cameras.txt``, ``images.txt`` and ``points3D.txt``.
+"""A recording as a COLMAP model: which points the keyframes see, and the images that go with them.
 
-For splats, NeRFs and multi-view stereo.  COLMAP's pixels have (0.5, 0.5) at the centre of the
-top-left pixel, and its poses map the world to the camera.
+Map updates tell where points are, not by which tracks they were seen.  So observations are found
+again: a track belongs to the point that it meets, within the mapper's own limit, in the most
+keyframes; a track that meets none twice, or a point that fewer than two keyframes see, is left out.
 """
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I64, U8
+from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse, matrix_to_pose
-from pliant.export.text import format_fixed, write_lines
+from pliant.algorithms.geometry import inverse, pose_to_matrix
+from pliant.algorithms.mapping.reacquisition import MaximaGrid
+from pliant.errors import ResultError
+from pliant.formats.colmap import ColmapImage, write_colmap
+from pliant.map_history import MapHistory
+from pliant.messages import topics
+from pliant.messages.types import CameraStream, Extrema
+from pliant.recording.reader import Recording
+
+_NEAR_PX = 1.5  # an inlier of the mapper
 
 
 @dataclass(frozen=True)
-class ColmapImage:
-    """One image: its file, T_world_camera (4, 4), and what it sees.
+class _View:
+    """A keyframe: its pose, and which track (row) meets which point (row) at what distance."""
 
-    points_px: (N, 2), (0, 0) at the centre of the top-left pixel.    points: (N,) rows of points.
-    """
-
-    name: str
+    frame: int
     T_world_camera: F64
     points_px: F64
+    tracks: I64
     points: I64
+    errors: F64
 
 
-def write_colmap(
-    folder: Path,
-    camera: PinholeCamera,
-    images: Sequence[ColmapImage],
-    positions: F64,
-    colours: U8,
-) -> None:
-    """Write a model: images are numbered from 1 in their order, points from 1 by row.
+def write_colmap_model(
+    recording: Recording, stream: CameraStream, history: MapHistory, folder: Path
+) -> list[int]:
+    """Write the model of the longest segment; returns the frames whose images belong to it.
 
-    positions: (N, 3) in the world.     colours: (N, 3) RGB.
-    Raises ResultError where the disk fails.
+    Raises ResultError where there is no map.
     """
-    write_lines(
-        folder / "cameras.txt",
-        [
-            "# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]",
-            f"1 PINHOLE {camera.width} {camera.height} {camera.fx!r} {camera.fy!r} "
-            f"{camera.cx + 0.5!r} {camera.cy + 0.5!r}",
-        ],
-    )
-    write_lines(folder / "images.txt", _image_lines(images))
-    write_lines(folder / "points3D.txt", _point_lines(camera, images, positions, colours))
-
-
-def _image_lines(images: Sequence[ColmapImage]) -> Iterator[str]:
-    yield "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; then POINTS2D[] as X Y POINT3D_ID"
-    for number, image in enumerate(images, start=1):
-        pose = matrix_to_pose(inverse(image.T_world_camera)).tolist()
-        values = [pose[6], *pose[3:6], *pose[:3]]
-        yield f"{number} {' '.join(format_fixed(v) for v in values)} 1 {image.name}"
-        pixels = (image.points_px + 0.5).tolist()
-        yield " ".join(
-            f"{u:.3f} {v:.3f} {point + 1}"
-            for (u, v), point in zip(pixels, image.points.tolist(), strict=True)
+    segment = history.longest_segment()
+    poses = {f: pose for f, (s, pose) in history.keyframe_poses().items() if s == segment}
+    if not poses:
+        raise ResultError("the run has no map to export")
+    points = history.points()
+    points = points.select(points.segments == segment)
+    views = [
+        _meet(tracks, pose_to_matrix(poses[tracks.frame]), points.positions, stream.camera)
+        for tracks in recording.decoded(topics.EXTREMA)
+        if isinstance(tracks, Extrema) and tracks.frame in poses and not tracks.missing
+    ]
+    owner = _owners(views)
+    seen = [_observations(view, owner) for view in views]
+    counts = np.bincount(np.concatenate([p for _, p in seen]), minlength=len(points))
+    kept = np.flatnonzero(counts >= 2)
+    row = np.full(len(points), -1, np.int64)
+    row[kept] = np.arange(len(kept))
+    images = [
+        ColmapImage(
+            image_name(view.frame), view.T_world_camera, pixels[row[p] >= 0], row[p][row[p] >= 0]
         )
+        for view, (pixels, p) in zip(views, seen, strict=True)
+    ]
+    colours = np.asarray(points.colours[kept], np.uint8)
+    write_colmap(folder, stream.camera, images, points.positions[kept], colours)
+    return [view.frame for view in views]
 
 
-def _point_lines(
-    camera: PinholeCamera, images: Sequence[ColmapImage], positions: F64, colours: U8
-) -> Iterator[str]:
-    yield "# POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX"
-    tracks: list[list[str]] = [[] for _ in range(len(positions))]
-    errors = np.zeros(len(positions))
-    for number, image in enumerate(images, start=1):
-        T_camera_world = inverse(image.T_world_camera)
-        seen = positions[image.points] @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-        error = np.linalg.norm(camera.project(seen) - image.points_px, axis=1)
-        np.add.at(errors, image.points, error)
-        for row, point in enumerate(image.points.tolist()):
-            tracks[point].append(f"{number} {row}")
-    for point, track in enumerate(tracks):
-        xyz = " ".join(format_fixed(value) for value in positions[point])
-        rgb = " ".join(str(value) for value in colours[point].tolist())
-        mean = errors[point] / max(1, len(track))
-        yield f"{point + 1} {xyz} {rgb} {format_fixed(mean, 4)} {' '.join(track)}".rstrip()
+def image_name(frame: int) -> str:
+    """The file of a frame."""
+    return f"{frame:06d}.png"
+
+
+def _meet(tracks: Extrema, T_world_camera: F64, positions: F64, camera: PinholeCamera) -> _View:
+    """For every point in view the track that is nearest to it, where one is near."""
+    T_camera_world = inverse(T_world_camera)
+    space = positions @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    front = np.flatnonzero(space[:, 2] > 0.0)
+    pixels = camera.project(space[front])
+    inside = np.all((pixels > -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5)), axis=1)
+    front, pixels = front[inside], pixels[inside]
+    places = np.zeros((len(tracks.ids), 3), np.float32)
+    places[:, :2] = tracks.points_px
+    grid = MaximaGrid.build(places, camera.width, camera.height)
+    nearest = grid.nearest(pixels.astype(np.float32), _NEAR_PX)
+    met = nearest >= 0
+    rows = nearest[met]
+    points_px = tracks.points_px[rows].astype(np.float64)
+    errors = np.linalg.norm(pixels[met] - points_px, axis=1)
+    return _View(tracks.frame, T_world_camera, points_px, tracks.ids[rows], front[met], errors)
+
+
+def _owners(views: list[_View]) -> dict[int, int]:
+    """The point of each track that met one at least twice: most often, then nearest."""
+    pairs = np.concatenate([np.stack([v.tracks, v.points], axis=1) for v in views])
+    errors = np.concatenate([view.errors for view in views])
+    unique, inverse_rows, counts = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+    mean = np.bincount(inverse_rows.ravel(), errors, len(unique)) / counts
+    often = counts >= 2
+    unique, counts, mean = unique[often], counts[often], mean[often]
+    order = np.lexsort((unique[:, 1], mean, -counts, unique[:, 0]))
+    tracks, first = np.unique(unique[order, 0], return_index=True)
+    return dict(zip(tracks.tolist(), unique[order][first, 1].tolist(), strict=True))
+
+
+def _observations(view: _View, owner: dict[int, int]) -> tuple[F64, I64]:
+    """(N, 2) pixels and (N,) points that the view sees, each point at most once."""
+    owned = np.array([owner.get(track, -1) for track in view.tracks.tolist()], np.int64)
+    good = np.flatnonzero(owned == view.points)
+    good = good[np.lexsort((view.errors[good], view.points[good]))]
+    points, first = np.unique(view.points[good], return_index=True)
+    return view.points_px[good][first], points

@@ -15,6 +15,12 @@ from pliant.algorithms.surfels.states import SurfelFrame
 from pliant.algorithms.tracks import FrameTracks
 
 CAMERA_FRAME_ID = "camera"
+DROPPED = "dropped"
+"""Why an image is missing that live mode left out."""
+PASSED_OVER = "passed over to keep up"
+"""Why a frame that has pixels has no pose."""
+WAITING_FOR_DEPTH = "waiting for depth"
+"""Why a frame has no surfels yet."""
 WORLD_FRAME_ID = "world"
 
 _M = TypeVar("_M", bound="Header")
@@ -114,7 +120,7 @@ class Image(Header):
     grey: (H, W).     colour: (H, W, 3) RGB, or (0, 0, 3) where the source has none.
     missing: "" or why there are no pixels ("dropped", "broken: ..."); both arrays are empty then.
     jpeg, calibration: over a link, instead of pixels, what they are made from: the source's JPEG
-    and its camera as YAML; ``pliant_services.link_images`` makes them.
+    and its camera as YAML; ``pliant_services.runtime.link_images`` makes them.
     unmapped: bundle adjustment passes over this frame, as it is behind (live mode).
     """
 

@@ -28,7 +28,7 @@ FOOTER = struct.Struct("<BQQQI")
 CHUNK_INDEX = struct.Struct("<QQQQI")  # start, end, offset, length, size of the channels' places
 CHUNK_PLACE = struct.Struct("<HQ")  # channel, offset of its message index
 
-_ZSTD_LEVEL = -5  # `pliant bench compression`: 900 MB/s; level 1 saves 5 % more at 350 MB/s
+_ZSTD_LEVEL = -5  # `scripts/bench compression`: 900 MB/s; level 1 saves 5 % more at 350 MB/s
 
 
 class Source(Protocol):

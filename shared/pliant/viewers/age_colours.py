@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pliant.algorithms.arrays import I32, I64, U8
-from pliant.export.overlay import OLDEST, palette
+from pliant.pictures.overlay import OLDEST, palette
 
 _STEPS = 8
 _PALETTE = palette(_STEPS)

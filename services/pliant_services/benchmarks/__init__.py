@@ -1,1 +1,0 @@
-"""What `pliant bench` measures.  Machines are noisy: ratios within one run are what counts."""

@@ -1,0 +1,143 @@
+"""Behind ``pliant mesh``: the final meshes of a recording, made again without a new recording."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.meshing import BlockMesh
+from pliant.bus.replay_bus import ReplayBus
+from pliant.config import Config, recorded_config
+from pliant.errors import RecordingError, ResultError
+from pliant.fusion.memory import check_voxel_sizes
+from pliant.fusion.open3d_import import require_open3d
+from pliant.map_history import MapHistory
+from pliant.messages import topics
+from pliant.messages.topics import Topic
+from pliant.messages.types import CameraStream, Header, MeshPiece, MeshUpdate, Status
+from pliant.recording.reader import Recording
+from pliant.recording.summary import summarise
+from pliant.results.folder import check_output
+from pliant.results.mesh import mesh_report, meshes_of, write_meshes
+from pliant.results.run import folded_map
+from pliant_services.nodes import meshing
+from pliant_services.processes import BY_NAME
+from pliant_services.runtime.host import one_thread_each
+from pliant_services.runtime.monitor import StatusMonitor
+
+REPORT_NAME = "mesh.json"
+
+
+@dataclass
+class Meshing:
+    """What meshing a recording gave.
+
+    seconds: total time of each stage.    live: the live mesh of the segment that was last, as a
+    viewer has it in the end.    cpu_seconds: of the process, at each report.
+    """
+
+    pieces: list[MeshPiece] = field(default_factory=list[MeshPiece])
+    seconds: dict[str, float] = field(default_factory=dict[str, float])
+    counters: dict[str, float] = field(default_factory=dict[str, float])
+    notes: list[str] = field(default_factory=list[str])
+    live: BlockMesh = field(default_factory=BlockMesh)
+    live_segment: int = -1
+    cpu_seconds: list[float] = field(default_factory=list[float])
+
+    def take(self, topic: Topic, message: Header) -> None:
+        """What the service publishes."""
+        if isinstance(message, MeshPiece):
+            self.pieces.append(message)
+        elif isinstance(message, MeshUpdate):
+            if message.segment != self.live_segment:
+                self.live, self.live_segment = BlockMesh(), message.segment
+            self.live.apply(message)
+        elif isinstance(message, Status):
+            for stage, spent in zip(message.stages, message.seconds.tolist(), strict=True):
+                self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
+            self.counters.update(zip(message.counters, message.values.tolist(), strict=True))
+            self.cpu_seconds.append(self.counters["cpu_seconds"])
+            if message.note:
+                self.notes.append(message.note)
+
+
+def mesh_recording(recording: Path, config: Config) -> Meshing:
+    """Run the meshing service on a recording.
+
+    Raises RecordingError where it has no keyframes; VoxelSizeError before the work starts.
+    """
+    reader = Recording(recording)
+    inputs = BY_NAME["meshing"].inputs
+    known = summarise(recording).topics
+    missing = [topic.key for topic in inputs if topic.key not in known]
+    if missing:
+        raise RecordingError(f"{recording}: without {missing[0]}: `pliant replay` makes it")
+    for stream in reader.decoded(topics.STREAM):
+        assert isinstance(stream, CameraStream)
+        check_voxel_sizes(stream.camera, config.meshing.tsdf)
+    found = Meshing()
+    bus = ReplayBus(
+        {topic: reader.decoded(topic) for topic in inputs}, through_codec=False,
+        on_publish=found.take,
+    )  # fmt: skip
+    meshing.run(bus, config, StatusMonitor(bus, "meshing"))
+    return found
+
+
+def run_mesh(
+    recording: Path, *, output: Path | None, force: bool, overrides: Sequence[str]
+) -> Iterator[str]:
+    """Mesh, write the files, and say what came of it.  Raises PliantError."""
+    one_thread_each()
+    config = recorded_config(summarise(recording).metadata, overrides)
+    require_open3d()
+    folder = recording.resolve().parent
+    output = output or _beside(folder)
+    if output.resolve() == folder:
+        raise ResultError(f"{output} holds the recording itself: choose another --output")
+    check_output(output, force=force)
+    found = mesh_recording(recording, config)
+    yield from dict.fromkeys(found.notes)
+    history = folded_map(recording)
+    output.mkdir(parents=True, exist_ok=True)
+    write_all(output, found, history)
+    report = {
+        "mesh": mesh_report(found.pieces),
+        "seconds": found.seconds,
+        "counters": found.counters,
+        "notes": found.notes,
+        "config": config.meshing.model_dump(mode="json"),
+    }
+    (output / REPORT_NAME).write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    for mesh in mesh_report(found.pieces):
+        yield (
+            f"segment {mesh['segment']}, {mesh['level']}: {mesh['triangles']} triangles, "
+            f"{mesh['vertices']} vertices, voxel {mesh['voxel_size']:.4g}"
+        )
+    if not found.pieces:
+        raise RecordingError(
+            f"{recording}: no keyframe has a surface: {' '.join(found.notes[-1:])}"
+        )
+    yield f"results in {output}/"
+
+
+def is_meshed(result: Path, output: Path | None) -> bool:
+    """Whether the mesh of a result folder is there, whole: its report is written last."""
+    return ((output or _beside(result.resolve())) / REPORT_NAME).exists()
+
+
+def _beside(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}_mesh")
+
+
+def write_all(output: Path, found: Meshing, history: MapHistory) -> None:
+    """The meshes and pictures of every segment, as the results of a run have them."""
+    longest = history.longest_segment()
+    for segment in sorted({segment for segment, _ in meshes_of(found.pieces)}):
+        poses = [pose for of, pose in history.keyframe_poses().values() if of == segment]
+        suffix = "" if segment == longest else f"_segment_{segment}"
+        T_world_camera = pose_to_matrix(np.array(poses, np.float64).reshape(-1, 7))
+        write_meshes(output, found.pieces, segment, suffix, T_world_camera)

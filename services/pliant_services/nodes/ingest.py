@@ -1,0 +1,181 @@
+"""Ingest: frames from a source, rectified once for everybody.
+
+in   an image folder, a video, a camera, a built-in sequence
+out  camera/stream   once: the camera
+     camera/source   every frame: its bytes as they came
+     camera/image    every frame: rectified; empty where it was dropped or does not decode; over a
+                     link as ``link_images`` says; who passes over it, as ``keeping_up`` says
+     camera/depth    every frame: the bytes of its depth map, where it has one that somebody wants
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+from pliant.bus.base import Bus, resume
+from pliant.config import Config
+from pliant.datasets.base import Dataset, SourceFrame
+from pliant.datasets.calibration import calibration_yaml
+from pliant.datasets.rectifier import Rectifier, rectified
+from pliant.errors import DatasetError, SourceLostError
+from pliant.messages import topics
+from pliant.messages.types import CAMERA_FRAME_ID, CameraStream, Depth, Image, SourceImage
+from pliant_services.runtime.keeping_up import MappingPace, images_that_wait, readers_that_may_lag
+from pliant_services.runtime.link_images import Sender
+from pliant_services.runtime.monitor import Monitor
+
+
+def run(
+    bus: Bus, config: Config, monitor: Monitor, dataset: Dataset, stopping: Callable[[], bool]
+) -> None:
+    """Publish until the source ends or ``stopping()``.
+
+    Raises SourceLostError where the source fails after its first frame; what came before is sent.
+    """
+    live = plays_live(dataset, config)
+    rectifier = Rectifier(dataset.calibration)
+    link = Sender(config.bus, dataset.calibration)
+
+    def start() -> tuple[Any, ...]:
+        bus.publish(topics.STREAM, _stream(dataset, rectifier, live=live))
+        bus.end(topics.STREAM)  # its readers wait for its end before the first frame
+        # One less than there is credit for: the tracks of a frame are taken after its image.
+        return 0, 0, 0, (deque[int](maxlen=config.bus.window - 1),)
+
+    begin, dropped, broken, kept = resume(bus, start)
+    pace = MappingPace(*kept)
+    image: Image | None = None
+    try:
+        for source in newest(dataset, stopping) if live else every(dataset, stopping):
+            if source.index < begin:  # sent before we were started again
+                continue
+            with monitor.stage("rectify"):
+                source, made_from = link.source(source)
+                image = rectified(source, rectifier)
+            if live and pace.passes_over(image, images_that_wait(bus), config.ingest.mapping_lag_s):
+                image = replace(image, unmapped=True)
+            dropped += source.dropped
+            broken += bool(image.missing) and not source.dropped
+            bus.publish(topics.SOURCE, _source_message(source, made_from, image.unmapped))
+            may_lag = readers_that_may_lag(image)
+            bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)
+            bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
+            monitor.report(image, dropped=dropped, broken=broken, unmapped=pace.passed)
+            kept = tuple(vars(pace).values())
+            bus.checkpoint(image.frame, (image.frame + 1, dropped, broken, kept))
+    except DatasetError as error:
+        if image is None:
+            raise
+        monitor.report(image, note=str(error), dropped=dropped, broken=broken, unmapped=pace.passed)
+        raise SourceLostError(str(error)) from None
+
+
+def plays_live(dataset: Dataset, config: Config) -> bool:
+    """Whether the newest frame wins, and others are passed over."""
+    return dataset.is_live if config.ingest.mode == "auto" else config.ingest.mode == "live"
+
+
+def every(dataset: Dataset, stopping: Callable[[], bool]) -> Iterator[SourceFrame]:
+    """Lossless: every frame, at the pace of the slowest reader."""
+    for frame in dataset:
+        if stopping():
+            return
+        yield frame
+
+
+def newest(dataset: Dataset, stopping: Callable[[], bool]) -> Iterator[SourceFrame]:
+    """Live: the newest frame wins; those passed over come out without data, to be counted.
+
+    A source that is not a camera is played at the pace of its own time stamps.
+    """
+    slot: list[SourceFrame] = []
+    failure: list[BaseException] = []
+    changed = threading.Condition()
+    finished = threading.Event()
+
+    def capture() -> None:
+        try:
+            play()
+        except BaseException as error:
+            failure.append(error)
+        finally:
+            finished.set()
+            with changed:
+                changed.notify()
+
+    def play() -> None:
+        start_s, first_ns = time.monotonic(), None
+        for frame in dataset:
+            first_ns = frame.stamp_ns if first_ns is None else first_ns
+            if not dataset.is_live:
+                due_s = start_s + (frame.stamp_ns - first_ns) * 1e-9
+                finished.wait(max(0.0, due_s - time.monotonic()))
+            if finished.is_set():
+                return
+            with changed:
+                if slot:  # passed over: only its number and time are kept
+                    slot[-1] = slot[-1].without_data()
+                slot.append(frame)
+                changed.notify()
+
+    threading.Thread(target=capture, daemon=True).start()
+    try:
+        while True:
+            with changed:
+                changed.wait_for(lambda: slot or finished.is_set(), timeout=1.0)
+                frames, slot[:] = slot[:], []
+                over = finished.is_set()
+            yield from frames
+            if stopping():
+                return
+            if over and not slot:
+                if failure:
+                    raise failure[0]
+                return
+    finally:
+        finished.set()
+
+
+def _stream(dataset: Dataset, rectifier: Rectifier, *, live: bool) -> CameraStream:
+    camera = rectifier.camera
+    return CameraStream(
+        frame=0,
+        stamp_ns=0,
+        frame_id=CAMERA_FRAME_ID,
+        source=dataset.name,
+        mode="live" if live else "lossless",
+        frames=dataset.frame_count if dataset.frame_count is not None else -1,
+        calibration=calibration_yaml(dataset.calibration),
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+    )
+
+
+def _source_message(source: SourceFrame, made_from: str, unmapped: bool) -> SourceImage:
+    return SourceImage(
+        frame=source.index,
+        stamp_ns=source.stamp_ns,
+        frame_id=CAMERA_FRAME_ID,
+        encoding=source.encoding,
+        width=source.width,
+        height=source.height,
+        data=source.data,
+        made_from=made_from,
+        unmapped=unmapped,
+    )
+
+
+def _depth_message(source: SourceFrame) -> Depth:
+    return Depth(
+        frame=source.index,
+        stamp_ns=source.stamp_ns,
+        frame_id=CAMERA_FRAME_ID,
+        data=source.depth,
+    )

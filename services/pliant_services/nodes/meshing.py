@@ -1,0 +1,66 @@
+"""Meshing: a dense surface from the keyframes of the map.
+
+in   camera/stream        once
+     map/update           every frame
+     map/keyframe         every frame: the keyframes that are new or leave the window
+     map/final, map/keyframe_final   once, after the last frame
+out  mesh/blocks          the blocks of the live mesh that changed
+     mesh/final           the meshes of every segment from the final poses, in pieces
+"""
+
+from collections.abc import Iterable
+
+from pliant.bus.base import Bus, join, receive, receive_one
+from pliant.config import Config
+from pliant.fusion.keyframe_spool import KeyframeSpool
+from pliant.fusion.mesher import LiveChange, Mesher
+from pliant.fusion.open3d_import import require_open3d
+from pliant.messages import topics
+from pliant.messages.mesh_pieces import split
+from pliant.messages.types import (
+    WORLD_FRAME_ID,
+    CameraStream,
+    Header,
+    Keyframe,
+    MapUpdate,
+    MeshUpdate,
+)
+from pliant_services.runtime.monitor import Monitor
+
+
+def run(bus: Bus, config: Config, monitor: Monitor) -> None:
+    """Mesh until the map ends."""
+    require_open3d()
+    stream = receive_one(bus, topics.STREAM, CameraStream)
+    is_live = stream.mode == "live"
+    with KeyframeSpool() as spool:
+        mesher = Mesher(stream.camera, config.meshing, spool)
+        updates = receive(bus, topics.MAP_UPDATE, MapUpdate)
+        keyframes = receive(bus, topics.KEYFRAME, Keyframe)
+        for update, keyframe in join(updates, keyframes):
+            mesher.take(update, keyframe, keyframe.images(), update.frame)
+            # Live: first all that has come is taken, so that nobody waits for the mesh.
+            if not (is_live and bus.is_waiting(topics.KEYFRAME)):
+                changes = mesher.fuse(newest_only=is_live, timer=monitor.stage)
+                _publish(bus, keyframe, changes)
+            monitor.report(keyframe, note=mesher.note, **mesher.counts, **mesher.memory)
+        last = receive_one(bus, topics.MAP_FINAL, MapUpdate)
+        rest = receive_one(bus, topics.KEYFRAME_FINAL, Keyframe)
+        mesher.take(last, rest, rest.images(), last.frame)
+        for final in mesher.finish(timer=monitor.stage):
+            for piece in split(
+                last, final.mesh, segment=final.segment, level=final.level,
+                voxel_size=final.voxel_size, keyframes=final.keyframes,
+            ):  # fmt: skip
+                bus.publish(topics.MESH_FINAL, piece)
+        monitor.report(last, note=mesher.note, **mesher.counts, **mesher.memory)
+
+
+def _publish(bus: Bus, header: Header, changes: Iterable[LiveChange]) -> None:
+    for change in changes:
+        message = MeshUpdate.of(
+            header, change.blocks, frame_id=WORLD_FRAME_ID,
+            segment=change.segment, voxel_size=change.voxel_size, again=change.again,
+            first_key=change.span[0], last_key=change.span[1],
+        )  # fmt: skip
+        bus.publish(topics.MESH_BLOCKS, message)

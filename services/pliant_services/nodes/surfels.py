@@ -1,0 +1,197 @@
+"""Surfels: follows small patches of a deforming surface, each on its own, from a depth on.
+
+in   camera/stream    once
+     camera/image     every frame
+     camera/depth     every frame: empty, or a depth map: the first one starts the surfels
+     tracks/extrema   every frame, where tracking runs: where surfels may have gone
+     map/update, map/keyframe   every frame, where bundle adjustment runs: depths for births
+out  surfels/state    one per frame: all surfels, and the camera; empty without pixels
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.surfels import SurfelFrame, SurfelState, SurfelTracker, agree, predict
+from pliant.algorithms.tracks import FrameTracks
+from pliant.bus.base import Bus, join, receive, receive_one, resume
+from pliant.config import Config
+from pliant.datasets.base import BrokenFrame
+from pliant.datasets.calibration import calibration_from_yaml
+from pliant.datasets.depth import DepthRectifier
+from pliant.errors import ConfigError
+from pliant.map_depth import MapDepth, MapView
+from pliant.messages import topics
+from pliant.messages.types import (
+    WAITING_FOR_DEPTH,
+    WORLD_FRAME_ID,
+    CameraStream,
+    Depth,
+    Extrema,
+    Image,
+    Keyframe,
+    MapUpdate,
+    Surfels,
+)
+from pliant_services.runtime.link_images import receive_images
+from pliant_services.runtime.monitor import Monitor
+
+_FLAT_DEPTH = 1.0
+
+
+@dataclass(frozen=True)
+class _Heard:
+    """What has come for one frame.  tracks, update, keyframe: where somebody makes them."""
+
+    image: Image
+    depth: Depth
+    tracks: Extrema | None = None
+    update: MapUpdate | None = None
+    keyframe: Keyframe | None = None
+
+    @property
+    def frame(self) -> int:
+        return self.image.frame
+
+
+@dataclass
+class _State:
+    """map_depth: as long as surfels are born on our own map.    tracks, points_px: of the last
+    frame.    ratio, segment: units of the surfels by one of the map, and the segment of the map,
+    when surfels were last born on it."""
+
+    stream: CameraStream
+    tracker: SurfelTracker
+    map_depth: MapDepth | None
+    started: bool
+    tracks: FrameTracks | None
+    points_px: F32
+    ratio: float = 1.0
+    segment: int = -1
+
+
+def run(bus: Bus, config: Config, monitor: Monitor) -> None:
+    """Follow surfels until the images end."""
+    _check(bus, config)
+
+    def start() -> tuple[Any, ...]:
+        stream = receive_one(bus, topics.STREAM, CameraStream)
+        uses_map = config.surfels.depth_from == "map"
+        map_depth = MapDepth(stream.camera, config.surfels) if uses_map else None
+        nothing = np.zeros((0, 2), np.float32)
+        return stream, SurfelTracker(config.surfels), map_depth, False, None, nothing
+
+    state = _State(*resume(bus, start))
+    rectifier = DepthRectifier(calibration_from_yaml(state.stream.calibration))
+    for heard in _hear(bus):
+        image, missing = heard.image, heard.image.missing
+        frame, metres, note = SurfelFrame.empty(), None, ""
+        view = _look_at_map(state, heard, config)
+        if heard.depth.data and not missing and config.surfels.depth_from == "sensor":
+            try:
+                metres = rectifier.rectify(image.frame, heard.depth.data)
+            except BrokenFrame as error:
+                note = str(error)
+        if not missing and state.started:
+            with monitor.stage("track"):
+                frame = state.tracker.track(image.grey, _prediction(state, heard, config), metres)
+            if view is not None:
+                with monitor.stage("births"):
+                    frame, note = _add(state, image.grey, frame, view, config)
+        elif not missing:
+            with monitor.stage("start"):
+                frame, missing = _start(state, heard, metres, view, config)
+        if not heard.image.missing:
+            state.tracks, state.points_px = heard.tracks, frame.points_px
+        message = Surfels.of(image, frame, frame_id=WORLD_FRAME_ID, missing=missing, note=note)
+        bus.publish(topics.SURFELS, message)
+        monitor.report(
+            image,
+            note=missing or note or ("tracking is lost" if frame.lost else ""),
+            surfels=len(frame.ids),
+            alive=int(np.count_nonzero(frame.state == SurfelState.TRACKED)),
+        )
+        bus.checkpoint(image.frame, tuple(vars(state).values()))
+
+
+def _check(bus: Bus, config: Config) -> None:
+    """Raise ConfigError where the configuration needs what nobody of the fleet makes."""
+    needs = {
+        "surfels.depth_from=map": (config.surfels.depth_from == "map", topics.KEYFRAME),
+        "surfels.prediction=tracks": (config.surfels.prediction == "tracks", topics.EXTREMA),
+    }
+    for setting, (wanted, topic) in needs.items():
+        if wanted and not bus.reads(topic):
+            raise ConfigError(f"{setting}: nobody here publishes {topic.key}, which it needs")
+
+
+def _hear(bus: Bus) -> Iterator[_Heard]:
+    """Everything for each frame, whatever the fleet makes."""
+    pairs = join(receive_images(bus), receive(bus, topics.DEPTH, Depth))
+    heard = (_Heard(image, depth) for image, depth in pairs)
+    if bus.reads(topics.EXTREMA):
+        extrema = receive(bus, topics.EXTREMA, Extrema)
+        heard = (replace(h, tracks=tracks) for h, tracks in join(heard, extrema))
+    if bus.reads(topics.KEYFRAME):
+        updates = receive(bus, topics.MAP_UPDATE, MapUpdate)
+        heard = (replace(h, update=update) for h, update in join(heard, updates))
+        keyframes = receive(bus, topics.KEYFRAME, Keyframe)
+        heard = (replace(h, keyframe=keyframe) for h, keyframe in join(heard, keyframes))
+    return heard
+
+
+def _prediction(state: _State, heard: _Heard, config: Config) -> F64 | None:
+    if config.surfels.prediction == "none" or state.tracks is None or heard.tracks is None:
+        return None
+    return predict(state.points_px, state.tracks, heard.tracks)
+
+
+def _look_at_map(state: _State, heard: _Heard, config: Config) -> MapView | None:
+    """What our own map shows in this frame.  Every frame tells of the map, pixels or not."""
+    if state.map_depth is None or heard.update is None or heard.keyframe is None:
+        return None
+    p = config.surfels
+    max_sigma = p.map_birth_sigma if state.started else p.map_sigma
+    return state.map_depth.take(heard.update, heard.keyframe, heard.frame, max_sigma=max_sigma)
+
+
+def _start(
+    state: _State, heard: _Heard, metres: F64 | None, view: MapView | None, config: Config
+) -> tuple[SurfelFrame, str]:
+    """Surfels where there is depth for this frame, and else what is waited for."""
+    image, T_world_camera, missing = heard.image.grey, None, WAITING_FOR_DEPTH
+    if config.surfels.depth_from == "flat":
+        metres = np.full(image.shape, _FLAT_DEPTH)
+    elif view is not None:
+        # From here on world and scale are those of the map as it is now, whatever it learns later.
+        metres, T_world_camera, state.segment = view.depth, view.T_world_camera, view.segment
+    elif state.map_depth is not None:
+        missing = f"{WAITING_FOR_DEPTH} from the map: {state.map_depth.problem}"
+    if metres is None:
+        return SurfelFrame.empty(), missing
+    frame = state.tracker.start(image, metres, state.stream.camera, T_world_camera)
+    state.started = True
+    if not config.surfels.map_births:
+        state.map_depth = None
+    return frame, ""
+
+
+def _add(
+    state: _State, image: U8, frame: SurfelFrame, view: MapView, config: Config
+) -> tuple[SurfelFrame, str]:
+    """More surfels on a later keyframe of our own map, and else why there are none."""
+    if not frame.lost:
+        found = agree(view.depth, frame, config.surfels)
+        if found.depth is None:
+            return frame, f"no surfels are born on the map: {found.problem}"
+        state.ratio, state.segment = found.ratio, view.segment
+        return state.tracker.add(image, found.depth), ""
+    # Nobody is left to compare with.  For the same map the last ratio holds, another starts anew.
+    if view.segment != state.segment:
+        state.ratio, state.segment = 1.0, view.segment
+    T_world_camera = view.T_world_camera.copy()
+    T_world_camera[:3, 3] *= state.ratio
+    return state.tracker.add(image, state.ratio * view.depth, T_world_camera), ""

@@ -1,0 +1,35 @@
+"""Tracking: follows curvature extrema through the video.
+
+in   camera/stream    once
+     camera/image     every frame
+out  tracks/extrema   one per frame: tracks and all maxima; empty where the frame has no pixels
+"""
+
+from pliant.algorithms.tracking import ExtremaTracker
+from pliant.algorithms.tracks import FrameTracks
+from pliant.bus.base import Bus, receive_one, resume
+from pliant.config import Config
+from pliant.messages import topics
+from pliant.messages.types import CameraStream, Extrema
+from pliant_services.runtime.keeping_up import readers_that_may_lag
+from pliant_services.runtime.link_images import receive_images
+from pliant_services.runtime.monitor import Monitor
+
+
+def run(bus: Bus, config: Config, monitor: Monitor) -> None:
+    """Track until the images end."""
+
+    def start() -> ExtremaTracker:
+        stream = receive_one(bus, topics.STREAM, CameraStream)
+        return ExtremaTracker(stream.width, stream.height, config.tracking, config.seed)
+
+    tracker = resume(bus, start)
+    for image in receive_images(bus):
+        if image.missing:
+            tracks = FrameTracks.empty()
+        else:
+            tracks = tracker.track(image.grey, monitor.stage)
+        extrema = Extrema.of(image, tracks, missing=image.missing)
+        bus.publish(topics.EXTREMA, extrema, may_lag=readers_that_may_lag(image))
+        monitor.report(image, tracks=len(tracks.ids), maxima=len(tracks.maxima))
+        bus.checkpoint(image.frame, tracker)

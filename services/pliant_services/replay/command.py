@@ -1,0 +1,106 @@
+"""Behind ``pliant replay``: from a result folder to a new one, and whether they agree."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pliant.config import config_yaml, recorded_config
+from pliant.errors import RecordingError, ResultError
+from pliant.messages import topics
+from pliant.messages.topics import Topic
+from pliant.recording.compare import check_tolerances, compare
+from pliant.recording.reader import Recording
+from pliant.recording.summary import summarise
+from pliant.results.folder import RECORDING_NAME, check_output, prepare, run_metadata
+from pliant.results.verdict import summary
+from pliant.results.write import write_results
+from pliant_services.replay.as_processes import run_as_processes
+from pliant_services.replay.services import (
+    Replay,
+    gaps,
+    recorded_services,
+    replayable,
+    require_inputs,
+)
+from pliant_services.runtime.host import one_thread_each
+
+SAME, DIFFERENT = 0, 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayRequest:
+    """What the user asked for."""
+
+    recording: Path
+    services: Sequence[str]  # without any, all that were recorded
+    output: Path | None = None
+    force: bool = False
+    overrides: Sequence[str] = ()
+    check: bool = False
+    tolerances: Mapping[str, float] = field(default_factory=dict[str, float])
+    processes: bool = False
+
+
+def comparable(made: Sequence[Topic], mode: str) -> list[Topic]:
+    """What must be the same: in live mode the live mesh shows what there was time for."""
+    return [topic for topic in made if mode != "live" or topic != topics.MESH_BLOCKS]
+
+
+def run_replay(request: ReplayRequest) -> int:
+    """Replay, write the results, compare; returns the exit code.  Raises PliantError."""
+    one_thread_each()
+    recorded = summarise(request.recording)
+    services = replayable(request.services or recorded_services(recorded))
+    if not recorded.has_index:
+        raise RecordingError(
+            f"{request.recording}: not closed: `pliant recover` makes a recording that replays"
+        )
+    config = recorded_config(recorded.metadata, request.overrides)
+    folder = request.recording.resolve().parent
+    require_inputs(recorded, services)
+    replay = Replay(request.recording, recorded, services, config)
+    check_tolerances(replay.made, request.tolerances)
+    output = request.output or folder.with_name(f"{folder.name}_replay")
+    check_output(output, force=request.force)
+    if output.resolve() == folder:
+        raise ResultError(f"{output} holds the recording itself: choose another --output")
+    prepare(output, config_yaml(config))
+    metadata = run_metadata(config_yaml(config))
+    metadata["replay"] = {
+        "of": str(request.recording),
+        "services": ",".join(s.name for s in services),
+    }
+    made = output / RECORDING_NAME
+    for line in gaps(recorded, services):
+        print(line, file=sys.stderr)
+    if request.processes:
+        run_as_processes(request.recording, services, config, output, metadata)
+    else:
+        replay.run(made, metadata)
+    report = write_results(output)
+    has_map = topics.MAP_UPDATE in replay.made or topics.MAP_UPDATE.key not in replay.affected
+    for line in summary(report, has_map=has_map):
+        print(line)
+    print(f"results in {output}/")
+    if not request.check:
+        return SAME
+    compared = comparable(replay.made, report["mode"])
+    differences = compare(
+        Recording(request.recording), Recording(made), compared, request.tolerances
+    )
+    for difference in differences:
+        print(
+            f"{difference.topic} differs in {difference.messages} messages, "
+            f"first {difference.first}"
+        )
+    if not differences:
+        keys = ", ".join(topic.key for topic in compared)
+        how = "the same within the tolerances" if request.tolerances else "the same bytes"
+        print(f"{how} as recorded: {keys}")
+        return SAME
+    before, now = recorded.metadata.get("packages", {}), metadata["packages"]
+    for name in sorted(before.keys() & now.keys()):
+        if before[name] != now[name]:
+            print(f"recorded with {name} {before[name]}, here is {now[name]}")
+    return DIFFERENT

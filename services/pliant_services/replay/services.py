@@ -1,0 +1,254 @@
+"""Runs services again on what was recorded: in one process, without a bus, at full speed.
+
+Services run one after the other, and what one makes goes to the new recording, from where the next
+one reads it: so memory stays that of one message, and nothing depends on timing.
+"""
+
+import importlib
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from threading import Event
+
+from pliant.bus.replay_bus import ReplayBus
+from pliant.config import Config
+from pliant.datasets.calibration import calibration_from_yaml
+from pliant.datasets.own_recording import recorded_frame
+from pliant.datasets.rectifier import Rectifier, rectified
+from pliant.errors import RecordingError
+from pliant.messages import codec, topics
+from pliant.messages.topics import Topic, by_key
+from pliant.messages.types import CameraStream, Header, Image, SourceImage, StreamEnd
+from pliant.recording.reader import Recorded, Recording
+from pliant.recording.summary import Summary
+from pliant.recording.writer import RecordingWriter
+from pliant_services.processes import PROCESSES, Process, outputs_of
+from pliant_services.replay.ahead import Do, behind, quick_turns, read_ahead
+from pliant_services.runtime.monitor import StatusMonitor
+
+
+def replayable(names: Sequence[str]) -> tuple[Process, ...]:
+    """The services in the order in which they read each other.  Raises RecordingError."""
+    able = [p.name for p in PROCESSES if p.inputs and not p.observer]
+    wrong = [name for name in names if name not in able]
+    if wrong or not names:
+        raise RecordingError(f"--services {','.join(names)}: choose from {', '.join(able)}")
+    return tuple(process for process in PROCESSES if process.name in names)
+
+
+def recorded_services(summary: Summary) -> list[str]:
+    """Names of the services whose outputs the recording holds, but for the source."""
+    return [
+        p.name for p in PROCESSES if p.inputs and any(t.key in summary.topics for t in p.outputs)
+    ]
+
+
+def require_inputs(summary: Summary, services: Sequence[Process]) -> None:
+    """Raise RecordingError where the recording lacks what services read of every frame."""
+    needing = _lacking(summary, services, topics.IMAGE)
+    if needing:
+        raise RecordingError(
+            f"{' and '.join(needing)} cannot be replayed: the recording is without "
+            f"{topics.SOURCE.key} (made with --no-images?)"
+        )
+    made = _made_by(services)
+    needed = {t: None for p in services for t in p.inputs if t.per_frame or t == topics.STREAM}
+    for topic in [topic for topic in needed if topic not in made]:
+        needing = _lacking(summary, services, topic)
+        if needing:
+            raise RecordingError(
+                f"{' and '.join(needing)} cannot be replayed: the recording is without {topic.key} "
+                "(cut off early, or one part of several? their folder replays as a whole)"
+            )
+
+
+def _made_by(services: Sequence[Process]) -> tuple[Topic, ...]:
+    """What services publish: in a replay of several it is made again, and not read."""
+    return tuple(topic for process in services for topic in process.outputs)
+
+
+def _lacking(summary: Summary, services: Sequence[Process], topic: Topic) -> list[str]:
+    """Names of the services that read a topic, if the recording has nothing of it."""
+    there = _recorded_as(topic).key in summary.topics
+    return [] if there else [p.name for p in services if topic in p.inputs]
+
+
+def _recorded_as(topic: Topic) -> Topic:
+    """Rectified images are not recorded; they are made again from the source's."""
+    return topics.SOURCE if topic == topics.IMAGE else topic
+
+
+def gaps(summary: Summary, services: Sequence[Process]) -> list[str]:
+    """What is known to be missing of what the services read, for people."""
+    read = {t for p in services for t in (*p.inputs, *p.optional)}.difference(_made_by(services))
+    missing = {(key := _recorded_as(t).key): summary.missing_of(key) for t in read}
+    return [
+        f"{key} lacks {count} of its messages: what is made of the others is not what the run made"
+        for key, count in sorted(missing.items())
+        if count
+    ]
+
+
+class Replay:
+    """One replay: from a recording into a new one."""
+
+    def __init__(
+        self, path: Path, summary: Summary, services: Sequence[Process], config: Config
+    ) -> None:
+        self._recorded = Recording(path)
+        self._summary = summary
+        self._services = services
+        self._config = config
+        self.made = _made_by(services)
+        self.affected = affected(services)
+        """Keys of the topics that are not taken over: they would be out of date."""
+
+    def run(self, output: Path, metadata: Mapping[str, Mapping[str, str]]) -> None:
+        """Write the new recording: what came before the services as it was, and what they make.
+
+        Raises PliantError; KeyboardInterrupt leaves a recording that is closed and incomplete.
+        """
+        with RecordingWriter(output, metadata) as writer:
+            for process in self._services:
+                writer.sync()  # what was made so far is the input of this one
+                made = Recording(output)
+                inputs = {
+                    topic: self.messages(topic, made if topic in self.made else self._recorded)
+                    for topic in self._inputs_of(process)
+                }
+                first = process == self._services[0]  # it reads nothing of what is copied
+                beside = partial(self._copy, writer) if first else None
+                run_on(process, inputs, self._config, writer, beside)
+
+    def messages(self, topic: Topic, recording: Recording | None = None) -> Iterator[Header]:
+        """A topic as a service reads it; of a recording that was cut off, what all topics have."""
+        if topic == topics.IMAGE:
+            found = read_ahead(self._images())  # they take half as long as tracking
+        else:
+            found = (recording or self._recorded).decoded(topic)
+        return islice(found, self._frames()) if topic.per_frame else found
+
+    def _inputs_of(self, process: Process) -> tuple[Topic, ...]:
+        """What it reads: as in the run, and what other services of this replay make."""
+        recorded = self._summary.topics
+        there = (t for t in process.optional if t in self.made or t.key in recorded)
+        return (*process.inputs, *there)
+
+    def _frames(self) -> int:
+        """Frames that every recorded input has."""
+        wanted = {t for p in self._services for t in self._inputs_of(p) if t.per_frame}
+        keys = {_recorded_as(topic).key for topic in wanted if topic not in self.made}
+        found = self._summary.topics
+        return min((found[key].messages if key in found else 0) for key in keys)
+
+    def _images(self) -> Iterator[Image]:
+        """The rectified images, made again from their bytes."""
+        rectifier: Rectifier | None = None
+        for stream in self._recorded.decoded(topics.STREAM):
+            assert isinstance(stream, CameraStream)
+            rectifier = Rectifier(calibration_from_yaml(stream.calibration))
+        if rectifier is None:
+            raise RecordingError("the recording has no camera: it stopped before its first frame")
+        for source in self._recorded.decoded(topics.SOURCE):
+            assert isinstance(source, SourceImage)
+            yield rectified(recorded_frame(source), rectifier, unmapped=source.unmapped)
+
+    def _copy(self, writer: RecordingWriter, failed: Event) -> None:
+        """What the services do not touch: it makes the new recording one that can be replayed."""
+        for message in self._recorded.messages(*self._untouched()):
+            if failed.is_set():  # or interrupted
+                return
+            key = message.topic.key
+            if message.topic == topics.STREAM_END:
+                end = message.decode()
+                assert isinstance(end, StreamEnd)
+                key = end.topic
+            if key not in self.affected:
+                _write(writer, message)
+
+    def _untouched(self) -> list[Topic]:
+        found = (by_key(key) for key in self._summary.topics if key not in self.affected)
+        return [topics.STREAM_END, *(topic for topic in found if topic is not None)]
+
+
+def run_on(
+    process: Process,
+    inputs: Mapping[Topic, Iterable[Header]],
+    config: Config,
+    writer: RecordingWriter,
+    beside: Callable[[Event], None] | None = None,
+) -> None:
+    """Run a service on messages; what it makes is recorded, numbered and closed as on the bus.
+
+    beside: done by the thread that writes, before it writes; told when the service has failed.
+    """
+    failed = Event()
+    with quick_turns(), behind() as do:
+        if beside is not None:
+            do(partial(beside, failed))
+        sink = _Sink(writer, outputs_of(process.name), do)
+        bus = ReplayBus(inputs, through_codec=False, on_publish=sink.publish)
+        module = importlib.import_module(process.module)
+        complete = False
+        try:
+            module.run(bus, config, StatusMonitor(bus, process.name))
+            complete = True
+        finally:
+            if not complete:
+                failed.set()
+            sink.end(complete=complete)
+
+
+class _Sink:
+    """Writes what a service publishes, numbered as on the bus."""
+
+    def __init__(self, writer: RecordingWriter, outputs: Iterable[Topic], do: Do) -> None:
+        self._writer = writer
+        self._do = do
+        self._sent = dict.fromkeys(outputs, 0)
+
+    def publish(self, topic: Topic, message: Header) -> None:
+        self._write(topic, topic, message)
+
+    def end(self, *, complete: bool) -> None:
+        for topic, sent in list(self._sent.items()):
+            closing = StreamEnd(
+                frame=sent, stamp_ns=0, frame_id="",
+                topic=topic.key, messages=sent, complete=complete,
+            )  # fmt: skip
+            self._write(topic, topics.STREAM_END, closing)
+
+    def _write(self, of: Topic, topic: Topic, message: Header) -> None:
+        write = partial(
+            self._writer.write,
+            topic,
+            codec.encode(message),  # now: the service may go on with the arrays
+            sequence=self._sent[of],
+            log_time_ns=time.time_ns(),
+            publish_time_ns=message.stamp_ns,
+        )
+        self._do(write)
+        self._sent[of] += 1
+
+
+def affected(services: Sequence[Process]) -> set[str]:
+    """Topics of the services, and of all that read what these make: they would be out of date."""
+    stale: set[Topic] = set()
+    affected: set[str] = set()
+    for process in PROCESSES:  # in the order in which they read each other
+        if process in services or stale & {*process.inputs, *process.optional}:
+            stale |= set(process.outputs)
+            affected |= {topic.key for topic in outputs_of(process.name)}
+    return affected
+
+
+def _write(writer: RecordingWriter, message: Recorded) -> None:
+    writer.write(
+        message.topic,
+        message.data,
+        sequence=message.sequence,
+        log_time_ns=message.log_time_ns,
+        publish_time_ns=message.publish_time_ns,
+    )

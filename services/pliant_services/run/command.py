@@ -1,0 +1,242 @@
+"""One run from the command line: check, compile, launch, wait, write the results."""
+
+import re
+import shutil
+import sys
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pliant.config import Config, config_yaml, load_config
+from pliant.datasets import open_source
+from pliant.datasets.builtin import builtin_folder, is_builtin
+from pliant.datasets.rectifier import Rectifier
+from pliant.errors import PliantError, ResultError
+from pliant.fusion.memory import check_voxel_sizes
+from pliant.recording import parts
+from pliant.recording.recover import mend
+from pliant.results.folder import (
+    CONFIG_NAME,
+    RECORDING_NAME,
+    STATE_FOLDER,
+    check_output,
+    files_of,
+    prepare,
+)
+from pliant.results.verdict import grade, summary
+from pliant.results.write import write_results
+from pliant_services.mesh.afterwards import add_mesh
+from pliant_services.nodes.ingest import plays_live
+from pliant_services.processes import PROFILES, deformable_fleet, inputs_of, reads_depth
+from pliant_services.run.mesh_check import WITH_MESH, choose_profile
+from pliant_services.run.progress import Progress
+from pliant_services.run.spectators import announced, check_viewer, viewer
+from pliant_services.runtime import kernels as warm_up
+from pliant_services.runtime.launcher import Fleet
+
+INTERRUPTED = 130
+_DEFORMABLE = "deformable"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRequest:
+    """What the user asked for."""
+
+    source: str
+    profile: str = "rigid"
+    output: Path | None = None
+    force: bool = False
+    config_file: Path | None = None
+    overrides: Sequence[str] = ()
+    seed: int | None = None
+    calibration: Path | None = None
+    fov_deg: float | None = None
+    topic: str = ""
+    port: int | None = None
+    view: Literal["window", "web"] | None = None
+    save: Path | None = None
+    on_crash: Literal["stop", "restart"] = "stop"
+    resume: bool = False
+
+
+def run_pipeline(request: RunRequest) -> int:
+    """Run the pipeline; returns the exit code.  Raises PliantError for what the user can mend.
+
+    Everything is checked before an earlier result is touched.
+    """
+    config = load_config(request.config_file, request.overrides, seed=request.seed)
+    output = request.output or Path("results") / _folder_name(request.source)
+    profile = request.profile
+    state = output / STATE_FOLDER if request.on_crash == "restart" or request.resume else None
+    if request.resume:
+        config = resumed_config(output, request)
+        profile = _DEFORMABLE if (output / STATE_FOLDER / "surfels").is_dir() else profile
+    else:
+        check_output(output, force=request.force)
+    if request.view or request.save:
+        check_viewer(output, web=request.view == "web", save=request.save, force=request.force)
+    if is_builtin(request.source):
+        builtin_folder(request.source, progress=_say_rendering)
+    dataset = open_source(
+        request.source,
+        calibration=request.calibration,
+        fov_deg=request.fov_deg,
+        topic=request.topic,
+        depth=config.ingest.depth if reads_depth(PROFILES[profile], config) else "none",
+    )
+    progress = Progress(dataset.frame_count)
+    if profile == _DEFORMABLE:
+        profile = deformable_fleet(config)
+    else:
+        profile, without_mesh = choose_profile(config)
+        if without_mesh:
+            progress.say(without_mesh)
+        if profile == WITH_MESH:
+            check_voxel_sizes(Rectifier(dataset.calibration).camera, config.meshing.tsdf)
+    mesh_afterwards = state is not None and profile == WITH_MESH
+    services = PROFILES["points" if mesh_afterwards else profile]
+    if request.resume and _has_ended(output, services, config):
+        progress.say("the run had come to its end already: what follows from it is written again")
+        interrupted, failure = False, None
+    else:
+        if request.resume and plays_live(dataset, config):
+            raise ResultError(
+                f"{output} was recorded live, and what was passed over then would be others now: "
+                f"`pliant run {output / RECORDING_NAME} --output ...` works on what was recorded"
+            )
+        fleet = Fleet(
+            services,
+            log_folder=output / "logs",
+            on_status=progress.on_status,
+            port=request.port,
+            state=state,
+        )
+        interrupted, failure = _go_through(request, config, output, fleet, progress)
+    if failure is None and mesh_afterwards and parts.exists(output / RECORDING_NAME):
+        progress.say("meshing what was recorded ...")
+        try:
+            add_mesh(output)
+        except KeyboardInterrupt:
+            interrupted = True
+        except PliantError as error:
+            failure = error
+    if failure is None and not interrupted:
+        shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
+    return _finish(output, interrupted=interrupted, failure=failure)
+
+
+def _go_through(
+    request: RunRequest, config: Config, output: Path, fleet: Fleet, progress: Progress
+) -> tuple[bool, PliantError | None]:
+    """Start the services and wait for their end: whether it was Ctrl-C, and what went wrong."""
+    try:
+        warm_up.compile_kernels(progress.say)  # whatever ends it, an earlier result is as it was
+        if not request.resume:
+            prepare(output, config_yaml(config))
+        looking_on = (
+            viewer(fleet, web=request.view == "web", save=request.save)
+            if request.view or request.save
+            else nullcontext()
+        )
+        try:
+            with announced(output, fleet.endpoint, fleet.session), looking_on, progress:
+                fleet.start(lambda name: service_arguments(name, request, output))
+                progress.say(f"services are up; look on: pliant view {output}")
+                return _wait(fleet, progress), None
+        except KeyboardInterrupt:
+            return True, None
+        except PliantError as error:
+            return False, error
+    finally:
+        fleet.close()
+
+
+def resumed_config(output: Path, request: RunRequest) -> Config:
+    """The configuration of the run that is taken up again.  Raises ResultError, ConfigError."""
+    if not (output / STATE_FOLDER).is_dir():
+        raise ResultError(
+            f"{output} holds no run that can be resumed: start it with --on-crash restart"
+        )
+    if request.overrides or request.config_file or request.seed is not None:
+        raise ResultError(
+            "--resume takes the configuration of its run: leave --config, --set, --seed"
+        )
+    return load_config(output / CONFIG_NAME)
+
+
+def _has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
+    """Whether all that the services had to say was recorded, and nobody is to be started again."""
+    _, ended = mend(output / RECORDING_NAME)
+    recorded = inputs_of("recorder", services, images=config.recorder.images)
+    return ended >= {topic.key for topic in recorded}
+
+
+def _wait(fleet: Fleet, progress: Progress) -> bool:
+    """Wait for the end of the run; True if it was brought about by Ctrl-C."""
+    try:
+        fleet.wait()
+    except KeyboardInterrupt:
+        progress.say("stopping after the frame at hand (Ctrl-C again to kill)")
+        fleet.end_source()
+        fleet.wait()
+        return True
+    return False
+
+
+def service_arguments(name: str, request: RunRequest, output: Path) -> list[str]:
+    """What a service is told on its command line beside how to reach the others."""
+    extra = ["--config", str(output / CONFIG_NAME)]
+    if name == "ingest":
+        extra += ["--source", request.source]
+        extra += ["--calibration", str(request.calibration)] if request.calibration else []
+        extra += ["--fov", str(request.fov_deg)] if request.fov_deg is not None else []
+        extra += ["--topic", request.topic] if request.topic else []
+    if name == "recorder":
+        extra += ["--output", str(output / RECORDING_NAME)]
+        extra += ["--metadata", str(output / "logs" / "metadata.json")]
+    return extra
+
+
+def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> int:
+    """Write what can be written of the recording, and say where it is; then raise the failure."""
+    if not parts.exists(output / RECORDING_NAME):
+        if failure is not None:
+            raise failure
+        raise KeyboardInterrupt if interrupted else ResultError(f"{output}: nothing was recorded")
+    try:
+        report = write_results(output)
+    except PliantError:
+        if failure is not None:  # it came first, and says why this one followed
+            raise failure from None
+        raise
+    with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
+        for line in summary(report):
+            print(line)
+        files = ", ".join(files_of(output, report))
+        print(f"results in {output}/: {files}, {_recording_in(output)}")
+    if failure is not None:
+        raise failure
+    return INTERRUPTED if interrupted else grade(report)
+
+
+def _recording_in(output: Path) -> str:
+    """The recording of a result folder by its name there: a file, or a folder of parts."""
+    path = output / RECORDING_NAME
+    if path.is_file():
+        return path.name
+    count = len(parts.parts_of(path))
+    return f"{parts.folder_of_parts(path).name}/ ({count} {'part' if count == 1 else 'parts'})"
+
+
+def _say_rendering(what: str, done: int, total: int) -> None:
+    if done == 0:
+        print(f"built-in sequence, {what} (once) ...", file=sys.stderr)
+
+
+def _folder_name(source: str) -> str:
+    name = source.rstrip("/").rsplit("/", 1)[-1]
+    if name in ("", ".", ".."):
+        name = Path(source).resolve().name
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name) or "run"

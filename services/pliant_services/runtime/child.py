@@ -1,0 +1,80 @@
+"""One service's process as its launcher sees it."""
+
+import signal
+import subprocess
+import threading
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pliant_services.runtime.host import ENDED_EARLY
+
+_LAST_WORDS = 12  # lines of a service's log that are shown when it dies
+
+
+@dataclass
+class Child:
+    """What it prints goes to its log, and the last of it is kept here: the log may lie on the disk
+    that is full."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    lines: deque[str] = field(default_factory=lambda: deque[str](maxlen=_LAST_WORDS))
+
+    def __post_init__(self) -> None:
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def failed(self) -> bool:
+        """Whether it has ended, and not as it should."""
+        return self.process.poll() not in (None, 0, ENDED_EARLY)
+
+    @property
+    def crashed(self) -> bool:
+        """Whether it died of a fault of its own or a signal, not of something a user can mend."""
+        words = self.last_words() if self.failed else []
+        return self.failed and not (words and words[-1].startswith("pliant: "))
+
+    def last_words(self) -> list[str]:
+        """The last lines that it printed."""
+        self._reader.join(1.0)  # what it said last may still be in the pipe
+        return [line for line in tuple(self.lines) if line]
+
+    def close(self) -> None:
+        """Let go of the pipes of a process that has ended."""
+        self._reader.join(1.0)
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        try:
+            log = self.log.open("ab", buffering=0)
+        except OSError:
+            log = None
+        for line in self.process.stdout:
+            self.lines.append(line.decode(errors="replace").rstrip())
+            if log is not None:
+                with suppress(OSError):
+                    log.write(line)
+        if log is not None:
+            log.close()
+
+    def obituary(self) -> str:
+        """Who died of what: one line where it said so itself, else its last words."""
+        words, code = self.last_words(), self.process.returncode
+        if words and words[-1].startswith("pliant: "):
+            return f"{self.name}: {words[-1].removeprefix('pliant: ')}"
+        if code >= 0:
+            how = f"ended with code {code}"
+        else:
+            known = {s.value: s.name for s in signal.Signals}
+            how = f"was killed by {known.get(-code, f'signal {-code}')}"
+            how += " (is the memory full?)" if -code == signal.SIGKILL else ""
+        text = "\n".join(words)
+        return f"{self.name} {how}; its log is {self.log}" + (f":\n{text}" if text else "")

@@ -1,0 +1,106 @@
+"""Compiles every kernel once, before services start together and would each compile them all."""
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pliant
+from pliant.cache import cache_folder
+from pliant.errors import PliantError
+
+COMPILED = ("tracking", "bundle_adjustment", "meshing", "surfels")
+"""The services that have kernels."""
+
+
+def compile_kernels(say: Callable[[str], None]) -> None:
+    """Fill numba's cache on disk unless this version's kernels are there already."""
+    stamp = cache_folder() / "compiled" / _fingerprint()
+    if stamp.exists():
+        return
+    say("compiling kernels (once, about a minute) ...")
+    # In processes of their own: the launcher stays small, a crash of the compiler is one line.
+    compilers = {service: start_compiler(service) for service in COMPILED}
+    try:
+        for number, (service, compiler) in enumerate(compilers.items(), start=1):
+            assert compiler.stderr is not None
+            errors = compiler.stderr.read()
+            if compiler.wait() != 0:
+                words = errors.strip() or f"the compiler ended with code {compiler.returncode}"
+                raise PliantError(f"compiling the kernels of {service} failed:\n{words}")
+            say(f"compiled {service} ({number} of {len(compilers)})")
+    finally:
+        for compiler in compilers.values():
+            end_compiler(compiler)
+    with suppress(OSError):  # without the stamp the next run checks once more, that is all
+        stamp.parent.mkdir(parents=True, exist_ok=True)
+        stamp.touch()
+
+
+def start_compiler(service: str) -> subprocess.Popen[str]:
+    """Compile the kernels of a service in a process that ends with this one, whatever kills it."""
+    code = (
+        "from pliant_services.runtime.host import end_with_launcher; end_with_launcher(); "
+        f"from pliant_services.runtime.kernels import load_kernels; load_kernels({service!r})"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C reaches the launcher alone
+    )
+
+
+def end_compiler(compiler: subprocess.Popen[str]) -> None:
+    """Kill a compiler if it still works, and let go of its pipes."""
+    compiler.kill()
+    compiler.wait()
+    for pipe in (compiler.stdin, compiler.stderr):
+        if pipe is not None:
+            pipe.close()
+
+
+def load_kernels(service: str) -> None:
+    """Call every kernel of a service on a small input with the types that it meets.
+
+    Compiles what is not in the cache; otherwise loads it, so that the first frame is as quick as
+    all others.  Services without kernels have nothing to load.
+    """
+    if service == "tracking":
+        from pliant.algorithms import tracking
+
+        tracking.warm_up()
+    elif service == "bundle_adjustment":
+        from pliant.algorithms import bundle, mapping
+
+        bundle.warm_up()
+        mapping.warm_up(mapping.MappingParameters())
+    elif service == "meshing":
+        from pliant.algorithms import meshing
+        from pliant.fusion.open3d_import import FusionError
+        from pliant.fusion.warm_up import warm_up as fuse_something
+
+        meshing.warm_up()
+        with suppress(FusionError):  # where there is no open3d there is no mesh
+            fuse_something()
+    elif service == "surfels":
+        from pliant.algorithms import surfels
+
+        surfels.warm_up()
+
+
+def _fingerprint() -> str:
+    import llvmlite.binding as llvm
+    import numba
+
+    digest = hashlib.sha256()
+    root = Path(pliant.__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(f"{path.relative_to(root)} {path.stat().st_mtime_ns}".encode())
+    where = f"{root} {numba.config.CACHE_DIR}"  # type: ignore[attr-defined]
+    digest.update(f"{where} {sys.version} {numba.__version__} {llvm.get_host_cpu_name()}".encode())
+    return digest.hexdigest()[:24]

@@ -1,0 +1,235 @@
+"""Supervises one run: starts the services in order, watches them, stops them cleanly.
+
+The launcher hosts the router, so that a run needs no other program; every service is a process of
+its own.  When the source ends, or on Ctrl-C, the end of the stream passes through the services and
+each leaves by itself once it has read everything, so that nothing on the way is lost.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import zenoh
+
+from pliant.bus.peers import service_of
+from pliant.bus.session import free_endpoint, open_router
+from pliant.errors import BusError, MessageError, PliantError
+from pliant.messages import codec, topics
+from pliant.messages.types import Status
+from pliant_services.processes import BY_NAME
+from pliant_services.runtime.child import Child
+from pliant_services.runtime.host import ONE_THREAD
+from pliant_services.runtime.relay import Relay
+
+READY_TIMEOUT_S = 120.0
+STOP_TIMEOUT_S = 5.0
+_POLL_S = 0.05
+MOST_DEATHS = 3  # of one service at the same frame
+
+
+class ServiceDiedError(PliantError):
+    """A service ended with an error; the text has its name and last words."""
+
+
+class Fleet:
+    """The running services of one session."""
+
+    def __init__(
+        self,
+        services: Sequence[str],
+        *,
+        log_folder: Path,
+        on_status: Callable[[Status], None],
+        port: int | None = None,
+        state: Path | None = None,
+        elsewhere: Sequence[str] = (),
+    ) -> None:
+        """Start the router.  ``state``: folder of checkpoints; with it, services that die are
+        started again.  ``elsewhere``: services of the session that somebody else runs.  Raises
+        BusError when the port is in use."""
+        self._services = tuple(services)
+        self._session_services = (*elsewhere, *services)
+        self._log_folder = log_folder
+        self._children: list[Child] = []
+        self._state = state
+        self._gave_up = False
+        self._arguments: Callable[[str], Sequence[str]] = lambda name: ()
+        self._frames: dict[str, int] = {}  # that each service reported last
+        self._deaths: dict[str, tuple[int, int]] = {}  # by service: at which frame, how often
+        self.endpoint = f"tcp/127.0.0.1:{port}" if port is not None else free_endpoint()
+        self.session = f"run-{os.getpid()}"
+        self._router = open_router(self.endpoint)
+        self._relay = Relay(self._router, self.session)
+        self._ready: set[str] = set()
+        prefix = f"pliant/{self.session}"
+        status = topics.status("*")
+
+        def on_ready(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._ready.add(service_of(str(sample.key_expr)))
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
+            if envelope[-1:] != b"\x00" or len(sample.payload) > status.max_bytes:
+                return
+            with suppress(MessageError):  # not from a service of ours
+                message = codec.decode(Status, sample.payload.to_bytes())
+                if message.service in self._session_services:
+                    self._frames[message.service] = message.frame
+                    on_status(message)
+
+        self._held = [
+            self._router.liveliness().declare_subscriber(
+                f"{prefix}/ready/**", on_ready, history=True
+            ),
+            self._router.declare_subscriber(f"{prefix}/{status.key}", on_sample),
+        ]
+
+    def start(self, arguments: Callable[[str], Sequence[str]]) -> None:
+        """Start every service, readers first, and wait until all have announced themselves.
+
+        ``arguments`` gives the further command line of each.  Raises ServiceDiedError, BusError.
+        """
+        self._arguments = arguments
+        for name in self._services:
+            (self._log_folder / f"{name}.log").unlink(missing_ok=True)
+        for name in reversed(self._services):
+            self._children.append(self._spawn(name))  # one by one: a Ctrl-C leaves none behind
+        deadline = time.monotonic() + READY_TIMEOUT_S
+        while not self._ready >= set(self._services):
+            self.raise_if_died()
+            if time.monotonic() > deadline:
+                missing = sorted(set(self._services) - self._ready)
+                raise BusError(f"{', '.join(missing)} did not come up in {READY_TIMEOUT_S:.0f} s")
+            time.sleep(_POLL_S)
+
+    def wait_for_viewer(self, timeout_s: float) -> bool:
+        """Wait until somebody looks on, or the time is over."""
+        return self._relay.wait_for_viewer(timeout_s)
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids by name, of those that have been started."""
+        return {child.name: child.process.pid for child in self._children}
+
+    def wait(self) -> None:
+        """Wait until every service has left by itself.
+
+        Raises ServiceDiedError when one fails, or, where services are started again, when one dies
+        three times of the same frame.
+        """
+        while not self._all_left():
+            time.sleep(_POLL_S)
+
+    def give_up(self) -> None:
+        """Start nobody again from now on."""
+        self._gave_up = True
+
+    def end_source(self) -> None:
+        """Ask the ingest to end the stream after the frame at hand; the others follow."""
+        for child in self._children:
+            if child.name == "ingest" and child.process.poll() is None:
+                child.process.send_signal(signal.SIGINT)
+
+    def close(self) -> None:
+        """Stop whatever still runs: SIGINT first, SIGKILL after five seconds; then the router.
+
+        Takes no more than that long, and cannot be interrupted: nothing may be left behind.
+        """
+        with _uninterrupted():
+            running = [child for child in self._children if child.process.poll() is None]
+            for child in running:
+                child.process.send_signal(signal.SIGINT)
+            deadline = time.monotonic() + STOP_TIMEOUT_S
+            for child in running:
+                try:
+                    child.process.wait(max(0.0, deadline - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    child.process.kill()
+                    child.process.wait()
+            for child in self._children:
+                child.close()
+            self._relay.close()
+            with suppress(zenoh.ZError):  # a viewer that was stopped does not answer: let it be
+                self._router.close()  # type: ignore[no-untyped-call]
+
+    def _spawn(self, name: str) -> Child:
+        patience = [] if self._state is not None else ["--patience", "0"]  # who dies is not awaited
+        command = [
+            *(sys.executable, "-m", "pliant_services.cli", "service", name),
+            *("--connect", self.endpoint, "--session", self.session),
+            *("--fleet", ",".join(self._session_services), "--with-launcher", *patience),
+            *(("--state", str(self._state)) if self._state is not None else ()),
+            *self._arguments(name),
+        ]
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, **ONE_THREAD},
+            start_new_session=True,  # Ctrl-C reaches the launcher alone
+        )
+        return Child(name, process, self._log_folder / f"{name}.log")
+
+    def _all_left(self) -> bool:
+        """Whether every service has left by itself; those that crashed start again, if they may.
+
+        Raises ServiceDiedError.
+        """
+        over = all(child.process.poll() is not None for child in self._children)
+        if self._state is None or self._gave_up:
+            self.raise_if_died()
+            return over
+        if all(c.process.poll() == 0 for c in self._children if BY_NAME[c.name].observer):
+            return over  # all is on the disk: whoever dies now is not missed
+        for index, child in enumerate(self._children):
+            if child.failed:
+                self._restart_or_raise(index, child)
+                over = False  # also where all had died at once
+        return over
+
+    def _restart_or_raise(self, index: int, child: Child) -> None:
+        if not child.crashed:
+            raise ServiceDiedError(child.obituary())
+        frame = self._frames.get(child.name, max(self._frames.values(), default=-1)) + 1
+        last, times = self._deaths.get(child.name, (-1, 0))
+        times = times + 1 if frame == last else 1
+        self._deaths[child.name] = (frame, times)
+        if times >= MOST_DEATHS:
+            raise ServiceDiedError(
+                f"frame {frame} killed {child.name} {times} times: {child.obituary()}"
+            )
+        child.close()
+        self._children[index] = self._spawn(child.name)
+
+    def raise_if_died(self) -> None:
+        """Raise ServiceDiedError where a service has failed."""
+        if not any(child.failed for child in self._children):
+            return
+        # One death makes others complain that it went away: name the one that did not say so.
+        time.sleep(4 * _POLL_S)
+        failed = [child for child in self._children if child.failed]
+        first = next((c for c in failed if "went away" not in " ".join(c.last_words())), failed[0])
+        raise ServiceDiedError(first.obituary())
+
+
+@contextmanager
+def _uninterrupted() -> Generator[None]:
+    """Ignore Ctrl-C and its like; a thread that is not the main one cannot be interrupted."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    kinds = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(kind, signal.SIG_IGN) for kind in kinds]
+    try:
+        yield
+    finally:
+        for kind, handler in zip(kinds, before, strict=True):
+            signal.signal(kind, handler)

@@ -1,0 +1,250 @@
+"""Behind ``pliant view``: a running session or a recording, drawn by Rerun."""
+
+import json
+import os
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from pliant.bus.session import Identity, open_session
+from pliant.errors import MessageError, PliantError, ResultError
+from pliant.export.models import MESH_NAME, camera_of, draw
+from pliant.messages import codec, topics
+from pliant.messages.topics import Topic, by_key
+from pliant.messages.types import StreamEnd
+from pliant.recording import parts
+from pliant.recording.reader import Recording
+from pliant.results.folder import RECORDING_NAME
+from pliant.viewers.canvas import Canvas
+from pliant.viewers.rerun import RerunCanvas, Where
+from pliant.viewers.scene import Scene
+
+SESSION_NAME = "session.json"
+"""In the result folder while a run goes on: how to reach it."""
+_ENVELOPE_BYTES = 17
+_WAITING = 512  # messages between the network and the drawing; the oldest give way
+_WAITING_BYTES = 256 << 20
+_ASK_S = 0.5
+_GONE_S = 0.2  # what is on the way when the last service has gone
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRequest:
+    """What is to be seen, and where."""
+
+    source: Path | None
+    endpoints: list[str]
+    session: str
+    identity: Identity | None = None
+    web: bool = False
+    save: Path | None = None
+    force: bool = False
+    web_port: int = 9090
+    patience_s: float = 0.0
+
+
+def run_view(request: ViewRequest) -> None:
+    """Show it.  Raises PliantError."""
+    where = place(web=request.web, save=request.save, force=request.force)
+    endpoints, session = request.endpoints, request.session
+    if not endpoints and request.source is not None and request.source.is_dir():
+        endpoints, session = running_session(request.source)
+    if not endpoints and request.source is None:
+        raise ResultError("nothing to view: give a result, a recording, or --connect and --session")
+    if endpoints and not session:
+        raise ResultError("--connect needs --session: `pliant status` lists what runs there")
+    recording = None if endpoints else _recording(request.source)
+    name = session or (request.source.stem if request.source else "pliant")
+    canvas = RerunCanvas(where, name=name, web_port=request.web_port)
+    try:
+        if canvas.address:
+            print(f"open {canvas.address} in a browser", flush=True)
+        if endpoints:
+            follow(endpoints, session, canvas, request.patience_s, request.identity)
+        elif recording is not None and request.source is not None:
+            draw(recording, canvas, request.source / MESH_NAME)
+        if request.web:
+            canvas.send()
+            _stay()
+    except PliantError:
+        if request.save is not None:  # nothing came to be seen: the next try shall find no file
+            request.save.unlink(missing_ok=True)
+        raise
+    finally:
+        if not canvas.is_watched:
+            print("the window of Rerun is closed, or could not open", file=sys.stderr)
+        canvas.close()
+    if request.save is not None:
+        print(request.save)
+
+
+def running_session(result: Path) -> tuple[list[str], str]:
+    """The endpoint and name of the run that is writing this result; ([], "") if none is."""
+    try:
+        content = json.loads((result / SESSION_NAME).read_text(encoding="utf-8"))
+        return [str(content["endpoint"])], str(content["session"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return [], ""
+
+
+def follow(
+    endpoints: list[str],
+    session: str,
+    canvas: RerunCanvas,
+    patience_s: float = 0.0,
+    identity: Identity | None = None,
+) -> None:
+    """Draw a running session until it ends.  Never asks it to wait.
+
+    patience_s: for a session that is about to start.     identity: for tls/ endpoints.
+
+    Raises BusError where nothing listens, ResultError where the session does not run.
+    """
+    prefix = f"pliant/{session}/view/"
+    waiting = Backlog(_WAITING, _WAITING_BYTES)
+
+    def on_sample(sample: zenoh.Sample) -> None:
+        envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
+        topic = by_key(str(sample.key_expr).removeprefix(prefix))
+        if (
+            topic is None
+            or len(envelope) != _ENVELOPE_BYTES
+            or len(sample.payload) > topic.max_bytes
+        ):
+            return
+        kind = topics.STREAM_END if envelope[-1] else topic
+        sequence = int.from_bytes(envelope[:8], "little")
+        waiting.put(Arrived(kind, sequence, time.monotonic_ns(), sample.payload.to_bytes()))
+
+    with open_session(endpoints, identity) as connection:
+        held: list[Any] = [
+            connection.declare_subscriber(f"{prefix}**", on_sample),
+            connection.liveliness().declare_token(f"pliant/{session}/viewer/{os.getpid()}"),
+        ]
+        deadline = time.monotonic() + patience_s
+        while not _runs(connection, session):
+            if time.monotonic() > deadline:
+                raise ResultError("no such session runs there: `pliant status` lists what does")
+            time.sleep(0.1)
+        _draw_while(canvas, waiting, lambda: canvas.is_watched and _runs(connection, session))
+        held.clear()
+
+
+@dataclass(frozen=True)
+class Arrived:
+    """A message as it came, and when."""
+
+    topic: Topic
+    sequence: int
+    arrived_ns: int
+    data: bytes
+
+
+class Backlog:
+    """What came and is not drawn yet, bounded in number and size: the oldest give way."""
+
+    def __init__(self, most: int, most_bytes: int) -> None:
+        self._most, self._most_bytes = most, most_bytes
+        self._items: deque[Arrived] = deque()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def put(self, item: Arrived) -> None:
+        """Add the newest."""
+        with self._lock:
+            self._items.append(item)
+            self._bytes += len(item.data)
+            while len(self._items) > self._most or (
+                self._bytes > self._most_bytes and len(self._items) > 1
+            ):
+                self._bytes -= len(self._items.popleft().data)
+
+    def take(self) -> Arrived | None:
+        """The oldest, None where there is nothing."""
+        with self._lock:
+            if not self._items:
+                return None
+            item = self._items.popleft()
+            self._bytes -= len(item.data)
+            return item
+
+
+def _draw_while(canvas: Canvas, waiting: Backlog, goes_on: Callable[[], bool]) -> None:
+    """Draw until nothing more comes and all is drawn: the final mesh comes last of all.
+
+    goes_on: whether a service still runs, and somebody looks on.
+    """
+    scene = Scene(canvas)
+    asked, is_over = time.monotonic(), False
+    while True:
+        if not is_over and time.monotonic() - asked > _ASK_S:
+            is_over, asked = not goes_on(), time.monotonic()
+        arrived = waiting.take()
+        if arrived is None:
+            if is_over and time.monotonic() - asked > _GONE_S:
+                break
+            time.sleep(0.005)
+            continue
+        topic = arrived.topic
+        behind = len(waiting) > _WAITING // 8
+        if behind and topic in (topics.SOURCE, topics.EXTREMA, topics.SURFELS):
+            continue  # newest wins; updates of the map and mesh are kept while there is room
+        try:
+            message = codec.decode(topic.message, arrived.data, max_bytes=topic.max_bytes)
+        except MessageError:
+            continue
+        if not isinstance(message, StreamEnd):
+            scene.take(topic, message, arrived.sequence, arrived.arrived_ns)
+    scene.close()
+    if scene.missed_updates:
+        print(
+            f"{scene.missed_updates} updates of the map did not reach the viewer", file=sys.stderr
+        )
+
+
+def _runs(connection: zenoh.Session, session: str) -> bool:
+    return any(True for _ in connection.liveliness().get(f"pliant/{session}/ready/**"))
+
+
+def _recording(source: Path | None) -> Recording | None:
+    """The recording of a result folder, or the file itself; looked for before a file is made."""
+    if source is None:
+        return None
+    result = source.is_dir() and parts.exists(source / RECORDING_NAME)
+    recording = Recording(source / RECORDING_NAME if result else source)
+    camera_of(recording)
+    return recording
+
+
+def place(*, web: bool, save: Path | None, force: bool) -> Where:
+    """Where a view goes.  Raises ResultError where it cannot."""
+    if web and save is not None:
+        raise ResultError("--web and --save contradict each other: give one")
+    if save is not None:
+        if save.exists() and not force:
+            raise ResultError(f"{save} exists: choose another --save, or --force")
+        return save
+    if web:
+        return "web"
+    if (
+        not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        and sys.platform == "linux"
+    ):
+        raise ResultError("there is no display here: use --web, or --save FILE.rrd")
+    return "window"
+
+
+def _stay() -> None:
+    """A browser may come, or look on, until Ctrl-C."""
+    while True:
+        time.sleep(3600.0)

@@ -1,0 +1,90 @@
+"""Behind ``pliant eval``: results against true poses and, for built-in sequences, true depth."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pliant.datasets.builtin import builtin_folder, is_builtin
+from pliant.errors import ResultError
+from pliant.evaluation.report import (
+    evaluation_to_json,
+    format_evaluation,
+    format_summary,
+    summarise,
+    summary_to_json,
+    write_json,
+)
+from pliant.evaluation.result import evaluate_result
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationRequest:
+    """What the user asked for."""
+
+    results: Sequence[Path]
+    groundtruth: str
+    times: Path | None
+    frames: int | None
+    tracks: bool
+    points: bool
+    mesh: bool
+    surfels: bool
+    plot: Path | None
+    json: Path | None
+
+
+def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
+    """Evaluate, write what was asked for, and say the figures.  Raises ResultError."""
+    missing = [str(result) for result in request.results if not result.exists()]
+    if missing:
+        raise ResultError(f"{missing[0]}: no such result")
+    if request.surfels:
+        yield from _evaluate_surfels(request)
+        return
+    truth = Path(request.groundtruth)
+    if is_builtin(request.groundtruth):
+        truth = builtin_folder(request.groundtruth)
+    elif request.tracks or request.points:
+        raise ResultError("--tracks and --map need exact depth: --groundtruth built-in:NAME")
+    evaluations = [
+        evaluate_result(result, groundtruth=truth, times=request.times, frames=request.frames)
+        for result in request.results
+    ]
+    figures: dict[str, Any] = evaluation_to_json(evaluations[0])
+    for evaluation in evaluations:
+        yield format_evaluation(evaluation)
+    if len(evaluations) > 1:
+        summaries = [summarise(evaluations, kind=kind) for kind in ("final", "causal")]
+        for summary in summaries:
+            yield format_summary(summary)
+        figures = {summary.kind: summary_to_json(summary) for summary in summaries}
+    if request.plot is not None:
+        from pliant.evaluation.plots import plot_errors
+
+        plot_errors(request.plot, evaluations[0])
+        yield f"error over time: {request.plot}"
+    if request.tracks:
+        from pliant.evaluation.truth import tracks_against_truth
+
+        yield from tracks_against_truth(request.results[0], truth, figures)
+    if request.points:
+        from pliant.evaluation.truth import points_against_truth
+
+        yield from points_against_truth(request.results[0], truth, evaluations[0], figures)
+    if request.mesh:
+        from pliant.evaluation.recorded_mesh import mesh_against_truth
+
+        yield from mesh_against_truth(request.results[0], truth, evaluations[0], figures)
+    if request.json is not None:
+        write_json(request.json, figures)
+
+
+def _evaluate_surfels(request: EvaluationRequest) -> Iterator[str]:
+    from pliant.evaluation.recorded_surfels import surfels_against_truth
+
+    for result in request.results:
+        figures: dict[str, Any] = {}
+        yield from surfels_against_truth(result, request.groundtruth, figures)
+        if request.json is not None:
+            write_json(request.json, figures)

@@ -1,0 +1,215 @@
+"""Behind ``pliant export``: what a result folder becomes for other programs and for the eye."""
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
+from pliant.errors import ResultError
+from pliant.export import models as export_models
+from pliant.export.models import camera_of, rectified_images
+from pliant.export.surface import overlay_pictures, surfaces
+from pliant.formats.euroc import write_euroc
+from pliant.formats.kitti import write_kitti
+from pliant.formats.tum import write_tum
+from pliant.map_history import MapHistory, Points
+from pliant.messages import topics
+from pliant.messages.topics import Topic
+from pliant.messages.types import CameraStream, Extrema, MapUpdate
+from pliant.pictures.map import choose_view, render_map, write_map_picture
+from pliant.pictures.movie import beside, write_animation, write_movie
+from pliant.pictures.overlay import OverlayFrame, TrackPainter, write_overlay_video
+from pliant.recording.parts import parts_in
+from pliant.recording.reader import Recording
+from pliant.results.folder import RECORDING_NAME
+from pliant.results.run import read_run
+from pliant.results.surfels import has_surfels, surfel_trajectory
+from pliant.trajectory import Trajectory
+
+_OVERVIEW_FRAMES = 40
+_OVERVIEW_WIDTH = 960
+_OVERVIEW_FPS = 10.0
+
+
+Export = Callable[[Recording, Path, Path | None], None]
+"""Writes to a path what a recording holds; the folder is that of the result, if it is one."""
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """One frame of a recording with what became of it."""
+
+    image: U8
+    tracks: Extrema
+    update: MapUpdate
+
+
+def export_result(
+    result: Path, to: str, output: Path | None, *, force: bool = False, every: int | None = None
+) -> Path:
+    """Write one export of a result folder or a recording and return where.
+
+    every: of surfaces, which frames.
+
+    Raises ResultError for an unknown kind, and for what is there already unless ``force``.
+    """
+    if to not in EXPORTS:
+        raise ResultError(f"--to {to}: choose {', '.join(EXPORTS)}")
+    if every is not None and EXPORTS[to][1] is not surfaces:
+        raise ResultError(f"--every: {to} has no such option, surface has")
+    if not result.exists():
+        raise ResultError(f"{result}: no such result folder or recording")
+    folder = result if result.is_dir() and not parts_in(result) else None
+    recording = Recording(result / RECORDING_NAME if folder is not None else result)
+    name, write = EXPORTS[to]
+    path = output or (result / name if folder is not None else _beside(result, name))
+    if path.exists() and not force:
+        raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
+    if path.exists() and path.samefile(recording.files[0]):
+        raise ResultError(f"{path}: is the recording itself: choose another --output")
+    fresh = not path.exists()
+    try:
+        if every is not None:
+            surfaces(recording, path, folder, every)
+        else:
+            write(recording, path, folder)
+    except BaseException:  # Ctrl-C, too: half an export is none
+        if fresh:
+            _remove(path)
+        raise
+    return path
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
+
+
+def _beside(recording: Path, name: str) -> Path:
+    """Beside a recording, an export is called after it."""
+    return recording.with_name(f"{recording.stem}_{name}")
+
+
+def recorded_frames(recording: Recording) -> Iterator[RecordedFrame]:
+    """The frames of a recording that have pixels, rectified again from their source bytes."""
+    images = rectified_images(recording, camera_of(recording))
+    others = zip(
+        recording.decoded(topics.EXTREMA),
+        recording.decoded(topics.MAP_UPDATE),
+        strict=False,  # a recording that was cut off ends where its shortest topic ends
+    )
+    for frame, _, pixels in images:
+        for tracks, update in others:
+            assert isinstance(tracks, Extrema)
+            assert isinstance(update, MapUpdate)
+            if tracks.frame == frame:
+                yield RecordedFrame(pixels, tracks, update)
+                break
+
+
+def _overlay(recording: Recording, path: Path, folder: Path | None) -> None:
+    if has_surfels(recording.path):
+        fps = _frames_per_second(recording, topics.SURFELS)
+        write_movie(path, overlay_pictures(recording), fps=fps)
+        return
+    stream = camera_of(recording)
+    frames = (_overlay_frame(frame, stream) for frame in recorded_frames(recording))
+    write_overlay_video(path, frames, fps=_frames_per_second(recording), scale=1)
+
+
+def _picture(recording: Recording, path: Path, folder: Path | None) -> None:
+    points, T_world_camera = _longest_segment(read_run(recording.path).history)
+    if not len(T_world_camera):
+        raise ResultError(f"{recording.path}: the run has no map to draw")
+    write_map_picture(path, points.positions, points.colours, T_world_camera)
+
+
+def _overview(recording: Recording, path: Path, folder: Path | None) -> None:
+    """Tracks on the image beside the map that grows: the moving picture of the README."""
+    run = read_run(recording.path)
+    stream = run.stream
+    last, final = _longest_segment(run.history)
+    if stream is None or not len(final):
+        raise ResultError(f"{recording.path}: the run has no map to draw")
+    view = choose_view(last.positions, final)
+    every = max(1, len(run.tracks) // _OVERVIEW_FRAMES)
+    painter, history, pictures = TrackPainter(scale=2), MapHistory(), list[U8]()
+    for frame in recorded_frames(recording):
+        number = frame.update.frame
+        history.apply(frame.update, frame=number, stamp_ns=frame.update.stamp_ns)
+        left = painter.draw(_overlay_frame(frame, stream))
+        if number % every == 0:
+            points, poses = _longest_segment(history)
+            right = render_map(points.positions, points.colours, poses, view=view)
+            pictures.append(beside(left, right))
+    write_animation(path, pictures, fps=_OVERVIEW_FPS, width=_OVERVIEW_WIDTH)
+
+
+def _longest_segment(history: MapHistory) -> tuple[Points, F64]:
+    """Points and (N, 4, 4) poses of one map segment: those of others lie in worlds of their own."""
+    longest, points = history.longest_segment(), history.points()
+    poses = {frame: known for frame, known in history.final().items() if known[0] == longest}
+    return points.select(points.segments == longest), history.trajectory(poses).T_world_camera
+
+
+def _overlay_frame(frame: RecordedFrame, stream: CameraStream) -> OverlayFrame:
+    update = frame.update
+    words = {WAITING: "starting", TRACKING: "tracking", LOST: "lost"}[update.state]
+    detail = f"{update.inliers} mapped" if update.state == TRACKING else update.reason
+    return OverlayFrame(
+        image=frame.image,
+        tracks=frame.tracks,
+        number=update.frame,
+        status=f"{stream.source}  {words}  {detail}",
+    )
+
+
+def _poses(write: Callable[[Path, Trajectory], None]) -> Export:
+    """Writes the final poses of the longest segment in one of the formats of trajectories."""
+
+    def export(recording: Recording, path: Path, folder: Path | None) -> None:
+        poses = _final_poses(recording)
+        if not len(poses.stamps_ns):
+            raise ResultError(f"{recording.path}: the run has no poses to export")
+        write(path, poses)
+
+    return export
+
+
+def _final_poses(recording: Recording) -> Trajectory:
+    if has_surfels(recording.path):
+        return surfel_trajectory(recording.path)
+    history = read_run(recording.path).history
+    longest = history.longest_segment()
+    return history.trajectory({f: p for f, p in history.final().items() if p[0] == longest})
+
+
+def _frames_per_second(recording: Recording, topic: Topic = topics.EXTREMA) -> float:
+    stamps = [m.stamp_ns for m in recording.decoded(topic)]
+    steps = np.diff(stamps)
+    return float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else 30.0
+
+
+EXPORTS: dict[str, tuple[str, Export]] = {
+    "foxglove": ("foxglove.mcap", export_models.foxglove),
+    "rerun": ("rerun.rrd", export_models.rerun),
+    "tum": ("trajectory_tum.txt", _poses(write_tum)),
+    "kitti": ("trajectory_kitti.txt", _poses(write_kitti)),
+    "euroc": ("trajectory_euroc.csv", _poses(write_euroc)),
+    "ply": ("points_longest.ply", export_models.ply),
+    "colmap": ("colmap", export_models.colmap),
+    "images": ("images", export_models.images),
+    "surface": ("surface", surfaces),
+    "overlay": ("overlay.mp4", _overlay),
+    "picture": ("picture.png", _picture),
+    "overview": ("overview.webp", _overview),
+}
+"""Kind of export: its default name, and who writes it."""

@@ -1,0 +1,73 @@
+"""The deforming surface as a sequence of meshes: ``pliant export --to surface``."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from pliant.algorithms.arrays import U8
+from pliant.algorithms.surfels import SurfelState
+from pliant.algorithms.surfels.surface import surface_of
+from pliant.errors import ResultError
+from pliant.export.models import camera_of, make_folder, rectified_images
+from pliant.formats.ply import write_ply
+from pliant.messages import topics
+from pliant.messages.types import Surfels
+from pliant.pictures.overlay import draw_marks
+from pliant.recording.reader import Recording
+from pliant.results.surfels import has_surfels, recorded_surfels
+from pliant.viewers.surfel_quads import surfel_picture
+
+
+def surfaces(recording: Recording, path: Path, folder: Path | None, every: int = 1) -> None:
+    """``NNNNNN.ply`` for each ``every``-th frame: tracked surfels, joined to triangles, in colour.
+
+    In metres, or in units of our own map, and in the world of the segment.  Raises ResultError for
+    a recording without surfels.
+    """
+    if not has_surfels(recording.path):
+        raise ResultError(f"{recording.path}: has no surfels: run it with --profile deformable")
+    make_folder(path)
+    has_images = next(recording.messages(topics.SOURCE), None) is not None
+    images = rectified_images(recording, camera_of(recording)) if has_images else iter(())
+    pixels: U8 | None = None
+    seen = -1
+    for surfels in recorded_surfels(recording.path):
+        if surfels.missing or surfels.frame % every:
+            continue
+        while seen < surfels.frame:
+            seen, _, pixels = next(images, (surfels.frame, 0, None))
+        here = pixels if seen == surfels.frame else None
+        _write(path / f"{surfels.frame:06d}.ply", surfels, here)
+
+
+def overlay_pictures(recording: Recording) -> Iterator[U8]:
+    """Each frame with its surfels, in the colours of the viewers: how each of them fares."""
+    stream = camera_of(recording)
+    images = rectified_images(recording, stream)
+    states = {
+        SurfelState.TRACKED: "alive",
+        SurfelState.OUTLIER: "outlier (red)",
+        SurfelState.OCCLUDED: "occluded (violet)",
+        SurfelState.LOST: "lost",
+    }
+    for surfels in recorded_surfels(recording.path):
+        if surfels.missing:
+            continue
+        pixels = next(image for frame, _, image in images if frame == surfels.frame)
+        seen = surfel_picture(surfels, stream.camera)
+        counts = [f"{np.count_nonzero(surfels.state == s)} {name}" for s, name in states.items()]
+        words = "   ".join([f"frame {surfels.frame}", *counts])
+        yield draw_marks(pixels, seen.points_px, seen.point_colours, words)
+
+
+def _write(path: Path, surfels: Surfels, pixels: U8 | None) -> None:
+    rows, normals, triangles = surface_of(surfels)
+    positions = surfels.positions[rows].astype(np.float32)
+    colours = None
+    if pixels is not None:
+        column, row = np.rint(surfels.points_px[rows]).astype(np.int64).T
+        height, width = pixels.shape[:2]
+        colours = pixels[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        colours = np.broadcast_to(colours.reshape(len(rows), -1), (len(rows), 3))
+    write_ply(path, positions, colours, normals=normals, faces=triangles)

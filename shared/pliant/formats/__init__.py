@@ -1,0 +1,1 @@
+"""Open file formats: what other tools read and write."""

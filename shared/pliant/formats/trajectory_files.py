@@ -1,0 +1,38 @@
+"""Read a trajectory in whichever of the known formats a file has."""
+
+from pathlib import Path
+
+from pliant.errors import ResultError
+from pliant.formats.euroc import read_euroc
+from pliant.formats.kitti import read_kitti, read_kitti_times
+from pliant.formats.text import numbered_lines
+from pliant.formats.tum import read_tum
+from pliant.trajectory import Trajectory
+
+
+def read_trajectory(
+    path: Path, *, times: Path | None = None, allow_empty: bool = False
+) -> Trajectory:
+    """Read TUM, EuRoC or KITTI poses, told apart by their first line.
+
+    path: the file, or a folder that holds ``groundtruth.txt``.
+    times: ``times.txt`` of a KITTI sequence; without it KITTI poses have no time, which is an
+        error.  Raises ResultError with file and line.
+    """
+    if path.is_dir():
+        path = path / "groundtruth.txt"
+    first = next((line for _, line in numbered_lines(path)), None)
+    if first is None:
+        if allow_empty:
+            return Trajectory.empty()
+        raise ResultError(f"{path}: holds no poses")
+    if "," in first:
+        return read_euroc(path)
+    if len(first.split()) == 12:
+        times = times if times is not None else path.with_name("times.txt")
+        if not times.is_file():
+            raise ResultError(
+                f"{path}: KITTI poses carry no times and {times} does not exist; name it as times"
+            )
+        return read_kitti(path, read_kitti_times(times))
+    return read_tum(path)

@@ -1,0 +1,1 @@
+"""Tracks, maps and meshes drawn without any GUI library."""

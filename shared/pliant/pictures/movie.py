@@ -1,0 +1,113 @@
+"""RGB pictures to image, video and animation files."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import U8
+from pliant.errors import ResultError
+from pliant.formats.text import write_bytes
+
+# What the headless wheels of OpenCV can encode without codecs of the system.
+_VIDEO_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
+_ANIMATIONS = (".webp", ".gif", ".avif")
+
+
+def write_image(path: Path, picture: U8) -> None:
+    """Write (H, W, 3) RGB in the format of the suffix.  ResultError where that is unknown."""
+    try:
+        good, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[:, :, ::-1]))
+    except cv2.error:
+        good, data = False, np.zeros(0, np.uint8)
+    if not good:
+        raise ResultError(f"{path}: unknown kind of image; use .png or .jpg")
+    write_bytes(path, data.tobytes())
+
+
+def write_movie(path: Path, pictures: Iterable[U8], *, fps: float) -> int:
+    """Write (H, W, 3) RGB pictures as a video; returns how many.
+
+    Raises ResultError for a suffix other than .mp4 and .avi, pictures that change size, no
+    pictures at all, and a file that cannot be written.
+    """
+    codec = _VIDEO_CODECS.get(path.suffix.lower())
+    if codec is None:
+        raise ResultError(f"{path}: unknown kind of video; use {' or '.join(_VIDEO_CODECS)}")
+    writer: Any = None
+    size = (0, 0)
+    count = 0
+    try:
+        for picture in pictures:
+            if writer is None:
+                size = (picture.shape[1], picture.shape[0])
+                write_bytes(path, b"")  # a clear error where the folder is not there
+                code = cv2.VideoWriter.fourcc(*codec)
+                writer = cv2.VideoWriter(str(path), code, fps, size)
+                if not writer.isOpened():
+                    raise ResultError(f"{path}: this OpenCV cannot encode {codec}")
+            if (picture.shape[1], picture.shape[0]) != size:
+                raise ResultError(f"{path}: picture {count} has another size than the first")
+            writer.write(np.ascontiguousarray(picture[:, :, ::-1]))
+            count += 1
+    finally:
+        if writer is not None:
+            writer.release()
+    if not count:
+        raise ResultError(f"{path}: there are no frames to write")
+    if path.stat().st_size == 0:
+        raise ResultError(f"{path}: cannot be written (is the disk full?)")
+    return count
+
+
+def write_animation(
+    path: Path, pictures: Sequence[U8], *, fps: float, width: int | None = None, quality: int = 55
+) -> None:
+    """Write a looping animation that a README can show.
+
+    pictures: (H, W, 3) RGB of one size.      width: columns to shrink them to.
+    quality: of .webp and .avif, 1 to 100.
+    Raises ResultError for a suffix other than .webp, .gif and .avif, no pictures, an OpenCV older
+    than 4.11, and a file that cannot be written.
+    """
+    if path.suffix.lower() not in _ANIMATIONS:
+        raise ResultError(f"{path}: unknown kind of animation; use {', '.join(_ANIMATIONS)}")
+    if not pictures:
+        raise ResultError(f"{path}: there are no frames to write")
+    module: Any = cv2
+    if not hasattr(module, "imencodeanimation"):
+        raise ResultError("animations need OpenCV 4.11: pip install 'opencv-python-headless>=4.11'")
+    animation = module.Animation()
+    animation.frames = [_bgr(picture, width) for picture in pictures]
+    animation.durations = np.full(len(pictures), round(1000.0 / fps), np.int32)
+    animation.loop_count = 0
+    options = {
+        ".webp": [cv2.IMWRITE_WEBP_QUALITY, quality],
+        ".avif": [cv2.IMWRITE_AVIF_QUALITY, quality],
+        ".gif": [],
+    }
+    suffix = path.suffix.lower()
+    good, data = module.imencodeanimation(suffix, animation, options[suffix])
+    if not good:
+        raise ResultError(f"{path}: this OpenCV cannot encode {suffix}")
+    write_bytes(path, data.tobytes())
+
+
+def _bgr(picture: U8, width: int | None) -> U8:
+    bgr = np.ascontiguousarray(picture[:, :, ::-1])
+    if width is None or width == bgr.shape[1]:
+        return bgr
+    height = round(bgr.shape[0] * width / bgr.shape[1])
+    return np.asarray(cv2.resize(bgr, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def beside(left: U8, right: U8, *, gap: int = 6) -> U8:
+    """Two RGB pictures next to each other; the right one is scaled to the left one's height."""
+    height = left.shape[0]
+    width = 2 * round(right.shape[1] * height / right.shape[0] / 2)
+    if right.shape[:2] != (height, width):
+        resized = cv2.resize(right, (width, height), interpolation=cv2.INTER_AREA)
+        right = np.asarray(resized, np.uint8)
+    return np.concatenate([left, np.full((height, gap, 3), 18, np.uint8), right], axis=1)

@@ -1,0 +1,1 @@
+"""A result folder: what a run leaves, written from its recording and read again."""

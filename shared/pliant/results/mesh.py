@@ -1,0 +1,60 @@
+"""The meshes of a recording as the files that a user opens."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.meshing import TriangleMesh
+from pliant.formats.ply import write_ply
+from pliant.messages.mesh_pieces import joined
+from pliant.messages.types import MeshPiece
+from pliant.pictures.mesh import draw_mesh, mesh_view
+from pliant.pictures.movie import write_image
+
+_NAMES = {"fine": "mesh", "coarse": "mesh_coarse"}
+
+
+def meshes_of(pieces: Sequence[MeshPiece]) -> dict[tuple[int, str], list[MeshPiece]]:
+    """The complete meshes by segment and level: those that an interruption cut off are left out."""
+    found: dict[tuple[int, str], list[MeshPiece]] = {}
+    for piece in pieces:
+        found.setdefault((piece.segment, piece.level), []).append(piece)
+    return {key: some for key, some in found.items() if len(some) == some[0].pieces}
+
+
+def write_meshes(
+    folder: Path, pieces: Sequence[MeshPiece], segment: int, suffix: str, T_world_camera: F64
+) -> None:
+    """Write the meshes of a segment, and pictures of the fine one from over the camera's path."""
+    for (of, level), some in meshes_of(pieces).items():
+        if of != segment or level not in _NAMES:
+            continue
+        mesh = joined(some)
+        path = folder / f"{_NAMES[level]}{suffix}.ply"
+        write_ply(path, mesh.positions, mesh.colours, normals=mesh.normals, faces=mesh.triangles)
+        if level == "fine" and len(mesh.triangles) and len(T_world_camera):
+            write_pictures(folder, mesh, T_world_camera, suffix)
+
+
+def write_pictures(folder: Path, mesh: TriangleMesh, T_world_camera: F64, suffix: str = "") -> None:
+    """The mesh in its colours, shaded, and its normals."""
+    pictures = draw_mesh(mesh, mesh_view(mesh, T_world_camera))
+    write_image(folder / f"mesh{suffix}.png", pictures.colours)
+    write_image(folder / f"mesh_shaded{suffix}.png", pictures.shaded)
+    write_image(folder / f"mesh_normals{suffix}.png", pictures.normals)
+
+
+def mesh_report(pieces: Sequence[MeshPiece]) -> list[dict[str, Any]]:
+    """What report.json says of each mesh."""
+    return [
+        {
+            "segment": segment,
+            "level": level,
+            "voxel_size": some[0].voxel_size,
+            "keyframes": some[0].keyframes,
+            "vertices": sum(len(piece.positions) for piece in some),
+            "triangles": sum(len(piece.triangles) for piece in some),
+        }
+        for (segment, level), some in sorted(meshes_of(pieces).items())
+    ]

@@ -1,0 +1,130 @@
+"""What report.json says of a run, the same in a few lines, and the exit code that follows."""
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.map_density import count_distinct, well_observed
+from pliant.results.mesh import mesh_report
+from pliant.results.run import Run
+
+_ROUGHLY = 0.02
+
+
+def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
+    history = run.history
+    frames = len(run.tracks)
+    by_segment: dict[int, list[int]] = defaultdict(list)
+    for frame, (segment, _) in final.items():
+        by_segment[segment].append(frame)
+    segments = [
+        {"id": segment, "first_frame": min(members), "frames": len(members)}
+        for segment, members in by_segment.items()
+    ]
+    segments.sort(key=lambda s: s["first_frame"])
+    reasons = {frame: reason for frame, (_, reason) in sorted(history.states.items()) if reason}
+    # That a frame is broken says nothing about why there is no map, unless all of them are.
+    silent = {*run.missing, *run.passed_over}
+    telling = [reason for frame, reason in reasons.items() if frame not in silent]
+    telling = telling or list(reasons.values())
+    return {
+        "source": run.stream.source if run.stream else "",
+        "mode": run.stream.mode if run.stream else "",
+        "complete": run.complete,
+        "ended_early": ended_early(run, frames),
+        "frames": frames,
+        "frames_with_pose": len(final),
+        "frames_per_second": round(run.frames_per_second, 2),
+        "success_rate": len(final) / frames if frames else 0.0,
+        "initialisation_retries": max(0, len(segments) - 1),
+        "segments": segments,
+        "last_reason": telling[-1] if telling else "",
+        "frames_without_pixels": {str(f): why for f, why in sorted(run.missing.items())},
+        "frames_passed_over": run.passed_over,
+        "keyframes": len(history.keyframes),
+        "points": len(history.points()),
+        "points_well_observed": _well_observed(run, final),
+        "calibration_correction": _correction(run.calibration_correction),
+        "median_tracks_per_frame": _median(run.tracks.values()),
+        "median_inliers_per_frame": _median(run.inliers[f] for f in final if f in run.inliers),
+        "mesh": mesh_report(run.mesh),
+        **process_figures(run, frames),
+        "tracks_per_frame": [run.tracks[f] for f in sorted(run.tracks)],
+        "inliers_per_frame": [run.inliers[f] for f in sorted(run.inliers)],
+        "map_points_per_frame": [run.map_points[f] for f in sorted(run.map_points)],
+        "scale_is_metric": bool(run.stream and run.stream.scale_is_metric),
+    }
+
+
+def process_figures(run: Run, frames: int) -> dict[str, Any]:
+    """What the services and the recorder counted and took, for the report."""
+    return {
+        "recorder": {
+            "messages": {key: t.messages for key, t in sorted(run.recorded.topics.items())},
+            "lost": run.recorded.missing,
+            "duplicated": run.recorded.repeated,
+        },
+        "counters": run.counters,
+        "cpu_milliseconds_per_frame": {
+            # Between the first frame and the last one: without start-up and final adjustment.
+            service: round(1e3 * (spent[frames - 1] - spent[0]) / (frames - 1), 2)
+            for service, spent in sorted(run.cpu_seconds.items())
+            if 1 < frames <= len(spent)
+        },
+        "milliseconds_per_frame": {
+            service: {stage: _milliseconds(values) for stage, values in stages.items()}
+            for service, stages in sorted(run.seconds.items())
+        },
+    }
+
+
+def ended_early(run: Run, came: int) -> str:
+    """Why the source gave less frames than it said; "" if it did not, or was told to stop."""
+    if run.source_failure or run.stream is None or not run.complete:
+        return run.source_failure
+    announced = run.stream.frames
+    # Containers of videos count their frames roughly.
+    if announced - came <= max(2, _ROUGHLY * announced):
+        return ""
+    return f"{came} of {announced} frames came; is the file cut off?"
+
+
+def _well_observed(run: Run, final: dict[int, Any]) -> int:
+    """Points of the longest segment in >= 3 keyframes under >= 1 degree, duplicates merged."""
+    longest = run.history.longest_segment()
+    if run.stream is None or longest < 0:
+        return 0
+    points = run.history.points()
+    chosen = well_observed(points.keyframes, points.parallax_rad) & (points.segments == longest)
+    points = points.select(chosen)
+    poses = {f: pose_to_matrix(pose) for f, (segment, pose) in final.items() if segment == longest}
+    return count_distinct(
+        points.positions, points.frames, camera=run.stream.camera, T_world_camera=poses
+    )
+
+
+def _correction(correction: tuple[float, ...]) -> dict[str, float] | None:
+    """What the final adjustment found wrong with the calibration; None if it was not asked."""
+    if len(correction) < 3:
+        return None
+    s, k1, k2, readout = (*correction, 0.0)[:4]  # recordings from before the readout have three
+    found = {"focal_factor": float(np.exp(s)), "k1": k1, "k2": k2, "readout": readout}
+    return {name: round(value, 6) for name, value in found.items()}
+
+
+def _median(values: Any) -> float:
+    values = list(values)
+    return float(np.median(values)) if values else 0.0
+
+
+def _milliseconds(seconds: list[float]) -> dict[str, float]:
+    values = 1e3 * np.array(seconds)
+    return {
+        "mean": round(float(values.mean()), 3),
+        "median": round(float(np.median(values)), 3),
+        "p95": round(float(np.percentile(values, 95)), 3),
+        "max": round(float(values.max()), 3),
+        "count": len(values),
+    }

@@ -1,0 +1,118 @@
+"""A recording read as one run: what it says of frames, map, mesh and services."""
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pliant.map_history import MapHistory
+from pliant.messages import topics
+from pliant.messages.types import (
+    PASSED_OVER,
+    CameraStream,
+    Extrema,
+    MapUpdate,
+    MeshPiece,
+    Status,
+    StreamEnd,
+)
+from pliant.recording.reader import Recording
+from pliant.recording.summary import Summary
+
+_LEFT_ALONE = (
+    *(topics.SOURCE, topics.DEPTH, topics.KEYFRAME, topics.KEYFRAME_FINAL, topics.MESH_BLOCKS),
+    topics.SURFELS,  # see surfels.py
+)
+"""Topics that results do not need; most bytes are theirs."""
+
+
+@dataclass
+class Run:
+    """What a recording says of its run."""
+
+    history: MapHistory = field(default_factory=MapHistory)
+    stream: CameraStream | None = None
+    tracks: dict[int, int] = field(default_factory=dict[int, int])
+    missing: dict[int, str] = field(default_factory=dict[int, str])
+    passed_over: list[int] = field(default_factory=list[int])
+    inliers: dict[int, int] = field(default_factory=dict[int, int])
+    map_points: dict[int, int] = field(default_factory=dict[int, int])
+    seconds: dict[str, dict[str, list[float]]] = field(
+        default_factory=lambda: defaultdict(lambda: defaultdict(list))
+    )
+    counters: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
+    cpu_seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    source_failure: str = ""
+    calibration_correction: tuple[float, ...] = ()
+    mesh: list[MeshPiece] = field(default_factory=list[MeshPiece])
+    ends: dict[str, StreamEnd] = field(default_factory=dict[str, StreamEnd])
+    arrivals_ns: list[int] = field(default_factory=list[int])
+    recorded: Summary = field(default_factory=Summary)
+
+    @property
+    def frames_per_second(self) -> float:
+        """Rate at which map updates reached the recorder."""
+        if len(self.arrivals_ns) < 2 or self.arrivals_ns[-1] <= self.arrivals_ns[0]:
+            return 0.0
+        return (len(self.arrivals_ns) - 1) * 1e9 / (self.arrivals_ns[-1] - self.arrivals_ns[0])
+
+    @property
+    def complete(self) -> bool:
+        """Whether every topic was closed at the end of its source, not by an interruption."""
+        return bool(self.ends) and all(end.complete for end in self.ends.values())
+
+
+def read_run(path: Path) -> Run:
+    """Fold a recording.  Raises RecordingError for a file that is none."""
+    run = Run()
+    for recorded in Recording(path).messages():
+        run.recorded.count(recorded)
+        if recorded.topic in _LEFT_ALONE:
+            continue
+        message = recorded.decode()
+        if isinstance(message, CameraStream):
+            run.stream = message
+        elif isinstance(message, Extrema):
+            run.tracks[message.frame] = len(message.ids)
+            if message.missing:
+                run.missing[message.frame] = message.missing
+        elif isinstance(message, MapUpdate):
+            final = recorded.topic.key == topics.MAP_FINAL.key
+            run.history.apply(message, frame=message.frame, stamp_ns=message.stamp_ns, final=final)
+            if final:
+                run.calibration_correction = message.calibration_correction
+            else:
+                run.inliers[message.frame] = message.inliers
+                if message.reason == PASSED_OVER:
+                    run.passed_over.append(message.frame)
+                run.arrivals_ns.append(recorded.log_time_ns)
+        elif isinstance(message, MeshPiece):
+            run.mesh.append(message)
+        elif isinstance(message, Status):
+            _take_status(run, message)
+        elif isinstance(message, StreamEnd):
+            run.ends[message.topic] = message
+    return run
+
+
+def _take_status(run: Run, status: Status) -> None:
+    for stage, seconds in zip(status.stages, status.seconds.tolist(), strict=True):
+        run.seconds[status.service][stage].append(seconds)
+    values = dict(zip(status.counters, status.values.tolist(), strict=True))
+    if "cpu_seconds" in values:
+        run.cpu_seconds[status.service].append(values["cpu_seconds"])
+    run.counters[status.service] = {**run.counters.get(status.service, {}), **values}
+    if status.service == "ingest" and status.note:
+        run.source_failure = status.note
+    if status.service == "bundle_adjustment" and "points" in values:
+        run.map_points[status.frame] = int(values["points"])
+
+
+def folded_map(path: Path) -> MapHistory:
+    """The map of a recording alone."""
+    history = MapHistory()
+    for topic in (topics.MAP_UPDATE, topics.MAP_FINAL):
+        for update in Recording(path).decoded(topic):
+            assert isinstance(update, MapUpdate)
+            final = topic == topics.MAP_FINAL
+            history.apply(update, frame=update.frame, stamp_ns=update.stamp_ns, final=final)
+    return history

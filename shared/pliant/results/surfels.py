@@ -1,0 +1,207 @@
+"""Turns a recording of surfels into the files that a user opens: see docs/surfels.md."""
+
+import json
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.surfels import SurfelState
+from pliant.config import recorded_config
+from pliant.errors import ResultError
+from pliant.formats.npz import NpzWriter
+from pliant.formats.tum import write_tum
+from pliant.messages import topics
+from pliant.messages.types import WAITING_FOR_DEPTH, Surfels
+from pliant.recording.reader import Recording
+from pliant.results.folder import RECORDING_NAME, REPORT_NAME, SURFELS_NAME, TRAJECTORY_NAME
+from pliant.results.report import ended_early, process_figures
+from pliant.results.run import Run, read_run
+from pliant.trajectory import Trajectory
+
+_PER_SURFEL = (
+    *("ids", "positions", "tangents", "deformations", "points_px", "zncc", "visible", "sigma"),
+    *("gains", "biases", "state", "age", "born", "tried"),
+)
+
+
+@dataclass
+class _Counts:
+    """What the report says of each frame."""
+
+    alive: list[int] = field(default_factory=list[int])
+    listed: list[int] = field(default_factory=list[int])
+    lost: list[int] = field(default_factory=list[int])
+    missing: dict[int, str] = field(default_factory=dict[int, str])
+    notes: dict[int, str] = field(default_factory=dict[int, str])
+    segments: dict[int, list[int]] = field(default_factory=dict[int, list[int]])
+    births: int = 0
+    last_states: dict[str, int] = field(default_factory=dict[str, int])
+    arrivals_ns: list[int] = field(default_factory=list[int])
+
+
+def has_surfels(recording: Path) -> bool:
+    """Whether a recording is one of the deformable profile."""
+    return next(Recording(recording).messages(topics.SURFELS), None) is not None
+
+
+def recorded_surfels(recording: Path) -> Iterator[Surfels]:
+    """The surfels of every frame."""
+    for message in Recording(recording).decoded(topics.SURFELS):
+        assert isinstance(message, Surfels)
+        yield message
+
+
+def write_surfel_results(output: Path) -> dict[str, Any]:
+    """Write trajectory, surfels and report beside the recording; returns the report.
+
+    All of them, or none where the disk is full.  Raises RecordingError and ResultError.
+    """
+    recording = output / RECORDING_NAME
+    run, counts = read_run(recording), _Counts()
+    followed: list[tuple[int, F64]] = []
+    try:
+        with tempfile.TemporaryDirectory(prefix=".partial-", dir=output) as name:
+            folder = Path(name)
+            with NpzWriter(folder / SURFELS_NAME) as npz:
+                for recorded in Recording(recording).messages(topics.SURFELS):
+                    surfels = recorded.decode()
+                    assert isinstance(surfels, Surfels)
+                    _count(counts, surfels, recorded.log_time_ns)
+                    _add(npz, surfels)
+                    followed += _followed(surfels)
+            write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
+            report = _report(run, counts, len(followed))
+            text = json.dumps(report, indent=1) + "\n"
+            (folder / REPORT_NAME).write_text(text, encoding="utf-8")
+            for path in sorted(folder.iterdir()):
+                path.replace(output / path.name)
+    except OSError as error:
+        raise ResultError(
+            f"{output}: cannot write the results ({error.strerror}); the recording is kept"
+        ) from None
+    return report
+
+
+def surfel_trajectory(recording: Path) -> Trajectory:
+    """The camera's pose of every frame whose surfels were followed."""
+    return _trajectory([f for surfels in recorded_surfels(recording) for f in _followed(surfels)])
+
+
+def _followed(surfels: Surfels) -> list[tuple[int, F64]]:
+    """Time and pose of a frame, none where it has no pixels or all surfels were lost."""
+    lost = surfels.missing or surfels.lost
+    return [] if lost else [(surfels.stamp_ns, surfels.T_world_camera)]
+
+
+def _trajectory(followed: list[tuple[int, F64]]) -> Trajectory:
+    return Trajectory(
+        stamps_ns=np.array([stamp_ns for stamp_ns, _ in followed], np.int64),
+        T_world_camera=np.array([pose for _, pose in followed]).reshape(-1, 4, 4),
+    )
+
+
+def surfel_summary(report: dict[str, Any]) -> list[str]:
+    """The report in a few lines."""
+    alive, frames = report["alive_per_frame"], report["frames"]
+    lines = [
+        f"{frames} frames at {report['frames_per_second']:.1f} frames/s, "
+        f"{report['frames_with_pose']} followed ({100.0 * report['success_rate']:.1f} %), "
+        f"{report['births']} surfels born",
+        f"alive: {report['median_alive']:.0f} in the median frame, "
+        f"{alive[-1] if alive else 0} in the last one "
+        f"({', '.join(f'{n} {state}' for state, n in report['last_states'].items()) or 'none'})",
+    ]
+    notes = list(report["notes"].values())
+    if notes:
+        lines.append(f"{len(notes)} unusable depth maps: {notes[0]}")
+    if not report["segments"]:
+        lines.append(f"no surfels could start: {report['last_reason']}")
+    elif report["frames_lost"]:
+        lines.append(
+            f"tracking was lost in {len(report['frames_lost'])} frames, "
+            f"first {report['frames_lost'][0]}; it starts again where there is depth"
+        )
+    return lines
+
+
+def _add(npz: NpzWriter, surfels: Surfels) -> None:
+    per_frame = {
+        "frames": surfels.frame, "stamps_ns": surfels.stamp_ns, "counts": len(surfels.ids),
+        "segments": surfels.segment,
+    }  # fmt: skip
+    for name, value in per_frame.items():
+        npz.add(name, np.array([value], np.int64))
+    npz.add("lost", np.array([surfels.lost]))
+    npz.add("T_world_camera", surfels.T_world_camera[None])
+    for name in _PER_SURFEL:
+        npz.add(name, getattr(surfels, name))
+
+
+def _count(counts: _Counts, surfels: Surfels, arrival_ns: int) -> None:
+    states = np.bincount(surfels.state, minlength=len(SurfelState)).tolist()
+    counts.alive.append(states[SurfelState.TRACKED])
+    counts.listed.append(len(surfels.ids))
+    counts.arrivals_ns.append(arrival_ns)
+    if surfels.note:
+        counts.notes[surfels.frame] = surfels.note
+    if surfels.missing:
+        counts.missing[surfels.frame] = surfels.missing
+        return
+    if surfels.lost:
+        counts.lost.append(surfels.frame)
+    counts.births += int(np.count_nonzero(surfels.age == 0))
+    counts.segments.setdefault(surfels.segment, []).append(surfels.frame)
+    names = [state.name.lower() for state in SurfelState]
+    counts.last_states = {
+        name: n for name, n in zip(names, states, strict=True) if n and name != "tracked"
+    }
+
+
+def is_metric(metadata: Mapping[str, Mapping[str, str]]) -> bool:
+    """Depth maps of a sensor are; a map of one camera has a scale of its own.
+
+    metadata: of the recording.
+    """
+    return recorded_config(metadata, []).surfels.depth_from == "sensor"
+
+
+def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
+    frames = len(counts.alive)
+    spent_ns = counts.arrivals_ns[-1] - counts.arrivals_ns[0] if frames else 0
+    missing = counts.missing
+    reasons = [*missing.values()]
+    return {
+        "source": run.stream.source if run.stream else "",
+        "mode": run.stream.mode if run.stream else "",
+        "profile": "deformable",
+        "complete": run.complete,
+        "ended_early": ended_early(run, frames),
+        "frames": frames,
+        "frames_with_pose": followed,
+        "frames_per_second": round((frames - 1) * 1e9 / spent_ns, 2) if spent_ns > 0 else 0.0,
+        "success_rate": followed / frames if frames else 0.0,
+        "segments": [
+            {"id": segment, "first_frame": members[0], "frames": len(members)}
+            for segment, members in sorted(counts.segments.items())
+        ],
+        "last_reason": reasons[-1] if reasons else "no frames",
+        "frames_without_pixels": {
+            str(f): why
+            for f, why in sorted(missing.items())
+            if not why.startswith(WAITING_FOR_DEPTH)
+        },
+        "frames_lost": counts.lost,
+        "notes": {str(f): note for f, note in sorted(counts.notes.items())},
+        "births": counts.births,
+        "median_alive": float(np.median(counts.alive)) if frames else 0.0,
+        "alive_per_frame": counts.alive,
+        "surfels_per_frame": counts.listed,
+        "last_states": counts.last_states,
+        "scale_is_metric": bool(counts.segments) and is_metric(run.recorded.metadata),
+        **process_figures(run, frames),
+    }

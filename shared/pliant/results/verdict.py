@@ -1,0 +1,65 @@
+"""What a run came to: its report in a few lines, and the exit code that follows."""
+
+from typing import Any
+
+from pliant.messages.types import DROPPED
+from pliant.results.surfels import surfel_summary
+
+DONE, INCOMPLETE = 0, 3
+
+
+def grade(report: dict[str, Any]) -> int:
+    """The exit code of a run with this report."""
+    whole = report["complete"] and not (_broken(report) or report["ended_early"])
+    return DONE if report["segments"] and whole else INCOMPLETE
+
+
+def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
+    """The report in a few lines.  has_map: False where nobody was to make one, as in a replay."""
+    if report.get("profile") == "deformable":
+        return [*surfel_summary(report), *_faults(report)]
+    frames = report["frames"]
+    if not has_map:
+        median = f"median per frame: {report['median_tracks_per_frame']:.0f} tracks"
+        return [f"{frames} frames, no map: bundle_adjustment was not replayed", median]
+    lines = [
+        f"{frames} frames at {report['frames_per_second']:.1f} frames/s, "
+        f"{report['frames_with_pose']} with a pose ({100.0 * report['success_rate']:.1f} %), "
+        f"{report['keyframes']} keyframes, {report['points']} points",
+        f"median per frame: {report['median_tracks_per_frame']:.0f} tracks, "
+        f"{report['median_inliers_per_frame']:.0f} mapped inliers",
+    ]
+    lines += [
+        f"{mesh['level']} mesh: {mesh['triangles']} triangles from {mesh['keyframes']} keyframes"
+        for mesh in report["mesh"]
+        if mesh["level"] == "fine"
+    ]
+    lines += _faults(report)
+    if not report["segments"]:
+        lines.append(f"no map could start: {report['last_reason'] or 'no frames'}")
+    elif len(report["segments"]) > 1:
+        lines.append(f"the map was lost and restarted: {len(report['segments'])} segments")
+    return lines
+
+
+def _broken(report: dict[str, Any]) -> list[str]:
+    """What is wrong with each broken image.  Those that live mode drops are no fault."""
+    return [why for why in report["frames_without_pixels"].values() if why != DROPPED]
+
+
+def _faults(report: dict[str, Any]) -> list[str]:
+    """What was wrong with the frames."""
+    lines: list[str] = []
+    broken = _broken(report)
+    dropped = len(report["frames_without_pixels"]) - len(broken)
+    if dropped:
+        lines.append(f"{dropped} images dropped to keep up (live mode)")
+    passed_over = len(report.get("frames_passed_over", ()))
+    if passed_over:
+        lines.append(f"{passed_over} images tracked, but not mapped, to keep up (live mode)")
+    if broken:
+        first = broken[0].removeprefix("broken: ")
+        lines.append(f"{len(broken)} broken {'image' if len(broken) == 1 else 'images'}: {first}")
+    if report["ended_early"]:
+        lines.append(f"the source ended early: {report['ended_early']}")
+    return lines

@@ -1,0 +1,1 @@
+"""What `scripts/bench` measures.  Machines are noisy: ratios within one run are what counts."""

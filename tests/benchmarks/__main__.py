@@ -1,0 +1,383 @@
+"""``scripts/bench``: measure, and compare within one run."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pliant_services.cli import main
+
+app = typer.Typer(
+    name="scripts/bench",
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    no_args_is_help=True,
+    help="Measure speed and accuracy.  Every figure in the docs names the command that made it.",
+)
+
+Sources = Annotated[list[str], typer.Argument(help="Folders or built-in:NAME.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE; may be repeated.")]
+
+
+@app.command()
+def tracking(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(help="Frames to measure.")] = 100,
+    overrides: Overrides = None,
+) -> None:
+    """Tracking per stage, beside OpenCV's pyramidal LK for the same points.
+
+    scripts/bench tracking built-in:room
+    """
+    from benchmarks.tracking import measure
+    from pliant.config import load_config
+
+    _print(measure(source, load_config(None, overrides or []), frames))
+
+
+@app.command("surfel-speed")
+def surfel_speed(
+    source: Annotated[
+        str | None, typer.Argument(help="Folder with depth, or built-in:NAME.  Default: a board.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames to measure.")] = 17,
+    surfels: Annotated[int, typer.Option(min=8, help="Most surfels.")] = 500,
+) -> None:
+    """Surfels per stage, beside OpenCV's pyramidal LK for the same points.
+
+    scripts/bench surfel-speed path/to/cloth
+    """
+    from benchmarks.surfel_speed import measure
+
+    _print(measure(source, frames, surfels))
+
+
+@app.command()
+def codec() -> None:
+    """Packing and unpacking an image.
+
+    scripts/bench codec
+    """
+    from benchmarks.codec import measure
+
+    _print(measure())
+
+
+@app.command()
+def recording(
+    seconds: Annotated[int, typer.Option(help="Length of the recording that is made.")] = 600,
+) -> None:
+    """Writing, reading, seeking and keeping up.  Ten minutes of recording take 12 GB for a while.
+
+    scripts/bench recording
+    """
+    from benchmarks.recording import measure
+
+    _print(measure(seconds))
+
+
+@app.command()
+def compression(recording: Annotated[Path, typer.Argument(help="A recording.")]) -> None:
+    """What each topic of a recording gains from compression, and at which speed.
+
+    scripts/bench compression results/room/recording.mcap
+    """
+    from benchmarks.recording import compression
+
+    _print(compression(recording))
+
+
+@app.command()
+def recorder(kills: Annotated[int, typer.Option(help="How often.")] = 50) -> None:
+    """kill -9 of the recorder at random moments, and what recovery keeps.
+
+    scripts/bench recorder --kills 50
+    """
+    from benchmarks.recorder_kills import measure
+
+    _print(measure(kills))
+
+
+@app.command()
+def reference(
+    folder: Annotated[Path, typer.Option(help="Where it is kept.")] = Path("tests/data/reference"),
+    refresh: Annotated[
+        bool, typer.Option("--refresh", help="Keep what the services make now.")
+    ] = False,
+) -> None:
+    """Replay the reference recording and compare; exit 1 where it differs.
+
+    scripts/bench reference --refresh
+    """
+    import reference as kept
+
+    changed = kept.refresh(folder) if refresh else kept.check(folder)
+    _print(changed or ["nothing has changed"])
+    if refresh:
+        version = kept.keep_version(folder.parent / "recordings", folder / kept.INPUT)
+        _print([f"a recording of this version: {version}"] if version else [])
+    elif changed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def bundle(
+    folder: Annotated[
+        Path | None, typer.Option("--problems", help="Folder of BAL and libmv problems.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG of the cost over time.")] = None,
+) -> None:
+    """Bundle adjustment beside Ceres (pyceres) and scipy: time to the same cost.  Ten minutes.
+
+    OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 scripts/bench bundle --problems bundle_adjustment
+    """
+    from benchmarks.bundle import measure
+
+    _print(measure(folder, plot))
+
+
+@app.command("mesh-parts")
+def mesh_parts(
+    vertices: Annotated[int, typer.Option(min=100, help="Of the keyframe.")] = 10_000,
+    repeats: Annotated[int, typer.Option(min=1, help="Of each part; the least counts.")] = 10,
+    seeds: Annotated[int, typer.Option(min=1, help="Scenes for the errors.")] = 8,
+) -> None:
+    """The parts of meshing on a synthetic keyframe, beside the paper's, and what NLTGV gains.
+
+    OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 scripts/bench mesh-parts
+    """
+    from benchmarks.mesh_parts import measure
+
+    _print(measure(vertices, repeats, seeds))
+
+
+@app.command()
+def images(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(min=1, help="Frames to measure.")] = 12,
+) -> None:
+    """Images for a link between machines: how small, and what that costs on either side.
+
+    scripts/bench images path/to/sequence
+    """
+    from benchmarks.images import measure
+
+    _print(measure(source, frames))
+
+
+@app.command()
+def accuracy(
+    sources: Sources,
+    output: Annotated[Path, typer.Option("--output", "-o")] = Path("results/bench"),
+    seeds: Annotated[int, typer.Option(help="Runs of each source, with seeds 0, 1, ...")] = 1,
+    overrides: Overrides = None,
+) -> None:
+    """The whole pipeline through its processes: accuracy, density and frames per second.
+
+    scripts/bench accuracy built-in:room path/to/sequence --seeds 5
+    """
+    from benchmarks.accuracy import measure
+
+    _print(measure(sources, output, seeds=seeds, overrides=overrides or []))
+
+
+@app.command()
+def losses(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    runs: Annotated[int, typer.Option(min=1, help="How often.")] = 20,
+) -> None:
+    """Run again and again at full speed: messages lost by sequence number, and equal bytes.
+
+    scripts/bench losses built-in:room --runs 20
+    """
+    from benchmarks.whole_runs import losses
+
+    _print(losses(source, runs))
+
+
+@app.command("recording-cost")
+def recording_cost(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    runs: Annotated[int, typer.Option(min=1, help="Runs with and without, in turns.")] = 3,
+) -> None:
+    """Frames a second of the pipeline with and without a recorder.
+
+    scripts/bench recording-cost built-in:room
+    """
+    from benchmarks.whole_runs import recording_cost
+
+    _print(recording_cost(source, runs))
+
+
+@app.command("viewer-cost")
+def viewer_cost(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    runs: Annotated[int, typer.Option(min=1, help="Of each kind, in turns.")] = 1,
+) -> None:
+    """Frames a second without a viewer, with one that draws, and with one that is stopped.
+
+    scripts/bench viewer-cost built-in:room
+    """
+    from benchmarks.viewer_cost import measure
+
+    _print(measure(source, runs))
+
+
+@app.command()
+def replay(
+    recording: Annotated[Path, typer.Argument(help="Result folder or recording.")],
+    service: Annotated[str, typer.Option(help="Which one.")] = "tracking",
+    runs: Annotated[int, typer.Option(min=1, help="Of each, in turns.")] = 3,
+) -> None:
+    """Frames a second of a replayed service, beside the same service on messages in memory.
+
+    scripts/bench replay results/room --service tracking
+    """
+    from benchmarks.replay_rate import measure
+
+    _print(measure(recording, service, runs))
+
+
+@app.command()
+def kills(
+    source: Annotated[str, typer.Argument(help="Of 300 frames.")] = "built-in:room",
+    count: Annotated[int, typer.Option(min=1, help="How often each.")] = 20,
+    seed: Annotated[int, typer.Option(help="Chooses the moments.")] = 0,
+) -> None:
+    """kill -9 of each service, and of all at once, at random moments: are the results the same?
+
+    scripts/bench kills built-in:room --count 20
+    """
+    from benchmarks.whole_runs import kills
+
+    _print(kills(source, count, seed))
+
+
+@app.command()
+def latency(images: Annotated[int, typer.Option(min=50, help="To send.")] = 1000) -> None:
+    """What a hop over the bus adds to a 361 kB image: TCP and mutual TLS through a router.
+
+    scripts/bench latency
+    """
+    from benchmarks.latency import measure
+
+    _print(measure(images))
+
+
+@app.command()
+def endurance(
+    source: Annotated[str, typer.Argument(help="built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(min=1, help="At most.")] = 108_000,
+    minutes: Annotated[float, typer.Option(min=0.1, help="At most.")] = 60.0,
+) -> None:
+    """An hour's worth of frames at full speed: memory, file handles, threads of each service.
+
+    scripts/bench endurance built-in:room --minutes 10
+    """
+    from benchmarks.endurance import measure
+
+    _print(measure(source, frames, minutes))
+
+
+@app.command("slow-mapping")
+def slow_mapping(
+    source: Annotated[str, typer.Argument(help="built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(min=40, help="Of the source, forth and back.")] = 1200,
+    fps: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 30.0,
+    slowdown: Annotated[float, typer.Option(min=1.0, help="Of bundle adjustment.")] = 10.0,
+    overrides: Overrides = None,
+) -> None:
+    """Live mode before, while and after bundle adjustment is slow: what tracking keeps of its rate.
+
+    scripts/bench slow-mapping built-in:room --fps 10 --frames 400
+    """
+    from benchmarks.slow_mapping import measure
+
+    _print(measure(source, frames, fps, slowdown, overrides or []))
+
+
+@app.command()
+def ablation(sources: Sources) -> None:
+    """What each addition to the paper is worth.
+
+    scripts/bench ablation built-in:room path/to/sequence
+    """
+    from benchmarks.ablation import measure
+
+    _print(measure(sources))
+
+
+@app.command()
+def mesh(
+    result: Annotated[Path, typer.Argument(help="Result folder of a run.")],
+    groundtruth: Annotated[
+        str, typer.Option("--groundtruth", "-g", help="Folder with depth maps, or built-in:NAME.")
+    ],
+    overrides: Overrides = None,
+) -> None:
+    """Meshes of one run: NLTGV, Laplacian, no smoothing, Poisson, against true depth.
+
+    scripts/bench mesh results/room --groundtruth built-in:room
+    """
+    from benchmarks.mesh import measure
+
+    _print(measure(result, groundtruth, overrides or []))
+
+
+@app.command("mesh-live")
+def mesh_live(
+    result: Annotated[Path, typer.Argument(help="Result folder of a run.")],
+    groundtruth: Annotated[
+        str, typer.Option("--groundtruth", "-g", help="Folder with depth maps, or built-in:NAME.")
+    ],
+    overrides: Overrides = None,
+) -> None:
+    """Two ways in which the live mesh can follow the corrections of the map, against true depth.
+
+    scripts/bench mesh-live results/room --groundtruth built-in:room
+    """
+    from benchmarks.mesh import measure_live
+
+    _print(measure_live(result, groundtruth, overrides or []))
+
+
+@app.command()
+def surfels(
+    sources: Annotated[
+        list[str] | None, typer.Argument(help="Instead of the tables' own sequences.")
+    ] = None,
+    tracks: Annotated[
+        str | None, typer.Option(help="mdh_23frames_301pts.npz of the Kinect paper.")
+    ] = None,
+    tables: Annotated[
+        str, typer.Option(help="targets,models,sizes,scales,cameras,neighbours,troubles,limits")
+    ] = "",
+    frames: Annotated[int, typer.Option(min=2, help="Of each sequence.")] = 60,
+    count: Annotated[int, typer.Option("--surfels", min=8, help="At most.")] = 200,
+    quick: Annotated[bool, typer.Option("--quick", help="A few rows of each table.")] = False,
+) -> None:
+    """Surfels on deforming sequences with exact truth: models, sizes, scales, cameras, troubles.
+
+    scripts/bench surfels --tracks kinect_paper_tracks/mdh_23frames_301pts.npz
+
+    scripts/bench surfels --quick
+
+    scripts/bench surfels path/to/cloth "built-in:sliding?light=0.5" --tables models,sizes
+    """
+    from benchmarks.surfels import measure
+
+    chosen = [name for name in tables.split(",") if name]
+    lines = measure(
+        sources or [], tracks=tracks, tables=chosen, frames=frames, surfels=count, quick=quick
+    )
+    _print(lines)
+
+
+def _print(lines: Iterable[str]) -> None:
+    for line in lines:
+        typer.echo(line)
+
+
+if __name__ == "__main__":
+    main(app)

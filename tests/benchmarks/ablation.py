@@ -1,0 +1,76 @@
+"""What each addition to the paper is worth: every switch off in turn, and all of them."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.stopwatch import Stopwatch
+from benchmarks.table import markdown
+from pliant.config import load_config
+from pliant.datasets import open_source
+from pliant.evaluation.report import metres
+from pliant.evaluation.result import evaluate_trajectory
+from pliant.formats.trajectory_files import read_trajectory
+from pliant.map_history import MapHistory
+from pliant.offline import Timers, process
+from pliant_services.runtime.host import one_thread_each
+
+_OFF = {
+    "mutual check": ["tracking.mutual_check=false"],
+    "local flow": ["tracking.local_flow=false"],
+    "de-duplication": ["tracking.deduplicate=false"],
+    "sub-pixel extrema": ["tracking.subpixel=false"],
+    "patch refinement and coasting": ["tracking.patch_refinement=false"],
+    "turned patches": ["tracking.turn_patches=false"],
+    "coasting": ["tracking.coast_frames=0"],
+    "minima beside maxima": ["tracking.both_signs=false"],
+    "re-acquisition": ["bundle_adjustment.reacquisition.enabled=false"],
+    "final adjustment": ["bundle_adjustment.window.final_adjustment=false"],
+    "readout of a rolling shutter": ["bundle_adjustment.calibration.readout=0"],
+}
+_TRACKER = ("mutual check", "local flow", "de-duplication", "sub-pixel extrema")
+_LITERAL = [s for name in (*_TRACKER, "patch refinement and coasting") for s in _OFF[name]]
+_LITERAL += _OFF["minima beside maxima"]
+
+VARIANTS: dict[str, list[str]] = {
+    "everything on": [],
+    **{f"without {name}": sets for name, sets in _OFF.items()},
+    "with affine refit": ["tracking.affine_refit=true"],
+    "with sweeps that move keyframes": ["bundle_adjustment.window.sweep_keyframes=true"],
+    "the paper's tracker": _LITERAL,
+    "the paper's tracker, without re-acquisition": [*_LITERAL, *_OFF["re-acquisition"]],
+}
+
+
+def measure(sources: Sequence[str]) -> Iterator[str]:
+    """ATE (success rate where below 99 %) / median mapped inliers, a column for each source."""
+    one_thread_each()
+    header = ["variant", *(Path(source).name for source in sources)]
+    rows = []
+    for name, overrides in VARIANTS.items():
+        rows.append([name, *(_cell(source, overrides) for source in sources)])
+    yield "ATE of the final trajectory / median mapped inliers / ms of tracking and mapping a frame"
+    yield markdown(header, rows)
+
+
+def _cell(source: str, overrides: Sequence[str]) -> str:
+    dataset = open_source(source)
+    history = MapHistory()
+    watches = Stopwatch(), Stopwatch()
+    inliers: list[int] = []
+    for frame in process(dataset, load_config(None, overrides), history, timers=Timers(*watches)):
+        inliers.append(frame.delta.inliers)
+        for watch in watches:
+            watch.lap()
+    milliseconds = sum(watch.mean_ms() for watch in watches)
+    poses = history.final()
+    assert dataset.ground_truth_path is not None
+    truth = read_trajectory(dataset.ground_truth_path)
+    longest = history.longest_segment()
+    chosen = {frame: pose for frame, pose in poses.items() if pose[0] == longest}
+    evaluation = evaluate_trajectory(history.trajectory(chosen), truth, frames=len(inliers))
+    rate = 100.0 * (evaluation.success_rate or 0.0)
+    shown = metres(evaluation.ate_m.rmse) if evaluation.ate_m else "fails"
+    at = f" at {rate:.0f} %" if rate < 99.0 else ""
+    return f"{shown}{at} / {np.median(inliers):.0f} / {milliseconds:.0f}"

@@ -1,0 +1,142 @@
+"""Whole runs, many times: is anything lost, what does recording cost, what does a kill change?"""
+
+import os
+import random
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from statistics import median
+
+from benchmarks.table import markdown, markdown_header, markdown_row
+from pliant.config import config_yaml, load_config
+from pliant.messages.types import Status
+from pliant.results.folder import STATE_FOLDER, prepare
+from pliant.results.write import write_results
+from pliant_services.processes import PROFILES
+from pliant_services.run.command import RunRequest, service_arguments
+from pliant_services.runtime import kernels as warm_up
+from pliant_services.runtime.launcher import Fleet
+
+SERVICES = PROFILES["points"]
+FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
+
+
+def losses(source: str, runs: int) -> Iterator[str]:
+    """Run a source again and again at full speed: the recorder's books, and whether bytes agree."""
+    first: dict[str, bytes] = {}
+    yield markdown_header(("run", "messages", "lost", "twice", "the same bytes"))
+    for number in range(runs):
+        with tempfile.TemporaryDirectory() as folder:
+            output = Path(folder)
+            run_once(source, output, SERVICES)
+            books = write_results(output)["recorder"]
+            files = {name: (output / name).read_bytes() for name in FILES}
+        first = first or files
+        yield markdown_row(
+            (
+                str(number + 1),
+                str(sum(books["messages"].values())),
+                str(books["lost"]),
+                str(books["duplicated"]),
+                "yes" if files == first else "NO",
+            )
+        )
+
+
+def recording_cost(source: str, runs: int) -> Iterator[str]:
+    """Frames a second of the pipeline with and without a recorder, run in turns."""
+    with_recorder = SERVICES
+    without = tuple(name for name in with_recorder if name != "recorder")
+    rates: dict[str, list[float]] = {"on": [], "off": []}
+    for _ in range(runs):
+        for name, services in (("on", with_recorder), ("off", without)):
+            with tempfile.TemporaryDirectory() as folder:
+                rates[name].append(run_once(source, Path(folder), services))
+    on, off = median(rates["on"]), median(rates["off"])
+    rows = [("off", f"{off:.1f}", "1.00"), ("on", f"{on:.1f}", f"{on / off:.2f}")]
+    yield markdown(("recording", "frames/s", "of that without"), rows)
+
+
+def kills(source: str, count: int, seed: int) -> Iterator[str]:
+    """kill -9 of each service, and of all at once, at random moments; compare the results."""
+    chance = random.Random(seed)
+    services = SERVICES
+    expected = _files_of_a_run(source, services, None)
+    yield markdown_header(("killed", "times", "byte-identical results"))
+    for victims in (*((name,) for name in services), services):
+        same = 0
+        for _ in range(count):
+            moment = chance.random()
+            same += _files_of_a_run(source, services, (moment, victims)) == expected
+        name = victims[0] if len(victims) == 1 else "all at once"
+        yield markdown_row((name, str(count), f"{same} of {count}"))
+
+
+def _files_of_a_run(
+    source: str, services: Sequence[str], kill: tuple[float, Sequence[str]] | None
+) -> dict[str, bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder)
+        run_once(source, output, services, state=output / STATE_FOLDER, kill=kill)
+        write_results(output)
+        return {name: (output / name).read_bytes() for name in FILES}
+
+
+def run_once(
+    source: str,
+    output: Path,
+    services: Sequence[str],
+    *,
+    state: Path | None = None,
+    kill: tuple[float, Sequence[str]] | None = None,
+    beside: Callable[[Fleet], AbstractContextManager[object]] = nullcontext,
+) -> float:
+    """One run; returns its frames a second.
+
+    kill: at which share of the run, and whom.     beside: entered before the services start.
+    """
+    warm_up.compile_kernels(print)
+    request = RunRequest(source=source)
+    prepare(output, config_yaml(load_config()))
+    times: list[float] = []
+    when = _Killer(kill)
+
+    def on_status(status: Status) -> None:
+        if status.service == "bundle_adjustment":
+            times.append(time.monotonic())
+            when.on_frame(status.frame, fleet.pids)
+
+    fleet = Fleet(services, log_folder=output / "logs", on_status=on_status, state=state)
+    try:
+        with beside(fleet):
+            fleet.start(lambda name: service_arguments(name, request, output))
+            fleet.wait()
+    finally:
+        fleet.close()
+    return (len(times) - 1) / (times[-1] - times[0])
+
+
+class _Killer:
+    """Kills once, at a moment that is a share of the frames, and not only between two frames."""
+
+    FRAMES = 300
+
+    def __init__(self, kill: tuple[float, Sequence[str]] | None) -> None:
+        self._kill = kill
+        self._done = kill is None
+
+    def on_frame(self, frame: int, pids: dict[str, int]) -> None:
+        if self._kill is None or self._done or frame < self._kill[0] * self.FRAMES:
+            return
+        self._done = True
+        victims = [pids[name] for name in self._kill[1]]
+
+        def strike() -> None:
+            for pid in victims:
+                os.kill(pid, signal.SIGKILL)
+
+        threading.Timer(0.05 * self._kill[0], strike).start()
