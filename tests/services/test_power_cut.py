@@ -17,7 +17,7 @@ from pliant.messages.types import SourceImage
 from pliant.recording.parts import parts_of
 from pliant.recording.recover import mend, recover
 from pliant.recording.writer import RecordingWriter
-from pliant_services import recorder
+from pliant_services.nodes import recorder
 
 
 class Disk:
