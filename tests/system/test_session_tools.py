@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from benchmarks.latency import hop
 
 from pliant.bus.session import free_endpoint
 from pliant_services.processes import PROFILES
