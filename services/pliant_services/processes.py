@@ -2,10 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from pliant.config import Config
 from pliant.messages import topics
 from pliant.messages.topics import Topic
+
+if TYPE_CHECKING:
+    from pliant.config import Config
 
 
 @dataclass(frozen=True)
@@ -15,6 +18,7 @@ class Process:
     optional: topics that it reads besides where a service of the fleet publishes them.
     observer: it reads every logged topic of the others, and nobody reads it.
     niceness: how much it gives way where processors are few; others do not wait for what it makes.
+    kernels: modules whose ``warm_up()`` compiles, or loads, what it calls.
     may_lag: it may be further behind than others with frames that bundle adjustment passes over.
     """
 
@@ -25,6 +29,7 @@ class Process:
     optional: tuple[Topic, ...] = ()
     observer: bool = False
     niceness: int = 0
+    kernels: tuple[str, ...] = ()
     may_lag: bool = False
 
 
@@ -37,12 +42,14 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "tracking",
         "pliant_services.nodes.tracking",
+        kernels=("pliant.algorithms.tracking",),
         inputs=(topics.STREAM, topics.IMAGE),
         outputs=(topics.EXTREMA,),
     ),
     Process(
         "bundle_adjustment",
         "pliant_services.nodes.bundle_adjustment",
+        kernels=("pliant.algorithms.bundle", "pliant.algorithms.mapping"),
         inputs=(topics.STREAM, topics.IMAGE, topics.EXTREMA),
         outputs=(topics.MAP_UPDATE, topics.MAP_FINAL, topics.KEYFRAME, topics.KEYFRAME_FINAL),
         may_lag=True,
@@ -50,6 +57,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "meshing",
         "pliant_services.nodes.meshing",
+        kernels=("pliant.algorithms.meshing", "pliant.fusion.warm_up"),
         inputs=(
             topics.STREAM,
             topics.MAP_UPDATE,
@@ -63,6 +71,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "surfels",
         "pliant_services.nodes.surfels",
+        kernels=("pliant.algorithms.surfels",),
         inputs=(topics.STREAM, topics.IMAGE, topics.DEPTH),
         optional=(topics.EXTREMA, topics.MAP_UPDATE, topics.KEYFRAME),
         outputs=(topics.SURFELS,),
@@ -84,14 +93,14 @@ PROFILES: dict[str, tuple[str, ...]] = {
 """``deformable`` becomes one of the others where surfels are configured to use what those make."""
 
 
-def reads_depth(fleet: Sequence[str], config: Config) -> bool:
+def reads_depth(fleet: Sequence[str], config: "Config") -> bool:
     """Whether a service of the fleet works with the source's depth maps."""
     return config.surfels.depth_from == "sensor" and any(
         topics.DEPTH in BY_NAME[name].inputs for name in fleet
     )
 
 
-def deformable_fleet(config: Config) -> str:
+def deformable_fleet(config: "Config") -> str:
     """The profile that makes what surfels are configured to use."""
     if config.surfels.depth_from == "map":
         return "deformable-map"

@@ -83,12 +83,12 @@ def test_every_compose_on_this_machine_reads_the_file(profile: str) -> None:
 def test_a_profile_starts_its_services_and_each_is_told_of_the_others(profile: str) -> None:
     content = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
     mine = [s for s in content["services"].values() if profile in s.get("profiles", [])]
-    fleets = {part for s in mine for part in s["command"] if part.startswith("--fleet=")}
-    assert len(fleets) == 1
-    fleet = fleets.pop().removeprefix("--fleet=").split(",")
-    assert set(fleet) == {s["command"][1] for s in mine if s["command"][0] == "service"}
+    told = {part for s in mine for part in s["command"] if part.startswith("--profile=")}
     # The mesh is made when the session is over: a mesher cannot go on where it was.
-    assert tuple(fleet) == PROFILES["points" if profile == "rigid" else profile]
+    session = "points" if profile == "rigid" else profile
+    assert told == {f"--profile={session}"}
+    services = {s["command"][1] for s in mine if s["command"][0] == "service"}
+    assert services == set(PROFILES[session])
 
 
 def test_nothing_runs_as_root_or_writes_into_its_image() -> None:

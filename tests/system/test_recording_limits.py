@@ -71,16 +71,6 @@ def test_the_same_bytes_with_delays_a_busy_core_and_another_order_of_start(
     assert_same(result, tmp_path)
 
 
-def test_a_replay_in_processes_gives_the_same_bytes(result: Path, tmp_path: Path) -> None:
-    done = pliant(
-        "replay", result, "--services", "tracking,bundle_adjustment", "--processes", "--check",
-        "--output", tmp_path / "again",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "the same bytes" in done.stdout
-    assert summarise(tmp_path / "again").complete
-
-
 def test_a_full_disk_is_one_line_and_what_was_written_is_readable(tmp_path: Path) -> None:
     """No file may grow beyond a third of a recording: what a full disk looks like to its writer.
 

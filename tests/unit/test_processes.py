@@ -8,7 +8,6 @@ import pytest
 from pliant.config import Config
 from pliant.messages import topics
 from pliant_services import processes
-from pliant_services.cli import service as cli_service
 from pliant_services.processes import PROCESSES, PROFILES
 from pliant_services.runtime.host import checkpoint_windows
 
@@ -47,10 +46,6 @@ def test_every_topic_of_the_table_is_published_by_one_process() -> None:
 @pytest.mark.parametrize("process", PROCESSES, ids=lambda p: p.name)
 def test_every_process_has_a_module_with_run(process: processes.Process) -> None:
     assert callable(importlib.import_module(process.module).run)
-
-
-def test_the_help_names_every_service() -> None:
-    assert cli_service.NAMES.split(", ") == list(processes.BY_NAME)
 
 
 def test_what_is_kept_for_checkpoints_is_what_the_docs_say() -> None:

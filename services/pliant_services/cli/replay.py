@@ -46,9 +46,6 @@ def replay(
         list[str] | None,
         typer.Option(help="FIELD=X: numbers of the field may differ by X; may be repeated."),
     ] = None,
-    processes: Annotated[
-        bool, typer.Option("--processes", help="Services as processes, over the bus.")
-    ] = False,
 ) -> None:
     """Play a recording on the bus as if live; or run services again on what was recorded.
 
@@ -61,7 +58,7 @@ def replay(
     from pliant_services.cli.info import recording_file
 
     file = recording_file(recording)
-    if services or output or force or overrides or check or tolerance or processes:
+    if services or output or force or overrides or check or tolerance:
         playing = {
             "--rate": rate != "1", "--start": start, "--end": end is not None, "--topics": topics,
             "--readers": readers, "--loop": loop, "--connect": connect, "--port": port,
@@ -80,7 +77,6 @@ def replay(
             overrides=overrides or [],
             check=check,
             tolerances=_tolerances(tolerance or []),
-            processes=processes,
         )
         raise typer.Exit(run_replay(again))
     from pliant_services.replay.play import PlayRequest, run_play

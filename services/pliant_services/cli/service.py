@@ -8,20 +8,21 @@ import typer
 
 from pliant.errors import PliantError
 from pliant_services.cli.options import Connect, TlsFolder, identity_in
+from pliant_services.processes import BY_NAME, PROFILES
 
 if TYPE_CHECKING:
     from pliant.config import Config
 
-NAMES = "ingest, tracking, bundle_adjustment, meshing, surfels, recorder"
+_NAMES, _PROFILES = ", ".join(BY_NAME), ", ".join(PROFILES)
 
 
 def service(
-    name: Annotated[str, typer.Argument(help=f"One of {NAMES}.")],
+    name: Annotated[str, typer.Argument(help=f"One of {_NAMES}.")],
     connect: Connect,
     session: Annotated[str, typer.Option(help="Name of the session to join.")] = "default",
-    fleet: Annotated[
-        str, typer.Option(help="The services of this session, separated by commas.")
-    ] = "",
+    profile: Annotated[
+        str, typer.Option(help=f"Which services the session has: {_PROFILES}.")
+    ] = "points",
     config_file: Annotated[Path | None, typer.Option("--config", help="YAML file.")] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE over the file; may be repeated.")
@@ -52,6 +53,9 @@ def service(
     alive: Annotated[
         Path | None, typer.Option(help="File to touch once a second, for health checks.")
     ] = None,
+    fleet: Annotated[
+        str, typer.Option(hidden=True, help="The services themselves, from a launcher.")
+    ] = "",
     with_launcher: Annotated[
         bool, typer.Option(hidden=True, help="End when standard input closes.")
     ] = False,
@@ -64,7 +68,7 @@ def service(
     pliant service tracking --connect tcp/host:7447
     """
     from pliant.config import load_config
-    from pliant_services.processes import BY_NAME, PROFILES, reads_depth
+    from pliant_services.processes import reads_depth
     from pliant_services.runtime.host import ServiceOptions, end_with_launcher, run_service
     from pliant_services.runtime.session_end import run_alone
 
@@ -73,10 +77,12 @@ def service(
 
     if name not in BY_NAME:
         raise PliantError(f"no service {name}: choose {', '.join(BY_NAME)}")
-    names = tuple(fleet.split(",")) if fleet else PROFILES["points"]
-    unknown = [other for other in (*names, name) if other not in BY_NAME or name not in names]
-    if unknown:
-        raise PliantError(f"--fleet {fleet}: choose from {', '.join(BY_NAME)}, including {name}")
+    if profile not in PROFILES:
+        raise PliantError(f"--profile {profile}: choose {_PROFILES}")
+    names = tuple(fleet.split(",")) if fleet else PROFILES[profile]
+    if name not in names:
+        having = ", ".join(each for each, services in PROFILES.items() if name in services)
+        raise PliantError(f"--profile {profile} has no {name}: choose {having}")
     config = load_config(config_file, overrides or [])
     arguments: dict[str, Any] = {}
     if name == "ingest":

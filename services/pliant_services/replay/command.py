@@ -15,7 +15,6 @@ from pliant.recording.summary import summarise
 from pliant.results.folder import RECORDING_NAME, check_output, prepare, run_metadata
 from pliant.results.verdict import summary
 from pliant.results.write import write_results
-from pliant_services.replay.as_processes import run_as_processes
 from pliant_services.replay.services import (
     Replay,
     gaps,
@@ -39,7 +38,6 @@ class ReplayRequest:
     overrides: Sequence[str] = ()
     check: bool = False
     tolerances: Mapping[str, float] = field(default_factory=dict[str, float])
-    processes: bool = False
 
 
 def comparable(made: Sequence[Topic], mode: str) -> list[Topic]:
@@ -74,10 +72,7 @@ def run_replay(request: ReplayRequest) -> int:
     made = output / RECORDING_NAME
     for line in gaps(recorded, services):
         print(line, file=sys.stderr)
-    if request.processes:
-        run_as_processes(request.recording, services, config, output, metadata)
-    else:
-        replay.run(made, metadata)
+    replay.run(made, metadata)
     report = write_results(output)
     has_map = topics.MAP_UPDATE in replay.made or topics.MAP_UPDATE.key not in replay.affected
     for line in summary(report, has_map=has_map):

@@ -1,6 +1,7 @@
 """Compiles every kernel once, before services start together and would each compile them all."""
 
 import hashlib
+import importlib
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,8 +11,9 @@ from pathlib import Path
 import pliant
 from pliant.cache import cache_folder
 from pliant.errors import PliantError
+from pliant_services.processes import BY_NAME, PROCESSES
 
-COMPILED = ("tracking", "bundle_adjustment", "meshing", "surfels")
+COMPILED = tuple(process.name for process in PROCESSES if process.kernels)
 """The services that have kernels."""
 
 
@@ -70,27 +72,8 @@ def load_kernels(service: str) -> None:
     Compiles what is not in the cache; otherwise loads it, so that the first frame is as quick as
     all others.  Services without kernels have nothing to load.
     """
-    if service == "tracking":
-        from pliant.algorithms import tracking
-
-        tracking.warm_up()
-    elif service == "bundle_adjustment":
-        from pliant.algorithms import bundle, mapping
-
-        bundle.warm_up()
-        mapping.warm_up(mapping.MappingParameters())
-    elif service == "meshing":
-        from pliant.algorithms import meshing
-        from pliant.fusion.open3d_import import FusionError
-        from pliant.fusion.warm_up import warm_up as fuse_something
-
-        meshing.warm_up()
-        with suppress(FusionError):  # where there is no open3d there is no mesh
-            fuse_something()
-    elif service == "surfels":
-        from pliant.algorithms import surfels
-
-        surfels.warm_up()
+    for name in BY_NAME[service].kernels:
+        importlib.import_module(name).warm_up()
 
 
 def _fingerprint() -> str:

@@ -48,13 +48,10 @@ class Fleet:
         on_status: Callable[[Status], None],
         port: int | None = None,
         state: Path | None = None,
-        elsewhere: Sequence[str] = (),
     ) -> None:
         """Start the router.  ``state``: folder of checkpoints; with it, services that die are
-        started again.  ``elsewhere``: services of the session that somebody else runs.  Raises
-        BusError when the port is in use."""
+        started again.  Raises BusError when the port is in use."""
         self._services = tuple(services)
-        self._session_services = (*elsewhere, *services)
         self._log_folder = log_folder
         self._children: list[Child] = []
         self._state = state
@@ -80,7 +77,7 @@ class Fleet:
                 return
             with suppress(MessageError):  # not from a service of ours
                 message = codec.decode(Status, sample.payload.to_bytes())
-                if message.service in self._session_services:
+                if message.service in self._services:
                     self._frames[message.service] = message.frame
                     on_status(message)
 
@@ -164,7 +161,7 @@ class Fleet:
         command = [
             *(sys.executable, "-m", "pliant_services.cli", "service", name),
             *("--connect", self.endpoint, "--session", self.session),
-            *("--fleet", ",".join(self._session_services), "--with-launcher", *patience),
+            *("--fleet", ",".join(self._services), "--with-launcher", *patience),
             *(("--state", str(self._state)) if self._state is not None else ()),
             *self._arguments(name),
         ]

@@ -11,7 +11,7 @@ from pliant.algorithms.tracks import FrameTracks
 _FRAMES, _POINTS = 12, 400
 
 
-def warm_up(parameters: MappingParameters) -> None:
+def warm_up() -> None:
     """Start a map, extend it, lose some tracks and find them again, so that all code has run."""
     camera = PinholeCamera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
     generator = np.random.default_rng(0)
@@ -19,7 +19,7 @@ def warm_up(parameters: MappingParameters) -> None:
     kappas = generator.uniform(1.0, 100.0, _POINTS).astype(np.float32)
     grey = generator.integers(0, 256, (240, 320), np.uint8)
     colour = np.repeat(grey[:, :, None], 3, axis=2)
-    mapper = Mapper(camera, parameters, seed=0)
+    mapper = Mapper(camera, MappingParameters(), seed=0)
     for frame in range(_FRAMES):
         turned = points @ so3_exp(np.array([0.0, 0.01 * frame, 0.0])).T
         px = camera.project(turned - (0.1 * frame, 0.02 * frame, 0.0)).astype(np.float32)
