@@ -24,8 +24,6 @@ from pliant_services.runtime.host import one_thread_each
 
 KINDS: dict[str, dict[str, Any]] = {
     "static camera, each on its own": {"neighbours": 0},
-    "the same, derivatives of the texture": {"neighbours": 0, "jacobian": "template"},
-    "the same, derivatives of the frame": {"neighbours": 0, "jacobian": "frame"},
     "static camera, neighbours": {},
     "moving camera": {"camera": "moving"},
 }

@@ -21,12 +21,10 @@ from pliant_services.runtime.host import one_thread_each
 
 _STATIC = ("sliding", "objects", "stretching", "stretching?poisson=1", "stretching?held=1")
 _BREATHING = tuple(f"breathing?amplitude={share}" for share in ("0", "0.01", "0.03", "0.08"))
-_MODELS = ("isometric", "conformal", "equiareal", "general")
-_LIGHTS = ("light=0.3", "exposure=0.2")
-_ILLUMINATION = ("both", "bias", "none")
+_MODELS = ("isometric", "equiareal", "general")
 _AREAS = ("auc", "auc_visible", "auc_image")
 _SIDES = (11, 15, 23, 31, 45)
-_CAMERAS = {"SM": "static_map", "SC": "static", "moving": "moving"}
+_CAMERAS = {"SC": "static", "moving": "moving"}
 _TROUBLES = ("tool=1", "light=0.3", "gloss=1", "drop=4", "tool=1&light=0.3&gloss=1&drop=4")
 _HEADER = (
     *(
@@ -49,7 +47,6 @@ TABLES = (
     "scales",
     "cameras",
     "neighbours",
-    "illumination",
     "predictions",
     "troubles",
     LIMITS,
@@ -119,10 +116,7 @@ def _rows(table: str, sources: list[str], tracks: str | None) -> list[_Row]:
     if table == "targets":
         return _each([*still, *([] if sources else moving)], {"default": {}})
     if table == "models":
-        kinds: dict[str, dict[str, Any]] = {model: {"model": model} for model in _MODELS}
-        # Without the pull towards the isometry, which keeps soft models from saying anything.
-        kinds |= {f"{model}, free": {"model": model, "omega_i": 0.0} for model in _MODELS[1:]}
-        return _each([*still, *one_moving], kinds)
+        return _each([*still, *one_moving], {model: {"model": model} for model in _MODELS})
     if table == "sizes":
         return _each(few, {f"{side} px": {"patch_px": side} for side in _SIDES})
     if table == "scales":
@@ -132,9 +126,6 @@ def _rows(table: str, sources: list[str], tracks: str | None) -> list[_Row]:
         return _each(moving, {name: {"camera": mode} for name, mode in _CAMERAS.items()})
     if table == "neighbours":
         return _each(still, {f"{count} neighbours": {"neighbours": count} for count in (0, 8)})
-    if table == "illumination":
-        lit = sources or [*few, *(_with(source, light) for source in few for light in _LIGHTS)]
-        return _each(lit, {name: {"illumination": name} for name in _ILLUMINATION})
     if table == "predictions":
         jumping = sources or [*few, *(_with(s, f"drop={n}") for s in few for n in (8, 12))]
         return _each(jumping, {name: {"prediction": name} for name in ("none", "tracks")})

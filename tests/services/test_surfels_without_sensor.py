@@ -166,8 +166,6 @@ def test_surfels_are_born_later_on_our_own_map(everything: Messages) -> None:
     later = next(m for m in followed if m.frame == frame + 2)
     mine = np.isin(later.ids, born.ids[born.age == 0])
     assert (later.state[mine] == SurfelState.TRACKED).mean() > 0.7
-    none = follow(load_config(None, [*LATER, "surfels.map_births=false"]), made, *OPTIONAL)
-    assert not born_later(none)
 
 
 def test_a_map_of_another_scale_is_brought_to_that_of_the_surfels(everything: Messages) -> None:

@@ -8,11 +8,11 @@ import pytest
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import transform
-from pliant.algorithms.surfels import SurfelFrame, SurfelParameters, SurfelState, agree
+from pliant.algorithms.surfels import SurfelFrame, SurfelState, agree
 from pliant.algorithms.surfels.joint import se3_exp
 
 CAMERA = PinholeCamera(width=160, height=120, fx=200.0, fy=200.0, cx=79.5, cy=59.5)
-PARAMETERS = SurfelParameters(map_surfels=20)
+PATCH_PX = 23
 
 
 def surface() -> F64:
@@ -40,7 +40,7 @@ def surfels(depth: F64) -> SurfelFrame:
 def test_the_map_is_brought_to_the_scale_of_the_surfels() -> None:
     depth = surface()
     depth[:, :16] = 0.0
-    found = agree(0.4 * depth, surfels(surface()), PARAMETERS)
+    found = agree(0.4 * depth, surfels(surface()), PATCH_PX)
     assert found.depth is not None
     assert found.ratio == pytest.approx(2.5)
     np.testing.assert_allclose(found.depth, depth)
@@ -50,7 +50,7 @@ def test_nothing_is_taken_where_surfels_disagree() -> None:
     """The right quarter has come nearer by 10 % since the map was made."""
     moved = surface()
     moved[:, 120:] *= 0.9
-    found = agree(2.0 * surface(), surfels(moved), PARAMETERS)
+    found = agree(2.0 * surface(), surfels(moved), PATCH_PX)
     assert found.depth is not None
     assert found.ratio == pytest.approx(0.5)
     assert not found.depth[:, 144:].any()
@@ -58,14 +58,14 @@ def test_nothing_is_taken_where_surfels_disagree() -> None:
     # Where there is no surfel nobody disagrees.
     some = surfels(moved)
     unseen = np.where(some.points_px[:, 0] > 100, SurfelState.LOST, some.state).astype(np.uint8)
-    found = agree(2.0 * surface(), replace(some, state=unseen), PARAMETERS)
+    found = agree(2.0 * surface(), replace(some, state=unseen), PATCH_PX)
     assert found.depth is not None
     np.testing.assert_allclose(found.depth, surface())
 
 
 def test_a_map_is_refused_that_most_surfels_do_not_agree_with() -> None:
     bent = surface() * np.linspace(0.8, 1.3, CAMERA.width)
-    found = agree(bent, surfels(surface()), PARAMETERS)
+    found = agree(bent, surfels(surface()), PATCH_PX)
     assert found.depth is None
     assert "agree with it" in found.problem
 
@@ -73,8 +73,8 @@ def test_a_map_is_refused_that_most_surfels_do_not_agree_with() -> None:
 def test_too_few_surfels_cannot_tell() -> None:
     depth = np.zeros_like(surface())
     depth[:30, :30] = 1.0
-    found = agree(depth, surfels(surface()), PARAMETERS)
+    found = agree(depth, surfels(surface()), PATCH_PX)
     assert found.depth is None
-    assert found.problem == "4 surfels lie on it, 20 needed"
+    assert found.problem == "4 surfels lie on it, 30 needed"
     outside = replace(surfels(surface()), points_px=surfels(surface()).points_px + 500)
-    assert agree(surface(), outside, PARAMETERS).problem.startswith("0 surfels")
+    assert agree(surface(), outside, PATCH_PX).problem.startswith("0 surfels")

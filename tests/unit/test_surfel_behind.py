@@ -13,8 +13,8 @@ from pliant.algorithms.surfels import SurfelFrame, SurfelParameters, SurfelState
 from pliant.algorithms.surfels.sampling import X
 from pliant.rendering.render import RenderedFrame
 
-Mode = Literal["static", "moving", "static_map"]
-KINDS = [("static", 8), ("static", 0), ("moving", 8), ("moving", 0), ("static_map", 8)]
+Mode = Literal["static", "moving"]
+KINDS = [("static", 8), ("static", 0), ("moving", 8), ("moving", 0)]
 
 
 @pytest.fixture(scope="module")

@@ -118,12 +118,11 @@ def ramps() -> F32:
     return (20.0 + 0.9 * u - 0.5 * v + 0.012 * u * v).astype(np.float32)
 
 
-@pytest.mark.parametrize("model", range(4), ids=motion.MODELS)
+@pytest.mark.parametrize("model", motion.MODELS.values(), ids=motion.MODELS)
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("light", motion.ILLUMINATION.values(), ids=motion.ILLUMINATION)
-def test_jacobians_by_finite_differences(model: int, seed: int, light: int) -> None:
+def test_jacobians_by_finite_differences(model: int, seed: int) -> None:
     image, pose = ramps(), slanted_surfels(seed=seed)[0]
-    pose[F : F + 3] = {0: (1, 0, 1), 1: (1.1, 0, 1.1)}.get(model, (1.1, 0.07, (1 + 0.0049) / 1.1))
+    pose[F : F + 3] = (1.1, 0.07, (1 + 0.0049) / 1.1) if model else (1, 0, 1)
     if model == motion.GENERAL:
         pose[F + 2] = 0.8
     pose[GAIN], pose[BIAS] = 1.3, 4.0
@@ -133,15 +132,12 @@ def test_jacobians_by_finite_differences(model: int, seed: int, light: int) -> N
     features = features[INNER]
     n = motion.parameter_count(model)
     mix = np.zeros((FEATURES, motion.MOST_PARAMETERS))
-    motion.mixing(pose, level_of(image), model, mix, light)
+    motion.mixing(pose, level_of(image), model, mix)
     J = features[:FEATURES].T.astype(np.float64) @ mix[:, :n]
     after = np.zeros_like(pose)
     for k in range(n):
         residuals = []
         delta = 2e-3 if k < 3 else 1e-2
-        if k >= n - 2 and not light & (1 if k == n - 2 else 2):  # what is held has no derivative
-            assert not J[:, k].any()
-            continue
         for sign in (1.0, -1.0):
             step = np.zeros(motion.MOST_PARAMETERS)
             step[k] = sign * delta
@@ -226,42 +222,35 @@ def test_sums_against_numpy(blend: float) -> None:
     np.testing.assert_allclose(matrix / scale, expected / scale, atol=1e-5)
 
 
-def normal_matrix(model: int, omega: float) -> tuple[F64, F64]:
+def normal_matrix(model: int) -> tuple[F64, F64]:
     image, poses = waves(), slanted_surfels(seed=6)
     level, n = level_of(image), motion.parameter_count(model)
     templates = make_templates(poses, level, HIGH, 0.5, EVERYWHERE, np.inf)
     mix = np.zeros((FEATURES, motion.MOST_PARAMETERS))
     motion.mixing(poses[0], level, model, mix)
-    H, g = np.zeros((motion.MOST_PARAMETERS,) * 2), np.zeros(motion.MOST_PARAMETERS)
+    H = np.zeros((motion.MOST_PARAMETERS,) * 2)
     scratch = np.zeros((FEATURES, motion.MOST_PARAMETERS))
     motion.hessian(templates.matrices[0], 1.0, mix, n, scratch, H)
-    motion.add_deformation_energy(poses[0], model, omega, H, g)
     return H[: n - 2, : n - 2], poses[0]
 
 
-@pytest.mark.parametrize("model", [motion.CONFORMAL, motion.GENERAL])
-def test_growing_map_ambiguity(model: int) -> None:
-    """Eq. 7-9: farther and larger is the same image, unless isometry holds the size."""
+def test_growing_map_ambiguity() -> None:
+    """Eq. 7-9: farther and larger is the same image."""
     image, pose = waves(), slanted_surfels(seed=6)[0]
     grown = pose.copy()
     grown[X : X + 3] *= 1.3
     grown[F : F + 3] *= 1.3
     np.testing.assert_allclose(sampled(grown, image), sampled(pose, image), atol=1e-2)
-    H, pose = normal_matrix(model, 0.0)
+    H, pose = normal_matrix(motion.GENERAL)
     direction = np.zeros(len(H))
-    direction[:3], direction[6] = pose[X : X + 3], 1.0
-    if model == motion.GENERAL:
-        direction[8] = 1.0
-    curvature = direction @ H @ direction
+    direction[:3], direction[6], direction[8] = pose[X : X + 3], 1.0, 1.0
     along_ray = np.zeros(len(H))
     along_ray[:3] = pose[X : X + 3]
-    assert curvature < 1e-6 * (along_ray @ H @ along_ray)
-    held, _ = normal_matrix(model, 1e5)
-    assert direction @ held @ direction == pytest.approx(2e5, rel=1e-3)
+    assert direction @ H @ direction < 1e-6 * (along_ray @ H @ along_ray)
 
 
 def test_isometry_resolves_the_depth() -> None:
-    H, _ = normal_matrix(motion.ISOMETRIC, 0.0)
+    H, _ = normal_matrix(motion.ISOMETRIC)
     scaled = H / np.sqrt(np.outer(np.diag(H), np.diag(H)))
     assert np.linalg.eigvalsh(scaled)[0] > 1e-5
 
@@ -277,23 +266,6 @@ def test_equiareal_steps_keep_the_area(alpha: float, beta: float) -> None:
     assert out[F] * out[F + 2] - out[F + 1] ** 2 == pytest.approx(1.0)
     if abs(beta - beta**2) > 1e-3:
         assert out[F] * (1.0 + beta) / out[F] - beta**2 != pytest.approx(1.0, abs=1e-4)
-
-
-@pytest.mark.parametrize("model", [motion.CONFORMAL, motion.EQUIAREAL, motion.GENERAL])
-def test_deformation_energy_by_finite_differences(model: int) -> None:
-    pose, out = slanted_surfels()[0], np.zeros(14)
-    pose[F : F + 3] = (1.2, 0.0, 1.2) if model == 1 else (1.2, 0.1, 1.01 / 1.2)
-    H, g = np.zeros((motion.MOST_PARAMETERS,) * 2), np.zeros(motion.MOST_PARAMETERS)
-    motion.add_deformation_energy(pose, model, 3.0, H, g)
-    for k in range(model):
-        values = []
-        for delta in (1e-5, -1e-5):
-            step = np.zeros(motion.MOST_PARAMETERS)
-            step[6 + k] = delta
-            motion.apply_step(pose, step, model, out)
-            values.append(3.0 * motion.deformation_energy(out))
-        # g is half of the gradient, as J' r is.
-        assert g[6 + k] == pytest.approx((values[0] - values[1]) / 4e-5, rel=1e-4, abs=1e-8)
 
 
 def test_steps_against_numpy() -> None:

@@ -22,7 +22,7 @@ def plane(count: int = N, seed: int = 0) -> F64:
 
 
 def pairs_of(poses: F64, count: int = 3) -> Edges:
-    return find_edges(poses, np.ones(len(poses), np.int64), 0, count, 0.3)
+    return find_edges(poses, np.ones(len(poses), np.int64), 0, count)
 
 
 def rows_of(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
@@ -63,7 +63,7 @@ def test_pairs_follow_their_rows() -> None:
     w, residuals, _ = rows_of(poses[rows], kept)
     np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
     np.testing.assert_allclose(w, 1.0)
-    new = find_edges(poses, np.ones(N, np.int64), N - 2, 3, 0.3)
+    new = find_edges(poses, np.ones(N, np.int64), N - 2, 3)
     assert (new.ends.max(axis=1) >= N - 2).all()
     assert len(join_edges(old, new).ends) == len(old.ends) + len(new.ends)
 

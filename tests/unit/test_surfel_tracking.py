@@ -40,19 +40,18 @@ def arrays(frame: SurfelFrame) -> list[bytes]:
     return [v.tobytes() for v in vars(frame).values() if isinstance(v, np.ndarray)]
 
 
-@pytest.mark.parametrize("jacobian", ["template", "both", "frame"])
 def test_recovery_without_noise(
-    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]], jacobian: str
+    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
 ) -> None:
     frames, camera, motions = board
-    tracker = SurfelTracker(SMALL.model_copy(update={"jacobian": jacobian}))
+    tracker = SurfelTracker(SMALL)
     first = tracker.start(frames[0].image, frames[0].depth_m, camera)
     assert len(first.ids) == 60
     for frame, T in zip(frames[1:], motions[1:], strict=True):
         result = tracker.track(frame.image)
         truth = transform(inverse(T), first.positions)
         good = result.state == SurfelState.TRACKED
-        assert good.mean() >= (0.7 if jacobian == "template" else 0.95)
+        assert good.mean() >= 0.95
         error = np.linalg.norm(result.positions - truth, axis=1)[good]
         assert np.median(error) < 0.003
         lateral = np.linalg.norm(camera.project(truth) - result.points_px, axis=1)[good]
@@ -126,12 +125,12 @@ def test_a_second_look_finds_what_was_carried_past_its_image(
         found = off.copy()
         look_again(
             found, wanted, table.edges, level, table.templates[0], tracker._limits(fine=True),
-            make_workspace(23), omega_e=25.0, strain=strain,
+            make_workspace(23), strain,
         )  # fmt: skip
         np.testing.assert_array_equal(found[wanted == 0], off[wanted == 0])
         errors = np.linalg.norm((found - table.poses)[wanted > 0, X : X + 3], axis=1)
         assert np.median(errors) < left * 1.2 / camera.fx
-    held = held_by(table.edges, n, 25.0, 0.02)
+    held = held_by(table.edges, n, 0.02)
     ends, lengths = table.edges.ends, table.edges.lengths
     mine = (ends == 0).any(axis=1)
     np.testing.assert_allclose(held[0], (25.0 / (0.02 * lengths[mine]) ** 2).sum() * np.eye(3))
@@ -168,29 +167,6 @@ def test_gain_and_bias_take_up_the_light(
     assert good.mean() > 0.95
     assert np.median(result.gains[good]) == pytest.approx(1 / 0.7, rel=0.03)
     assert np.median(result.biases[good]) == pytest.approx(-10 / 0.7, abs=5.0)
-
-
-@pytest.mark.parametrize("mode", ["static", "moving", "static_map"])
-@pytest.mark.parametrize("neighbours", [0, 8])
-def test_what_does_not_follow_the_light_stays_as_it_was(
-    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]], mode: str, neighbours: int
-) -> None:
-    frames, camera, _ = board
-    brighter = np.minimum(frames[1].image.astype(np.int32) + 8, 255).astype(np.uint8)
-    held = {}
-    for kind in ("both", "bias", "none"):
-        changes = {"camera": mode, "neighbours": neighbours, "illumination": kind}
-        tracker = SurfelTracker(SMALL.model_copy(update=changes))
-        tracker.start(frames[0].image, frames[0].depth_m, camera)
-        result = tracker.track(brighter)
-        good = result.state == SurfelState.TRACKED
-        assert good.mean() > 0.9
-        held[kind] = result.gains[good] == 1.0, result.biases[good]
-    assert held["both"][0].mean() < 0.05
-    assert held["bias"][0].all()
-    assert np.median(held["bias"][1]) == pytest.approx(-8.0, abs=0.5)
-    assert held["none"][0].all()
-    assert (held["none"][1] == 0.0).all()
 
 
 def test_black_frame_jump_and_cover_are_stated(

@@ -59,7 +59,7 @@ class _Heard:
 
 @dataclass
 class _State:
-    """map_depth: as long as surfels are born on our own map.    tracks, points_px: of the last
+    """map_depth: where surfels are born on our own map.    tracks, points_px: of the last
     frame.    ratio, segment: units of the surfels by one of the map, and the segment of the map,
     when surfels were last born on it."""
 
@@ -174,8 +174,6 @@ def _start(
         return SurfelFrame.empty(), missing
     frame = state.tracker.start(image, metres, state.stream.camera, T_world_camera)
     state.started = True
-    if not config.surfels.map_births:
-        state.map_depth = None
     return frame, ""
 
 
@@ -184,7 +182,7 @@ def _add(
 ) -> tuple[SurfelFrame, str]:
     """More surfels on a later keyframe of our own map, and else why there are none."""
     if not frame.lost:
-        found = agree(view.depth, frame, config.surfels)
+        found = agree(view.depth, frame, config.surfels.patch_px)
         if found.depth is None:
             return frame, f"no surfels are born on the map: {found.problem}"
         state.ratio, state.segment = found.ratio, view.segment

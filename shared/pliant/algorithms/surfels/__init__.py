@@ -1,7 +1,6 @@
 """Surfels that move on their own, followed through the images of one camera (DSDT)."""
 
 from pliant.algorithms.surfels.agreement import agree
-from pliant.algorithms.surfels.joint import learn_equilibrium
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import predict
 from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
@@ -14,7 +13,6 @@ __all__ = [
     "SurfelState",
     "SurfelTracker",
     "agree",
-    "learn_equilibrium",
     "predict",
     "warm_up",
 ]

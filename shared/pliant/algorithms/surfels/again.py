@@ -12,27 +12,25 @@ import numpy as np
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.surfels.align import Limits, Templates, Workspace, align_all
 from pliant.algorithms.surfels.neighbours import Edges
-from pliant.algorithms.surfels.rest import Rest
+from pliant.algorithms.surfels.rest import OMEGA_E, Rest
 from pliant.algorithms.surfels.sampling import Level, X
 
 
 def look_again(
     poses: F64, wanted: U8, edges: Edges, level: Level, templates: Templates, limits: Limits,
-    work: Workspace, *, omega_e: float, strain: float,
+    work: Workspace, strain: float,
 ) -> None:  # fmt: skip
     """Align the wanted surfels alone at full size.
 
     poses: (N, POSE_FLOATS) in the camera's frame, those that are wanted are overwritten.  wanted:
-    (N,) 1 or 0.  omega_e, strain: of the pairs, DN^2 and relative.
+    (N,) 1 or 0.  strain: of the pairs, relative.
     """
-    rest = Rest(
-        np.ascontiguousarray(poses[:, X : X + 3]), held_by(edges, len(poses), omega_e, strain)
-    )
+    rest = Rest(np.ascontiguousarray(poses[:, X : X + 3]), held_by(edges, len(poses), strain))
     align_all(poses, wanted, rest, level, templates, limits, work)
 
 
-def held_by(edges: Edges, count: int, omega_e: float, strain: float) -> F64:
+def held_by(edges: Edges, count: int, strain: float) -> F64:
     """(N, 3, 3) DN^2 / m^2 by which its pairs hold each of ``count`` surfels where it is."""
-    pulls = np.repeat(omega_e / (strain * edges.lengths) ** 2, 2)
+    pulls = np.repeat(OMEGA_E / (strain * edges.lengths) ** 2, 2)
     total = np.bincount(edges.ends.ravel(), weights=pulls, minlength=count)
     return np.ascontiguousarray(total[:, None, None] * np.eye(3))

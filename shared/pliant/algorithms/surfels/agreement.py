@@ -9,11 +9,14 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
 
 _CELL_PX = 16
 """The agreement is asked for once in a square of this side."""
+_MIN_SURFELS = 30
+"""So many surfels that agree, and half of those that the map shows, are needed."""
+_MAX_DISAGREEMENT = 0.02
+"""A surfel disagrees whose depth is off the map's by more than this share, after the median."""
 _REACH = 2.0
 """Surfels within so many sides of a patch say whether a depth is right."""
 
@@ -31,21 +34,20 @@ class Agreement:
     problem: str = ""
 
 
-def agree(depth: F64, surfels: SurfelFrame, parameters: SurfelParameters) -> Agreement:
+def agree(depth: F64, surfels: SurfelFrame, patch_px: int) -> Agreement:
     """Compare a depth map with the surfels that are tracked in its frame.
 
     depth: (H, W) along the optical axis in any unit, 0 where nothing is known.
     """
-    p = parameters
     pixels, ratios = _ratios(depth, surfels)
-    if len(ratios) < p.map_surfels:
-        return Agreement(0.0, None, f"{len(ratios)} surfels lie on it, {p.map_surfels} needed")
+    if len(ratios) < _MIN_SURFELS:
+        return Agreement(0.0, None, f"{len(ratios)} surfels lie on it, {_MIN_SURFELS} needed")
     ratio = float(np.median(ratios))
-    agrees = np.abs(ratios - ratio) < p.map_disagreement * ratio
+    agrees = np.abs(ratios - ratio) < _MAX_DISAGREEMENT * ratio
     count = int(agrees.sum())
-    if count < max(p.map_surfels, 0.5 * len(ratios)):
+    if count < max(_MIN_SURFELS, 0.5 * len(ratios)):
         return Agreement(ratio, None, f"{count} of the {len(ratios)} surfels on it agree with it")
-    reach = _REACH * p.patch_px
+    reach = _REACH * patch_px
     return Agreement(ratio, np.where(_doubted(depth, pixels, agrees, reach), 0.0, ratio * depth))
 
 

@@ -36,23 +36,23 @@ class Templates(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Parameters of the minimisation, as kernels read them."""
+    """Settings of the minimisation, as kernels read them.  DSDT leaves all of them open."""
 
     model: int
-    light: int  # of motion.ILLUMINATION
     blend: float  # share of the frame in the derivatives of the patch
-    tau: float
-    highlight: float
-    omega_i: float
-    damped_steps: int
-    first_lambda: float
-    start_lambda: float
-    lambda_up: float
-    lambda_down: float
-    iterations: int
-    min_step_px: float
-    stale_px: float  # how far a surfel moves until its matrix is made anew
-    slack: float  # share by which a success may raise the cost
+    highlight: float  # DN
+    iterations: int  # most steps
+    min_step_px: float  # a step that moves no corner farther ends a level
+    saturation: float = 40.0  # a residual beyond this counts as this, DN
+    damped_steps: int = 1  # how many accepted steps of a level are the first ones
+    first_lambda: float = 1.0  # lambda is at least this in the first steps
+    start_lambda: float = 0.01
+    lambda_up: float = 4.0  # multiplies lambda after a failure
+    lambda_down: float = 10.0  # divides lambda after a success
+    stale_px: float = 0.3  # how far a surfel moves until its matrix is made anew
+    # Share by which a success may raise the cost: noise that interpolation smooths more or less
+    # moves the cost by as much.
+    slack: float = 0.1
 
 
 class Workspace(NamedTuple):
@@ -68,7 +68,7 @@ class Workspace(NamedTuple):
     mix: F64
     product: F64
     H: F64
-    photometric: F64  # H without the energy of deformation
+    photometric: F64  # H without the equilibrium
     L: F64
     inverse: F64  # of the pivots of L
     g: F64
@@ -101,24 +101,19 @@ def evaluate(
     if not sample_patch(work.h, level, work.grid, limits.highlight):
         return -1.0, 0
     return photometric_sums(
-        images, work.grid, mean, pose[GAIN], pose[BIAS], limits.tau, limits.blend, sums
+        images, work.grid, mean, pose[GAIN], pose[BIAS], limits.saturation, limits.blend, sums
     )
 
 
 @inner_kernel
 def curvature(
-    pose: F64, images: F32, mean: float, template_matrix: F64, limits: Limits, work: Workspace,
-    matrix: F64,
-) -> None:  # fmt: skip
+    pose: F64, images: F32, mean: float, limits: Limits, work: Workspace, matrix: F64
+) -> None:
     """Fill the (FEATURES, FEATURES) matrix of the pose that was evaluated last."""
-    if limits.blend > 0.0:
-        feature_matrix(
-            images, work.grid, mean, pose[GAIN], pose[BIAS], limits.tau, limits.blend,
-            work.features, matrix,
-        )  # fmt: skip
-        return
-    for row in range(FEATURES):
-        copy(template_matrix[row], matrix[row])
+    feature_matrix(
+        images, work.grid, mean, pose[GAIN], pose[BIAS], limits.saturation, limits.blend,
+        work.features, matrix,
+    )  # fmt: skip
 
 
 @leaf_kernel
@@ -139,14 +134,14 @@ def patch_step_px(before: F64, after: F64, half: float) -> float:
 
 @inner_kernel
 def align(
-    pose: F64, level: Level, images: F32, mean: float, count: float, template_matrix: F64,
-    point: F64, weight: F64, limits: Limits, work: Workspace,
+    pose: F64, level: Level, images: F32, mean: float, count: float, point: F64, weight: F64,
+    limits: Limits, work: Workspace,
 ) -> tuple[float, int]:  # fmt: skip
-    """Minimise Eq. 11 (hard) or Eq. 13 (soft) from ``pose``, which is overwritten.
+    """Minimise Eq. 11 from ``pose``, which is overwritten.
 
-    template_matrix: (FEATURES, FEATURES) of the texture.  point, weight: of its ``Rest``; with it
-    this is Eq. 21 for a camera that is held.  Returns (cost DN^2, evaluations); the
-    cost is negative where the patch is not in front of the camera, and the pose is then unchanged.
+    point, weight: of its ``Rest``; with it this is Eq. 21 for a camera that is held.  Returns
+    (cost DN^2, evaluations); the cost is negative where the patch is not in front of the camera,
+    and the pose is then unchanged.
     """
     sums, next_sums = work.sums, work.next_sums
     before, candidate = work.before, work.pose
@@ -156,21 +151,20 @@ def align(
     if cost < 0.0:
         return cost, 1
     copy(work.h, before)
-    cost += limits.omega_i * motion.deformation_energy(pose) + rest_cost(pose, point, weight)
+    cost += rest_cost(pose, point, weight)
     # Samples that the template lacks cost the same everywhere; slack is a share of the others.
-    lacking = limits.tau * limits.tau * (images.shape[1] - count)
+    lacking = limits.saturation * limits.saturation * (images.shape[1] - count)
     damping, accepted, fresh, travelled = limits.start_lambda, 0, True, 1e9
     for iteration in range(limits.iterations):
         if fresh:
-            motion.mixing(pose, level, limits.model, work.mix, limits.light)
+            motion.mixing(pose, level, limits.model, work.mix)
             motion.gradient(sums, work.mix, n, work.g)
             if travelled > limits.stale_px:
-                curvature(pose, images, mean, template_matrix, limits, work, work.matrix)
+                curvature(pose, images, mean, limits, work, work.matrix)
                 motion.hessian(work.matrix, 1.0, work.mix, n, work.product, work.photometric)
                 travelled = 0.0
             for row in range(n):
                 copy(work.photometric[row], work.H[row])
-            motion.add_deformation_energy(pose, limits.model, limits.omega_i, work.H, work.g)
             add_rest(pose, point, weight, work.H, work.g)
         bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
         if not factorise(work.H, n, n - 2, bound, work.L, work.inverse):
@@ -180,7 +174,6 @@ def align(
         candidate[GAIN] = max(candidate[GAIN], _MIN_GAIN)
         next_cost, _ = evaluate(candidate, level, images, mean, limits, work, next_sums)
         front = next_cost >= 0.0
-        next_cost += limits.omega_i * motion.deformation_energy(candidate)
         next_cost += rest_cost(candidate, point, weight)
         moved = patch_step_px(before, work.h, half) if front else 1e9
         if front and next_cost < cost + limits.slack * (cost - lacking):
@@ -210,7 +203,7 @@ def align_all(
         if active[k] and templates.usable[k]:
             _, used = align(
                 poses[k], level, templates.images[k], templates.means[k], templates.counts[k],
-                templates.matrices[k], rest.points[k], rest.weights[k], limits, work,
+                rest.points[k], rest.weights[k], limits, work,
             )  # fmt: skip
             evaluations += used
     return evaluations

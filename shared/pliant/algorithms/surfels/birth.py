@@ -35,6 +35,20 @@ from pliant.algorithms.surfels.tangent import fit_inverse_depth, tangent_jacobia
 
 _FAR = 0.5 * INVALID
 _MIN_VARIANCE = 4.0  # DN^2: a patch with less contrast is noise
+_CORNER_WINDOW_PX = 7
+_TANGENT_RADIUS_PX = 11
+_DEPTH_JUMP = 0.08
+"""A larger relative step of depth is another surface."""
+_DEPTH_NOISE = 5e-4
+"""No depth is expected to be more exact than this share of itself."""
+_MIN_DEPTH_SHARE = 0.5
+"""Least share of the window of a tangent that has the surface of its middle."""
+_MAX_SLOPE = 4.0
+"""Steepest surface: relative change of depth per unit of normalised coordinate."""
+_MAX_OFF_PLANE = 0.03
+"""What is off a surfel's plane by more than this share of its depth is no part of its texture."""
+_MIN_TEMPLATE = 0.6
+"""Least share of a patch inside of the image and on the surfel's plane."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +78,14 @@ def find_births(
     corners = find_corners(
         image,
         allowed,
-        window=p.corner_window_px,
+        window=_CORNER_WINDOW_PX,
         threshold=p.min_strength,
         radius=p.spacing_px,
         margin=p.patch_px // 2 + 1,
     )
     poses = place(corners[:, :2], depth, camera, p)
     templates = [
-        make_templates(poses, each, p.highlight, p.min_template, depth, p.max_off_plane)
+        make_templates(poses, each, p.highlight, _MIN_TEMPLATE, depth, _MAX_OFF_PLANE)
         for each in pyramid
     ]
     rows = np.flatnonzero(templates[0].usable)[: max(count, 0)]
@@ -91,11 +105,12 @@ def _allowed(depth: F64, image: F32, occupied: F64, p: SurfelParameters) -> U8:
 
 def place(points_px: F64, depth: F64, camera: PinholeCamera, p: SurfelParameters) -> F64:
     """(M, POSE_FLOATS) surfels at those of (N, 2) pixels that have a surface (Eq. 3 and 4)."""
-    radius = p.tangent_px // 2
     fits, supported = np.zeros((len(points_px), 4)), np.zeros(len(points_px), np.bool_)
     for k, (column, row) in enumerate(points_px):
-        share = fit_inverse_depth(depth, column, row, radius, p.depth_jump, p.depth_noise, fits[k])
-        supported[k] = share >= p.min_depth_share and fits[k, 3] <= p.max_depth_residual
+        share = fit_inverse_depth(
+            depth, column, row, _TANGENT_RADIUS_PX, _DEPTH_JUMP, _DEPTH_NOISE, fits[k]
+        )
+        supported[k] = share >= _MIN_DEPTH_SHARE and fits[k, 3] <= p.max_depth_residual
     fits, points = fits[supported], points_px[supported]
     rays = camera.normalise(points)
     z = 1.0 / fits[:, 0]
@@ -103,7 +118,7 @@ def place(points_px: F64, depth: F64, camera: PinholeCamera, p: SurfelParameters
     dz_dx, dz_dy = -(z**2) * fits[:, 1] * camera.fx, -(z**2) * fits[:, 2] * camera.fy
     facing = (z - rays[:, 0] * dz_dx - rays[:, 1] * dz_dy) > 0.0
     slope = np.hypot(dz_dx, dz_dy) / z
-    good = facing & (slope <= p.max_slope) & np.isfinite(z)
+    good = facing & (slope <= _MAX_SLOPE) & np.isfinite(z)
     rays, z, dz_dx, dz_dy = rays[good], z[good], dz_dx[good], dz_dy[good]
     poses = identity_poses(len(z))
     poses[:, X : X + 2], poses[:, X + 2] = rays * z[:, None], z

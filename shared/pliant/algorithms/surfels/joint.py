@@ -1,4 +1,10 @@
-"""Camera and surfels together, one level of the pyramid at a time (DSDT, section V)."""
+"""The camera before surfels (DSDT, section V).
+
+Everything is in the camera's frame.  What an image sees of a surfel is its motion relative to the
+camera alone (the floating map ambiguity, Eq. 16-19), so that Eq. 20 alone ties the camera to the
+surfels.  Camera and surfels take turns: surfels by Eq. 21 before a camera that is held, then the
+camera that fits them, which needs no image.
+"""
 
 from dataclasses import dataclass
 
@@ -8,20 +14,16 @@ from pliant.algorithms.arrays import F64, U8, BoolArray
 from pliant.algorithms.geometry import hat, so3_exp
 from pliant.algorithms.surfels import joint_kernels as kernels
 from pliant.algorithms.surfels.align import Limits, Templates, Workspace
-from pliant.algorithms.surfels.motion import MOST_PARAMETERS
 from pliant.algorithms.surfels.rest import Rest, no_rest, turn_rest
 from pliant.algorithms.surfels.sampling import BIAS, GAIN, Level, X
 from pliant.algorithms.surfels.sums import FEATURES
 from pliant.algorithms.surfels.table import move_poses
 
-_STILL_SHARE = 0.02
-"""A level is done when no more than this share of the surfels still moves."""
 _RIDGE = 1e-9
 _REGISTER_STEPS = 3
 _REGISTERED = 1e-6
 """A step that turns the camera, and moves it relative to the depth, by less than this is the last:
 a thousandth of a pixel."""
-_NONE: F64 = np.zeros((0, FEATURES, FEATURES))
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def align_rigid(
     """
     n = len(poses)
     usable, costs, sums = active.copy(), np.zeros(n), np.zeros((n, FEATURES))
-    kernels.evaluate_all(poses, usable, level, templates, limits, work, costs, sums, _NONE)
+    kernels.evaluate_all(poses, usable, level, templates, limits, work, costs, sums)
     light = np.zeros((n, 2, 7))
     M, v = np.zeros((6, 6)), np.zeros(6)
     damping, accepted = limits.start_lambda, 0
@@ -71,9 +73,7 @@ def align_rigid(
         rows: BoolArray = usable > 0
         if not rows.any():
             break
-        kernels.rigid_system(
-            poses, usable, level, work, sums, templates.matrices, light, M, v, limits.light
-        )
+        kernels.rigid_system(poses, usable, level, work, sums, templates.matrices, light, M, v)
         bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
         zeta = _solve(M, v, bound)
         motion, before = se3_exp(zeta), poses.copy()
@@ -82,7 +82,7 @@ def align_rigid(
         moved[:, BIAS] += light[:, 1] @ np.r_[1.0, zeta]
         still_usable, new_costs, new_sums = usable.copy(), np.zeros(n), np.zeros((n, FEATURES))
         kernels.evaluate_all(
-            moved, still_usable, level, templates, limits, work, new_costs, new_sums, _NONE
+            moved, still_usable, level, templates, limits, work, new_costs, new_sums
         )
         both: BoolArray = still_usable > 0
         if 2 * np.count_nonzero(both) > np.count_nonzero(rows) and (
@@ -125,44 +125,6 @@ def register(poses: F64, active: U8, T_camera_world: F64, equilibrium: Equilibri
     return T_camera_world
 
 
-def align_jointly(
-    poses: F64, active: U8, T_camera_world: F64, equilibrium: Equilibrium, level: Level,
-    templates: Templates, limits: Limits, work: Workspace,
-) -> F64:  # fmt: skip
-    """Minimise Eq. 21 from the present poses and camera, both of which are updated.
-
-    poses: (N, POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
-    """
-    n = len(poses)
-    usable, costs, sums = active.copy(), np.zeros(n), np.zeros((n, FEATURES))
-    matrices = np.zeros((n, FEATURES, FEATURES))
-    kernels.evaluate_all(poses, usable, level, templates, limits, work, costs, sums, matrices)
-    own, follow = np.zeros((n, MOST_PARAMETERS)), np.zeros((n, MOST_PARAMETERS, 6))
-    M, v = np.zeros((6, 6)), np.zeros(6)
-    damping, travelled = np.full(n, limits.start_lambda), np.zeros(n)
-    for iteration in range(limits.iterations):
-        if not usable.any():
-            break
-        if iteration < limits.damped_steps:
-            damping = np.maximum(damping, limits.first_lambda)
-        points, weights = equilibrium.seen_from(T_camera_world)
-        kernels.joint_system(
-            poses, usable, level, limits, work, sums, matrices, points, weights,
-            damping, own, follow, M, v,
-        )  # fmt: skip
-        zeta = _solve(M, v, 0.0)
-        T_camera_world = se3_exp(zeta) @ T_camera_world
-        points, weights = equilibrium.seen_from(T_camera_world)
-        steps = own + follow @ zeta
-        moving = kernels.step_all(
-            poses, usable, level, templates, limits, work, steps, points, weights, damping,
-            travelled, costs, sums, matrices,
-        )  # fmt: skip
-        if moving <= _STILL_SHARE * usable.sum():
-            break
-    return T_camera_world
-
-
 def _solve(M: F64, v: F64, damping: float) -> F64:
     """Damped step, scaled by the diagonal (Eq. 14-15); zero where nothing is known."""
     diagonal: F64 = np.diag(M) * (1.0 + damping)
@@ -173,21 +135,3 @@ def _solve(M: F64, v: F64, damping: float) -> F64:
     scaled = M * scale[:, None] * scale[None, :]
     np.fill_diagonal(scaled, 1.0 + _RIDGE)
     return scale * np.linalg.solve(scaled, scale * v)
-
-
-def learn_equilibrium(trajectories: F64, min_sigma_m: float) -> tuple[F64, F64]:
-    """Mean and covariance of points whose trajectory is known in advance (section V).
-
-    trajectories: (T, N, 3) metres, world, NaN where a point was not seen; each point is seen at
-    least once.  min_sigma_m: no direction is held tighter.  Returns (N, 3) and (N, 3, 3).  Raises
-    ValueError for a point that was never seen.
-    """
-    seen = np.asarray(np.isfinite(trajectories).all(axis=2), np.bool_)
-    counts = seen.sum(axis=0)
-    if (counts == 0).any():
-        raise ValueError(f"point {int(np.argmin(counts))} of the trajectories was never seen")
-    filled = np.where(seen[:, :, None], trajectories, 0.0)
-    mean = filled.sum(axis=0) / counts[:, None]
-    offset = np.where(seen[:, :, None], trajectories - mean, 0.0)
-    covariance = np.einsum("tni,tnj->nij", offset, offset) / counts[:, None, None]
-    return mean, covariance + min_sigma_m**2 * np.eye(3)

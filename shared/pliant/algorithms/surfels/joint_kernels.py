@@ -1,43 +1,20 @@
-"""Normal equations of camera and surfels together (DSDT, section V).
-
-Everything is in the camera's frame.  What an image sees of surfel i is its motion p relative to
-the camera alone (the floating map ambiguity, Eq. 16-19).  So p is the unknown, and the camera's
-step zeta = (rho, phi) of Eq. 22 enters only through the equilibrium of Eq. 20: its distance is
-
-    X_i - T_cw X_i^0  ->  e + p_t - G zeta,     G = [I, -[T_cw X_i^0]x].
-
-Each surfel's p is eliminated from its own 8x8 block, which leaves a 6x6 system for zeta.  A rigid
-scene has p = Ad zeta instead, with the adjoint of the surfel's own position.
-"""
+"""Normal equations of the camera before surfels that stand still, or stay where they are."""
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.surfels import motion
-from pliant.algorithms.surfels.align import (
-    Limits,
-    Templates,
-    Workspace,
-    curvature,
-    evaluate,
-    patch_step_px,
-)
-from pliant.algorithms.surfels.damped import copy, factorise, solve
-from pliant.algorithms.surfels.rest import rest_cost
-from pliant.algorithms.surfels.sampling import GAIN, Level, X, homography
-
-_MIN_GAIN = 0.05
+from pliant.algorithms.surfels.align import Limits, Templates, Workspace, evaluate
+from pliant.algorithms.surfels.sampling import Level, X
 
 
 @leaf_kernel
 def evaluate_all(
     poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
-    costs: F64, sums: F64, matrices: F64,
+    costs: F64, sums: F64,
 ) -> None:  # fmt: skip
-    """Photometric cost (N,), sums (N, FEATURES) and matrix (N, FEATURES, FEATURES) of surfels.
-
-    matrices: (0, ...) where none are wanted.
+    """Photometric cost (N,) and sums (N, FEATURES) of surfels.
 
     Surfels that are not in front of the camera, or have no template here, become inactive.
     """
@@ -53,18 +30,16 @@ def evaluate_all(
             active[s] = 0
         else:
             costs[s] = cost
-            if len(matrices) > 0:
-                curvature(poses[s], images, mean, templates.matrices[s], limits, work, matrices[s])
 
 
 @fast_kernel
 def rigid_system(
     poses: F64, active: U8, level: Level, work: Workspace, sums: F64,
-    matrices: F64, light: F64, M: F64, v: F64, illumination: int = 3,
+    matrices: F64, light: F64, M: F64, v: F64,
 ) -> None:  # fmt: skip
     """Add up M zeta = v of a rigid scene.  light: (N, 2, 7): gain and bias from (1, zeta).
 
-    illumination: of motion.ILLUMINATION.
+    A rigid scene has the surfels' steps p = Ad zeta, with the adjoint of each surfel's position.
     """
     n = 8
     A, Q, QA = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
@@ -74,15 +49,11 @@ def rigid_system(
     for s in range(len(poses)):
         if not active[s]:
             continue
-        motion.mixing(poses[s], level, motion.ISOMETRIC, work.mix, illumination)
+        motion.mixing(poses[s], level, motion.ISOMETRIC, work.mix)
         motion.hessian(matrices[s], 1.0, work.mix, n, work.product, work.H)
         motion.gradient(sums[s], work.mix, n, work.g)
         H, g = work.H, work.g
-        # Gain and bias, the last two, are eliminated from the surfel's block.  One that is held
-        # has rows of zeros: with any pivot it takes no step.
-        for k in range(6, 8):
-            if H[k, k] == 0.0:
-                H[k, k] = 1.0
+        # Gain and bias, the last two, are eliminated from the surfel's block.
         det = H[6, 6] * H[7, 7] - H[6, 7] * H[7, 6]
         if not det > 1e-6 * H[6, 6] * H[7, 7]:
             light[s] = 0.0
@@ -126,71 +97,6 @@ def _adjoint(pose: F64, A: F64) -> None:
     A[0, 4], A[0, 5] = z, -y
     A[1, 3], A[1, 5] = -z, x
     A[2, 3], A[2, 4] = y, -x
-
-
-@fast_kernel
-def joint_system(
-    poses: F64, active: U8, level: Level, limits: Limits, work: Workspace, sums: F64,
-    matrices: F64, equilibrium: F64, weights: F64, damping: F64, own: F64, follow: F64,
-    M: F64, v: F64,
-) -> None:  # fmt: skip
-    """Add up M zeta = v with every surfel eliminated.
-
-    equilibrium: (N, 3) T_cw X^0.  weights: (N, 3, 3) omega_E Sigma^-1, camera axes.  damping: (N,)
-    lambda.  own: (N, P) and follow: (N, P, 6) receive the surfels' steps own + follow zeta.
-    """
-    n = motion.parameter_count(limits.model)
-    G, WG = np.zeros((3, 6)), np.zeros((3, 6))
-    e, we = np.zeros(3), np.zeros(3)
-    rhs = np.zeros(motion.MOST_PARAMETERS)
-    M[:] = 0.0
-    v[:] = 0.0
-    for s in range(len(poses)):
-        own[s] = 0.0
-        follow[s] = 0.0
-        if not active[s]:
-            continue
-        W = weights[s]
-        motion.mixing(poses[s], level, limits.model, work.mix, limits.light)
-        motion.hessian(matrices[s], 1.0, work.mix, n, work.product, work.H)
-        motion.gradient(sums[s], work.mix, n, work.g)
-        motion.add_deformation_energy(poses[s], limits.model, limits.omega_i, work.H, work.g)
-        _equilibrium_rows(equilibrium[s], G)
-        for r in range(3):
-            e[r] = poses[s, X + r] - equilibrium[s, r]
-        for r in range(3):
-            we[r] = W[r, 0] * e[0] + W[r, 1] * e[1] + W[r, 2] * e[2]
-            for c in range(6):
-                WG[r, c] = W[r, 0] * G[0, c] + W[r, 1] * G[1, c] + W[r, 2] * G[2, c]
-            for c in range(3):
-                work.H[r, c] += W[r, c]
-        if not factorise(work.H, n, n - 2, damping[s], work.L, work.inverse):
-            continue
-        for k in range(n):
-            rhs[k] = work.g[k] + (we[k] if k < 3 else 0.0)
-        solve(work.L, work.inverse, n, rhs, own[s])
-        for c in range(6):
-            for k in range(n):
-                rhs[k] = -WG[k, c] if k < 3 else 0.0
-            solve(work.L, work.inverse, n, rhs, work.step)
-            for k in range(n):
-                follow[s, k, c] = work.step[k]
-        for r in range(6):
-            for k in range(3):
-                v[r] += G[k, r] * we[k] + WG[k, r] * own[s, k]
-            for c in range(6):
-                for k in range(3):
-                    M[r, c] += G[k, r] * WG[k, c] - WG[k, r] * follow[s, k, c]
-
-
-@leaf_kernel
-def _equilibrium_rows(x: F64, G: F64) -> None:
-    """[I, -[x]x]: how a point of the world moves in the camera's frame under a step of T_cw."""
-    G[:] = 0.0
-    G[0, 0] = G[1, 1] = G[2, 2] = 1.0
-    G[0, 4], G[0, 5] = x[2], -x[1]
-    G[1, 3], G[1, 5] = -x[2], x[0]
-    G[2, 3], G[2, 4] = x[1], -x[0]
 
 
 @leaf_kernel
@@ -238,47 +144,3 @@ def register_system(poses: F64, active: U8, equilibrium: F64, weights: F64, M: F
     for k in range(3):
         for m in range(3):
             M[k, 3 + m] = M[3 + m, k]
-
-
-@leaf_kernel
-def step_all(
-    poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
-    steps: F64, equilibrium: F64, weights: F64, damping: F64, travelled: F64, costs: F64,
-    sums: F64, matrices: F64,
-) -> int:  # fmt: skip
-    """Take every surfel's step where it lowers its own cost under the new camera.
-
-    equilibrium, weights: those of the new camera.  Returns how many surfels still moved.
-    """
-    half = float((work.grid.side - 2) // 2)
-    before = work.before
-    moving = 0
-    for s in range(len(poses)):
-        if not active[s]:
-            continue
-        candidate = work.pose
-        motion.apply_step(poses[s], steps[s], limits.model, candidate)
-        candidate[GAIN] = max(candidate[GAIN], _MIN_GAIN)
-        if not homography(poses[s], level, before):
-            continue
-        images, mean = templates.images[s], templates.means[s]
-        cost, _ = evaluate(candidate, level, images, mean, limits, work, work.next_sums)
-        new = cost + limits.omega_i * motion.deformation_energy(candidate)
-        new += rest_cost(candidate, equilibrium[s], weights[s])
-        old = costs[s] + limits.omega_i * motion.deformation_energy(poses[s])
-        old += rest_cost(poses[s], equilibrium[s], weights[s])
-        if cost >= 0.0 and new < old * (1.0 + limits.slack):
-            moved = patch_step_px(before, work.h, half)
-            travelled[s] += moved
-            if moved * (1.0 + damping[s]) > limits.min_step_px:
-                moving += 1
-            copy(candidate, poses[s])
-            costs[s] = cost
-            copy(work.next_sums, sums[s])
-            if travelled[s] > limits.stale_px:
-                curvature(candidate, images, mean, templates.matrices[s], limits, work, matrices[s])
-                travelled[s] = 0.0
-            damping[s] /= limits.lambda_down
-        else:
-            damping[s] *= limits.lambda_up
-    return moving

@@ -53,18 +53,18 @@ def judge_all(
         t, count = templates.images[s, 0], templates.counts[s]
         values = grid.values[at : at + len(t)]
         verdict[INSIDE] = _inside(t, grid.x[at:], grid.y[at:], level) / count
-        seen, squares = _agreeing(t, values, templates.means[s], pose[GAIN], pose[BIAS], limits.tau)
+        seen, squares = _agreeing(
+            t, values, templates.means[s], pose[GAIN], pose[BIAS], limits.saturation
+        )
         verdict[SEEN] = seen / count
         verdict[CORRELATION], _ = correlation(t, values)
         if seen < parameters:
             continue
-        motion.mixing(pose, level, limits.model, work.mix, limits.light)
+        motion.mixing(pose, level, limits.model, work.mix)
         # What is covered tells nothing: the information shrinks with the share that is seen.
         motion.hessian(
             templates.matrices[s], verdict[SEEN], work.mix, parameters, work.product, work.H
         )
-        work.g[:] = 0.0
-        motion.add_deformation_energy(pose, limits.model, limits.omega_i, work.H, work.g)
         noise = max(squares / seen, _MIN_NOISE * _MIN_NOISE)
         if factorise(work.H, parameters, 0, 0.0, work.L, work.inverse):
             trace = inverse_diagonal(work.L, work.inverse, parameters, 3, work.step)

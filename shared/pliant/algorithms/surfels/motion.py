@@ -17,16 +17,13 @@ from pliant.algorithms.kernel import inner_kernel, leaf_kernel
 from pliant.algorithms.surfels.sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, Level, X
 from pliant.algorithms.surfels.sums import FEATURES
 
-ISOMETRIC, CONFORMAL, EQUIAREAL, GENERAL = 0, 1, 2, 3
-MODELS = ("isometric", "conformal", "equiareal", "general")
-"""Columns of Table I."""
+ISOMETRIC, EQUIAREAL, GENERAL = 0, 2, 3
+MODELS = {"isometric": ISOMETRIC, "equiareal": EQUIAREAL, "general": GENERAL}
+"""Columns of Table I, by the number of parameters that F has.  The conformal one is left out:
+whatever stretches is nearer to the truth with one of the last two."""
 
 RIGID = 6
 MOST_PARAMETERS = RIGID + 3 + 2
-
-ILLUMINATION = {"none": 0, "bias": 2, "both": 3}
-"""Which of gain (1) and bias (2) follow the light; the other keeps its value of birth."""
-_GAIN_BIT, _BIAS_BIT = 1, 2
 
 _MIN_STRETCH, _MAX_STRETCH = 0.2, 5.0
 
@@ -40,8 +37,6 @@ def parameter_count(model: int) -> int:
 @leaf_kernel
 def deformation_directions(model: int, pose: F64, k: int) -> tuple[float, float, float]:
     """Derivative of (f11, f12, f22) with respect to the k-th parameter of F."""
-    if model == CONFORMAL:
-        return 1.0, 0.0, 1.0
     if model == EQUIAREAL:
         alpha, beta = pose[F], pose[F + 1]
         if k == 0:
@@ -51,14 +46,12 @@ def deformation_directions(model: int, pose: F64, k: int) -> tuple[float, float,
 
 
 @leaf_kernel
-def mixing(pose: F64, level: Level, model: int, out: F64, light: int = 3) -> None:
+def mixing(pose: F64, level: Level, model: int, out: F64) -> None:
     """The (FEATURES, parameters) matrix that mixes the sums' features into Jacobian rows.
 
     A displacement dX of the point X + i a + j b moves the patch along its grid by (w1, w2), where
     dX = w1 a + w2 b + s (X + i a + j b): along the ray nothing changes.  With the rows n1, n2, n3
     of [a b X]^-1 that is w1 = n1 dX - i n3 dX and w2 = n2 dX - j n3 dX.
-
-    light: of ILLUMINATION.  Nothing depends on a gain or bias that is held, so it takes no step.
     """
     su, sv = level.step_u, level.step_v
     f11, f12, f22 = pose[F], pose[F + 1], pose[F + 2]
@@ -90,10 +83,8 @@ def mixing(pose: F64, level: Level, model: int, out: F64, light: int = 3) -> Non
         )  # fmt: skip
     gain = parameters - 2
     # The feature is the texture; the residual's derivative is the frame, (T - bias) / gain.
-    if light & _GAIN_BIT:
-        out[8, gain], out[9, gain] = 1.0 / pose[GAIN], -pose[BIAS] / pose[GAIN]
-    if light & _BIAS_BIT:
-        out[9, gain + 1] = 1.0
+    out[8, gain], out[9, gain] = 1.0 / pose[GAIN], -pose[BIAS] / pose[GAIN]
+    out[9, gain + 1] = 1.0
 
 
 @inner_kernel
@@ -175,10 +166,7 @@ def apply_step(pose: F64, step: F64, model: int, out: F64) -> None:
         out[X + k] += step[k]
     _rotate(out, A, step[3], step[4], step[5])
     _rotate(out, B, step[3], step[4], step[5])
-    if model == CONFORMAL:
-        s = min(max(pose[F] + step[RIGID], _MIN_STRETCH), _MAX_STRETCH)
-        out[F], out[F + 1], out[F + 2] = s, 0.0, s
-    elif model == EQUIAREAL:
+    if model == EQUIAREAL:
         alpha = min(max(pose[F] + step[RIGID], _MIN_STRETCH), _MAX_STRETCH)
         beta = pose[F + 1] + step[RIGID + 1]
         out[F], out[F + 1], out[F + 2] = alpha, beta, (1.0 + beta * beta) / alpha
@@ -206,24 +194,6 @@ def _rotate(pose: F64, start: int, wx: float, wy: float, wz: float) -> None:
     pose[start] = x + s * ux + c * (wy * uz - wz * uy)
     pose[start + 1] = y + s * uy + c * (wz * ux - wx * uz)
     pose[start + 2] = z + s * uz + c * (wx * uy - wy * ux)
-
-
-@leaf_kernel
-def deformation_energy(pose: F64) -> float:
-    """||F - I||^2 of Eq. 12, Frobenius: the off-diagonal element counts twice."""
-    return float((pose[F] - 1.0) ** 2 + 2.0 * pose[F + 1] ** 2 + (pose[F + 2] - 1.0) ** 2)
-
-
-@leaf_kernel
-def add_deformation_energy(pose: F64, model: int, weight: float, H: F64, g: F64) -> None:
-    """Add omega_I ||F - I||^2 (Eq. 13) to the normal equations."""
-    e11, e12, e22 = pose[F] - 1.0, pose[F + 1], pose[F + 2] - 1.0
-    for k in range(model):
-        p11, p12, p22 = deformation_directions(model, pose, k)
-        g[RIGID + k] += weight * (p11 * e11 + 2.0 * p12 * e12 + p22 * e22)
-        for m in range(model):
-            q11, q12, q22 = deformation_directions(model, pose, m)
-            H[RIGID + k, RIGID + m] += weight * (p11 * q11 + 2.0 * p12 * q12 + p22 * q22)
 
 
 def identity_poses(count: int) -> F64:

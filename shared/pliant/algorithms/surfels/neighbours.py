@@ -11,6 +11,9 @@ from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.surfels.sampling import A, B, F, X
 
+_OFF_PLANE = 0.3
+"""Neighbours are off each other's plane by at most this share of their distance."""
+
 
 class Edges(NamedTuple):
     """E pairs of neighbours, d metres apart when the younger was born."""
@@ -87,12 +90,11 @@ def _nearest(
             best[at], out[i, at] = squares, j
 
 
-def find_edges(poses: F64, known: I64, first_new: int, count: int, off_plane: float) -> Edges:
+def find_edges(poses: F64, known: I64, first_new: int, count: int) -> Edges:
     """The ``count`` nearest neighbours of each surfel that lie on the same surface.
 
     poses: (N, POSE_FLOATS).  known: (N,) 1 where the pose is trusted.  first_new: pairs of earlier
-    rows are left out.  off_plane: neighbours are off each other's plane by at most this share of
-    their distance.
+    rows are left out.
     """
     n = len(poses)
     if n < 2 or count == 0:
@@ -101,7 +103,7 @@ def find_edges(poses: F64, known: I64, first_new: int, count: int, off_plane: fl
     normals = np.cross(poses[:, A : A + 3], poses[:, B : B + 3])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
     nearest = np.empty((n, count), np.int64)
-    _nearest(points, normals, known, first_new, off_plane, nearest)
+    _nearest(points, normals, known, first_new, _OFF_PLANE, nearest)
     rows, columns = np.repeat(np.arange(n), count), nearest.ravel()
     pairs = np.stack([rows, columns], axis=1)[columns >= 0]
     ends = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64).reshape(-1, 2)

@@ -43,23 +43,23 @@ def samples_of(side: int, stride: int) -> int:
     return 2 * ((side // 2 + stride - 1) // stride) + 1
 
 
-def make_pyramid(
-    image: U8, camera: PinholeCamera, levels: int, side: int, stride: int
-) -> list[Level]:
+_SPARSE_STRIDE_PX = 2
+
+
+def make_pyramid(image: U8, camera: PinholeCamera, levels: int, side: int) -> list[Level]:
     """``levels`` levels, each half the size of the one before.
 
     image: (H, W) uint8.  Half scale: ``u' = (u + 0.5) / 2 - 0.5``.  A patch has ``side`` pixels of
     every level along an edge, so that one of the coarsest level covers most of the scene.  Its
-    samples are ``stride`` pixels apart at every second level: with 2, two levels share each
-    distance of samples in the image, 1, 4, 4, 16 pixels, which is time saved where it is missed
-    least.
+    samples are two pixels apart at every second level: two levels share each distance of samples
+    in the image, 1, 4, 4, 16 pixels, which is time saved where it is missed least.
     """
     out: list[Level] = []
     pixels = smooth(image)
     for level in range(levels):
         scale = float(2**level)
         cx, cy = (camera.cx + 0.5) / scale - 0.5, (camera.cy + 0.5) / scale - 0.5
-        apart = stride if level % 2 else 1
+        apart = _SPARSE_STRIDE_PX if level % 2 else 1
         focal = camera.fx / scale, camera.fy / scale
         out.append(make_level(pixels, *focal, cx, cy, samples_of(side, apart), apart))
         pixels = halve(pixels)

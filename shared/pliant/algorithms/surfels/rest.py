@@ -13,6 +13,10 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.kernel import leaf_kernel
 from pliant.algorithms.surfels.sampling import X
 
+OMEGA_E = 25.0
+"""omega_E, DN^2: the variance of a residual that is as likely as a surfel one Sigma off its
+equilibrium."""
+
 
 class Rest(NamedTuple):
     """Equilibria of N surfels as a camera sees them."""

@@ -85,10 +85,10 @@ class SurfelTable:
         ):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[rows]))
 
-    def connect(self, first_new: int, count: int, off_plane: float) -> None:
+    def connect(self, first_new: int, count: int) -> None:
         """Give the rows from ``first_new`` on their neighbours."""
         known = self.tracked.astype(np.int64)
-        new = find_edges(self.guesses, known, first_new, count, off_plane)
+        new = find_edges(self.guesses, known, first_new, count)
         self.edges = join_edges(self.edges, new)
 
     @property

@@ -12,8 +12,6 @@ and bias are eliminated from its block, and one sparse system moves all.  A surf
 is carried along.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8, BoolArray
@@ -21,10 +19,15 @@ from pliant.algorithms.surfels import together_kernels as kernels
 from pliant.algorithms.surfels.align import Limits, Templates, Workspace
 from pliant.algorithms.surfels.motion import MOST_PARAMETERS, RIGID
 from pliant.algorithms.surfels.neighbours import Edges
-from pliant.algorithms.surfels.rest import Rest
+from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.rest import OMEGA_E, Rest
 from pliant.algorithms.surfels.sampling import Level, X
 from pliant.algorithms.surfels.sums import FEATURES
 
+STEPS, COARSE_STEPS = 3, 2
+"""Steps of all surfels, at full size and at half the size."""
+_TEAR = 0.3
+"""Strain at which neighbours hold on by a quarter only: what tears or slides."""
 _CG_ITERATIONS = 60
 _CG_TOLERANCE = 1e-4
 _FEW = 3
@@ -32,22 +35,9 @@ _HELD_SHARE = 0.25
 _DIAGONAL = np.arange(RIGID)
 
 
-@dataclass(frozen=True)
-class Hold:
-    """How neighbours hold on to each other."""
-
-    weight: float  # omega_E, DN^2
-    strain: float
-    bend: float  # rad
-    tear: float
-    steps: int
-    min_zncc: float  # a surfel whose image fits worse is carried along
-    min_visible: float
-
-
 def align_together(
     poses: F64, start: F64, active: U8, edges: Edges, rest: Rest, level: Level,
-    templates: Templates, limits: Limits, work: Workspace, hold: Hold,
+    templates: Templates, limits: Limits, work: Workspace, parameters: SurfelParameters, steps: int,
 ) -> BoolArray:  # fmt: skip
     """Move all surfels as one, from the present poses, which are overwritten.
 
@@ -57,12 +47,12 @@ def align_together(
     they are.  Returns (N,) which surfels have torn themselves off their neighbours: their pose is
     that of ``start``.
     """
-    n, pairs = len(poses), len(edges.ends)
+    n, pairs, p = len(poses), len(edges.ends), parameters
     costs, sums = np.zeros(n), np.zeros((n, FEATURES))
     matrices = np.zeros((n, FEATURES, FEATURES))
     seen = active.copy()
     kernels.look_at_all(
-        poses, start, seen, level, templates, limits, work, hold.min_zncc, hold.min_visible,
+        poses, start, seen, level, templates, limits, work, p.min_zncc, p.min_visible,
         costs, sums, matrices,
     )  # fmt: skip
     S, b, x = np.zeros((n, RIGID, RIGID)), np.zeros((n, RIGID)), np.zeros((n, RIGID))
@@ -72,17 +62,17 @@ def align_together(
     damping, travelled = np.full(n, limits.start_lambda), np.zeros(n)
     # What is not seen goes where its neighbours do.
     weights = np.where(seen[:, None, None] > 0, rest.weights, 0.0)
-    for _ in range(hold.steps):
+    for _ in range(steps):
         kernels.reduce_all(poses, seen, level, limits, work, sums, matrices, S, b, inner, follow)
-        kernels.edge_rows(poses, edges, hold.tear, w, residuals, arms)
+        kernels.edge_rows(poses, edges, _TEAR, w, residuals, arms)
         damped, descent = S.copy(), b.copy()
         damped[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping[:, None]
         held = weights @ (poses[:, X : X + 3] - rest.points)[:, :, None]
         damped[:, :3, :3] += weights
         descent[:, :3] += held[:, :, 0]
-        pull = hold.weight * w / edges.lengths**2
+        pull = OMEGA_E * w / edges.lengths**2
         kernels.solve_together(
-            damped, descent, edges, arms, residuals, pull / hold.strain**2, pull / hold.bend**2,
+            damped, descent, edges, arms, residuals, pull / p.strain**2, pull / p.bend**2,
             _CG_ITERATIONS, _CG_TOLERANCE, x,
         )  # fmt: skip
         if not np.isfinite(x).all():
@@ -91,7 +81,7 @@ def align_together(
             poses, seen, level, templates, limits, work, S, b, inner, follow, x, damping,
             travelled, costs, sums, matrices,
         )  # fmt: skip
-    kernels.edge_rows(poses, edges, hold.tear, w, residuals, arms)
+    kernels.edge_rows(poses, edges, _TEAR, w, residuals, arms)
     torn = torn_off(edges, w, n)
     poses[torn] = start[torn]
     return torn

@@ -44,7 +44,7 @@ def look_at_all(
         if found:
             active[s] = 1
             costs[s] = cost
-            curvature(poses[s], images, mean, templates.matrices[s], limits, work, matrices[s])
+            curvature(poses[s], images, mean, limits, work, matrices[s])
         else:
             active[s] = 0
             copy(start[s], poses[s])
@@ -79,10 +79,9 @@ def _reduce(
     n = motion.parameter_count(limits.model)
     m = n - _RIGID
     H, g, rhs, x = work.H, work.g, work.step, work.inverse[m:]
-    motion.mixing(pose, level, limits.model, work.mix, limits.light)
+    motion.mixing(pose, level, limits.model, work.mix)
     motion.hessian(matrix, 1.0, work.mix, n, work.product, H)
     motion.gradient(sums, work.mix, n, g)
-    motion.add_deformation_energy(pose, limits.model, limits.omega_i, H, g)
     if not factorise(H[_RIGID:n, _RIGID:n], m, 0, 0.0, work.L, work.inverse):
         return
     for k in range(m):
@@ -330,7 +329,7 @@ def step_together(
             costs[s] = cost
             copy(work.next_sums, sums[s])
             if travelled[s] > limits.stale_px:
-                curvature(candidate, images, mean, templates.matrices[s], limits, work, matrices[s])
+                curvature(candidate, images, mean, limits, work, matrices[s])
                 travelled[s] = 0.0
             damping[s] /= limits.lambda_down
         else:

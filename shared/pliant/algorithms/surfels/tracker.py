@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I64, U8, BoolArray
+from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.stages import StageTimer, no_stages
@@ -10,26 +10,30 @@ from pliant.algorithms.surfels import judge
 from pliant.algorithms.surfels.again import look_again
 from pliant.algorithms.surfels.align import Limits, Workspace, align_all, make_workspace
 from pliant.algorithms.surfels.birth import find_births
-from pliant.algorithms.surfels.joint import Equilibrium, align_jointly, align_rigid, register
-from pliant.algorithms.surfels.motion import ILLUMINATION, MODELS
+from pliant.algorithms.surfels.joint import Equilibrium, align_rigid, register
+from pliant.algorithms.surfels.motion import MODELS
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import start_at, targets
 from pliant.algorithms.surfels.pyramid import make_pyramid, usable_levels
-from pliant.algorithms.surfels.rest import Rest, no_rest
+from pliant.algorithms.surfels.rest import OMEGA_E, Rest, no_rest
 from pliant.algorithms.surfels.sampling import BIAS, GAIN, A, B, F, Level, X
 from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.table import SurfelTable, move_poses
-from pliant.algorithms.surfels.together import Hold, align_together
+from pliant.algorithms.surfels.together import COARSE_STEPS, STEPS, align_together
 
 _FOUND_AGAIN_ZNCC = 0.9
 """A surfel that was missing must fit better than one that was followed: chance has had tries."""
-_TOGETHER_LEVELS = 2
-"""Levels, the finest, at which surfels with neighbours move as one before a static camera."""
+_TOGETHER_LEVELS = {False: 2, True: 1}
+"""Levels, the finest, at which surfels with neighbours move as one: before a static camera, and
+before a moving one, where more takes twice as long and the camera is hardly better."""
 _RIGID_SURFELS = 150
 """So many surfels say where the camera is before each of them is looked for."""
-_BLENDS = {"template": (0.0, 0.0), "both": (0.5, 1.0), "frame": (1.0, 1.0)}
-"""Share of the frame in the derivatives of a patch, at the coarse scales of a static camera and
-otherwise: with a moving camera the mean finds fewer surfels again after a jump."""
+_BLEND, _COARSE_STATIC_BLEND = 1.0, 0.5
+"""Share of the frame in the derivatives of a patch; the rest is the texture's.  At the coarse
+scales of a static camera their mean converges most often (second order, as in ESM); before a moving
+one it finds fewer surfels again after a jump."""
+_ITERATIONS, _COARSE_ITERATIONS = 10, 6
+_STEP_PX, _COARSE_STEP_PX = 0.01, 0.05
 
 
 class SurfelTracker:
@@ -83,14 +87,9 @@ class SurfelTracker:
         goals = self._goals(prediction, len(pyramid))
         self._frame += 1
         poses = move_poses(self._table.guesses, inverse(self._T_world_camera))
-        active = np.ones(len(poses), np.uint8)
-        if self._parameters.camera == "static":
-            self._start_at(goals, pyramid[-1], poses, active)
-            torn = self._align(pyramid, poses, active, timer)
-        else:
-            torn = self._align_with_camera(pyramid, poses, goals, timer)
+        torn = self._align(pyramid, poses, goals, timer)
         with timer("judge"):
-            self._judge(pyramid[0], poses, active, torn)
+            self._judge(pyramid[0], poses, torn)
         if depth is not None:
             with timer("births"):
                 self._give_birth(pyramid, _checked_depth(depth, self._camera))
@@ -110,19 +109,6 @@ class SurfelTracker:
         self._give_birth(self._pyramid(image), _checked_depth(depth, self._camera))
         return self._result()
 
-    def set_equilibrium(self, ids: I64, positions: F64, covariances: F64) -> None:
-        """Say where surfels rest and how far they stray, for example from ``learn_equilibrium``.
-
-        ids: (M,).  positions: (M, 3) metres, world.  covariances: (M, 3, 3) m^2, positive definite.
-        Raises ValueError for an id that is not tracked.
-        """
-        rows = np.searchsorted(self._table.ids, ids)
-        rows = np.minimum(rows, max(len(self._table) - 1, 0))
-        if len(self._table) == 0 or (self._table.ids[rows] != ids).any():
-            raise ValueError("set_equilibrium() names a surfel that is not in the map")
-        self._table.rest[rows] = positions
-        self._table.information[rows] = np.linalg.inv(covariances)
-
     def _pyramid(self, image: U8) -> list[Level]:
         camera, p = self._camera, self._parameters
         assert camera is not None
@@ -132,7 +118,7 @@ class SurfelTracker:
                 f"got {image.dtype} {image.shape}"
             )
         levels = usable_levels(camera.width, camera.height, p.patch_px, p.levels)
-        pyramid = make_pyramid(image, camera, levels, p.patch_px, p.sparse_stride_px)
+        pyramid = make_pyramid(image, camera, levels, p.patch_px)
         if len(self._works) != len(pyramid):
             self._works = [make_workspace(level.side) for level in pyramid]
         return pyramid
@@ -148,25 +134,62 @@ class SurfelTracker:
         points = self._table.verdicts[:, judge.U : judge.V + 1]
         return targets(points, prediction, float(2 ** (levels - 1)))
 
-    def _start_at(self, goals: F64 | None, level: Level, poses: F64, active: U8) -> None:
-        if goals is not None:
-            templates, limits = self._table.templates, self._limits(fine=False)
-            if templates:
-                start_at(poses, active, goals, level, templates[-1], limits, self._works[-1])
+    def _align(
+        self, pyramid: list[Level], poses: F64, goals: F64 | None, timer: StageTimer
+    ) -> BoolArray:
+        """Coarse to fine: the solution of a scale is the guess of the next (section VI-A2).
 
-    def _align(self, pyramid: list[Level], poses: F64, active: U8, timer: StageTimer) -> BoolArray:
-        """Coarse to fine: the solution of a scale is the guess of the next (section VI-A2)."""
-        together = len(self._table.edges.ends) > 0
-        start, torn, rest = poses.copy(), np.zeros(len(poses), np.bool_), no_rest(len(poses))
-        coarsest = len(pyramid) - 1
+        A camera that moves is found first as if the scene were rigid.  Then camera and surfels take
+        turns: surfels before a camera that is held, then the camera that fits them.  The image
+        decides far more of a surfel's place than its equilibrium does, so one turn a level comes
+        close.  Returns which surfels have left their neighbours.
+        """
+        table, moving, n = self._table, self._parameters.camera == "moving", len(poses)
+        everyone, torn, coarsest = np.ones(n, np.uint8), np.zeros(n, np.bool_), len(pyramid) - 1
+        # What was missing is looked for, too, but says nothing of the camera.
+        guides = table.tracked.astype(np.uint8)
+        if not moving or int(guides.sum()) < self._parameters.min_alive:
+            guides = everyone
+        T_camera_world, rest, start = inverse(self._T_world_camera), no_rest(n), poses
+        equilibrium = Equilibrium(table.rest, OMEGA_E * table.information)
+        together = _TOGETHER_LEVELS[moving] if len(table.edges.ends) else 0
         for number in range(coarsest, -1, -1):
             level = pyramid[number]
+            if number == coarsest:
+                if moving:
+                    T_camera_world = self._align_rigid(level, poses, guides, T_camera_world, timer)
+                self._start_at(goals, level, poses, guides)
+                start = poses.copy()
+            if moving:
+                rest = equilibrium.seen_from(T_camera_world)
+                start = move_poses(table.guesses, T_camera_world)
             # Alone each finds its place in the image; close to it depth would go astray.
-            if number == coarsest or number >= _TOGETHER_LEVELS or not together:
-                self._align_alone(number, level, poses, active, rest, timer)
-            if together and number < _TOGETHER_LEVELS:
-                torn = self._hold_together(number, level, poses, start, active, rest, timer)
+            if number == coarsest or number >= together:
+                self._align_alone(number, level, poses, everyone, rest, timer)
+            if number < together:
+                torn = self._hold_together(number, level, poses, start, everyone, rest, timer)
+            if moving:
+                with timer("camera"):
+                    T_camera_world = register(poses, guides, T_camera_world, equilibrium)
+        if moving:
+            self._T_world_camera = inverse(T_camera_world)
         return torn
+
+    def _start_at(self, goals: F64 | None, level: Level, poses: F64, active: U8) -> None:
+        if goals is not None and self._table.templates:
+            templates, limits = self._table.templates[-1], self._limits(fine=False)
+            start_at(poses, active, goals, level, templates, limits, self._works[-1])
+
+    def _align_rigid(
+        self, level: Level, poses: F64, guides: U8, T_camera_world: F64, timer: StageTimer
+    ) -> F64:
+        templates = self._table.templates[-1]
+        some = _spread(guides * templates.usable)
+        with timer("camera alone"):
+            return align_rigid(
+                poses, some, T_camera_world, level, templates, self._limits(fine=False),
+                self._works[-1],
+            )  # fmt: skip
 
     def _align_alone(
         self, number: int, level: Level, poses: F64, active: U8, rest: Rest, timer: StageTimer
@@ -185,93 +208,28 @@ class SurfelTracker:
         rest: Rest,
         timer: StageTimer,
     ) -> BoolArray:
-        p = self._parameters
-        steps = p.together_steps if number == 0 else p.coarse_together_steps
-        hold = Hold(p.omega_e, p.strain, p.bend, p.tear, steps, p.min_zncc, p.min_visible)
         with timer(f"together, level {number}"):
             return align_together(
                 poses, start, active, self._table.edges, rest, level,
                 self._table.templates[number], self._limits(fine=number == 0), self._works[number],
-                hold,
+                self._parameters, STEPS if number == 0 else COARSE_STEPS,
             )  # fmt: skip
 
-    def _align_with_camera(
-        self, pyramid: list[Level], poses: F64, goals: F64 | None, timer: StageTimer
-    ) -> BoolArray:
-        """Section V: rigid at the coarsest level first, then Eq. 21 from coarse to fine.
-
-        With neighbours camera and surfels take turns: surfels before a camera that is held, then
-        the camera that fits them.  The image decides far more of a surfel's place than its
-        equilibrium does, so one turn a level comes close.  Returns which surfels have left their
-        neighbours.
-        """
-        table, p, coarsest = self._table, self._parameters, len(pyramid) - 1
-        n = len(table)
-        followed, everyone = table.tracked.astype(np.uint8), np.ones(n, np.uint8)
-        if int(followed.sum()) < p.min_alive:
-            followed = everyone
-        torn = np.zeros(n, np.bool_)
-        together = p.camera == "moving" and len(table.edges.ends) > 0 and coarsest > 0
-        T_camera_world = inverse(self._T_world_camera)
-        equilibrium = Equilibrium(table.rest, p.omega_e * table.information)
-        for number in range(coarsest, -1, -1):
-            level, templates = pyramid[number], table.templates[number]
-            limits = self._limits(fine=number == 0)
-            if number == coarsest or p.camera == "static_map":
-                # Turn and shift are nearly the same in the image: a last camera takes short steps.
-                share = 0.1 if p.camera == "static_map" else 1.0
-                short = limits._replace(min_step_px=share * limits.min_step_px)
-                whole = p.camera == "static_map"
-                guides = followed if whole else _spread(followed * templates.usable)
-                with timer(f"camera alone, level {number}"):
-                    T_camera_world = align_rigid(
-                        poses, guides, T_camera_world, level, templates, short,
-                        self._works[number],
-                    )  # fmt: skip
-            if p.camera == "static_map":
-                continue
-            if number == coarsest:
-                self._start_at(goals, level, poses, followed)
-            if not together:
-                with timer(f"camera and surfels, level {number}"):
-                    T_camera_world = align_jointly(
-                        poses, followed, T_camera_world, equilibrium, level, templates, limits,
-                        self._works[number],
-                    )  # fmt: skip
-                continue
-            # What was missing is looked for, too, but says nothing of the camera.
-            rest = equilibrium.seen_from(T_camera_world)
-            if number > 0:
-                self._align_alone(number, level, poses, everyone, rest, timer)
-            else:
-                start = move_poses(table.guesses, T_camera_world)
-                torn = self._hold_together(number, level, poses, start, everyone, rest, timer)
-            with timer("camera"):
-                T_camera_world = register(poses, followed, T_camera_world, equilibrium)
-        self._T_world_camera = inverse(T_camera_world)
-        if p.camera == "moving" and not together:
-            # What was missing is looked for where the camera says that it should be.
-            missing = 1 - followed
-            poses[missing > 0] = move_poses(table.guesses, T_camera_world)[missing > 0]
-            for number in range(coarsest, -1, -1):
-                self._align_alone(number, pyramid[number], poses, missing, no_rest(n), timer)
-        return torn
-
-    def _judge(self, level: Level, poses: F64, active: U8, torn: BoolArray) -> None:
+    def _judge(self, level: Level, poses: F64, torn: BoolArray) -> None:
         """Keep what was found; what was not stays where it was last good."""
         table, p = self._table, self._parameters
         verdicts, templates, limits = table.verdicts, table.templates[0], self._limits(fine=True)
-        judge.judge_all(poses, active, level, templates, limits, self._works[0], verdicts)
-        if len(table.edges.ends) and p.camera != "static_map":
+        everyone = np.ones(len(poses), np.uint8)
+        judge.judge_all(poses, everyone, level, templates, limits, self._works[0], verdicts)
+        if len(table.edges.ends):
             unlike = (verdicts[:, judge.CORRELATION] < p.min_zncc) & (
                 verdicts[:, judge.FRONT] > 0.0
             )
-            again = (active > 0) & (unlike | torn) & (verdicts[:, judge.INSIDE] >= p.min_visible)
+            again = (unlike | torn) & (verdicts[:, judge.INSIDE] >= p.min_visible)
             again = again.astype(np.uint8)
             look_again(
-                poses, again, table.edges, level, templates, limits, self._works[0],
-                omega_e=p.omega_e, strain=p.strain,
-            )  # fmt: skip
+                poses, again, table.edges, level, templates, limits, self._works[0], p.strain
+            )
             judge.judge_all(poses, again, level, templates, limits, self._works[0], verdicts)
             torn = torn & (again == 0)
         wanted = np.where(table.missing > 0, max(p.min_zncc, _FOUND_AGAIN_ZNCC), p.min_zncc)
@@ -292,7 +250,7 @@ class SurfelTracker:
         table.poses[good] = world[good]
         # With neighbours, what is not seen is looked for where they have carried it.
         table.guesses = table.poses.copy()
-        if p.neighbours and p.camera != "static_map" and not self._lost:
+        if p.neighbours and not self._lost:
             carried = ~good & np.isfinite(world).all(axis=1)
             table.guesses[carried] = world[carried]
 
@@ -312,7 +270,7 @@ class SurfelTracker:
         sigma = p.expected_motion * births.poses[:, X + 2]
         information = np.eye(3) / np.maximum(sigma, 1e-9)[:, None, None] ** 2
         table.add(births, self._T_world_camera, self._next_id, self._frame, information)
-        table.connect(len(table) - n, p.neighbours, p.off_plane)
+        table.connect(len(table) - n, p.neighbours)
         self._next_id += n
         self._lost = int(table.tracked.sum()) < p.min_alive
         rows = (table.born == self._frame).astype(np.uint8)
@@ -323,22 +281,13 @@ class SurfelTracker:
 
     def _limits(self, *, fine: bool) -> Limits:
         p = self._parameters
+        coarse_static = not fine and p.camera == "static"
         return Limits(
-            MODELS.index(p.model),
-            ILLUMINATION[p.illumination],
-            _BLENDS[p.jacobian][fine or p.camera != "static"],
-            p.saturation,
+            MODELS[p.model],
+            _COARSE_STATIC_BLEND if coarse_static else _BLEND,
             p.highlight,
-            p.omega_i if p.model != "isometric" else 0.0,
-            p.damped_steps,
-            p.first_lambda,
-            p.start_lambda,
-            p.lambda_up,
-            p.lambda_down,
-            p.fine_iterations if fine else p.coarse_iterations,
-            p.fine_step_px if fine else p.coarse_step_px,
-            p.stale_px,
-            p.slack,
+            _ITERATIONS if fine else _COARSE_ITERATIONS,
+            _STEP_PX if fine else _COARSE_STEP_PX,
         )
 
     def _result(self) -> SurfelFrame:

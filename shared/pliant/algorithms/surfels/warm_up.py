@@ -16,11 +16,8 @@ def warm_up() -> None:
     camera = PinholeCamera(width=96, height=72, fx=90.0, fy=90.0, cx=47.5, cy=35.5)
     image = np.random.default_rng(0).integers(0, 200, (72, 96), np.uint8)
     depth, nothing = np.ones((72, 96)), FrameTracks.empty()
-    modes: tuple[tuple[Literal["static", "moving"], int], ...]
-    modes = (("static", 8), ("moving", 8), ("moving", 0))
-    for mode, neighbours in modes:
-        tracker = SurfelTracker(
-            SurfelParameters(camera=mode, neighbours=neighbours, max_surfels=20)
-        )
+    modes: tuple[Literal["static", "moving"], ...] = ("static", "moving")
+    for mode in modes:
+        tracker = SurfelTracker(SurfelParameters(camera=mode, max_surfels=20))
         first = tracker.start(image, depth, camera)
         tracker.track(image, predict(first.points_px, nothing, nothing), depth)
