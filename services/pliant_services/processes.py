@@ -19,6 +19,7 @@ class Process:
     observer: it reads every logged topic of the others, and nobody reads it.
     niceness: how much it gives way where processors are few; others do not wait for what it makes.
     kernels: modules whose ``warm_up()`` compiles, or loads, what it calls.
+    finishing: what it does when the last frame is done, for people; "" where that is nothing.
     may_lag: it may be further behind than others with frames that bundle adjustment passes over.
     """
 
@@ -30,6 +31,7 @@ class Process:
     observer: bool = False
     niceness: int = 0
     kernels: tuple[str, ...] = ()
+    finishing: str = ""
     may_lag: bool = False
 
 
@@ -50,6 +52,7 @@ PROCESSES: tuple[Process, ...] = (
         "bundle_adjustment",
         "pliant_services.nodes.bundle_adjustment",
         kernels=("pliant.algorithms.bundle", "pliant.algorithms.mapping"),
+        finishing="adjusting the whole map",
         inputs=(topics.STREAM, topics.IMAGE, topics.EXTREMA),
         outputs=(topics.MAP_UPDATE, topics.MAP_FINAL, topics.KEYFRAME, topics.KEYFRAME_FINAL),
         may_lag=True,
@@ -58,6 +61,7 @@ PROCESSES: tuple[Process, ...] = (
         "meshing",
         "pliant_services.nodes.meshing",
         kernels=("pliant.algorithms.meshing", "pliant.fusion.warm_up"),
+        finishing="fusing the final mesh",
         inputs=(
             topics.STREAM,
             topics.MAP_UPDATE,

@@ -176,11 +176,11 @@ def _has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
 def _wait(fleet: Fleet, progress: Progress) -> bool:
     """Wait for the end of the run; True if it was brought about by Ctrl-C."""
     try:
-        fleet.wait()
+        fleet.wait(progress.on_rest)
     except KeyboardInterrupt:
         progress.say("stopping after the frame at hand (Ctrl-C again to kill)")
         fleet.end_source()
-        fleet.wait()
+        fleet.wait(progress.on_rest)
         return True
     return False
 

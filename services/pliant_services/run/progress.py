@@ -2,6 +2,7 @@
 
 import sys
 import threading
+from collections.abc import Sequence
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
@@ -9,6 +10,7 @@ from rich.progress import Progress as RichProgress
 
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.messages.types import Status
+from pliant_services.processes import BY_NAME
 
 _STATES = {WAITING: "starting", TRACKING: "tracking", LOST: "lost"}
 
@@ -84,6 +86,13 @@ class Progress:
             rate=f"{task.speed:.1f} fps" if task.speed else "",
             detail=detail + (f" ({status.note})" if status.note else ""),
         )
+
+    def on_rest(self, names: Sequence[str]) -> None:
+        """Say what those services do that are still there after the last frame."""
+        doing = [BY_NAME[name].finishing for name in names if BY_NAME[name].finishing]
+        detail = f"{(*doing, 'closing the recording')[0]} ..."
+        with self._lock:
+            self._bar.update(self._task, state="finishing", rate="", detail=detail)
 
     def __enter__(self) -> "Progress":
         self._bar.start()

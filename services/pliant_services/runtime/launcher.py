@@ -115,13 +115,19 @@ class Fleet:
         """Process ids by name, of those that have been started."""
         return {child.name: child.process.pid for child in self._children}
 
-    def wait(self) -> None:
+    def wait(self, on_rest: Callable[[Sequence[str]], None] = lambda names: None) -> None:
         """Wait until every service has left by itself.
+
+        on_rest: is given, again and again, the names of those that are still there once one has
+        left.
 
         Raises ServiceDiedError when one fails, or, where services are started again, when one dies
         three times of the same frame.
         """
         while not self._all_left():
+            rest = [child.name for child in self._children if child.process.poll() is None]
+            if len(rest) < len(self._children):
+                on_rest(rest)
             time.sleep(_POLL_S)
 
     def give_up(self) -> None:
