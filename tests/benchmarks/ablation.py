@@ -36,8 +36,6 @@ _LITERAL += _OFF["minima beside maxima"]
 VARIANTS: dict[str, list[str]] = {
     "everything on": [],
     **{f"without {name}": sets for name, sets in _OFF.items()},
-    "with affine refit": ["tracking.affine_refit=true"],
-    "with sweeps that move keyframes": ["bundle_adjustment.window.sweep_keyframes=true"],
     "the paper's tracker": _LITERAL,
     "the paper's tracker, without re-acquisition": [*_LITERAL, *_OFF["re-acquisition"]],
 }

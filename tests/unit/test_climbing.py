@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F32
+from pliant.algorithms.image.pixels import pixels_of
 from pliant.algorithms.tracking.climbing import climb
 from pliant.algorithms.tracking.curvature import CURVATURE_BORDER
 
@@ -35,16 +36,8 @@ def test_climbs_as_a_plain_search_does(sign: float, weight: float) -> None:
     kappa = np.asarray(kappa, np.float32)
     starts = rng.uniform(2.0, SIZE - 3.0, (200, 2)).astype(np.float32)
     for u, v in starts:
-        pixel = climb(
-            kappa.ravel(),
-            SIZE,
-            SIZE,
-            u,
-            v,
-            np.float32(sign),
-            np.float32(weight),
-            np.float32(3.0),
-        )
+        limits = np.float32(sign), np.float32(weight), np.float32(3.0)
+        pixel = climb(pixels_of(kappa), u, v, *limits)
         assert pixel == plain_climb(kappa, (float(u), float(v)), sign, weight)
 
 
@@ -52,4 +45,4 @@ def test_a_start_outside_ends_there() -> None:
     kappa = np.zeros((SIZE, SIZE), np.float32)
     start = np.float32(1e6)
     one = np.float32(1.0)
-    assert climb(kappa.ravel(), SIZE, SIZE, start, start, one, one, one) == -1
+    assert climb(pixels_of(kappa), start, start, one, one, one) == -1

@@ -4,14 +4,20 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.image.patch_alignment import align_patch, make_template, patch_tensor
+from pliant.algorithms.image.patch_alignment import (
+    PatchTensor,
+    Template,
+    align_patch,
+    make_template,
+    patch_tensor,
+)
 from pliant.algorithms.image.patch_sums import (
     BIRTH_FLOATS,
     BIRTH_MARGIN,
     BIRTH_SIZE,
     TEMPLATE_FLOATS,
 )
-from pliant.algorithms.tracking import track_table as table
+from pliant.algorithms.image.pixels import pixels_of
 from pliant.algorithms.tracking.deformation import (
     WINDOW_SIDE,
     keep_birth,
@@ -19,6 +25,7 @@ from pliant.algorithms.tracking.deformation import (
     slopes_of_motion,
     turn_templates,
 )
+from pliant.algorithms.tracking.track_table import TRACK, Patches, Track
 
 SIZE = 64
 IDENTITY = np.array([1, 0, 0, 0, 1, 0], np.float32)
@@ -38,22 +45,27 @@ def grid(height: int, width: int) -> F64:
     return np.stack([u, v], axis=-1)
 
 
-def born_at(point: F64, image: F32) -> tuple[F32, F32]:
+def born_at(point: F64, image: F32) -> tuple[Track, F32]:
     """The row of a track whose patch is centred within half a pixel of a point, and its birth."""
     left, top = (int(np.floor(x - 3.0)) for x in point)
-    track = np.zeros(table.FLOATS, np.float32)
-    track[[table.U, table.V]] = point
-    track[[table.LEFT, table.TOP]] = left - point[0], top - point[1]
+    tracks = np.zeros(1, TRACK)
+    tracks["u"], tracks["v"] = point
+    tracks["left"], tracks["top"] = left - point[0], top - point[1]
     births = np.zeros(BIRTH_FLOATS, np.float32)
-    keep_birth(image.ravel(), image.shape[1], image.shape[0], left, top, births, 0)
-    return track, births
+    keep_birth(pixels_of(image), left, top, births, 0)
+    return tracks[0], births
+
+
+def origin(track: Track) -> F64:
+    """First pixel of the template relative to the point."""
+    return np.array([track["left"], track["top"]], np.float64)
 
 
 def test_birth_keeps_the_surroundings_and_goes_on_beyond_the_image() -> None:
     image = np.random.default_rng(0).random((SIZE, SIZE)).astype(np.float32)
     for left, top in ((20, 30), (1, 1), (SIZE - 9, 25)):
         births = np.zeros(BIRTH_FLOATS, np.float32)
-        keep_birth(image.ravel(), SIZE, SIZE, left, top, births, 0)
+        keep_birth(pixels_of(image), left, top, births, 0)
         span = np.arange(BIRTH_SIZE) - BIRTH_MARGIN
         rows, columns = np.clip(top + span, 0, SIZE - 1), np.clip(left + span, 0, SIZE - 1)
         np.testing.assert_array_equal(births.reshape(BIRTH_SIZE, -1), image[np.ix_(rows, columns)])
@@ -65,7 +77,7 @@ def test_sampling_equals_plain_numpy(M: F64) -> None:
     track, births = born_at(point, np.random.default_rng(1).random((SIZE, SIZE)).astype(np.float32))
     window = np.zeros(WINDOW_SIDE**2, np.float32)
     sample_birth(births, 0, track, M.astype(np.float32).ravel(), window)
-    offset = track[[table.LEFT, table.TOP]].astype(np.float64)
+    offset = origin(track)
     seen = (grid(WINDOW_SIDE, WINDOW_SIDE) - 1.0 + offset) @ np.linalg.inv(M).T
     at = np.clip(seen - offset + BIRTH_MARGIN, 0.0, BIRTH_SIZE - 1.01)
     low = np.floor(at).astype(int)
@@ -86,19 +98,19 @@ def test_slopes_are_those_of_an_affine_motion() -> None:
     slope = np.array([[0.01, -0.02], [0.015, 0.03]])
     before = rng.uniform(5.0, [width - 5.0, height - 5.0], (count, 2))
     motion = before @ slope.T + [2.0, -1.0]
-    floats = np.zeros((count, table.FLOATS), np.float32)
-    floats[:, [table.U, table.V]] = before + motion
-    floats[:, [table.MOTION_U, table.MOTION_V]] = motion
-    slopes = slopes_of_motion(count, floats, IDENTITY, height, width)
+    tracks = np.zeros(count, TRACK)
+    tracks["u"], tracks["v"] = (before + motion).T
+    tracks["motion_u"], tracks["motion_v"] = motion.T
+    slopes = slopes_of_motion(tracks, IDENTITY, height, width)
     # Damping and the weights of cells that move otherwise take a little of it away.
     np.testing.assert_allclose(slopes[2:-2, 2:-2], np.tile(slope.ravel(), (2, 4, 1)), atol=4e-3)
     itself = np.array([1.01, -0.02, 2.0, 0.015, 1.03, -1.0], np.float32)
-    rest = slopes_of_motion(count, floats, itself, height, width)
+    rest = slopes_of_motion(tracks, itself, height, width)
     np.testing.assert_allclose(rest, 0.0, atol=1e-4)
 
 
 def test_no_tracks_have_no_slopes() -> None:
-    slopes = slopes_of_motion(0, np.zeros((4, table.FLOATS), np.float32), IDENTITY, 50, 70)
+    slopes = slopes_of_motion(np.zeros(0, TRACK), IDENTITY, 50, 70)
     assert not slopes.any()
 
 
@@ -106,49 +118,30 @@ def test_a_template_turns_with_the_view() -> None:
     point = np.array([32.4, 31.7])
     track, births = born_at(point, texture(grid(SIZE, SIZE)))
     templates = np.zeros(TEMPLATE_FLOATS, np.float32)
-    floats, ints = track[None].copy(), np.zeros((1, table.INTS), np.int32)
+    tracks = np.array([track])
     deformations = np.eye(2, dtype=np.float32).ravel()[[0, 1, 2, 3] * 2][None].copy()
     affine = np.array([*TURN[0], 0.0, *TURN[1], 0.0], np.float32)
-    window = np.zeros(WINDOW_SIDE**2, np.float32)
-    turn_templates(
-        1,
-        floats,
-        ints,
-        np.zeros((4, 4, 4), np.float32),
-        affine,
-        births,
-        deformations,
-        templates,
-        window,
-        np.zeros(1, np.int32),
-    )
+    window = pixels_of(np.zeros((WINDOW_SIDE, WINDOW_SIDE), np.float32))
+    patches = Patches(templates, births, deformations)
+    slopes = np.zeros((4, 4, 4), np.float32)
+    turn_templates(tracks, slopes, affine, patches, window, np.zeros(1, np.int32))
     np.testing.assert_allclose(deformations[0], np.tile(TURN.ravel(), 2), atol=1e-6)
     turned = texture((grid(SIZE, SIZE) - point) @ np.linalg.inv(TURN).T + point)
-    start = point + track[[table.LEFT, table.TOP]] + [0.6, -0.5]
+    start = (point + origin(track) + [0.6, -0.5]).astype(np.float32)
 
     def aligned(template: F32, energy: float) -> tuple[F64, float]:
-        found = align_patch(
-            turned.ravel(),
-            SIZE,
-            SIZE,
-            np.float32(start[0]),
-            np.float32(start[1]),
-            template,
-            0,
-            energy,
-            10,
-            np.float32(4.0),
-        )
-        return np.array(found[:2]) - track[[table.LEFT, table.TOP]] - point, found[2]
+        patch = Template(template, 0, np.float32(energy))
+        found = align_patch(pixels_of(turned), *start, patch, 10, np.float32(4.0))
+        return np.array([found.u, found.v]) - origin(track) - point, found.zncc
 
-    error, zncc = aligned(templates, floats[0, table.ENERGY])
+    error, zncc = aligned(templates, tracks[0]["energy"])
     assert np.linalg.norm(error) < 0.1
     assert zncc > 0.99
     # The patch of the birth itself fits less well.
-    left, top = np.rint(point + track[[table.LEFT, table.TOP]]).astype(int)
-    image = texture(grid(SIZE, SIZE)).ravel()
+    left, top = np.rint(point + origin(track)).astype(int)
+    image = pixels_of(texture(grid(SIZE, SIZE)))
     # A kernel called from Python returns Python's floats.
-    tensor = tuple(np.float32(x) for x in patch_tensor(image, SIZE, left, top))
+    tensor = PatchTensor(*(np.float32(x) for x in patch_tensor(image, left, top)))
     old = np.zeros(TEMPLATE_FLOATS, np.float32)
-    make_template(image, SIZE, left, top, tensor, old, 0)
-    assert aligned(old, tensor[4])[1] < zncc
+    make_template(image, left, top, tensor, old, 0)
+    assert aligned(old, tensor.energy)[1] < zncc

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F32
-from pliant.algorithms.image.downsampling import halve, shrink
+from pliant.algorithms.image.pixels import halve, pixels_of, shrink
 from pliant.algorithms.tracking.climbing import climb
 from pliant.algorithms.tracking.curvature import curvature
-from pliant.algorithms.tracking.local_flow import CELL_PX, flow_at, grid_shape, local_flow
+from pliant.algorithms.tracking.local_flow import CELL_PX, Flow, flow_at, grid_shape, local_flow
 from pliant.algorithms.tracking.maxima import find_maxima
 
 HEIGHT, WIDTH = 240, 320
-IDENTITY = np.eye(2, 3)
+IDENTITY = np.eye(2, 3, dtype=np.float32).ravel()
 
 
 def scene(shift_u: F32, shift_v: F32) -> F32:
@@ -42,7 +42,7 @@ def test_grid_finds_two_motions(shift: tuple[float, float]) -> None:
     _, kappa = curvature(before, 1.0)
     _, maxima = find_maxima(kappa, 0.5, both_signs=True)
     hint = np.zeros((*grid_shape(WIDTH, HEIGHT), 2), np.float32)
-    flow = local_flow(levels(before), levels(after), maxima, IDENTITY, hint)
+    flow = local_flow(levels(before), levels(after), maxima, IDENTITY, hint).grid
     columns = (np.arange(flow.shape[1]) + 0.5) * CELL_PX
     inner = flow[2:-2]
     for sign, expected in ((columns < WIDTH / 2 - 40, 0.0), (columns > WIDTH / 2 + 40, 4.0)):
@@ -52,28 +52,28 @@ def test_grid_finds_two_motions(shift: tuple[float, float]) -> None:
 
 
 def test_flow_is_interpolated_on_top_of_the_dominant_flow() -> None:
-    flow = np.zeros((3, 4, 2), np.float32)
-    flow[:, 1, 0], flow[:, 2, 0] = 1.0, 3.0
+    grid = np.zeros((3, 4, 2), np.float32)
+    grid[:, 1, 0], grid[:, 2, 0] = 1.0, 3.0
     affine = np.array([1.0, 0.0, 5.0, 0.0, 1.0, -2.0], np.float32)
     centre = np.float32(2.0 * CELL_PX)
-    found = flow_at(flow, affine, centre, np.float32(30.0))
+    found = flow_at(Flow(grid, affine), centre, np.float32(30.0))
     np.testing.assert_allclose(found, [7.0, -2.0], atol=1e-5)
-    corner = flow_at(flow, affine, np.float32(0.0), np.float32(0.0))
+    corner = flow_at(Flow(grid, affine), np.float32(0.0), np.float32(0.0))
     np.testing.assert_allclose(corner, [5.0, -2.0], atol=1e-5)
 
 
 def test_climb_reaches_the_summit_and_the_pull_holds_it_back() -> None:
     v, u = np.mgrid[0:40, 0:50]
-    hill = (100.0 - (u - 30.0) ** 2 - (v - 20.0) ** 2).astype(np.float32).ravel()
+    hill = (100.0 - (u - 30.0) ** 2 - (v - 20.0) ** 2).astype(np.float32)
     one = np.float32(1.0)
-    args = (50, 40, np.float32(24.0), np.float32(17.0))
-    free = climb(hill, *args, one, np.float32(0.0), np.float32(3.0))
+    args = (np.float32(24.0), np.float32(17.0))
+    free = climb(pixels_of(hill), *args, one, np.float32(0.0), np.float32(3.0))
     assert (free % 50, free // 50) == (30, 20)
-    valley = climb(-hill, *args, -one, np.float32(0.0), np.float32(3.0))
+    valley = climb(pixels_of(-hill), *args, -one, np.float32(0.0), np.float32(3.0))
     assert valley == free
-    held = climb(hill, *args, one, np.float32(1e5), np.float32(3.0))
+    held = climb(pixels_of(hill), *args, one, np.float32(1e5), np.float32(3.0))
     assert (held % 50, held // 50) == (24, 17)
-    assert climb(hill, 50, 40, np.float32(1.0), np.float32(20.0), one, one, one) == -1
+    assert climb(pixels_of(hill), np.float32(1.0), np.float32(20.0), one, one, one) == -1
 
 
 def test_smaller_images_are_means_of_blocks() -> None:

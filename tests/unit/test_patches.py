@@ -6,6 +6,8 @@ import pytest
 
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.image.patch_alignment import (
+    PatchTensor,
+    Template,
     align_patch,
     make_template,
     patch_strength,
@@ -18,6 +20,7 @@ from pliant.algorithms.image.patch_sums import (
     WINDOW,
     patch_sums,
 )
+from pliant.algorithms.image.pixels import pixels_of
 
 SIZE = 48
 
@@ -55,14 +58,14 @@ def sample(image: F32, u: float, v: float) -> F64:
     return ((1.0 - dv) * rows[:-1] + dv * rows[1:]).ravel()
 
 
-def template_of(image: F32, left: int, top: int) -> tuple[F32, float, float]:
+def template_of(image: F32, left: int, top: int) -> tuple[Template, float]:
     templates = np.zeros(TEMPLATE_FLOATS, np.float32)
     # A kernel called from Python returns Python's floats.
-    tensor = tuple(np.float32(x) for x in patch_tensor(image.ravel(), SIZE, left, top))
+    tensor = PatchTensor(*(np.float32(x) for x in patch_tensor(pixels_of(image), left, top)))
     strength, _ = patch_strength(tensor)
     if strength > 0.0:
-        make_template(image.ravel(), SIZE, left, top, tensor, templates, 0)
-    return templates, tensor[4], strength
+        make_template(pixels_of(image), left, top, tensor, templates, 0)
+    return Template(templates, 0, tensor.energy), strength
 
 
 def test_sums_equal_plain_numpy() -> None:
@@ -78,7 +81,7 @@ def test_sums_equal_plain_numpy() -> None:
 def test_templates_equal_plain_numpy() -> None:
     """Offset and gain projected out of both gradients, then the inverse of the tensor."""
     image = texture()
-    templates, energy, strength = template_of(image, 20, 18)
+    template, strength = template_of(image, 20, 18)
     block = image[17:27, 19:29].astype(np.float64)
     w = np.array(WINDOW)
     t = block[1:-1, 1:-1].ravel()
@@ -90,12 +93,12 @@ def test_templates_equal_plain_numpy() -> None:
         J -= np.outer(J @ (w * b) / ((b * b) @ w), b)
     tensor = (J * w) @ J.T
     eigenvalues = np.linalg.eigvalsh(tensor)
-    assert energy == pytest.approx(w @ basis[1] ** 2, rel=1e-4)
+    assert template.energy == pytest.approx(w @ basis[1] ** 2, rel=1e-4)
     assert strength == pytest.approx(eigenvalues[0] / PATCH_PIXELS, rel=1e-3)
-    isotropy = patch_strength(patch_tensor(image.ravel(), SIZE, 20, 18))[1]
+    isotropy = patch_strength(patch_tensor(pixels_of(image), 20, 18))[1]
     assert isotropy == pytest.approx(eigenvalues[0] / eigenvalues[1], rel=1e-3)
-    found = templates.reshape(3, PATCH_PIXELS)
-    np.testing.assert_allclose(found[0], w * basis[1] / energy, atol=1e-6)
+    found = template.values.reshape(3, PATCH_PIXELS)
+    np.testing.assert_allclose(found[0], w * basis[1] / template.energy, atol=1e-6)
     expected = -np.linalg.inv(tensor) @ (w * J)
     np.testing.assert_allclose(found[1:], expected, atol=1e-3 * np.abs(expected).max())
 
@@ -103,8 +106,8 @@ def test_templates_equal_plain_numpy() -> None:
 def test_steps_are_the_inverse_of_finite_differences() -> None:
     """Moving the image by h must give sums of -h (the step that leads back), to first order."""
     image = texture()
-    templates, _, _ = template_of(image, 20, 18)
-    t = templates.reshape(3, PATCH_PIXELS).astype(np.float64)
+    template, _ = template_of(image, 20, 18)
+    t = template.values.reshape(3, PATCH_PIXELS).astype(np.float64)
     h = 1e-2
     for axis in range(2):
         shift = np.eye(2)[axis] * h
@@ -119,47 +122,27 @@ def test_steps_are_the_inverse_of_finite_differences() -> None:
 def test_alignment_finds_the_shift_whatever_the_exposure(
     gain: float, shift: tuple[float, float]
 ) -> None:
-    templates, energy, strength = template_of(texture(), 20, 18)
+    template, strength = template_of(texture(), 20, 18)
     assert strength > 1.0
     image = np.float32(gain) * texture(*shift) - np.float32(11.0)
-    u, v, zncc, residual, step = align_patch(
-        image.ravel(),
-        SIZE,
-        SIZE,
-        np.float32(20.0),
-        np.float32(18.0),
-        templates,
-        0,
-        energy,
-        15,
-        np.float32(4.0),
-    )
-    np.testing.assert_allclose([u - 20.0, v - 18.0], shift, atol=0.03)
-    assert zncc > 0.99
-    assert residual < 3.0
-    assert step < 0.05
+    start = np.float32(20.0), np.float32(18.0)
+    found = align_patch(pixels_of(image), *start, template, 15, np.float32(4.0))
+    np.testing.assert_allclose([found.u - 20.0, found.v - 18.0], shift, atol=0.03)
+    assert found.zncc > 0.99
+    assert found.residual < 3.0
+    assert found.step < 0.05
 
 
 def test_flat_and_one_dimensional_patches_have_no_strength() -> None:
     flat = np.full((SIZE, SIZE), 90.0, np.float32)
-    assert template_of(flat, 20, 20)[2] == 0.0
+    assert template_of(flat, 20, 20)[1] == 0.0
     stripes = np.tile(20.0 * np.sin(np.arange(SIZE) * 0.7), (SIZE, 1)).astype(np.float32)
-    assert template_of(stripes, 20, 20)[2] == 0.0
+    assert template_of(stripes, 20, 20)[1] == 0.0
 
 
 @pytest.mark.parametrize("start", [(-3.0, 10.0), (10.0, 46.0), (np.nan, 10.0)])
 def test_alignment_outside_of_the_image_fails(start: tuple[float, float]) -> None:
-    templates, energy, _ = template_of(texture(), 20, 18)
-    zncc = align_patch(
-        texture().ravel(),
-        SIZE,
-        SIZE,
-        np.float32(start[0]),
-        np.float32(start[1]),
-        templates,
-        0,
-        energy,
-        5,
-        np.float32(4.0),
-    )[2]
-    assert zncc == -1.0
+    template, _ = template_of(texture(), 20, 18)
+    at = np.float32(start[0]), np.float32(start[1])
+    found = align_patch(pixels_of(texture()), *at, template, 5, np.float32(4.0))
+    assert found.zncc == -1.0

@@ -58,9 +58,7 @@ def sequence() -> list[U8]:
     [
         TrackingParameters(max_tracks=3000),
         TrackingParameters(max_tracks=3000, patch_refinement=False),
-        TrackingParameters(
-            max_tracks=3000, patch_refinement=False, local_flow=False, affine_refit=True
-        ),
+        TrackingParameters(max_tracks=3000, patch_refinement=False, local_flow=False),
     ],
 )
 def test_tracks_follow_the_known_motion(sequence: list[U8], parameters: TrackingParameters) -> None:

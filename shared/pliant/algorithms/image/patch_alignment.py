@@ -5,7 +5,7 @@ gain * template + offset, and both are projected out of the steepest-descent ima
 change of exposure moves nothing.  Pixels count by WINDOW, a Gaussian.
 """
 
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from pliant.algorithms.image.patch_sums import (
     tensor_sums,
     write_template,
 )
+from pliant.algorithms.image.pixels import Pixels
 from pliant.algorithms.kernel import leaf_kernel
 
 TEMPLATE_MARGIN = 1
@@ -25,35 +26,62 @@ MIN_ENERGY = np.float32(1e-3)
 MIN_STRENGTH = np.float32(1e-4)
 """DN^2: a patch with less than either has nothing to be placed by."""
 
-PatchTensor: TypeAlias = tuple[
-    np.float32,
-    np.float32,
-    np.float32,
-    np.float32,
-    np.float32,
-    np.float32,
-    np.float32,
-    np.float32,
-    np.float32,
-    np.float32,
-]
+
+class PatchTensor(NamedTuple):
+    """What there is to see in a patch.
+
+    level + mean: the mean grey level.  mean_x, mean_y: the mean gradient.  energy: the sum of
+    squares without the mean.  tx, ty: how much of the patch is in each gradient image, per unit of
+    it.  xx, xy, yy: the structure tensor without what offset and gain explain.
+    """
+
+    level: np.float32
+    mean: np.float32
+    mean_x: np.float32
+    mean_y: np.float32
+    energy: np.float32
+    tx: np.float32
+    ty: np.float32
+    xx: np.float32
+    xy: np.float32
+    yy: np.float32
+
+
+class Template(NamedTuple):
+    """One of many templates: values from ``offset`` on, and the energy of its patch."""
+
+    values: F32
+    offset: int
+    energy: np.float32
+
+
+class Alignment(NamedTuple):
+    """Where a patch is found.
+
+    u, v: of its first pixel.  zncc, residual: the correlation, and the RMS residual in grey levels
+    of the image, both *before* the last step.  step: length of that step, px.  zncc is -1 where
+    alignment fails: it left the image or its reach, or lost contrast.
+    """
+
+    u: np.float32
+    v: np.float32
+    zncc: np.float32
+    residual: np.float32
+    step: np.float32
 
 
 @leaf_kernel
-def patch_tensor(image: F32, width: int, left: int, top: int) -> PatchTensor:
-    """What there is to see in the patch whose first pixel is (left, top).
+def patch_tensor(image: Pixels, left: int, top: int) -> PatchTensor:
+    """The tensor of the patch whose first pixel is (left, top).
 
-    image: flat (H * W).  The patch and TEMPLATE_MARGIN must lie inside of the image.
-
-    Returns (level, mean, mean_x, mean_y, energy, tx, ty, xx, xy, yy).  level + mean is the mean
-    grey level; (mean_x, mean_y) the mean gradient; energy the sum of squares without the mean;
-    (tx, ty) how much of the patch is in each gradient image, per unit of it; the rest the
-    structure tensor without what offset and gain explain.
+    The patch and TEMPLATE_MARGIN must lie inside of the image.
     """
     n = np.float32(PATCH_PIXELS)
-    base = np.uint64(top * width + left)
-    level = image[(top + PATCH_SIZE // 2) * width + left + PATCH_SIZE // 2]
-    st, sx, sy, stt, stx, sty, sxx, sxy, syy = tensor_sums(image, base, np.uint64(width), level)
+    first = top * image.width + left
+    level = image.values[first + PATCH_SIZE // 2 * image.width + PATCH_SIZE // 2]
+    st, sx, sy, stt, stx, sty, sxx, sxy, syy = tensor_sums(
+        image.values, np.uint64(first), np.uint64(image.width), level
+    )
     mean, mean_x, mean_y = st / n, sx / n, sy / n
     energy = stt - st * mean
     # Orthogonal to the template, so that the gain moves nothing.
@@ -62,7 +90,7 @@ def patch_tensor(image: F32, width: int, left: int, top: int) -> PatchTensor:
     xx = sxx - sx * mean_x - tx * tx * energy
     xy = sxy - sx * mean_y - tx * ty * energy
     yy = syy - sy * mean_y - ty * ty * energy
-    return level, mean, mean_x, mean_y, energy, tx, ty, xx, xy, yy
+    return PatchTensor(level, mean, mean_x, mean_y, energy, tx, ty, xx, xy, yy)
 
 
 @leaf_kernel
@@ -71,43 +99,37 @@ def patch_strength(tensor: PatchTensor) -> tuple[np.float32, np.float32]:
 
     Strength 0: no use.
     """
-    energy, xx, xy, yy = tensor[4], tensor[7], tensor[8], tensor[9]
+    xx, xy, yy = tensor.xx, tensor.xy, tensor.yy
     half = np.float32(0.5)
     difference = np.sqrt((xx - yy) * (xx - yy) + np.float32(4.0) * xy * xy)
     smaller, larger = half * (xx + yy - difference), half * (xx + yy + difference)
     strength = smaller / np.float32(PATCH_PIXELS)
     determinant = xx * yy - xy * xy
-    if energy < MIN_ENERGY or strength < MIN_STRENGTH or determinant <= np.float32(0.0):
+    if tensor.energy < MIN_ENERGY or strength < MIN_STRENGTH or determinant <= np.float32(0.0):
         return np.float32(0.0), np.float32(0.0)
     return strength, smaller / larger
 
 
 @leaf_kernel
 def make_template(
-    image: F32,
-    width: int,
-    left: int,
-    top: int,
-    tensor: PatchTensor,
-    templates: F32,
-    offset: int,
+    image: Pixels, left: int, top: int, tensor: PatchTensor, templates: F32, offset: int
 ) -> None:
     """Make a template from the patch whose first pixel is (left, top).
 
     tensor: the patch's own, with a strength above 0.  templates: flat; written from ``offset``
     on: t0 with sum t0 v = gain, and t1, t2 with sum t v = gain * (displacement of the patch).
     """
-    level, mean, mean_x, mean_y, energy, tx, ty, xx, xy, yy = tensor
-    mean += level
+    mean, mean_x, mean_y = tensor.mean + tensor.level, tensor.mean_x, tensor.mean_y
+    tx, ty, xx, xy, yy = tensor.tx, tensor.ty, tensor.xx, tensor.xy, tensor.yy
     determinant = xx * yy - xy * xy
     # v = gain * (t - gradient . e) for a patch displaced by -e: minus the inverse of the tensor.
     ixx, ixy, iyy = -yy / determinant, xy / determinant, -xx / determinant
-    share = np.float32(1.0) / energy
+    share = np.float32(1.0) / tensor.energy
     of_u, of_v = ixx * tx + ixy * ty, ixy * tx + iyy * ty
     write_template(
-        image,
-        np.uint64(top * width + left),
-        np.uint64(width),
+        image.values,
+        np.uint64(top * image.width + left),
+        np.uint64(image.width),
         (
             -mean * share,
             share,
@@ -129,25 +151,17 @@ def make_template(
 
 @leaf_kernel
 def align_patch(
-    image: F32,
-    width: int,
-    height: int,
+    image: Pixels,
     u: np.float32,
     v: np.float32,
-    templates: F32,
-    offset: int,
-    energy: np.float32,
+    template: Template,
     iterations: int,
     reach: np.float32,
-) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32]:
+) -> Alignment:
     """Align a template with the image, from (u, v), where its first pixel is thought to be.
 
-    image: flat (H * W).  energy: of the template.  iterations: at most; it stops earlier once a
-    step is below 0.01 px.  reach: largest distance from the start, px.
-
-    Returns (u, v, zncc, residual, step): the place found, the correlation there and the RMS
-    residual in grey levels of the image, both *before* the last step, and the length of that
-    step, px.  zncc is -1 where alignment fails: it left the image or its reach, or lost contrast.
+    iterations: at most; it stops earlier once a step is below 0.01 px.  reach: largest distance
+    from the start, px.
     """
     n = np.float32(PATCH_PIXELS)
     failed = np.float32(-1.0)
@@ -158,24 +172,24 @@ def align_patch(
         inside = (
             u >= np.float32(0.0)
             and v >= np.float32(0.0)
-            and u < np.float32(width - PATCH_SIZE - 1)
-            and v < np.float32(height - PATCH_SIZE - 1)
+            and u < np.float32(image.width - PATCH_SIZE - 1)
+            and v < np.float32(image.height - PATCH_SIZE - 1)
         )
         if not inside:
-            return u, v, failed, zero, step
+            return Alignment(u, v, failed, zero, step)
         column, row = int(u), int(v)
         total, squares, gain, du, dv = patch_sums(
-            image,
-            np.uint64(row * width + column),
-            np.uint64(width),
+            image.values,
+            np.uint64(row * image.width + column),
+            np.uint64(image.width),
             u - np.float32(column),
             v - np.float32(row),
-            templates,
-            np.uint64(offset),
+            template.values,
+            np.uint64(template.offset),
         )
         variance = squares - total * total / n
         if gain <= np.float32(0.05) or gain >= np.float32(20.0) or variance <= np.float32(1e-3):
-            return u, v, failed, zero, step
+            return Alignment(u, v, failed, zero, step)
         du /= gain
         dv /= gain
         # A patch that is far off can throw a step out of its region of convergence.
@@ -187,9 +201,9 @@ def align_patch(
         v += dv
         away_u, away_v = u - start_u, v - start_v
         if not (away_u * away_u + away_v * away_v <= reach * reach):
-            return u, v, failed, zero, step
+            return Alignment(u, v, failed, zero, step)
         if step < np.float32(0.01):
             break
-    zncc = gain * np.sqrt(energy / variance)
-    residual = np.sqrt(max(variance - gain * gain * energy, zero) / n)
-    return u, v, zncc, residual, step
+    zncc = gain * np.sqrt(template.energy / variance)
+    residual = np.sqrt(max(variance - gain * gain * template.energy, zero) / n)
+    return Alignment(u, v, zncc, residual, step)

@@ -117,12 +117,10 @@ class WindowParameters(Parameters):
         default=4, ge=1, description="Iterations of Schur LM at a keyframe"
     )
     sweeps: int = Field(
-        default=2, ge=0, description="Subspace Gauss-Newton sweeps on every frame; 0 means none"
-    )
-    sweep_keyframes: int = Field(
-        default=0,
+        default=2,
         ge=0,
-        description="Newest keyframes that move in these sweeps; the paper lets all move",
+        description="Subspace Gauss-Newton sweeps on every frame, over its pose and the points "
+        "that it sees; 0 means none",
     )
     lens_radius: float = Field(
         default=0.25,

@@ -93,15 +93,14 @@ class Window:
     def sweep_current(self, camera: PinholeCamera, parameters: MappingParameters) -> F64:
         """A few subspace Gauss-Newton sweeps (Eq. 11-12) with the current frame.
 
-        The frame and the points that it sees move, and the newest keyframes where the parameters
-        say so.  Returns the pose of the frame.
+        The frame and the points that it sees move; the paper lets the keyframes move as well.
+        Returns the pose of the frame.
         """
         columns = seen_in_state(
             self.rows, self.points.state, MAPPED, self.seen, len(self.keyframes), 1
         )
         problem = self._problem(columns, camera)
-        first = len(self.keyframes) - parameters.window.sweep_keyframes
-        problem.fixed_cameras[: max(first, 0)] = True
+        problem.fixed_cameras[:-1] = True
         bundle = parameters.bundle.model_copy(update={"max_sweeps": parameters.window.sweeps})
         self._take(columns, solve_subspace(problem, bundle))
         return self.T_world_camera[-1].copy()

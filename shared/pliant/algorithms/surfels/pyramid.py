@@ -4,7 +4,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.image.downsampling import halve
+from pliant.algorithms.image.pixels import halve
 from pliant.algorithms.kernel import fast_kernel
 from pliant.algorithms.surfels.sampling import Level, make_level
 

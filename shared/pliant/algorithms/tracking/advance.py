@@ -1,350 +1,386 @@
-"""One step of every track to the next frame: predict, climb, check, refine (section 2.3)."""
+"""One step of every track to the next frame: predict, climb, check, refine (section 2.3).
+
+A template belongs to an octave: 0 is the full-size image, 1 half the size, where the same patch
+sees twice as far.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32
-from pliant.algorithms.image.patch_sums import (
-    PATCH_SIZE,
-    TEMPLATE_FLOATS,
-    prefetch_template,
+from pliant.algorithms.image.patch_alignment import (
+    Template,
+    align_patch,
+    make_template,
+    patch_strength,
+    patch_tensor,
 )
+from pliant.algorithms.image.patch_sums import PATCH_SIZE, TEMPLATE_FLOATS, prefetch_template
+from pliant.algorithms.image.pixels import Pixels
 from pliant.algorithms.image.vector_code import prefetch
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.tracking.climbing import climb
 from pliant.algorithms.tracking.curvature import CURVATURE_BORDER
-from pliant.algorithms.tracking.local_flow import flow_at
+from pliant.algorithms.tracking.local_flow import Flow, flow_at
 from pliant.algorithms.tracking.maxima import subpixel_offset
-from pliant.algorithms.tracking.patch_track import (
-    align_track,
-    leads_back,
-    renew_template,
-    to_octave,
-)
-from pliant.algorithms.tracking.step_limits import (
-    COAST_FRAMES,
-    COAST_GATE,
-    EXTREMUM_GATE,
-    MAX_CORRECTION,
-    MIN_CURVATURE,
-    MUTUAL_CHECK,
-    MUTUAL_GATE,
-    PATCH_REFINEMENT,
-    PREDICTION_SIGMA,
-    PREDICTION_WEIGHT,
-    REFRESH_ZNCC,
-    SUBPIXEL,
-)
-from pliant.algorithms.tracking.track_table import (
-    AGE,
-    ALIVE,
-    COASTED,
-    EXTREMUM_U,
-    EXTREMUM_V,
-    FLOATS,
-    INTS,
-    KAPPA,
-    LEFT,
-    MOTION_U,
-    MOTION_V,
-    OCTAVE,
-    PIXEL,
-    SLOT,
-    STATE,
-    TOP,
-    U,
-    V,
-)
+from pliant.algorithms.tracking.track_table import Track, Tracks
 from pliant.algorithms.tracks import COASTING, EXTREMUM
 
 AHEAD = 3
 """Tracks by which memory is asked for before it is read."""
 
+_COAST_ZNCC = np.float32(0.3)
+"""A patch with a small residual but less correlation than this has no contrast left."""
+
+_LEAST_GATE, _WIDEST_GATE = np.float32(0.25), np.float32(1.0)
+"""Pixels of the octave: bounds of the gate of the way back."""
+
+
+class FrameImages(NamedTuple):
+    """What a step reads of a frame: smoothed grey levels, at half size too, and the curvature."""
+
+    full: Pixels
+    half: Pixels
+    kappa: Pixels
+
+
+class StepLimits(NamedTuple):
+    """Limits and switches of a step: see the fields of TrackingParameters."""
+
+    prediction_weight: np.float32
+    prediction_sigma: np.float32
+    max_correction: np.float32
+    mutual_gate: np.float32
+    min_curvature: np.float32
+    min_zncc: np.float32
+    min_residual: np.float32
+    extremum_gate: np.float32
+    coast_gate: np.float32
+    backward_gate: np.float32
+    mutual_check: bool
+    subpixel: bool
+    patch_refinement: bool
+    patch_iterations: int
+    coast_frames: int
+
+
+class _Place(NamedTuple):
+    """Where a template is found: the point (u, v), and whether that is to be believed."""
+
+    u: np.float32
+    v: np.float32
+    accepted: bool
+
 
 @leaf_kernel
 def advance_tracks(
-    smooth_before: F32,
-    smooth: F32,
-    half_before: F32,
-    half: F32,
-    kappa_before: F32,
-    kappa: F32,
-    flow: F32,
-    affine: F32,
-    limits: F32,
-    switches: I32,
+    before: FrameImages,
+    now: FrameImages,
+    flow: Flow,
+    limits: StepLimits,
     order: I32,
     motions: F32,
-    floats: F32,
-    ints: I32,
+    tracks: Tracks,
     templates: F32,
     scratch: F32,
 ) -> None:
-    """Move rows of a track table on by one frame; ALIVE says which survive.
+    """Move tracks on by one frame; ``alive`` says which survive.
 
-    smooth_before, smooth, kappa_before, kappa: (H, W) of both frames; half_before, half: the
-    images at half size.  flow, affine: as in
-    ``flow_at``.  limits, switches: see the columns above.  order: the rows, from ``scan_order``.
-    motions: (len(order), 2) and scratch: (TEMPLATE_FLOATS), both overwritten.
+    order: the rows, from ``scan_order``.  motions: (len(order), 2) and scratch: (TEMPLATE_FLOATS),
+    both overwritten.
     """
-    height, width = kappa.shape
-    full_before, full = smooth_before.reshape(-1), smooth.reshape(-1)
-    coarse_before, coarse = half_before.reshape(-1), half.reshape(-1)
-    coarse_height, coarse_width = half.shape
-    k_before, k = kappa_before.reshape(-1), kappa.reshape(-1)
     count = len(order)
     for rank in range(count):
-        track = floats[order[rank]]
-        motions[rank, 0], motions[rank, 1] = flow_at(flow, affine, track[U], track[V])
+        track = tracks[order[rank]]
+        motions[rank, 0], motions[rank, 1] = flow_at(flow, track.u, track.v)
     for rank in range(count):
-        i = order[rank]
-        far = order[min(rank + 2 * AHEAD, count - 1)]
-        prefetch(floats.reshape(-1), far * FLOATS)
-        prefetch(ints.reshape(-1), far * INTS)
+        _prefetch_record(tracks, order[min(rank + 2 * AHEAD, count - 1)])
         ahead = min(rank + AHEAD, count - 1)
+        later = tracks[order[ahead]]
+        image = now.full if later.octave == 0 else now.half
         _prefetch_track(
-            full if ints[order[ahead], OCTAVE] == 0 else coarse,
-            width if ints[order[ahead], OCTAVE] == 0 else coarse_width,
-            k_before,
-            k,
-            width,
-            motions[ahead, 0],
-            motions[ahead, 1],
-            floats[order[ahead]],
-            ints[order[ahead]],
-            templates,
+            image, before.kappa, now.kappa, motions[ahead, 0], motions[ahead, 1], later, templates
         )
-        track, state = floats[i], ints[i]
-        state[AGE] += 1
+        track = tracks[order[rank]]
+        track.age += 1
         du, dv = motions[rank, 0], motions[rank, 1]
-        before_u, before_v = track[U], track[V]
-        pixel = _find_extremum(k_before, k, width, height, du, dv, limits, switches, track, state)
-        if switches[PATCH_REFINEMENT] != 0:
-            fine = state[OCTAVE] == 0
+        before_u, before_v = track.u, track.v
+        pixel = _find_extremum(before.kappa, now.kappa, du, dv, limits, track)
+        if limits.patch_refinement:
+            fine = track.octave == 0
             alive = _follow_patch(
-                full_before if fine else coarse_before,
-                full if fine else coarse,
-                width if fine else coarse_width,
-                height if fine else coarse_height,
-                k,
-                width,
-                height,
+                before.full if fine else before.half,
+                now.full if fine else now.half,
+                now.kappa,
                 pixel,
                 du,
                 dv,
                 limits,
-                switches,
                 track,
-                state,
                 templates,
                 scratch,
             )
         else:
             alive = pixel >= 0
             if alive:
-                _settle(k, width, pixel, switches[SUBPIXEL] != 0, track, state)
-                track[U], track[V] = track[EXTREMUM_U], track[EXTREMUM_V]
-        track[MOTION_U], track[MOTION_V] = track[U] - before_u, track[V] - before_v
-        state[ALIVE] = 1 if alive else 0
+                _settle(now.kappa, pixel, limits.subpixel, track)
+                track.u, track.v = track.extremum_u, track.extremum_v
+        track.motion_u, track.motion_v = track.u - before_u, track.v - before_v
+        track.alive = 1 if alive else 0
+
+
+@leaf_kernel
+def _prefetch_record(tracks: Tracks, row: int) -> None:
+    prefetch(tracks, row)
+    prefetch(tracks, row + 1)
 
 
 @leaf_kernel
 def _prefetch_track(
-    image: F32,
-    image_width: int,
-    kappa_before: F32,
-    kappa: F32,
-    width: int,
+    image: Pixels,
+    kappa_before: Pixels,
+    kappa: Pixels,
     du: np.float32,
     dv: np.float32,
-    track: F32,
-    state: I32,
+    track: Track,
     templates: F32,
 ) -> None:
     """Ask for all that a track is about to read: waiting for it takes longer than the work."""
-    prefetch_template(templates, state[SLOT] * TEMPLATE_FLOATS)
-    octave = state[OCTAVE]
-    left = int(to_octave(track[U] + du, octave) + track[LEFT])
-    top = int(to_octave(track[V] + dv, octave) + track[TOP])
+    prefetch_template(templates, track.slot * TEMPLATE_FLOATS)
+    left = int(to_octave(track.u + du, track.octave) + track.left)
+    top = int(to_octave(track.v + dv, track.octave) + track.top)
     for row in range(PATCH_SIZE + 1):
-        prefetch(image, (top + row) * image_width + left)
-        prefetch(image, (top + row) * image_width + left + PATCH_SIZE)
-    to = int(track[V] + dv) * width + int(track[U] + du)
-    at = int(track[EXTREMUM_V]) * width + int(track[EXTREMUM_U])
+        prefetch(image.values, (top + row) * image.width + left)
+        prefetch(image.values, (top + row) * image.width + left + PATCH_SIZE)
+    to = int(track.v + dv) * kappa.width + int(track.u + du)
+    at = int(track.extremum_v) * kappa.width + int(track.extremum_u)
     for row in range(-1, 3):
-        prefetch(kappa, to + row * width)
-        prefetch(kappa_before, at + row * width)
+        prefetch(kappa.values, to + row * kappa.width)
+        prefetch(kappa_before.values, at + row * kappa.width)
 
 
 @fast_kernel
-def scan_order(count: int, floats: F32, height: int) -> I32:
-    """Rows of a track table by bands of 8 image rows: neighbours share what is in cache."""
+def scan_order(tracks: Tracks, height: int) -> I32:
+    """Rows of tracks by bands of 8 image rows: neighbours share what is in cache."""
     bands = height // 8 + 1
     starts = np.zeros(bands + 1, np.int32)
-    order = np.empty(count, np.int32)
-    for i in range(count):
-        starts[min(max(int(floats[i, V]) >> 3, 0), bands - 1) + 1] += 1
+    order = np.empty(len(tracks), np.int32)
+    for i in range(len(tracks)):
+        starts[min(max(int(tracks[i].v) >> 3, 0), bands - 1) + 1] += 1
     for band in range(bands):
         starts[band + 1] += starts[band]
-    for i in range(count):
-        band = min(max(int(floats[i, V]) >> 3, 0), bands - 1)
+    for i in range(len(tracks)):
+        band = min(max(int(tracks[i].v) >> 3, 0), bands - 1)
         order[starts[band]] = i
         starts[band] += 1
     return order
 
 
 @leaf_kernel
-def extremum_position(
-    kappa: F32, width: int, pixel: int, subpixel: bool
-) -> tuple[np.float32, np.float32]:
+def to_octave(position: np.float32, octave: int) -> np.float32:
+    """A coordinate of the full-size image in the image of an octave."""
+    if octave == 0:
+        return position
+    half = np.float32(0.5)
+    return (position + half) * half - half
+
+
+@leaf_kernel
+def _from_octave(position: np.float32, octave: int) -> np.float32:
+    """A coordinate of the image of an octave in the full-size image."""
+    if octave == 0:
+        return position
+    half = np.float32(0.5)
+    return (position + half) * np.float32(2.0) - half
+
+
+@leaf_kernel
+def patch_origin(u: np.float32, v: np.float32) -> tuple[int, int]:
+    """First pixel of the patch whose centre is within half a pixel of a point."""
+    centre = np.float32(0.5 * (PATCH_SIZE - 2))
+    return int(np.floor(u - centre)), int(np.floor(v - centre))
+
+
+@leaf_kernel
+def patch_inside(image: Pixels, left: int, top: int) -> bool:
+    """Whether a patch and the margin of its gradients lie in the image."""
+    right, bottom = left + PATCH_SIZE + 1, top + PATCH_SIZE + 1
+    return left >= 1 and top >= 1 and right <= image.width and bottom <= image.height
+
+
+@leaf_kernel
+def _extremum_position(kappa: Pixels, pixel: int, subpixel: bool) -> tuple[np.float32, np.float32]:
     """Position of an extremum: of its pixel, or of the parabola around it."""
+    k, width = kappa.values, kappa.width
     x, y = pixel % width, pixel // width
     u, v = np.float32(x), np.float32(y)
     if subpixel:
-        u += subpixel_offset(kappa[pixel - 1], kappa[pixel], kappa[pixel + 1])
-        v += subpixel_offset(kappa[pixel - width], kappa[pixel], kappa[pixel + width])
+        u += subpixel_offset(k[pixel - 1], k[pixel], k[pixel + 1])
+        v += subpixel_offset(k[pixel - width], k[pixel], k[pixel + width])
     return u, v
 
 
 @leaf_kernel
-def _settle(kappa: F32, width: int, pixel: int, subpixel: bool, track: F32, state: I32) -> None:
+def _settle(kappa: Pixels, pixel: int, subpixel: bool, track: Track) -> None:
     """Put a track on an extremum of this frame."""
-    u, v = extremum_position(kappa, width, pixel, subpixel)
-    track[EXTREMUM_U], track[EXTREMUM_V] = u, v
-    track[KAPPA] = kappa[pixel]
-    state[PIXEL] = pixel
-    state[STATE] = EXTREMUM
-    state[COASTED] = 0
+    u, v = _extremum_position(kappa, pixel, subpixel)
+    track.extremum_u, track.extremum_v = u, v
+    track.kappa = kappa.values[pixel]
+    track.pixel = pixel
+    track.state = EXTREMUM
+    track.coasted = 0
 
 
 @leaf_kernel
 def _find_extremum(
-    kappa_before: F32,
-    kappa: F32,
-    width: int,
-    height: int,
+    kappa_before: Pixels,
+    kappa: Pixels,
     du: np.float32,
     dv: np.float32,
-    limits: F32,
-    switches: I32,
-    track: F32,
-    state: I32,
+    limits: StepLimits,
+    track: Track,
 ) -> int:
     """Climb from the prediction (Eq. 4-5), and back again.  Returns the pixel, or -1."""
-    sign = np.float32(1.0) if track[KAPPA] >= np.float32(0.0) else np.float32(-1.0)
-    weight = limits[PREDICTION_WEIGHT] * abs(track[KAPPA])
-    sigma = limits[PREDICTION_SIGMA]
+    sign = np.float32(1.0) if track.kappa >= np.float32(0.0) else np.float32(-1.0)
+    weight = limits.prediction_weight * abs(track.kappa)
+    sigma = limits.prediction_sigma
     # An extremum moves with the surface: from where it was, not from where the patch has put it.
-    from_u, from_v = track[U], track[V]
-    if state[PIXEL] >= 0:
-        from_u, from_v = track[EXTREMUM_U], track[EXTREMUM_V]
+    from_u, from_v = track.u, track.v
+    if track.pixel >= 0:
+        from_u, from_v = track.extremum_u, track.extremum_v
     u, v = from_u + du, from_v + dv
-    pixel = climb(kappa, width, height, u, v, sign, weight, sigma)
-    if pixel < 0 or sign * kappa[pixel] < limits[MIN_CURVATURE]:
+    pixel = climb(kappa, u, v, sign, weight, sigma)
+    if pixel < 0 or sign * kappa.values[pixel] < limits.min_curvature:
         return -1
-    off_u, off_v = np.float32(pixel % width) - u, np.float32(pixel // width) - v
-    if off_u * off_u + off_v * off_v > limits[MAX_CORRECTION] * limits[MAX_CORRECTION]:
+    off_u, off_v = np.float32(pixel % kappa.width) - u, np.float32(pixel // kappa.width) - v
+    if off_u * off_u + off_v * off_v > limits.max_correction * limits.max_correction:
         return -1
-    if switches[MUTUAL_CHECK] != 0 and state[PIXEL] >= 0:
-        subpixel = switches[SUBPIXEL] != 0
-        at_u, at_v = extremum_position(kappa, width, pixel, subpixel)
-        back = climb(kappa_before, width, height, at_u - du, at_v - dv, sign, weight, sigma)
+    if limits.mutual_check and track.pixel >= 0:
+        at_u, at_v = _extremum_position(kappa, pixel, limits.subpixel)
+        back = climb(kappa_before, at_u - du, at_v - dv, sign, weight, sigma)
         if back < 0:
             return -1
-        back_u, back_v = extremum_position(kappa_before, width, back, subpixel)
+        back_u, back_v = _extremum_position(kappa_before, back, limits.subpixel)
         off_u, off_v = back_u - from_u, back_v - from_v
-        if off_u * off_u + off_v * off_v > limits[MUTUAL_GATE] * limits[MUTUAL_GATE]:
+        if off_u * off_u + off_v * off_v > limits.mutual_gate * limits.mutual_gate:
             return -1
     return pixel
 
 
 @leaf_kernel
 def _follow_patch(
-    image_before: F32,
-    image: F32,
-    image_width: int,
-    image_height: int,
-    kappa: F32,
-    width: int,
-    height: int,
+    image_before: Pixels,
+    image: Pixels,
+    kappa: Pixels,
     pixel: int,
     du: np.float32,
     dv: np.float32,
-    limits: F32,
-    switches: I32,
-    track: F32,
-    state: I32,
+    limits: StepLimits,
+    track: Track,
     templates: F32,
     scratch: F32,
 ) -> bool:
     """Refine on the extremum, or coast from the prediction where there is none."""
-    u, v = track[U], track[V]
-    subpixel = switches[SUBPIXEL] != 0
-    accepted = False
+    u, v = track.u, track.v
+    place = _Place(u, v, False)
     on_extremum = False
-    to_u, to_v, zncc = u, v, np.float32(-1.0)
     if pixel >= 0:
-        start_u, start_v = extremum_position(kappa, width, pixel, subpixel)
-        if state[PIXEL] >= 0:
-            start_u, start_v = u + (start_u - track[EXTREMUM_U]), v + (start_v - track[EXTREMUM_V])
-        to_u, to_v, zncc, accepted = align_track(
-            image,
-            image_width,
-            image_height,
-            start_u,
-            start_v,
-            limits[MAX_CORRECTION],
-            limits,
-            switches,
-            track,
-            state,
-            templates,
+        start_u, start_v = _extremum_position(kappa, pixel, limits.subpixel)
+        if track.pixel >= 0:
+            start_u, start_v = u + (start_u - track.extremum_u), v + (start_v - track.extremum_v)
+        place = _align_track(
+            image, start_u, start_v, limits.max_correction, limits, track, templates
         )
-        off_u, off_v = to_u - start_u, to_v - start_v
-        gate = limits[EXTREMUM_GATE]
-        on_extremum = off_u * off_u + off_v * off_v < gate * gate
-        accepted = accepted and on_extremum
-    if not accepted:
-        on_extremum = False
-        if state[COASTED] >= switches[COAST_FRAMES]:
+        off_u, off_v = place.u - start_u, place.v - start_v
+        gate = limits.extremum_gate
+        on_extremum = place.accepted and off_u * off_u + off_v * off_v < gate * gate
+    if not on_extremum:
+        if track.coasted >= limits.coast_frames:
             return False
-        to_u, to_v, zncc, accepted = align_track(
-            image,
-            image_width,
-            image_height,
-            u + du,
-            v + dv,
-            limits[COAST_GATE],
-            limits,
-            switches,
-            track,
-            state,
-            templates,
-        )
-        accepted = accepted and leads_back(
-            image_before,
-            image,
-            image_width,
-            image_height,
-            to_u,
-            to_v,
-            limits,
-            switches,
-            track,
-            state,
-            scratch,
-        )
-    if not accepted:
-        return False
-    track[U], track[V] = to_u, to_v
+        place = _align_track(image, u + du, v + dv, limits.coast_gate, limits, track, templates)
+        if not place.accepted or not _leads_back(
+            image_before, image, place.u, place.v, limits, track, scratch
+        ):
+            return False
+    track.u, track.v = place.u, place.v
     if on_extremum:
-        _settle(kappa, width, pixel, subpixel, track, state)
+        _settle(kappa, pixel, limits.subpixel, track)
     else:
-        state[PIXEL] = -1
-        state[STATE] = COASTING
-        state[COASTED] += 1
-    if zncc < limits[REFRESH_ZNCC] and on_extremum:
-        renew_template(image, image_width, image_height, limits, track, state, templates, scratch)
+        track.pixel = -1
+        track.state = COASTING
+        track.coasted += 1
     border = np.float32(CURVATURE_BORDER)
-    if to_u < border or to_v < border:
+    if place.u < border or place.v < border:
         return False
-    return bool(to_u < np.float32(width) - border) and bool(to_v < np.float32(height) - border)
+    right, bottom = np.float32(kappa.width) - border, np.float32(kappa.height) - border
+    return bool(place.u < right) and bool(place.v < bottom)
+
+
+@leaf_kernel
+def _align_track(
+    image: Pixels,
+    start_u: np.float32,
+    start_v: np.float32,
+    reach: np.float32,
+    limits: StepLimits,
+    track: Track,
+    templates: F32,
+) -> _Place:
+    """Align the template of a track from a place of the full-size image, and judge it."""
+    octave = track.octave
+    scale = np.float32(1.0) if octave == 0 else np.float32(0.5)
+    found = align_patch(
+        image,
+        to_octave(start_u, octave) + track.left,
+        to_octave(start_v, octave) + track.top,
+        Template(templates, track.slot * TEMPLATE_FLOATS, track.energy),
+        limits.patch_iterations,
+        reach * scale,
+    )
+    u, v = _from_octave(found.u - track.left, octave), _from_octave(found.v - track.top, octave)
+    accepted = found.zncc >= _COAST_ZNCC and found.step <= np.float32(0.5)
+    fits = found.zncc > limits.min_zncc or found.residual < limits.min_residual
+    return _Place(u, v, accepted and fits)
+
+
+@leaf_kernel
+def _leads_back(
+    image_before: Pixels,
+    image: Pixels,
+    u: np.float32,
+    v: np.float32,
+    limits: StepLimits,
+    track: Track,
+    scratch: F32,
+) -> bool:
+    """Whether the patch seen now at (u, v) is found again where the track was."""
+    octave = track.octave
+    at_u, at_v = to_octave(u, octave), to_octave(v, octave)
+    left, top = patch_origin(at_u, at_v)
+    if not patch_inside(image, left, top):
+        return False
+    tensor = patch_tensor(image, left, top)
+    strength, _ = patch_strength(tensor)
+    if strength <= np.float32(0.0):
+        return False
+    make_template(image, left, top, tensor, scratch, 0)
+    from_u = to_octave(track.u, octave) + (np.float32(left) - at_u)
+    from_v = to_octave(track.v, octave) + (np.float32(top) - at_v)
+    # As the noise of a patch: what is sharp has to come back exactly.
+    gate = limits.backward_gate / np.sqrt(strength)
+    gate = min(max(gate, _LEAST_GATE), _WIDEST_GATE)
+    if octave != 0:
+        gate *= np.float32(0.6)
+    back = align_patch(
+        image_before,
+        from_u,
+        from_v,
+        Template(scratch, np.int64(0), tensor.energy),
+        limits.patch_iterations,
+        np.float32(2.0) * gate,
+    )
+    off_u, off_v = back.u - from_u, back.v - from_v
+    if back.zncc <= np.float32(0.0):
+        return False
+    return bool(off_u * off_u + off_v * off_v < gate * gate)

@@ -7,7 +7,7 @@ over neighbouring cells is exact to about 0.1 % a frame, far better than one pat
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, I32
+from pliant.algorithms.arrays import F32, I32, BoolArray
 from pliant.algorithms.image.patch_alignment import make_template, patch_strength, patch_tensor
 from pliant.algorithms.image.patch_sums import (
     BIRTH_FLOATS,
@@ -16,19 +16,11 @@ from pliant.algorithms.image.patch_sums import (
     PATCH_SIZE,
     TEMPLATE_FLOATS,
 )
+from pliant.algorithms.image.pixels import Pixels
 from pliant.algorithms.image.vector_code import CACHE_LINE_FLOATS, prefetch
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
-from pliant.algorithms.tracking.local_flow import CELL_PX, agree, grid_shape
-from pliant.algorithms.tracking.track_table import (
-    ENERGY,
-    LEFT,
-    MOTION_U,
-    MOTION_V,
-    SLOT,
-    TOP,
-    U,
-    V,
-)
+from pliant.algorithms.tracking.local_flow import CELL_PX, fit_planes, grid_shape
+from pliant.algorithms.tracking.track_table import Patches, Track, Tracks
 
 WINDOW_SIDE = PATCH_SIZE + 2
 """Of the samples of a patch with the margin of its gradients."""
@@ -46,7 +38,7 @@ MAX_GROWTH, MIN_GROWTH = np.float32(4.0), np.float32(0.4)
 """Of the area, beyond which what was kept from the birth says too little."""
 
 
-def slopes_of_motion(count: int, floats: F32, affine: F32, height: int, width: int) -> F32:
+def slopes_of_motion(tracks: Tracks, affine: F32, height: int, width: int) -> F32:
     """Slope of the tracks' motion in each cell of the grid of local flow.
 
     affine: six numbers of [A | b], the dominant flow.  Returns (rows, columns, 4) float32
@@ -57,19 +49,17 @@ def slopes_of_motion(count: int, floats: F32, affine: F32, height: int, width: i
     points = np.zeros((rows, columns, 3), np.float32)
     found = np.zeros((rows, columns), np.bool_)
     slopes = np.zeros((rows, columns, 4), np.float32)
-    _mean_motion(count, floats, affine, motion, points, found)
-    agree(motion, found, points, AGREEMENT_PX, slopes)
+    _mean_motion(tracks, affine, motion, points, found)
+    fit_planes(motion, found, points, AGREEMENT_PX, slopes)
     return slopes
 
 
 @fast_kernel
-def _mean_motion(
-    count: int, floats: F32, affine: F32, motion: F32, points: F32, found: np.ndarray
-) -> None:
+def _mean_motion(tracks: Tracks, affine: F32, motion: F32, points: F32, found: BoolArray) -> None:
     rows, columns = found.shape
-    for i in range(count):
-        du, dv = floats[i, MOTION_U], floats[i, MOTION_V]
-        u, v = floats[i, U] - du, floats[i, V] - dv
+    for i in range(len(tracks)):
+        du, dv = tracks[i].motion_u, tracks[i].motion_v
+        u, v = tracks[i].u - du, tracks[i].v - dv
         row = min(max(int(v) // CELL_PX, 0), rows - 1)
         column = min(max(int(u) // CELL_PX, 0), columns - 1)
         motion[row, column, 0] += du - (affine[0] * u + affine[1] * v + affine[2] - u)
@@ -90,57 +80,47 @@ def _mean_motion(
 
 @leaf_kernel
 def turn_templates(
-    count: int,
-    floats: F32,
-    ints: I32,
-    slopes: F32,
-    affine: F32,
-    births: F32,
-    deformations: F32,
-    templates: F32,
-    window: F32,
-    rows: I32,
+    tracks: Tracks, slopes: F32, affine: F32, patches: Patches, window: Pixels, lagging: I32
 ) -> None:
     """Carry every track's deformation on by one frame, and make anew the templates that lag.
 
-    slopes: from ``slopes_of_motion``.  births, deformations, templates: of the track table.
-    window, rows: scratch for WINDOW_SIDE^2 samples, and for count rows.
+    slopes: from ``slopes_of_motion``.  window, lagging: scratch for WINDOW_SIDE x WINDOW_SIDE
+    samples, and for as many rows as there are tracks.
     """
-    turned = _deform(count, floats, ints, slopes, affine, deformations, rows)
+    births, templates = patches.births, patches.templates
+    turned = _deform(tracks, slopes, affine, patches.deformations, lagging)
     for rank in range(turned):
         # What was kept of births is too much for the cache: ask for it before it is needed.
-        ahead = ints[rows[min(rank + AHEAD, turned - 1)], SLOT] * BIRTH_FLOATS
+        ahead = tracks[lagging[min(rank + AHEAD, turned - 1)]].slot * BIRTH_FLOATS
         for start in range(0, BIRTH_FLOATS, CACHE_LINE_FLOATS):
             prefetch(births, ahead + start)
-        i = rows[rank]
-        slot = ints[i, SLOT]
-        m = deformations[slot]
-        sample_birth(births, slot * BIRTH_FLOATS, floats[i], m, window)
-        tensor = patch_tensor(window, WINDOW_SIDE, 1, 1)
+        track = tracks[lagging[rank]]
+        m = patches.deformations[track.slot]
+        sample_birth(births, track.slot * BIRTH_FLOATS, track, m, window.values)
+        tensor = patch_tensor(window, 1, 1)
         if patch_strength(tensor)[0] <= np.float32(0.0):
             continue
-        make_template(window, WINDOW_SIDE, 1, 1, tensor, templates, slot * TEMPLATE_FLOATS)
-        floats[i, ENERGY] = tensor[4]
+        make_template(window, 1, 1, tensor, templates, track.slot * TEMPLATE_FLOATS)
+        track.energy = tensor.energy
         m[4], m[5], m[6], m[7] = m[0], m[1], m[2], m[3]
 
 
 @leaf_kernel
-def _deform(
-    count: int, floats: F32, ints: I32, slopes: F32, affine: F32, deformations: F32, lagging: I32
-) -> int:
+def _deform(tracks: Tracks, slopes: F32, affine: F32, deformations: F32, lagging: I32) -> int:
     """Carry the deformations on.  Writes the rows whose template lags; returns their number."""
     rows, columns = slopes.shape[0], slopes.shape[1]
     lags = 0
-    for i in range(count):
-        prefetch(deformations.reshape(-1), ints[min(i + 4 * AHEAD, count - 1), SLOT] * 8)
-        row = min(max(int(floats[i, V]) // CELL_PX, 0), rows - 1)
-        column = min(max(int(floats[i, U]) // CELL_PX, 0), columns - 1)
+    for i in range(len(tracks)):
+        track = tracks[i]
+        prefetch(deformations.reshape(-1), tracks[min(i + 4 * AHEAD, len(tracks) - 1)].slot * 8)
+        row = min(max(int(track.v) // CELL_PX, 0), rows - 1)
+        column = min(max(int(track.u) // CELL_PX, 0), columns - 1)
         slope = slopes[row, column]
         a = affine[0] + min(max(slope[0], -MAX_SLOPE), MAX_SLOPE)
         b = affine[1] + min(max(slope[1], -MAX_SLOPE), MAX_SLOPE)
         c = affine[3] + min(max(slope[2], -MAX_SLOPE), MAX_SLOPE)
         d = affine[4] + min(max(slope[3], -MAX_SLOPE), MAX_SLOPE)
-        m = deformations[ints[i, SLOT]]
+        m = deformations[track.slot]
         m00, m01 = a * m[0] + b * m[2], a * m[1] + b * m[3]
         m10, m11 = c * m[0] + d * m[2], c * m[1] + d * m[3]
         m[0], m[1], m[2], m[3] = m00, m01, m10, m11
@@ -153,7 +133,7 @@ def _deform(
 
 
 @leaf_kernel
-def sample_birth(births: F32, offset: int, track: F32, m: F32, window: F32) -> None:
+def sample_birth(births: F32, offset: int, track: Track, m: F32, window: F32) -> None:
     """Sample what was kept of a birth as a deformation m = [m00 m01 m10 m11] shows it now.
 
     window: WINDOW_SIDE^2, the patch with a margin of one pixel.  Beyond what was kept its
@@ -161,10 +141,10 @@ def sample_birth(births: F32, offset: int, track: F32, m: F32, window: F32) -> N
     """
     scale = np.float32(1.0) / (m[0] * m[3] - m[1] * m[2])
     i00, i01, i10, i11 = m[3] * scale, -m[1] * scale, -m[2] * scale, m[0] * scale
-    first_x, first_y = track[LEFT] - np.float32(1.0), track[TOP] - np.float32(1.0)
+    first_x, first_y = track.left - np.float32(1.0), track.top - np.float32(1.0)
     margin = np.float32(BIRTH_MARGIN)
-    first_u = margin - track[LEFT] + i00 * first_x + i01 * first_y
-    first_v = margin - track[TOP] + i10 * first_x + i11 * first_y
+    first_u = margin - track.left + i00 * first_x + i01 * first_y
+    first_v = margin - track.top + i10 * first_x + i11 * first_y
     reach = np.float32(WINDOW_SIDE - 1)
     zero, limit = np.float32(0.0), np.float32(BIRTH_SIZE) - np.float32(1.01)
     # The extremes of a linear map lie at corners; most windows need no clamping.
@@ -202,12 +182,10 @@ def _blend(births: F32, start: np.uint64, u: np.float32, v: np.float32) -> np.fl
 
 
 @leaf_kernel
-def keep_birth(
-    image: F32, width: int, height: int, left: int, top: int, births: F32, offset: int
-) -> None:
+def keep_birth(image: Pixels, left: int, top: int, births: F32, offset: int) -> None:
     """Keep the surroundings of a new patch; beyond the image its edge goes on."""
     for row in range(BIRTH_SIZE):
-        y = min(max(top + row - BIRTH_MARGIN, 0), height - 1)
+        y = min(max(top + row - BIRTH_MARGIN, 0), image.height - 1)
         for column in range(BIRTH_SIZE):
-            x = min(max(left + column - BIRTH_MARGIN, 0), width - 1)
-            births[offset + row * BIRTH_SIZE + column] = image[y * width + x]
+            x = min(max(left + column - BIRTH_MARGIN, 0), image.width - 1)
+            births[offset + row * BIRTH_SIZE + column] = image.values[y * image.width + x]

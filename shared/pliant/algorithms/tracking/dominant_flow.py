@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F32, F64, Shape
-from pliant.algorithms.image.downsampling import shrink
+from pliant.algorithms.image.pixels import shrink
 from pliant.algorithms.image.vector_code import count_bits
 from pliant.algorithms.kernel import fast_kernel
 from pliant.algorithms.tracking.maxima import curvature_and_maxima

@@ -5,16 +5,20 @@ half of the size; after each level a plane through each cell and its neighbours 
 from the patch to the centre of the cell, and mends cells that failed or stand alone.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64
+from pliant.algorithms.arrays import F32, BoolArray
 from pliant.algorithms.image.patch_alignment import (
+    Template,
     align_patch,
     make_template,
     patch_strength,
     patch_tensor,
 )
 from pliant.algorithms.image.patch_sums import PATCH_SIZE, TEMPLATE_FLOATS
+from pliant.algorithms.image.pixels import Pixels, pixels_of
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 
 CELL_PX = 20
@@ -34,51 +38,56 @@ def grid_shape(width: int, height: int) -> tuple[int, int]:
     return -(-height // CELL_PX), -(-width // CELL_PX)
 
 
+class Flow(NamedTuple):
+    """The dominant flow and what remains of the local flow without it.
+
+    grid: (rows, columns, 2) full-size pixels, at cell centres.  affine: six numbers of [A | b].
+    """
+
+    grid: F32
+    affine: F32
+
+
+class _Cells(NamedTuple):
+    """points: (rows, columns, 3) (u, v, |kappa|) of each cell's strongest extremum, 0 where there
+    is none.  hint: a second flow to begin with.  coarser: the flow of the level before.
+    """
+
+    points: F32
+    hint: F32
+    coarser: Flow
+
+
 def local_flow(
-    previous: list[F32], current: list[F32], maxima: F32, dominant_flow: F64, hint: F32
-) -> F32:
+    previous: list[F32], current: list[F32], maxima: F32, affine: F32, hint: F32
+) -> Flow:
     """Estimate the flow that remains when the dominant flow is taken away.
 
     previous, current: images at 1/2, 1/4 and 1/8 of the size.  maxima: (M, 3) rows
     (u, v, kappa) of the previous frame: the strongest of each cell is followed.
-    dominant_flow: (2, 3) [A | b].  hint: (rows, columns, 2) a second place to begin at (the flow
-    of the frame before).  Returns (rows, columns, 2) float32, full-size pixels, at cell centres.
+    affine: six numbers of the dominant flow.  hint: (rows, columns, 2) a second place to begin at
+    (the flow of the frame before).
     """
     rows, columns = hint.shape[:2]
     points = np.zeros((rows, columns, 3), np.float32)
     _strongest_of_cells(maxima, points)
-    flow = np.zeros_like(hint)
-    affine = dominant_flow.astype(np.float32).ravel()
+    grid = np.zeros_like(hint)
     slopes = np.zeros((rows, columns, 4), np.float32)
     template = np.empty(TEMPLATE_FLOATS, np.float32)
     for octave in range(COARSEST, 0, -1):
-        height, width = previous[octave - 1].shape
         found = np.zeros((rows, columns), np.bool_)
-        _align_cells(
-            previous[octave - 1].reshape(-1),
-            current[octave - 1].reshape(-1),
-            width,
-            height,
-            octave,
-            points,
-            affine,
-            hint,
-            flow.copy(),
-            flow,
-            found,
-            template,
-        )
-        flow = agree(flow, found, points, AGREEMENT_PX * np.float32(1 << octave), slopes)
-    return flow
+        cells = _Cells(points, hint, Flow(grid.copy(), affine))
+        before, now = pixels_of(previous[octave - 1]), pixels_of(current[octave - 1])
+        _align_cells(before, now, octave, cells, grid, found, template)
+        grid = fit_planes(grid, found, points, AGREEMENT_PX * np.float32(1 << octave), slopes)
+    return Flow(grid, affine)
 
 
 @leaf_kernel
-def flow_at(flow: F32, affine: F32, u: np.float32, v: np.float32) -> tuple[np.float32, np.float32]:
-    """Displacement of a pixel: the dominant flow plus the grid's bilinear correction.
-
-    affine: the six numbers of [A | b].
-    """
-    rows, columns = flow.shape[0], flow.shape[1]
+def flow_at(flow: Flow, u: np.float32, v: np.float32) -> tuple[np.float32, np.float32]:
+    """Displacement of a pixel: the dominant flow plus the grid's bilinear correction."""
+    grid, affine = flow.grid, flow.affine
+    rows, columns = grid.shape[0], grid.shape[1]
     cell = np.float32(1.0 / CELL_PX)
     half = np.float32(0.5)
     x = min(max(u * cell - half, np.float32(0.0)), np.float32(columns - 1))
@@ -88,8 +97,8 @@ def flow_at(flow: F32, affine: F32, u: np.float32, v: np.float32) -> tuple[np.fl
     fx, fy = x - np.float32(c), y - np.float32(r)
     gx, gy = np.float32(1.0) - fx, np.float32(1.0) - fy
     w00, w01, w10, w11 = gx * gy, fx * gy, gx * fy, fx * fy
-    du = w00 * flow[r, c, 0] + w01 * flow[r, c1, 0] + w10 * flow[r1, c, 0] + w11 * flow[r1, c1, 0]
-    dv = w00 * flow[r, c, 1] + w01 * flow[r, c1, 1] + w10 * flow[r1, c, 1] + w11 * flow[r1, c1, 1]
+    du = w00 * grid[r, c, 0] + w01 * grid[r, c1, 0] + w10 * grid[r1, c, 0] + w11 * grid[r1, c1, 0]
+    dv = w00 * grid[r, c, 1] + w01 * grid[r, c1, 1] + w10 * grid[r1, c, 1] + w11 * grid[r1, c1, 1]
     du += affine[0] * u + affine[1] * v + affine[2] - u
     dv += affine[3] * u + affine[4] * v + affine[5] - v
     return du, dv
@@ -108,38 +117,34 @@ def _strongest_of_cells(maxima: F32, points: F32) -> None:
 
 @leaf_kernel
 def _align_cells(
-    previous: F32,
-    current: F32,
-    width: int,
-    height: int,
+    previous: Pixels,
+    current: Pixels,
     octave: int,
-    points: F32,
-    affine: F32,
-    hint: F32,
-    coarser: F32,
-    flow: F32,
-    found: np.ndarray,
+    cells: _Cells,
+    grid: F32,
+    found: BoolArray,
     template: F32,
 ) -> None:
-    rows, columns = flow.shape[0], flow.shape[1]
+    """Write the flow of every cell whose patch is found.  template: scratch."""
+    affine, points = cells.coarser.affine, cells.points
     scale = np.float32(1.0) / np.float32(1 << octave)
     half = np.float32(0.5)
     centre = np.float32(0.5 * (PATCH_SIZE - 1))
-    for row in range(rows):
-        for column in range(columns):
+    for row in range(grid.shape[0]):
+        for column in range(grid.shape[1]):
             if points[row, column, 2] == np.float32(0.0):
                 continue
             u, v = points[row, column, 0], points[row, column, 1]
             left = int(np.floor((u + half) * scale - half - centre + half))
             top = int(np.floor((v + half) * scale - half - centre + half))
-            if left < 1 or top < 1 or left > width - PATCH_SIZE - 1:
+            if left < 1 or top < 1 or left > previous.width - PATCH_SIZE - 1:
                 continue
-            if top > height - PATCH_SIZE - 1:
+            if top > previous.height - PATCH_SIZE - 1:
                 continue
-            tensor = patch_tensor(previous, width, left, top)
+            tensor = patch_tensor(previous, left, top)
             if patch_strength(tensor)[0] < MIN_STRENGTH:
                 continue
-            make_template(previous, width, left, top, tensor, template, 0)
+            make_template(previous, left, top, tensor, template, 0)
             base_u = affine[0] * u + affine[1] * v + affine[2] - u
             base_v = affine[3] * u + affine[4] * v + affine[5] - v
             best = MIN_ZNCC
@@ -147,42 +152,38 @@ def _align_cells(
             for attempt in range(4):
                 # What is known of this cell, then its neighbours, then the second hint.
                 if attempt == 0:
-                    guess_u, guess_v = flow_at(coarser, affine, u, v)
+                    guess_u, guess_v = flow_at(cells.coarser, u, v)
                     guess_u -= base_u
                     guess_v -= base_v
                 elif attempt == 1 and column > 0 and found[row, column - 1]:
-                    guess_u, guess_v = flow[row, column - 1, 0], flow[row, column - 1, 1]
+                    guess_u, guess_v = grid[row, column - 1, 0], grid[row, column - 1, 1]
                 elif attempt == 2 and row > 0 and found[row - 1, column]:
-                    guess_u, guess_v = flow[row - 1, column, 0], flow[row - 1, column, 1]
+                    guess_u, guess_v = grid[row - 1, column, 0], grid[row - 1, column, 1]
                 elif attempt == 3:
-                    guess_u, guess_v = hint[row, column, 0], hint[row, column, 1]
+                    guess_u, guess_v = cells.hint[row, column, 0], cells.hint[row, column, 1]
                 else:
                     continue
-                to_u, to_v, zncc, _, step = align_patch(
+                to = align_patch(
                     current,
-                    width,
-                    height,
                     np.float32(left) + (base_u + guess_u) * scale,
                     np.float32(top) + (base_v + guess_v) * scale,
-                    template,
-                    0,
-                    tensor[4],
+                    Template(template, np.int64(0), tensor.energy),
                     8,
                     np.float32(4.0),
                 )
-                if zncc > best and step < half:
-                    best = zncc
-                    best_u = (to_u - np.float32(left)) / scale - base_u
-                    best_v = (to_v - np.float32(top)) / scale - base_v
+                if to.zncc > best and to.step < half:
+                    best = to.zncc
+                    best_u = (to.u - np.float32(left)) / scale - base_u
+                    best_v = (to.v - np.float32(top)) / scale - base_v
                     found[row, column] = True
                 if best > np.float32(0.9):
                     break
             if found[row, column]:
-                flow[row, column, 0] = best_u
-                flow[row, column, 1] = best_v
+                grid[row, column, 0] = best_u
+                grid[row, column, 1] = best_v
 
 
-def agree(flow: F32, found: np.ndarray, points: F32, tolerance: np.float32, slopes: F32) -> F32:
+def fit_planes(flow: F32, found: BoolArray, points: F32, tolerance: np.float32, slopes: F32) -> F32:
     """Move the flow of each cell from its patch to its centre, in agreement with its neighbours.
 
     A plane is fitted to the flow of the 3x3 cells around, with Geman-McClure weights of their
@@ -191,14 +192,14 @@ def agree(flow: F32, found: np.ndarray, points: F32, tolerance: np.float32, slop
     [du/dx, du/dy, dv/dx, dv/dy] of the planes; 0 where there is none.
     """
     agreed = flow.copy()
-    _agree(flow, found, points, tolerance, slopes, agreed, np.empty((2, 9), np.float32))
+    _fit_planes(flow, found, points, tolerance, slopes, agreed, np.empty((2, 9), np.float32))
     return agreed
 
 
 @leaf_kernel
-def _agree(
+def _fit_planes(
     flow: F32,
-    found: np.ndarray,
+    found: BoolArray,
     points: F32,
     tolerance: np.float32,
     slopes: F32,

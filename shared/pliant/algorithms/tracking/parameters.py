@@ -62,9 +62,6 @@ class TrackingParameters(Parameters):
         default=True,
         description="Predict with a coarse-to-fine grid of local flow, not an affine alone.",
     )
-    affine_refit: bool = Field(
-        default=False, description="Fit the affine again to tracks that climbed with the first fit."
-    )
     deduplicate: bool = Field(
         default=True, description="Of tracks that run together (within 1 px) keep the oldest."
     )
@@ -86,13 +83,6 @@ class TrackingParameters(Parameters):
         ge=-1.0,
         le=1.0,
         description="A patch that correlates less has lost its point.",
-    )
-    refresh_zncc: float = Field(
-        default=0.0,
-        ge=-1.0,
-        le=1.0,
-        description="A patch that correlates less is taken anew, on an extremum.  0: never; more "
-        "lets tracks live on as they change their scale, and some slide along contours.",
     )
     min_residual: float = Field(
         default=1.5,

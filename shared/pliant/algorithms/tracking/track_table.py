@@ -1,50 +1,77 @@
-"""The living tracks of the tracker as columns of two arrays, and their templates."""
+"""The living tracks of the tracker, a record for each, and their templates."""
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pliant.algorithms.arrays import F32, I32, I64
+from pliant.algorithms.arrays import F32, I32
 from pliant.algorithms.image.patch_sums import BIRTH_FLOATS, TEMPLATE_FLOATS
 
-U, V = 0, 1
-"""Sub-pixel position of the point."""
-EXTREMUM_U, EXTREMUM_V = 2, 3
-"""Sub-pixel position of the last extremum."""
-KAPPA = 4
-"""Curvature at the last extremum, signed, DN^3."""
-LEFT, TOP = 5, 6
-"""First pixel of the template relative to the point, pixels of its octave."""
-ENERGY = 7
-"""Of the template; 0: there is none."""
-MOTION_U, MOTION_V = 8, 9
-"""From the frame before to this one."""
-FLOATS = 10
+TRACK = np.dtype(
+    [
+        ("id", np.int64),
+        # Sub-pixel position of the point, and of the last extremum.
+        ("u", np.float32),
+        ("v", np.float32),
+        ("extremum_u", np.float32),
+        ("extremum_v", np.float32),
+        # Curvature at the last extremum, signed, DN^3.
+        ("kappa", np.float32),
+        # First pixel of the template relative to the point, pixels of its octave.
+        ("left", np.float32),
+        ("top", np.float32),
+        # Of the template; 0: there is none.
+        ("energy", np.float32),
+        # From the frame before to this one.
+        ("motion_u", np.float32),
+        ("motion_v", np.float32),
+        ("age", np.int32),
+        ("state", np.int32),
+        # Frames in a row without an extremum.
+        ("coasted", np.int32),
+        # Flat pixel of the extremum in this frame, or -1.
+        ("pixel", np.int32),
+        # Row of the template.
+        ("slot", np.int32),
+        ("alive", np.int32),
+        # 0 for a template of the full-size image, 1 of half the size.
+        ("octave", np.int32),
+    ]
+)
+"""A track.  All that a step needs of one lies together in memory."""
 
-AGE, STATE, COASTED, PIXEL, SLOT, ALIVE, OCTAVE = 0, 1, 2, 3, 4, 5, 6
-"""Age; state; frames coasted; flat pixel of the extremum in this frame or -1; row of the template;
-1 or 0; 0 for a template of the full-size image, 1 of half the size."""
-INTS = 7
+Track: TypeAlias = Any
+"""A record of type TRACK."""
+Tracks: TypeAlias = NDArray[Any]
+"""(N,) records of type TRACK."""
+
+
+class Patches(NamedTuple):
+    """What tracks look like, by the slot of a track.
+
+    templates: flat, TEMPLATE_FLOATS each.  births: flat, BIRTH_FLOATS grey levels around the patch
+    in the frame of birth.  deformations: (capacity, 8), the 2x2 map from then to now, and the one
+    that the template was made with.
+    """
+
+    templates: F32
+    births: F32
+    deformations: F32
 
 
 @dataclass
 class TrackTable:
     """Tracks in order of their ids, in the first ``count`` rows.
 
-    Templates stay where they are while rows move up: a row names its template by SLOT, and
-    free_slots[:free_count] are the unused ones.  By slot too: births, BIRTH_FLOATS grey levels
-    around the patch in the frame of birth; deformations, (capacity, 8), the 2x2 map from then to
-    now, and the one that the template was made with.
+    Patches stay where they are while rows move up; free_slots[:free_count] are the unused ones.
     """
 
     count: int
     free_count: int
-    ids: I64
-    floats: F32
-    ints: I32
-    templates: F32
-    births: F32
-    deformations: F32
+    rows: Tracks
+    patches: Patches
     free_slots: I32
 
     @staticmethod
@@ -53,11 +80,16 @@ class TrackTable:
         return TrackTable(
             count=0,
             free_count=capacity,
-            ids=np.zeros(capacity, np.int64),
-            floats=np.zeros((capacity, FLOATS), np.float32),
-            ints=np.zeros((capacity, INTS), np.int32),
-            templates=np.zeros(capacity * TEMPLATE_FLOATS, np.float32),
-            births=np.zeros(capacity * BIRTH_FLOATS, np.float32),
-            deformations=np.zeros((capacity, 8), np.float32),
+            rows=np.zeros(capacity, TRACK),
+            patches=Patches(
+                templates=np.zeros(capacity * TEMPLATE_FLOATS, np.float32),
+                births=np.zeros(capacity * BIRTH_FLOATS, np.float32),
+                deformations=np.zeros((capacity, 8), np.float32),
+            ),
             free_slots=np.arange(capacity - 1, -1, -1, dtype=np.int32),
         )
+
+    @property
+    def tracks(self) -> Tracks:
+        """The living tracks, in order of their ids."""
+        return self.rows[: self.count]

@@ -1,101 +1,100 @@
 """Keeps the set of tracks in order: doubles and the dead go, new extrema take their places."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pliant.algorithms.arrays import F32, I32, I64
+from pliant.algorithms.arrays import F32, I32
 from pliant.algorithms.image.patch_alignment import make_template, patch_strength, patch_tensor
 from pliant.algorithms.image.patch_sums import BIRTH_FLOATS, TEMPLATE_FLOATS
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
-from pliant.algorithms.tracking.deformation import keep_birth
-from pliant.algorithms.tracking.patch_track import patch_inside, patch_origin, to_octave
-from pliant.algorithms.tracking.track_table import (
-    AGE,
-    ALIVE,
-    COASTED,
-    ENERGY,
-    EXTREMUM_U,
-    EXTREMUM_V,
-    KAPPA,
-    LEFT,
-    OCTAVE,
-    PIXEL,
-    SLOT,
-    STATE,
-    TOP,
-    U,
-    V,
+from pliant.algorithms.tracking.advance import (
+    FrameImages,
+    patch_inside,
+    patch_origin,
+    to_octave,
 )
+from pliant.algorithms.tracking.deformation import keep_birth
+from pliant.algorithms.tracking.track_table import Patches, Track, Tracks
 from pliant.algorithms.tracks import EXTREMUM
 
 BINS = 2048
 """Bins of |kappa|, eight to the octave: the upper bits of its float32."""
 
+MAX_REACH = 31
+"""Pixels: a row of a square of bits fits into one word."""
+
+
+class BirthLimits(NamedTuple):
+    """Where new tracks start: see the fields of TrackingParameters."""
+
+    spacing: int
+    cell: int
+    min_strength: np.float32
+    fine_strength: np.float32
+    min_isotropy: np.float32
+    subpixel: bool
+    patch_refinement: bool
+
+
+class _Birth(NamedTuple):
+    """The patch of a new track: its octave and first pixel, and its energy, below 0: no use."""
+
+    octave: int
+    left: int
+    top: int
+    energy: np.float32
+
 
 @fast_kernel
-def compact(
-    count: int, free_count: int, ids: I64, floats: F32, ints: I32, free_slots: I32
-) -> tuple[int, int]:
+def compact(rows: Tracks, count: int, free_slots: I32, free_count: int) -> tuple[int, int]:
     """Move living tracks up over dead ones, in order.  Returns (count, free_count)."""
     to = 0
     for i in range(count):
-        if ints[i, ALIVE] == 0:
-            free_slots[free_count] = ints[i, SLOT]
+        if rows[i].alive == 0:
+            free_slots[free_count] = rows[i].slot
             free_count += 1
             continue
         if to != i:
-            ids[to] = ids[i]
-            floats[to] = floats[i]
-            ints[to] = ints[i]
+            rows[to] = rows[i]
         to += 1
     return to, free_count
 
 
 @fast_kernel
 def start_tracks(
-    smooth: F32,
-    half: F32,
+    now: FrameImages,
     pixels: I32,
     maxima: F32,
-    spacing: int,
-    cell: int,
-    min_strength: np.float32,
-    fine_strength: np.float32,
-    min_isotropy: np.float32,
-    subpixel: bool,
-    patch_refinement: bool,
+    limits: BirthLimits,
     next_id: int,
+    rows: Tracks,
     count: int,
-    free_count: int,
-    ids: I64,
-    floats: F32,
-    ints: I32,
-    templates: F32,
-    births: F32,
-    deformations: F32,
+    patches: Patches,
     free_slots: I32,
+    free_count: int,
 ) -> tuple[int, int]:
     """Start tracks at extrema that no track is near to, the strongest of each cell first.
 
-    pixels, maxima: from ``find_maxima``.  Every cell may hold
-    its share of the table's capacity; what weak cells leave goes to the strongest of the rest.
-    Returns (count, free_count); ids count on from next_id.
+    pixels, maxima: from ``find_maxima``.  Every cell may hold its share of the table's capacity;
+    what weak cells leave goes to the strongest of the rest.  Returns (count, free_count); ids
+    count on from next_id.
     """
-    height, width = smooth.shape
-    full, coarse = smooth.reshape(-1), half.reshape(-1)
-    capacity = len(ids)
-    rows, columns = (height + cell - 1) // cell, (width + cell - 1) // cell
-    share = capacity // (rows * columns) + 1
-    load = np.zeros((rows, columns), np.int32)
+    height, width = now.full.height, now.full.width
+    cell, spacing = limits.cell, limits.spacing
+    lines, columns = (height + cell - 1) // cell, (width + cell - 1) // cell
+    share = len(rows) // (lines * columns) + 1
+    load = np.zeros((lines, columns), np.int32)
     occupied = no_bits(height, width)
     for i in range(count):
-        x, y = int(floats[i, U] + np.float32(0.5)), int(floats[i, V] + np.float32(0.5))
+        x, y = int(rows[i].u + np.float32(0.5)), int(rows[i].v + np.float32(0.5))
         load[y // cell, x // cell] += 1
         set_square(occupied, x, y, spacing, height, width)
     order = _strongest_first(maxima)
     for turn in range(2):
         for rank in range(len(order)):
-            if count >= capacity or free_count == 0:
+            if count >= len(rows) or free_count == 0:
                 return count, free_count
             i = order[rank]
             at = int(pixels[i])
@@ -105,59 +104,71 @@ def start_tracks(
             if turn == 0 and load[y // cell, x // cell] >= share:
                 continue
             u, v = np.float32(x), np.float32(y)
-            if subpixel:
+            if limits.subpixel:
                 u, v = maxima[i, 0], maxima[i, 1]
             slot = free_slots[free_count - 1]
-            energy = np.float32(0.0)
-            octave, left, top = 0, 0, 0
-            if patch_refinement:
+            birth = _Birth(np.int64(0), np.int64(0), np.int64(0), np.float32(0.0))
+            if limits.patch_refinement:
                 set_bit(occupied, at)
-                left, top = patch_origin(u, v)
-                if not patch_inside(left, top, width, height):
+                birth = _take_patch(now, u, v, limits, slot, patches)
+                if birth.energy < np.float32(0.0):
                     continue
-                seen, across, down = full, width, height
-                tensor = patch_tensor(full, width, left, top)
-                strength, isotropy = patch_strength(tensor)
-                if strength < fine_strength:
-                    # Little to see so near: a patch of half the size sees twice as far.
-                    octave = 1
-                    left, top = patch_origin(to_octave(u, 1), to_octave(v, 1))
-                    if not patch_inside(left, top, half.shape[1], half.shape[0]):
-                        continue
-                    seen, across, down = coarse, half.shape[1], half.shape[0]
-                    tensor = patch_tensor(coarse, across, left, top)
-                    strength, isotropy = patch_strength(tensor)
-                    if strength < min_strength:
-                        continue
-                if strength <= np.float32(0.0) or isotropy < min_isotropy:
-                    continue
-                make_template(seen, across, left, top, tensor, templates, slot * TEMPLATE_FLOATS)
-                energy = tensor[4]
-                keep_birth(seen, across, down, left, top, births, slot * BIRTH_FLOATS)
-                m = deformations[slot]
-                m[:] = 0.0
-                m[0] = m[3] = m[4] = m[7] = 1.0
             set_square(occupied, x, y, spacing, height, width)
             load[y // cell, x // cell] += 1
             free_count -= 1
-            ids[count] = next_id
+            track = rows[count]
+            track.id = next_id
+            track.u, track.v = u, v
+            track.extremum_u, track.extremum_v = u, v
+            track.kappa = maxima[i, 2]
+            track.left = np.float32(birth.left) - to_octave(u, birth.octave)
+            track.top = np.float32(birth.top) - to_octave(v, birth.octave)
+            track.energy = birth.energy
+            track.motion_u, track.motion_v = np.float32(0.0), np.float32(0.0)
+            track.age, track.coasted, track.alive = 0, 0, 1
+            track.state = EXTREMUM
+            track.pixel, track.slot, track.octave = at, slot, birth.octave
             next_id += 1
-            track, state = floats[count], ints[count]
-            track[U], track[V] = u, v
-            track[EXTREMUM_U], track[EXTREMUM_V] = u, v
-            track[KAPPA] = maxima[i, 2]
-            track[LEFT] = np.float32(left) - to_octave(u, octave)
-            track[TOP] = np.float32(top) - to_octave(v, octave)
-            track[ENERGY] = energy
-            state[AGE] = 0
-            state[STATE] = EXTREMUM
-            state[COASTED] = 0
-            state[PIXEL] = pixels[i]
-            state[OCTAVE] = octave
-            state[SLOT] = slot
-            state[ALIVE] = 1
             count += 1
     return count, free_count
+
+
+@leaf_kernel
+def _take_patch(
+    now: FrameImages,
+    u: np.float32,
+    v: np.float32,
+    limits: BirthLimits,
+    slot: int,
+    patches: Patches,
+) -> _Birth:
+    """Keep the patch around a point, at half size where there is little to see so near."""
+    nothing = _Birth(np.int64(0), np.int64(0), np.int64(0), np.float32(-1.0))
+    octave = 0
+    image = now.full
+    left, top = patch_origin(u, v)
+    if not patch_inside(image, left, top):
+        return nothing
+    tensor = patch_tensor(image, left, top)
+    strength, isotropy = patch_strength(tensor)
+    if strength < limits.fine_strength:
+        octave = 1
+        image = now.half
+        left, top = patch_origin(to_octave(u, 1), to_octave(v, 1))
+        if not patch_inside(image, left, top):
+            return nothing
+        tensor = patch_tensor(image, left, top)
+        strength, isotropy = patch_strength(tensor)
+        if strength < limits.min_strength:
+            return nothing
+    if strength <= np.float32(0.0) or isotropy < limits.min_isotropy:
+        return nothing
+    make_template(image, left, top, tensor, patches.templates, slot * TEMPLATE_FLOATS)
+    keep_birth(image, left, top, patches.births, slot * BIRTH_FLOATS)
+    m = patches.deformations[slot]
+    m[:] = 0.0
+    m[0] = m[3] = m[4] = m[7] = 1.0
+    return _Birth(np.int64(octave), left, top, tensor.energy)
 
 
 @fast_kernel
@@ -181,8 +192,8 @@ def _strongest_first(maxima: F32) -> I32:
 
 
 @fast_kernel
-def remove_doubles(count: int, floats: F32, ints: I32, owners: I32) -> None:
-    """Clear ALIVE of tracks within 1 px of an older one.
+def remove_doubles(tracks: Tracks, owners: I32) -> None:
+    """Clear ``alive`` of tracks within 1 px of an older one.
 
     owners: (H, W) scratch.  All living tracks lie a pixel or more inside.  Hardly any has another
     beside it.  A bit for every pixel, which stays in cache as ``owners`` does not, finds those
@@ -191,10 +202,10 @@ def remove_doubles(count: int, floats: F32, ints: I32, owners: I32) -> None:
     height, width = owners.shape
     taken, crowded = no_bits(height, width), no_bits(height, width)
     found = False
-    for i in range(count):
-        if ints[i, ALIVE] == 0:
+    for i in range(len(tracks)):
+        if tracks[i].alive == 0:
             continue
-        at = _pixel(floats[i], width)
+        at = _pixel(tracks[i], width)
         if any_around(taken, at, width):
             found = True
             for row in range(-1, 2):
@@ -203,47 +214,41 @@ def remove_doubles(count: int, floats: F32, ints: I32, owners: I32) -> None:
         set_bit(taken, at)
     if found:
         taken[:] = np.uint64(0)
-        _keep_oldest(count, floats, ints, crowded, taken, owners.reshape(-1), width)
+        _keep_oldest(tracks, crowded, taken, owners.reshape(-1), width)
 
 
 @leaf_kernel
 def _keep_oldest(
-    count: int,
-    floats: F32,
-    ints: I32,
+    tracks: Tracks,
     crowded: NDArray[np.uint64],
     taken: NDArray[np.uint64],
     owners: I32,
     width: int,
 ) -> None:
     """Compare the tracks of crowded pixels with those around.  taken: bits, none of them set."""
-    for i in range(count):
-        at = _pixel(floats[i], width)
-        if ints[i, ALIVE] == 0 or not get_bit(crowded, at):
+    for i in range(len(tracks)):
+        track = tracks[i]
+        at = _pixel(track, width)
+        if track.alive == 0 or not get_bit(crowded, at):
             continue
         for row in range(-1, 2):
             for column in range(-1, 2):
                 beside = at + row * width + column
                 if not get_bit(taken, beside):
                     continue
-                other = owners[beside]
-                du = floats[other, U] - floats[i, U]
-                dv = floats[other, V] - floats[i, V]
+                other = tracks[owners[beside]]
+                du, dv = other.u - track.u, other.v - track.v
                 if du * du + dv * dv < np.float32(1.0):
-                    ints[i, ALIVE] = 0
-        if ints[i, ALIVE] == 1:
+                    track.alive = 0
+        if track.alive == 1:
             owners[at] = i
             set_bit(taken, at)
 
 
 @leaf_kernel
-def _pixel(track: F32, width: int) -> int:
+def _pixel(track: Track, width: int) -> int:
     half = np.float32(0.5)
-    return int(track[V] + half) * width + int(track[U] + half)
-
-
-MAX_REACH = 31
-"""Pixels: a row of a square of bits fits into one word."""
+    return int(track.v + half) * width + int(track.u + half)
 
 
 @fast_kernel

@@ -1,15 +1,28 @@
-"""Smaller images by averaging blocks, in floats.
+"""Images as kernels read them, and smaller ones by averaging blocks, in floats.
 
 Half scale: ``u' = (u + 0.5) / 2 - 0.5``; a sixth likewise with 6.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F32
 from pliant.algorithms.kernel import fast_kernel
+
+
+class Pixels(NamedTuple):
+    """An image as kernels read it: float32 values, flat (height * width)."""
+
+    values: F32
+    width: int
+    height: int
+
+
+def pixels_of(image: F32) -> Pixels:
+    """A contiguous image (H, W) as kernels read it."""
+    return Pixels(image.reshape(-1), image.shape[1], image.shape[0])
 
 
 @fast_kernel
