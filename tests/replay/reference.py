@@ -49,12 +49,15 @@ def fingerprint() -> dict[str, str]:
 
 
 def make_input(path: Path) -> None:
-    """Record the camera and the images of the built-in sequence, and nothing else."""
+    """Record the camera and the images of the built-in sequence, and nothing else.
+
+    No configuration either: the defaults count, whatever parameters there will be.
+    """
     config = load_config()
     bus = ReplayBus({})
     ingest.run(bus, config, SilentMonitor(), open_source(SOURCE), stopping=lambda: False)
     logged = {topic: messages for topic, messages in bus.outputs.items() if topic.logged}
-    metadata = {"config": {"yaml": config_yaml(config)}, "pliant": {"command": f"of {SOURCE}"}}
+    metadata = {"pliant": {"command": f"of {SOURCE}"}}
     recorder.run(ReplayBus(logged), config, path, metadata)
 
 
