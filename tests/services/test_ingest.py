@@ -85,6 +85,7 @@ class SlowBus(ReplayBus):
         super().publish(topic, message, may_lag=may_lag)
         if topic is topics.IMAGE:
             self._on_image(message.frame)
+            self.waited_s = {"tracking": 0.5 * (message.frame + 1)}
 
 
 def run(
@@ -190,7 +191,9 @@ def test_live_passes_over_what_a_slow_reader_has_no_time_for() -> None:
     dataset = FakeDataset([png(i) for i in range(11)], is_live=True, before=before)
     images, monitor, bus = run(dataset, SlowBus(on_image))
     assert [image.missing for image in images] == ["", *["dropped"] * 9, ""]
-    assert monitor.counters == {"dropped": 9, "broken": 0, "unmapped": 0}
+    counted = {"dropped": 9, "broken": 0, "unmapped": 0}
+    why = {"dropped_for_tracking": 9, "waited_for_tracking_s": 5.0}
+    assert monitor.counters == {**counted, **why}
     sources = [s for s in bus.outputs[topics.SOURCE] if isinstance(s, SourceImage)]
     assert [len(s.data) > 0 for s in sources] == [True, *[False] * 9, True]
     (stream,) = bus.outputs[topics.STREAM]

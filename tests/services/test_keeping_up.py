@@ -2,8 +2,8 @@
 
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import pytest
 
 from pliant.algorithms.tracks import FrameTracks
 from pliant.bus.base import join, receive, receive_one
+from pliant.bus.replay_bus import ReplayBus
 from pliant.bus.session import free_endpoint, open_router
 from pliant.bus.zenoh_bus import ZenohBus
 from pliant.config import Config, load_config
@@ -20,11 +21,12 @@ from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration
 from pliant.messages import topics
 from pliant.messages.topics import Topic
-from pliant.messages.types import CameraStream, Extrema, Image
+from pliant.messages.types import CameraStream, Extrema, Header, Image
 from pliant.state import load_state, save_state
 from pliant_services.nodes import ingest
+from pliant_services.processes import PROFILES
 from pliant_services.runtime.host import lags
-from pliant_services.runtime.keeping_up import MappingPace, readers_that_may_lag
+from pliant_services.runtime.keeping_up import Drops, MappingPace, readers_that_may_lag
 from pliant_services.runtime.link_images import receive_images
 from pliant_services.runtime.monitor import SilentMonitor
 
@@ -87,6 +89,7 @@ class Camera:
 
     frames: int
     due: threading.Semaphore
+    came: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     name: str = "camera"
     is_live: bool = True
     frame_count: int | None = None
@@ -98,6 +101,7 @@ class Camera:
         for index in range(self.frames):
             assert self.due.acquire(timeout=PATIENCE_S)
             yield SourceFrame(index=index, stamp_ns=index * STEP_NS, encoding="jpeg", data=jpeg)
+            self.came.release()
 
 
 def bus_of(endpoint: str, service: str, config: Config, **how: object) -> ZenohBus:
@@ -180,6 +184,108 @@ def test_tracking_goes_on_while_bundle_adjustment_stands_still(
     sender.join(PATIENCE_S)
     router.close()
     assert not failures, failures
+
+
+class OneReader(ReplayBus):
+    """A bus whose only reader takes an image when it is told to, and has credit for a window."""
+
+    def __init__(self, window: int) -> None:
+        super().__init__({})
+        self._window = window
+        self._waiting: deque[Image] = deque()
+        self._changed = threading.Condition()
+        self._most: int | None = None  # that may wait before the ingest goes on
+        self.reported = -1
+
+    def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
+        super().publish(topic, message, may_lag=may_lag)
+        if isinstance(message, Image):
+            with self._changed:
+                self._wait_for(self._window - 1)
+                self._waiting.append(message)
+                self._changed.notify_all()
+
+    def wait_until_taken(self, topic: Topic) -> None:
+        with self._changed:
+            self._wait_for(0)
+
+    def _wait_for(self, most: int) -> None:
+        self._most = most
+        self._changed.notify_all()
+        assert self._changed.wait_for(lambda: len(self._waiting) <= most, PATIENCE_S)
+        self._most = None
+
+    def take(self) -> Image:
+        """The next image that has pixels."""
+        with self._changed:
+            while True:
+                assert self._changed.wait_for(lambda: self._waiting, PATIENCE_S)
+                image = self._waiting.popleft()
+                self._changed.notify_all()
+                if not image.missing:
+                    return image
+
+    def report(self, frame: int) -> None:
+        """The ingest is done with a frame."""
+        with self._changed:
+            self.reported = frame
+            self._changed.notify_all()
+
+    def settle(self, newest: int) -> None:
+        """Wait until the ingest is done with this frame, or waits for the reader."""
+
+        def settled() -> bool:
+            held_up = self._most is not None and len(self._waiting) > self._most
+            return held_up or self.reported == newest
+
+        with self._changed:
+            assert self._changed.wait_for(settled, PATIENCE_S)
+
+
+def test_an_image_is_at_most_two_of_the_readers_frame_times_old_when_it_is_taken() -> None:
+    """Two come while the reader works on one: so four at most are newer than the one it takes."""
+    frames, config = 80, Config()
+    camera, bus = Camera(frames, threading.Semaphore(0)), OneReader(config.bus.window)
+
+    class Reporter(SilentMonitor):
+        def report(self, header: Header, *, note: str = "", **counters: float) -> None:
+            bus.report(header.frame)
+
+    arguments = (bus, config, Reporter(), camera, lambda: False)
+    sender = threading.Thread(target=ingest.run, args=arguments, daemon=True)
+    sender.start()
+    newer: list[int] = []
+    for newest in range(frames):
+        camera.due.release()
+        assert camera.came.acquire(timeout=PATIENCE_S)
+        bus.settle(newest)
+        if newest % 2 == 1:
+            newer.append(newest - bus.take().frame)
+    assert max(newer) <= 4
+    while sender.is_alive() and bus.reported < frames - 1:
+        bus.take()
+    sender.join(PATIENCE_S)
+
+
+def test_only_who_reads_what_is_passed_over_may_lag() -> None:
+    config = Config()
+    assert lags(config, PROFILES["deformable"]) == {}
+    assert lags(config, PROFILES["rigid"]).keys() == {"bundle_adjustment"}
+    assert lags(config, PROFILES["deformable-map"]).keys() == {"bundle_adjustment", "surfels"}
+
+
+def test_whoever_was_waited_for_longest_is_why_images_were_dropped() -> None:
+    drops = Drops()
+    waits = [("", {}), ("d", {"recorder": 0.5}), ("", {"tracking": 0.75, "recorder": 0.5})]
+    waits += [("d", waits[-1][1]), ("d", waits[-1][1]), ("", waits[-1][1])]  # of nobody
+    waits += [("", {"tracking": 9.0, "recorder": 0.5})]  # waited for, and nothing dropped
+    for dropped, waited_s in waits:
+        drops.take(dropped=bool(dropped), waited_s=waited_s)
+    assert drops.counters == {
+        "dropped_for_tracking": 1,
+        "waited_for_tracking_s": 0.75,
+        "dropped_for_ingest": 2,
+    }
 
 
 def test_frames_without_pixels_take_no_room_either() -> None:

@@ -1,8 +1,10 @@
 """What a user reads of a run: everything that went wrong is counted, named and said once."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -36,7 +38,13 @@ def stream(frames: int) -> CameraStream:
 
 
 def record(
-    folder: Path, missing: list[str], *, announced: int = -1, note: str = "", complete: bool = True
+    folder: Path,
+    missing: list[str],
+    *,
+    announced: int = -1,
+    note: str = "",
+    complete: bool = True,
+    counters: Mapping[str, float] = MappingProxyType({}),
 ) -> list[str]:
     """The summary of a recorded run without a map, with one frame for each of ``missing``."""
     mapper = Mapper(stream(0).camera, MappingParameters(), 0)
@@ -55,7 +63,7 @@ def record(
             write(topics.MAP_UPDATE, MapUpdate.of(header, delta, frame_id="world"))
         status = Status(
             frame=0, stamp_ns=0, frame_id="", service="ingest", note=note, stages=(),
-            seconds=np.zeros(0), counters=(), values=np.zeros(0),
+            seconds=np.zeros(0), counters=tuple(counters), values=np.array([*counters.values()]),
         )  # fmt: skip
         write(topics.status("ingest"), status)
         end = StreamEnd(
@@ -76,6 +84,16 @@ def test_dropped_and_broken_images_are_told_apart(tmp_path: Path) -> None:
     lines = record(tmp_path, why)
     assert "2 images dropped to keep up (live mode)" in lines
     assert "1 broken image: frame 2: the png image is cut off" in lines
+
+
+def test_whose_credit_was_missing_is_said_of_dropped_images(tmp_path: Path) -> None:
+    counters = {"dropped": 3.0, "dropped_for_ingest": 1.0}
+    counters |= {"dropped_for_tracking": 2.0, "waited_for_tracking_s": 0.75}
+    lines = record(tmp_path, ["", *["dropped"] * 3, ""], counters=counters)
+    why = "1 for ingest, 2 for tracking (waited 0.8 s)"
+    assert f"3 images dropped to keep up (live mode): {why}" in lines
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["counters"]["ingest"] == counters
 
 
 @pytest.mark.parametrize(

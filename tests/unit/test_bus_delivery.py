@@ -36,7 +36,7 @@ def test_every_message_is_taken_once_and_in_order(seed: int, loss: float) -> Non
         if len(taken) == 60:
             break
         step = chance.randrange(6)
-        if step == 0 and outbox.has_room() and outbox.sent < 60:
+        if step == 0 and not outbox.full() and outbox.sent < 60:
             network.append(outbox.add(0, str(outbox.sent).encode()))
         elif step == 1 and network:
             message = network.pop(chance.randrange(len(network)))
@@ -101,12 +101,22 @@ def test_a_wait_is_told_with_its_length_once_it_is_long() -> None:
     assert waiting.told(now=107.0) == "an image"
 
 
-def test_all_who_are_furthest_behind_are_named() -> None:
-    outbox = Outbox("t", ["a", "c", "b"], window=10)
+def test_who_lacks_what_is_named() -> None:
+    windows, lags = {"disk": Window(messages=2, size=100)}, {"slow": Window(messages=9, size=100)}
+    outbox = Outbox("t", ["a", "b", "disk", "slow"], window=2, windows=windows, lags=lags)
+    assert outbox.silent() == ["a", "b", "disk", "slow"]
+    assert outbox.full() == outbox.behind() == outbox.not_safe() == []
     outbox.add(0, b"x")
-    assert outbox.slowest() == "a, b, c"
+    outbox.add(0, b"x")
+    assert outbox.full() == ["a", "b", "disk", "slow"]
+    outbox.credit("a", 1, 2, 2)
     outbox.credit("b", 1, 1, 1)
-    assert outbox.slowest() == "a, c"
+    outbox.credit("disk", 1, 2, 0)
+    assert outbox.silent() == ["slow"]
+    assert outbox.full() == ["slow", "disk"]
+    assert outbox.full(0, ["slow"]) == ["disk"]
+    assert outbox.behind() == ["b"]
+    assert outbox.not_safe() == ["b", "disk", "slow"]
 
 
 def test_counts_fall_only_with_a_new_incarnation() -> None:
@@ -125,14 +135,14 @@ def test_counts_fall_only_with_a_new_incarnation() -> None:
 def test_a_reader_that_makes_safe_seldom_bounds_messages_and_bytes() -> None:
     outbox = Outbox("t", ["disk"], window=100, windows={"disk": Window(messages=3, size=25)})
     outbox.add(0, b"0123456789")
-    assert outbox.has_room(10)
+    assert not outbox.full(10)
     outbox.add(0, b"0123456789")
-    assert not outbox.has_room(10)
-    assert outbox.has_room(5)
+    assert outbox.full(10)
+    assert not outbox.full(5)
     outbox.add(0, b"")
-    assert not outbox.has_room(0)
+    assert outbox.full(0)
     outbox.credit("disk", 1, 3, 3)
-    assert outbox.has_room(1000)  # nothing is kept: larger than the window may pass alone
+    assert not outbox.full(1000)  # nothing is kept: larger than the window may pass alone
 
 
 def test_messages_with_which_a_reader_may_lag_take_no_room_in_its_window() -> None:
@@ -140,32 +150,32 @@ def test_messages_with_which_a_reader_may_lag_take_no_room_in_its_window() -> No
     outbox = Outbox("t", ["slow", "fast"], window=2, lags=lags)
     for _ in range(2):
         outbox.add(0, b"x")
-    assert not outbox.has_room(1)
-    assert not outbox.has_room(1, ["slow"])  # the other one has no room
+    assert outbox.full(1)
+    assert outbox.full(1, ["slow"])  # the other one has no room
     outbox.credit("fast", 1, 2, 2)
     assert outbox.untaken("slow") == 2
     for sent in range(2, 6):
-        assert not outbox.has_room(1)
-        assert outbox.has_room(1, ["slow"])
+        assert outbox.full(1)
+        assert not outbox.full(1, ["slow"])
         outbox.add(0, b"x", ["slow"])
         outbox.credit("fast", 1, sent + 1, sent + 1)
-    assert not outbox.has_room(1, ["slow"])  # six are on the way
+    assert outbox.full(1, ["slow"])  # six are on the way
     outbox.credit("slow", 1, 2, 0)
-    assert outbox.has_room(46, ["slow"])
-    assert not outbox.has_room(47, ["slow"])  # four bytes are on the way
+    assert not outbox.full(46, ["slow"])
+    assert outbox.full(47, ["slow"])  # four bytes are on the way
     outbox.add(0, b"x")
-    assert outbox.has_room(1)  # one of those in the window
+    assert not outbox.full(1)  # one of those in the window
     outbox.credit("fast", 1, 7, 7)
     outbox.add(0, b"x")
     outbox.credit("fast", 1, 8, 8)
-    assert not outbox.has_room(1)
+    assert outbox.full(1)
     outbox.credit("slow", 2, 0, 0)  # it starts anew, and lags with the same messages
     assert outbox.untaken("slow") == 8
-    assert not outbox.has_room(1)
+    assert outbox.full(1)
     outbox.credit("slow", 2, 3, 3)
-    assert not outbox.has_room(1)
+    assert outbox.full(1)
     outbox.credit("slow", 2, 7, 7)
-    assert outbox.has_room(1)
+    assert not outbox.full(1)
     assert outbox.untaken("nobody") == 0
 
 

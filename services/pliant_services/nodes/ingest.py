@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from pliant.bus.base import Bus, resume
@@ -23,7 +24,12 @@ from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import topics
 from pliant.messages.types import CAMERA_FRAME_ID, CameraStream, Depth, Image, SourceImage
-from pliant_services.runtime.keeping_up import MappingPace, images_that_wait, readers_that_may_lag
+from pliant_services.runtime.keeping_up import (
+    Drops,
+    MappingPace,
+    images_that_wait,
+    readers_that_may_lag,
+)
 from pliant_services.runtime.link_images import Sender
 from pliant_services.runtime.monitor import Monitor
 
@@ -43,15 +49,18 @@ def run(
         bus.publish(topics.STREAM, _stream(dataset, rectifier, live=live))
         bus.end(topics.STREAM)  # its readers wait for its end before the first frame
         # One less than there is credit for: the tracks of a frame are taken after its image.
-        return 0, 0, 0, (deque[int](maxlen=config.bus.window - 1),)
+        return 0, 0, 0, (deque[int](maxlen=config.bus.window - 1),), ({},)
 
-    begin, dropped, broken, kept = resume(bus, start)
-    pace = MappingPace(*kept)
+    begin, dropped, broken, *kept = resume(bus, start)
+    pace, drops = MappingPace(*kept[0]), Drops(*kept[1])
     image: Image | None = None
+    counters: dict[str, float] = {}
     try:
-        for source in newest(dataset, stopping) if live else every(dataset, stopping):
+        ready = partial(bus.wait_until_taken, topics.IMAGE)
+        for source in newest(dataset, stopping, ready) if live else every(dataset, stopping):
             if source.index < begin:  # sent before we were started again
                 continue
+            drops.take(dropped=source.dropped, waited_s=bus.waited_s)
             with monitor.stage("rectify"):
                 source, made_from = link.source(source)
                 image = rectified(source, rectifier)
@@ -63,13 +72,14 @@ def run(
             may_lag = readers_that_may_lag(image)
             bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)
             bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
-            monitor.report(image, dropped=dropped, broken=broken, unmapped=pace.passed)
-            kept = tuple(vars(pace).values())
-            bus.checkpoint(image.frame, (image.frame + 1, dropped, broken, kept))
+            counters = {"dropped": dropped, "broken": broken, "unmapped": pace.passed}
+            monitor.report(image, **counters, **drops.counters)
+            kept = (tuple(vars(pace).values()), (drops.counters,))
+            bus.checkpoint(image.frame, (image.frame + 1, dropped, broken, *kept))
     except DatasetError as error:
         if image is None:
             raise
-        monitor.report(image, note=str(error), dropped=dropped, broken=broken, unmapped=pace.passed)
+        monitor.report(image, note=str(error), **counters, **drops.counters)
         raise SourceLostError(str(error)) from None
 
 
@@ -86,10 +96,14 @@ def every(dataset: Dataset, stopping: Callable[[], bool]) -> Iterator[SourceFram
         yield frame
 
 
-def newest(dataset: Dataset, stopping: Callable[[], bool]) -> Iterator[SourceFrame]:
+def newest(
+    dataset: Dataset, stopping: Callable[[], bool], ready: Callable[[], None] = lambda: None
+) -> Iterator[SourceFrame]:
     """Live: the newest frame wins; those passed over come out without data, to be counted.
 
-    A source that is not a camera is played at the pace of its own time stamps.
+    ready: returns when readers are, and only then the newest is chosen: no image waits in front of
+    them but the one that they take next.  A source that is not a camera is played at the pace of
+    its own time stamps.
     """
     slot: list[SourceFrame] = []
     failure: list[BaseException] = []
@@ -126,6 +140,10 @@ def newest(dataset: Dataset, stopping: Callable[[], bool]) -> Iterator[SourceFra
         while True:
             with changed:
                 changed.wait_for(lambda: slot or finished.is_set(), timeout=1.0)
+                came = bool(slot)
+            if came:
+                ready()
+            with changed:
                 frames, slot[:] = slot[:], []
                 over = finished.is_set()
             yield from frames

@@ -130,6 +130,8 @@ def observer_windows(config: Config, fleet: Sequence[str]) -> dict[str, Window]:
 
 def lags(config: Config, fleet: Sequence[str]) -> dict[str, Window]:
     """How far behind services may be with frames that bundle adjustment passes over, by name."""
+    if "bundle_adjustment" not in fleet:
+        return {}
     lag = Window(config.bus.lag_messages, config.bus.lag_mib << 20)
     return {name: lag for name in fleet if processes.BY_NAME[name].may_lag}
 

@@ -5,14 +5,15 @@ stays a function of the messages, in a replay, too.
 """
 
 from collections import deque
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
 from pliant.bus.base import Bus
 from pliant.messages import topics
 from pliant.messages.types import Image
 from pliant_services.processes import PROCESSES
 
+_INGEST = "ingest"  # its own work took so long: nobody was waited for
 _MAPPING = "bundle_adjustment"
 _MAY_LAG = tuple(process.name for process in PROCESSES if process.may_lag)
 
@@ -47,6 +48,37 @@ class MappingPace:
             return True
         self.last = image.frame
         return False
+
+
+@dataclass
+class Drops:
+    """Why images are dropped: who was waited for while they came, and for how long.
+
+    counters: images by reader, and seconds.     waiting: dropped since the last that was not.
+    before_s: how long each reader had been waited for when that one was chosen.
+    """
+
+    counters: dict[str, float] = field(default_factory=dict[str, float])
+    waiting: int = 0
+    before_s: dict[str, float] = field(default_factory=dict[str, float])
+
+    def take(self, *, dropped: bool, waited_s: Mapping[str, float]) -> None:
+        """Count the next frame.  waited_s: how long each reader was waited for so far."""
+        if dropped:
+            self.waiting += 1
+            return
+        if self.waiting:
+            spent_s = {name: s - self.before_s.get(name, 0.0) for name, s in waited_s.items()}
+            name = max(spent_s, key=spent_s.__getitem__, default="")
+            if spent_s.get(name, 0.0) > 0.0:
+                self._add(f"dropped_for_{name}", self.waiting)
+                self._add(f"waited_for_{name}_s", spent_s[name])
+            else:
+                self._add(f"dropped_for_{_INGEST}", self.waiting)
+        self.waiting, self.before_s = 0, dict(waited_s)
+
+    def _add(self, key: str, value: float) -> None:
+        self.counters[key] = self.counters.get(key, 0.0) + value
 
 
 def images_that_wait(bus: Bus) -> int:

@@ -57,6 +57,15 @@ class Bus(Protocol):
         """
         ...
 
+    def wait_until_taken(self, topic: Topic) -> None:
+        """Block until all readers of a topic, but those that may lag, have taken all of it."""
+        ...
+
+    @property
+    def waited_s(self) -> Mapping[str, float]:
+        """How long each reader was waited for so far, by its name: a matter of timing, too."""
+        ...
+
     def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
         """Send one message.  Blocks while a required reader is a whole window behind.
 

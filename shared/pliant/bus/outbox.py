@@ -110,32 +110,36 @@ class Outbox:
         """How many messages no reader will ever ask for again."""
         return min((reader.safe for reader in self.readers.values()), default=self.sent)
 
-    def all_safe(self) -> bool:
-        """Whether no reader will ever ask for any of what was sent."""
-        return self.safe() >= self.sent
+    def not_safe(self) -> list[str]:
+        """The readers that may ask for some of what was sent."""
+        return [name for name, reader in self.readers.items() if reader.safe < self.sent]
 
-    def heard_from_all(self) -> bool:
-        """Whether every required reader has told its counts."""
-        return all(reader.incarnation >= 0 for reader in self.readers.values())
+    def silent(self) -> list[str]:
+        """The readers that have not told their counts."""
+        return [name for name, reader in self.readers.items() if reader.incarnation < 0]
 
-    def has_room(self, size: int = 0, may_lag: Collection[str] = ()) -> bool:
-        """Whether one more message, of so many bytes, may be sent."""
-        for name, reader in self.readers.items():
-            behind = self.untaken(name)
-            if name in may_lag and name in self._lags:
-                lag = self._lags[name]
-                full = behind > 0 and self._bytes_from(reader.taken) + size > lag.size
-                if full or behind >= max(lag.messages, self._window):
-                    return False
-            elif behind - self._light(reader) >= self._window:
-                return False
+    def behind(self) -> list[str]:
+        """The readers, but those that may lag, that have yet to take some of what was sent."""
+        return [name for name in self.readers if name not in self._lags and self.untaken(name)]
+
+    def full(self, size: int = 0, may_lag: Collection[str] = ()) -> list[str]:
+        """The readers without credit for one more message, of so many bytes."""
+        lacking = [name for name in self.readers if self._is_behind(name, size, may_lag)]
         for name, window in self._windows.items():
-            waiting = self.sent - self.readers[name].safe
-            if waiting >= window.messages:
-                return False
-            if waiting > 0 and self._bytes_from(self.readers[name].safe) + size > window.size:
-                return False
-        return True
+            safe = self.readers[name].safe
+            waiting = self.sent - safe
+            too_large = waiting > 0 and self._bytes_from(safe) + size > window.size
+            if (waiting >= window.messages or too_large) and name not in lacking:
+                lacking.append(name)
+        return lacking
+
+    def _is_behind(self, name: str, size: int, may_lag: Collection[str]) -> bool:
+        reader, behind = self.readers[name], self.untaken(name)
+        if name not in may_lag or name not in self._lags:
+            return behind - self._light(reader) >= self._window
+        lag = self._lags[name]
+        too_large = behind > 0 and self._bytes_from(reader.taken) + size > lag.size
+        return too_large or behind >= max(lag.messages, self._window)
 
     def _bytes_from(self, sequence: int) -> int:
         """Bytes kept of the messages from a number on: in every send, so no sum over them."""
@@ -156,11 +160,6 @@ class Outbox:
         """Messages that the slowest required reader has not taken."""
         slowest = min((reader.taken for reader in self.readers.values()), default=self.sent)
         return max(0, self.sent - slowest)
-
-    def slowest(self) -> str:
-        """The names of all readers that are furthest behind; "" where there is none."""
-        least = min((reader.taken for reader in self.readers.values()), default=0)
-        return ", ".join(sorted(n for n, reader in self.readers.items() if reader.taken == least))
 
     def kept(self) -> int:
         """Messages held here: at most a window and what the slowest checkpoint lies behind."""

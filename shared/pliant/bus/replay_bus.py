@@ -31,6 +31,7 @@ class ReplayBus:
         self.ended: list[Topic] = []
         self.acknowledged = self._given = 0
         """Messages that ``receive_any`` gave and ``acknowledge`` vouched for."""
+        self.waited_s: Mapping[str, float] = {}
         self._inputs = {topic: iter(messages) for topic, messages in inputs.items()}
         self._through_codec = through_codec
 
@@ -78,6 +79,9 @@ class ReplayBus:
     def untaken(self, topic: Topic, reader: str) -> int:
         """None: there is time for everything."""
         return 0
+
+    def wait_until_taken(self, topic: Topic) -> None:
+        """Nothing: there is time for everything."""
 
     def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
         """Keep the message.  Raises ValueError after the topic's end, as no reader would see it."""

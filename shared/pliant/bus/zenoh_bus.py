@@ -107,6 +107,8 @@ class ZenohBus:
         self._prefix = f"pliant/{session}"
         self.stop_requested = False
         """Whether somebody has asked the session to end (``pliant stop``)."""
+        self.waited_s: dict[str, float] = {}
+        """How long each reader was waited for, by its name."""
         shared = Shared(
             self._session,
             self._prefix,
@@ -169,6 +171,11 @@ class ZenohBus:
         with self._changed:
             return self._outputs[topic.key].box.untaken(reader)
 
+    def wait_until_taken(self, topic: Topic) -> None:
+        """Wait until all readers, but those that may lag, have taken all that was sent."""
+        output = self._outputs[topic.key]
+        self._wait_for_readers(output, output.box.behind)
+
     def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
         """Send one message, once every required reader is within the window.
 
@@ -213,7 +220,7 @@ class ZenohBus:
         """Wait until the required readers will never ask for any of what was sent."""
         for output in self._outputs.values():
             if output.box.sent:
-                self._wait_for_readers(output, lambda box=output.box: box.all_safe())
+                self._wait_for_readers(output, output.box.not_safe)
 
     def see_off(self) -> None:
         """Once all that we sent is safe, stay until our senders have left, some seconds at most.
@@ -237,16 +244,18 @@ class ZenohBus:
         if output.ended:
             raise ValueError(f"{output.topic.key} was published after its end")
         self._disturb()
-        self._wait_for_readers(output, lambda: output.box.has_room(len(payload), may_lag))
+        self._wait_for_readers(output, lambda: output.box.full(len(payload), may_lag))
         output.send(kind, payload, may_lag)
 
-    def _wait_for_readers(self, output: OutLink, enough: Callable[[], bool]) -> None:
+    def _wait_for_readers(self, output: OutLink, lacking: Callable[[], list[str]]) -> None:
+        """Wait while there is a reader that lacks something."""
         readers = output.box.readers.keys()
         with self._changed:
             while True:
                 self._peers.raise_if_refused()
                 here = self._peers.seen(readers)
-                if here and enough():
+                names = lacking() if here else self._peers.missing(readers)
+                if here and not names:
                     self._waiting.end()
                     return
                 patience_s = max(self._patience_s, _LAST_CREDITS_S)  # credits may be on the way
@@ -256,13 +265,16 @@ class ZenohBus:
                         f"{lost[0]} went away with {output.box.on_the_way()} messages of "
                         f"{output.topic.key} unread"
                     )
-                whom = self._peers.absent(readers) or output.box.slowest()
+                whom = self._peers.absent(readers) or ", ".join(names)
                 self._waiting.begin(f"{whom} to take {output.topic.key}", time.monotonic())
                 # Those who are there already are seen within a tick.
                 waits_long = time.monotonic() - self._waiting.since >= TICK_S
                 if not here and waits_long and self._interrupted():
                     raise KeyboardInterrupt
+                began = time.monotonic()
                 self._changed.wait(TICK_S)
+                for name in names:
+                    self.waited_s[name] = self.waited_s.get(name, 0.0) + time.monotonic() - began
 
     # -- receiving -----------------------------------------------------------------------------
 
@@ -378,7 +390,7 @@ class ZenohBus:
             with self._changed:
                 self._peers.expect((r for o in outputs for r in o.box.readers), time.monotonic())
         for output in outputs:
-            self._wait_for_readers(output, output.box.heard_from_all)
+            self._wait_for_readers(output, output.box.silent)
         with self._changed:
             place = self._checkpoints.usable({o.topic.key: o.box.safe() for o in outputs})
         state = None
@@ -419,7 +431,9 @@ class ZenohBus:
     def _tell_now_and_then(self, entry: InLink, received: Received) -> None:
         # Each credit wakes the router and the sender, while the service waits: for most, a
         # quarter of the window at a time is enough.
-        if received.is_end or entry.box.taken - entry.told >= self._tell_every:
+        box, newest_wins = entry.box, entry.topic.newest_wins
+        all_taken = newest_wins and not box.waiting
+        if received.is_end or all_taken or box.taken - entry.told >= self._tell_every:
             self._keeper.tell(entry)
 
     def _on_stop(self, _: zenoh.Sample) -> None:

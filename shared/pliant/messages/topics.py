@@ -33,6 +33,8 @@ class Topic:
     deterministic: bool = True
     """Same input, same bytes.  False for status and timings."""
     logged: bool = True
+    newest_wins: bool = False
+    """In live mode the next is not chosen before the last was taken, which readers tell at once."""
     max_bytes: int = 16 * _MIB
     """A larger message is refused before memory is taken for it."""
     compression: str = "zstd"
@@ -43,7 +45,9 @@ STREAM = Topic("camera/stream", CameraStream, per_frame=False, max_bytes=_MIB)
 # Not compressed: most images come compressed, and of raw ones zstd saves a tenth.
 SOURCE = Topic("camera/source", SourceImage, per_frame=True, max_bytes=128 * _MIB, compression="")
 # Not logged: made again from camera/source and the calibration.
-IMAGE = Topic("camera/image", Image, per_frame=True, logged=False, max_bytes=128 * _MIB)
+IMAGE = Topic(
+    "camera/image", Image, per_frame=True, logged=False, newest_wins=True, max_bytes=128 * _MIB
+)
 # Empty where nobody but the recorder would read it.
 DEPTH = Topic("camera/depth", Depth, per_frame=True, max_bytes=128 * _MIB, compression="")
 EXTREMA = Topic("tracks/extrema", Extrema, per_frame=True)

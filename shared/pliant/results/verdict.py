@@ -1,5 +1,6 @@
 """What a run came to: its report in a few lines, and the exit code that follows."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from pliant.messages.types import DROPPED
@@ -53,7 +54,8 @@ def _faults(report: dict[str, Any]) -> list[str]:
     broken = _broken(report)
     dropped = len(report["frames_without_pixels"]) - len(broken)
     if dropped:
-        lines.append(f"{dropped} images dropped to keep up (live mode)")
+        why = _why_dropped(report.get("counters", {}).get("ingest", {}))
+        lines.append(f"{dropped} images dropped to keep up (live mode){why and f': {why}'}")
     passed_over = len(report.get("frames_passed_over", ()))
     if passed_over:
         lines.append(f"{passed_over} images tracked, but not mapped, to keep up (live mode)")
@@ -63,3 +65,15 @@ def _faults(report: dict[str, Any]) -> list[str]:
     if report["ended_early"]:
         lines.append(f"the source ended early: {report['ended_early']}")
     return lines
+
+
+def _why_dropped(counters: Mapping[str, float]) -> str:
+    """What the ingest counted in words: "12 for tracking (waited 0.8 s)"; "" without any."""
+    prefix = "dropped_for_"
+    words: list[str] = []
+    for key in sorted(counters):
+        if key.startswith(prefix):
+            waited_s = counters.get(f"waited_for_{key.removeprefix(prefix)}_s")
+            how_long = "" if waited_s is None else f" (waited {waited_s:.1f} s)"
+            words.append(f"{counters[key]:.0f} for {key.removeprefix(prefix)}{how_long}")
+    return ", ".join(words)
