@@ -3,6 +3,7 @@
 Map updates tell where points are, not by which tracks they were seen.  So observations are found
 again: a track belongs to the point that it meets, within the mapper's own limit, in the most
 keyframes; a track that meets none twice, or a point that fewer than two keyframes see, is left out.
+The camera is the one that the map was made with; observations lie where it would have seen them.
 """
 
 from dataclasses import dataclass
@@ -11,14 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
-from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, pose_to_matrix
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
+from pliant.algorithms.meshing.corrected_view import CorrectedView
 from pliant.errors import ResultError
 from pliant.formats.colmap import ColmapImage, write_colmap
 from pliant.map_history import MapHistory
 from pliant.messages import topics
-from pliant.messages.types import CameraStream, Extrema
+from pliant.messages.types import Extrema
 from pliant.recording.reader import Recording
 
 _NEAR_PX = 1.5  # an inlier of the mapper
@@ -37,10 +38,11 @@ class _View:
 
 
 def write_colmap_model(
-    recording: Recording, stream: CameraStream, history: MapHistory, folder: Path
+    recording: Recording, view: CorrectedView, history: MapHistory, folder: Path
 ) -> list[int]:
     """Write the model of the longest segment; returns the frames whose images belong to it.
 
+    view: that of the camera with which this segment was made.
     Raises ResultError where there is no map.
     """
     segment = history.longest_segment()
@@ -49,26 +51,29 @@ def write_colmap_model(
         raise ResultError("the run has no map to export")
     points = history.points()
     points = points.select(points.segments == segment)
-    views = [
-        _meet(tracks, pose_to_matrix(poses[tracks.frame]), points.positions, stream.camera)
+    keyframes = [
+        _meet(tracks, pose_to_matrix(poses[tracks.frame]), points.positions, view)
         for tracks in recording.decoded(topics.EXTREMA)
         if isinstance(tracks, Extrema) and tracks.frame in poses and not tracks.missing
     ]
-    owner = _owners(views)
-    seen = [_observations(view, owner) for view in views]
+    owner = _owners(keyframes)
+    seen = [_observations(keyframe, owner) for keyframe in keyframes]
     counts = np.bincount(np.concatenate([p for _, p in seen]), minlength=len(points))
     kept = np.flatnonzero(counts >= 2)
     row = np.full(len(points), -1, np.int64)
     row[kept] = np.arange(len(kept))
     images = [
         ColmapImage(
-            image_name(view.frame), view.T_world_camera, pixels[row[p] >= 0], row[p][row[p] >= 0]
+            image_name(keyframe.frame),
+            keyframe.T_world_camera,
+            pixels[row[p] >= 0],
+            row[p][row[p] >= 0],
         )
-        for view, (pixels, p) in zip(views, seen, strict=True)
+        for keyframe, (pixels, p) in zip(keyframes, seen, strict=True)
     ]
     colours = np.asarray(points.colours[kept], np.uint8)
-    write_colmap(folder, stream.camera, images, points.positions[kept], colours)
-    return [view.frame for view in views]
+    write_colmap(folder, view.camera, images, points.positions[kept], colours)
+    return [keyframe.frame for keyframe in keyframes]
 
 
 def image_name(frame: int) -> str:
@@ -76,8 +81,9 @@ def image_name(frame: int) -> str:
     return f"{frame:06d}.png"
 
 
-def _meet(tracks: Extrema, T_world_camera: F64, positions: F64, camera: PinholeCamera) -> _View:
+def _meet(tracks: Extrema, T_world_camera: F64, positions: F64, view: CorrectedView) -> _View:
     """For every point in view the track that is nearest to it, where one is near."""
+    camera, tracks_px = view.camera, view.pixels(tracks.points_px)
     T_camera_world = inverse(T_world_camera)
     space = positions @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
     front = np.flatnonzero(space[:, 2] > 0.0)
@@ -85,12 +91,12 @@ def _meet(tracks: Extrema, T_world_camera: F64, positions: F64, camera: PinholeC
     inside = np.all((pixels > -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5)), axis=1)
     front, pixels = front[inside], pixels[inside]
     places = np.zeros((len(tracks.ids), 3), np.float32)
-    places[:, :2] = tracks.points_px
+    places[:, :2] = tracks_px
     grid = MaximaGrid.build(places, camera.width, camera.height)
     nearest = grid.nearest(pixels.astype(np.float32), _NEAR_PX)
     met = nearest >= 0
     rows = nearest[met]
-    points_px = tracks.points_px[rows].astype(np.float64)
+    points_px = tracks_px[rows].astype(np.float64)
     errors = np.linalg.norm(pixels[met] - points_px, axis=1)
     return _View(tracks.frame, T_world_camera, points_px, tracks.ids[rows], front[met], errors)
 

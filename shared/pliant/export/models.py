@@ -8,6 +8,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.meshing import TriangleMesh
+from pliant.algorithms.meshing.corrected_view import corrected_view
 from pliant.datasets import Rectifier, calibration_from_yaml
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import Calibration, calibration_yaml
@@ -17,7 +18,7 @@ from pliant.export.colmap import image_name, write_colmap_model
 from pliant.formats.ply import read_ply, write_ply
 from pliant.formats.text import format_seconds, write_bytes
 from pliant.messages import topics
-from pliant.messages.types import CameraStream, SourceImage
+from pliant.messages.types import CameraStream, MapUpdate, SourceImage
 from pliant.recording.reader import Recording
 from pliant.results.run import read_run
 from pliant.viewers.canvas import Canvas
@@ -72,27 +73,33 @@ def rerun(recording: Recording, path: Path, folder: Path | None) -> None:
 
 
 def colmap(recording: Recording, path: Path, folder: Path | None) -> None:
-    """``sparse/0`` with the text model, ``images`` with the keyframes, rectified."""
+    """``sparse/0`` with the text model, ``images`` with the keyframes as its camera sees them."""
     stream = camera_of(recording)
-    history = read_run(recording.path).history
+    run = read_run(recording.path)
+    was_corrected = run.corrected_segment == run.history.longest_segment()
+    view = corrected_view(stream.camera, run.calibration_correction if was_corrected else ())
     model = path / "sparse" / "0"
     make_folder(model)
-    frames = set(write_colmap_model(recording, stream, history, model))
+    frames = set(write_colmap_model(recording, view, run.history, model))
     make_folder(path / "images")
     for frame, _, pixels in rectified_images(recording, stream):
         if frame in frames:
-            write_png(path / "images" / image_name(frame), pixels)
+            write_png(path / "images" / image_name(frame), view.image(pixels))
 
 
 def images(recording: Recording, path: Path, folder: Path | None) -> None:
-    """A folder that ``pliant run`` opens: rectified PNG, ``rgb.txt`` and ``calib.yaml``."""
+    """A folder that ``pliant run`` opens: rectified PNG, ``rgb.txt`` and ``calib.yaml``.
+
+    As the camera sees that the last adjustment found, if there was one.
+    """
     stream = camera_of(recording)
+    view = corrected_view(stream.camera, _correction(recording))
     make_folder(path / "images")
     lines = ["# seconds file"]
     for frame, stamp_ns, pixels in rectified_images(recording, stream):
-        write_png(path / "images" / image_name(frame), pixels)
+        write_png(path / "images" / image_name(frame), view.image(pixels))
         lines.append(f"{format_seconds(stamp_ns)} images/{image_name(frame)}")
-    camera = stream.camera
+    camera = view.camera
     pinhole = Calibration(
         model="pinhole", width=camera.width, height=camera.height,
         fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy,
@@ -110,6 +117,13 @@ def ply(recording: Recording, path: Path, folder: Path | None) -> None:
         raise ResultError(f"{recording.path}: the run has no map to export")
     colours = np.asarray(points.colours, np.uint8).reshape(-1, 3)
     write_ply(path, np.asarray(points.positions, np.float32), colours)
+
+
+def _correction(recording: Recording) -> tuple[float, ...]:
+    for final in recording.decoded(topics.MAP_FINAL):
+        assert isinstance(final, MapUpdate)
+        return final.calibration_correction
+    return ()
 
 
 def camera_of(recording: Recording) -> CameraStream:

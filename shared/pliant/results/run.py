@@ -43,6 +43,7 @@ class Run:
     cpu_seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     source_failure: str = ""
     calibration_correction: tuple[float, ...] = ()
+    corrected_segment: int = -1
     mesh: list[MeshPiece] = field(default_factory=list[MeshPiece])
     ends: dict[str, StreamEnd] = field(default_factory=dict[str, StreamEnd])
     arrivals_ns: list[int] = field(default_factory=list[int])
@@ -80,6 +81,7 @@ def read_run(path: Path) -> Run:
             run.history.apply(message, frame=message.frame, stamp_ns=message.stamp_ns, final=final)
             if final:
                 run.calibration_correction = message.calibration_correction
+                run.corrected_segment = message.segment
             else:
                 run.inliers[message.frame] = message.inliers
                 if message.reason == PASSED_OVER:

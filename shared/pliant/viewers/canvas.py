@@ -21,8 +21,13 @@ class Moment:
 class Canvas(Protocol):
     """Draws.  Worlds are numbered by map segment; each has a place and a scale of its own."""
 
-    def camera(self, camera: PinholeCamera) -> None:
-        """The camera of all images; comes first."""
+    def camera(
+        self, at: Moment, camera: PinholeCamera, lens: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """The camera of all images; comes first, and again when a better one was found.
+
+        lens: k1 and k2 of what rectification left: ``u = fx (1 + k1 r^2 + k2 r^4) x + cx``.
+        """
         ...
 
     def image(self, at: Moment, data: bytes, encoding: str) -> None:

@@ -1,6 +1,6 @@
 """A run as Foxglove protobuf messages in an MCAP file, which opens without anything of ours.
 
-    /camera/image, /camera/calibration, /camera/tracks   every frame
+    /camera/image, /camera/calibration, /camera/tracks   every frame; the corrected one at the end
     /tf              map -> world -> camera, every frame with a pose
     /map/points      the points that changed, every ten frames
     /map/path        positions of the keyframes
@@ -55,6 +55,7 @@ class FoxgloveFile:
         self._channels: dict[str, int] = {}
         self._sequences: dict[str, int] = {}
         self._camera: PinholeCamera | None = None
+        self._lens = (0.0, 0.0)
         self._parts: dict[str, int] = {}
         self._kind("PointCloud")  # said now, before a file is there
         try:
@@ -81,23 +82,20 @@ class FoxgloveFile:
 
     # -- the canvas ----------------------------------------------------------------------------
 
-    def camera(self, camera: PinholeCamera) -> None:
-        """Keep the camera: it is written with every image."""
-        self._camera = camera
+    def camera(
+        self, at: Moment, camera: PinholeCamera, lens: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """Keep the camera: it is written with every image, and when it is corrected."""
+        is_correction = self._camera is not None
+        self._camera, self._lens = camera, lens
+        if is_correction:
+            self._write_calibration(at)
 
     def image(self, at: Moment, data: bytes, encoding: str) -> None:
         """The image and its calibration."""
         image = self._kind("CompressedImage")(frame_id="camera", data=data, format=encoding)
         self._write("/camera/image", at, image)
-        if self._camera is not None:
-            c, K = self._camera, self._camera.K
-            P = np.concatenate([K, np.zeros((3, 1))], axis=1)
-            calibration = self._kind("CameraCalibration")(
-                frame_id="camera", width=c.width, height=c.height, distortion_model="plumb_bob",
-                D=[0.0] * 5, K=K.ravel().tolist(), R=np.eye(3).ravel().tolist(),
-                P=P.ravel().tolist(),
-            )  # fmt: skip
-            self._write("/camera/calibration", at, calibration)
+        self._write_calibration(at)
 
     def tracks(self, at: Moment, points_px: F32, ages: I32) -> None:
         """Tracks by age, blue to orange; circles would be too many."""
@@ -192,6 +190,18 @@ class FoxgloveFile:
         self._write("/notes", at, self._kind("Log")(level=2, message=text, name="pliant"))
 
     # -- writing -------------------------------------------------------------------------------
+
+    def _write_calibration(self, at: Moment) -> None:
+        if self._camera is None:
+            return
+        c, K = self._camera, self._camera.K
+        P = np.concatenate([K, np.zeros((3, 1))], axis=1)
+        calibration = self._kind("CameraCalibration")(
+            frame_id="camera", width=c.width, height=c.height, distortion_model="plumb_bob",
+            D=[*self._lens, 0.0, 0.0, 0.0], K=K.ravel().tolist(), R=np.eye(3).ravel().tolist(),
+            P=P.ravel().tolist(),
+        )  # fmt: skip
+        self._write("/camera/calibration", at, calibration)
 
     def _cloud(self, segment: int, xyz: F32, rgb: U8) -> Any:
         rows = np.zeros(len(xyz), _ROW)

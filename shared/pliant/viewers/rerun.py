@@ -129,8 +129,10 @@ class RerunCanvas:
 
     # -- the canvas ----------------------------------------------------------------------------
 
-    def camera(self, camera: PinholeCamera) -> None:
-        """The pinhole, whose origin is the corner of the first pixel in Rerun."""
+    def camera(
+        self, at: Moment, camera: PinholeCamera, lens: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """The pinhole, whose origin is the corner of the first pixel in Rerun; it has no lens."""
         pinhole = self._rr.Pinhole(
             resolution=(camera.width, camera.height),
             focal_length=(camera.fx, camera.fy),

@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F64
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import matrix_to_pose, pose_to_matrix
+from pliant.algorithms.meshing.corrected_view import corrected_view
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.own_recording import recorded_frame
@@ -56,6 +58,7 @@ class Scene:
     def __init__(self, canvas: Canvas) -> None:
         self._canvas = canvas
         self._rectifier: Rectifier | None = None
+        self._camera: PinholeCamera | None = None
         self._world = _World()
         self._expected = 0
         self._drawn = -REDRAW_FRAMES
@@ -76,7 +79,7 @@ class Scene:
         """
         at = Moment(message.frame, message.stamp_ns)
         if isinstance(message, CameraStream):
-            self._begin(message)
+            self._begin(at, message)
         elif isinstance(message, SourceImage):
             self._entered = max(self._entered, message.frame)
             self._draw_image(at, recorded_frame(message))
@@ -104,10 +107,11 @@ class Scene:
         """The last moment of the map."""
         return self._last
 
-    def _begin(self, stream: CameraStream) -> None:
+    def _begin(self, at: Moment, stream: CameraStream) -> None:
         if self._rectifier is None:  # told again for those who come late
             self._rectifier = Rectifier(calibration_from_yaml(stream.calibration))
-            self._canvas.camera(stream.camera)
+            self._camera = stream.camera
+            self._canvas.camera(at, stream.camera)
             self._surfels.camera = stream.camera
 
     def _draw_image(self, at: Moment, frame: SourceFrame) -> None:
@@ -151,6 +155,9 @@ class Scene:
             snapshot=update.snapshot,
         )
         self._draw_pose(at, update)
+        if update.calibration_correction and self._camera is not None:
+            view = corrected_view(self._camera, update.calibration_correction)
+            self._canvas.camera(at, view.camera, view.lens)
         if final or at.frame - self._drawn >= REDRAW_FRAMES:
             self._draw_map(at)
 

@@ -1,5 +1,7 @@
 """Images and pixels as the corrected camera sees them, where the calibration was found wrong."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -13,24 +15,30 @@ class CorrectedView:
 
     correction: (s, k1, k2, ...) as MapDelta.calibration_correction, or () for none.  What a rolling
     shutter does is left: it moves pixels along the image, which depth hardly feels.
+    camera: the ideal camera.
     """
 
     def __init__(self, camera: PinholeCamera, correction: tuple[float, ...]) -> None:
-        self._camera = camera
+        self.camera = camera
         self._correction = np.array(correction[:3] if len(correction) >= 3 else (0.0, 0.0, 0.0))
+
+    @property
+    def lens(self) -> tuple[float, float]:
+        """(k1, k2) with which the ideal camera would see the image as it is."""
+        return float(self._correction[1]), float(self._correction[2])
 
     def pixels(self, points_px: F32) -> F32:
         """(N, 2) pixels of the rectified image in the ideal one."""
         if not self._correction.any():
             return points_px
         u, v = np.ascontiguousarray(points_px.T)
-        return np.stack(ideal_pixels(u, v, self._camera, self._correction), axis=1)
+        return np.stack(ideal_pixels(u, v, self.camera, self._correction), axis=1)
 
     def image(self, pixels: U8) -> U8:
-        """(H, W, 3) the ideal image of a rectified one."""
+        """(H, W) or (H, W, 3) the ideal image of a rectified one."""
         if not self._correction.any():
             return pixels
-        camera = self._camera
+        camera = self.camera
         s, k1, k2 = self._correction.tolist()
         x = (np.arange(camera.width) - camera.cx) / camera.fx
         y = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
@@ -40,3 +48,14 @@ class CorrectedView:
         v = (y * factor * camera.fy + camera.cy).astype(np.float32)
         moved = cv2.remap(pixels, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
         return np.asarray(moved, np.uint8)
+
+
+def corrected_view(camera: PinholeCamera, correction: tuple[float, ...]) -> CorrectedView:
+    """The view whose camera has the focal length that was found, so that its pixels move least.
+
+    camera: the one that was believed in.    correction: as of ``CorrectedView``.
+    """
+    s, k1, k2 = correction[:3] if len(correction) >= 3 else (0.0, 0.0, 0.0)
+    factor = float(np.exp(s))
+    found = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+    return CorrectedView(found, (0.0, k1, k2))
