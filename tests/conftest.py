@@ -47,6 +47,54 @@ def kill_descendants() -> None:
             os.kill(pid, signal.SIGKILL)
 
 
+ALLOWED_SKIPS = (
+    "is not here",  # what ../shared holds, and Rerun's own command
+    "the real sequences are not here",
+    "no ../shared/data",
+    "no public problems in",
+    "shared/data is not here",
+    "no Docker engine answers",
+    "no base image",
+    "neither docker-compose nor docker compose is installed",
+    "is not installed",
+    "containers do not reach Debian's packages here",
+    "hosts need root and",
+    "no network namespaces here",
+    "a small file system can be mounted by root only",
+    "takes minutes: scripts/soak runs it",
+    "systemd-analyze is not installed",
+    "there is a camera, which never ends",
+)
+"""What may lack on a machine on which all tests pass.  A test that skips for another reason is one
+that nobody runs: CI fails of it."""
+_unexpected: list[str] = []
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Keep the skips that nobody has allowed."""
+    if report.skipped and isinstance(report.longrepr, tuple):
+        _, _, reason = report.longrepr
+        if not any(allowed in reason for allowed in ALLOWED_SKIPS):
+            _unexpected.append(f"{report.nodeid}: {reason}")
+
+
+def pytest_collectreport(report: pytest.CollectReport) -> None:
+    """The same for a file that is skipped as a whole."""
+    if report.skipped and isinstance(report.longrepr, tuple):
+        _, _, reason = report.longrepr
+        if not any(allowed in reason for allowed in ALLOWED_SKIPS):
+            _unexpected.append(f"{report.nodeid}: {reason}")
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail where CI would otherwise pass without a test."""
+    is_worker = hasattr(session.config, "workerinput")
+    if _unexpected and os.environ.get("CI") and not is_worker:
+        for line in _unexpected:
+            print(f"\nskipped, and not in ALLOWED_SKIPS: {line}")
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
 @pytest.fixture(scope="session")
 def rigid_data() -> Path:
     """The real sequences, where they are at hand."""
