@@ -42,6 +42,13 @@ def put_in_place(partial: Path, path: Path) -> None:
     sync(path.parent)
 
 
+def write_whole(path: Path, text: str) -> None:
+    """Write a small file: there is all of it then, or what was there before.  Raises OSError."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    put_in_place(partial, path)
+
+
 def move_all(folder: Path, output: Path) -> None:
     """Put every file of a folder in place in another one of the same file system.
 

@@ -268,7 +268,7 @@ def test_wrong_requests_are_one_line(result: Path, tmp_path: Path) -> None:
     with pytest.raises(ResultError, match="--force"):
         export_result(result, "tum", there)
     assert there.read_text() == "mine"
-    with pytest.raises(ResultError, match="is the recording itself"):
+    with pytest.raises(ResultError, match="is read from there"):
         export_result(result, "foxglove", result / "recording.mcap", force=True)
     for kind in ("foxglove", "rerun", "colmap", "images"):
         with pytest.raises(ResultError, match="cannot be"):

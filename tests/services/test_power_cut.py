@@ -7,16 +7,19 @@ from pathlib import Path
 
 import pytest
 
+from pliant.algorithms.tracks import FrameTracks
 from pliant.bus.base import Received
 from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.bus.replay_bus import ReplayBus
-from pliant.config import load_config
+from pliant.config import config_yaml, load_config
 from pliant.files import make_folder
 from pliant.messages import codec, topics
-from pliant.messages.types import SourceImage
+from pliant.messages.types import Extrema, Header, SourceImage
 from pliant.recording.parts import parts_of
 from pliant.recording.recover import mend, recover
 from pliant.recording.writer import RecordingWriter
+from pliant.results.folder import prepare, run_metadata
+from pliant.results.write import write_results
 from pliant_services.nodes import recorder
 
 
@@ -101,6 +104,23 @@ def test_what_was_recovered_replaces_what_was_damaged(disk: Disk, tmp_path: Path
     assert disk.holds(tmp_path / "whole.mcap")
     mend(tmp_path / "recording.mcap")
     assert disk.holds(part)
+
+
+def test_results_are_those_of_a_run_as_a_whole(disk: Disk, tmp_path: Path) -> None:
+    output = tmp_path / "results" / "room"
+    config = config_yaml(load_config())
+    prepare(output, config)
+    with RecordingWriter(output / "recording.mcap", run_metadata(config)) as writer:
+        data = codec.encode(
+            Extrema.of(Header(frame=0, stamp_ns=0, frame_id="camera"), FrameTracks.empty())
+        )
+        writer.write(topics.EXTREMA, data, sequence=0, log_time_ns=1, publish_time_ns=0)
+    write_results(output)
+    files = [path for path in output.rglob("*") if path.is_file()]
+    assert {"report.json", "trajectory.txt", "config.yaml", "metadata.json", "points.ply"} <= {
+        path.name for path in files
+    }
+    assert [path.name for path in files if not disk.holds(path)] == []
 
 
 def test_a_checkpoint_is_told_when_a_power_cut_leaves_it(disk: Disk, tmp_path: Path) -> None:

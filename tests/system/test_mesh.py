@@ -88,7 +88,7 @@ def test_the_mesh_is_made_again_with_other_parameters(result: Path, tmp_path: Pa
     assert (tmp_path / "rough" / "mesh.ply").stat().st_size < (
         0.3 * (result / "mesh.ply").stat().st_size
     )
-    assert_one_line(pliant("mesh", result, "--output", result), "holds the recording")
+    assert_one_line(pliant("mesh", result, "--output", result), "is read from there")
 
 
 def test_a_voxel_too_small_for_the_memory_is_refused_before_the_work(

@@ -34,7 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "results": {
         *{"results", "formats", "pictures", "recording", "messages", "algorithms", "errors"},
-        *{"config", "map_history", "trajectory"},
+        *{"config", "files", "map_history", "trajectory"},
     },
     "offline": {"datasets", "messages", "algorithms", "config", "map_history"},
     "fusion": {"fusion", "algorithms", "errors", "map_history"},

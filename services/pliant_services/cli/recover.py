@@ -20,15 +20,18 @@ def recover(
     pliant recover broken.mcap --output whole.mcap
     """
     from pliant.errors import RecordingError
+    from pliant.recording.parts import parts_of
     from pliant.recording.recover import recover as make_whole
     from pliant.recording.summary import describe, summarise
+    from pliant.results.folder import keep_apart
     from pliant_services.cli.info import recording_file
 
     damaged = recording_file(recording)
     suffix = damaged.suffix or ".mcap"  # a folder of parts becomes one file
     whole = output or damaged.with_name(f"{damaged.stem}_recovered{suffix}")
-    if whole.exists() and (not force or (damaged.exists() and whole.samefile(damaged))):
-        raise RecordingError(f"{whole} exists: choose another --output")
+    keep_apart(whole, parts_of(damaged))
+    if whole.exists() and not force:
+        raise RecordingError(f"{whole} exists: choose another --output, or --force to replace it")
     recovery = make_whole(damaged, whole)
     typer.echo(f"{recovery.messages} messages kept in {whole}")
     if recovery.unchecked:

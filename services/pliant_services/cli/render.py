@@ -24,6 +24,7 @@ def render(
 
     from pliant.datasets.builtin import builtin_folder
     from pliant.errors import ResultError
+    from pliant.results.folder import keep_apart
 
     if output is not None and output.exists() and not force:
         raise ResultError(f"{output} exists: choose another --output, or --force to replace it")
@@ -35,6 +36,7 @@ def render(
 
     folder = builtin_folder(name, progress=progress)
     if output is not None:
+        keep_apart(output, [folder])
         shutil.copytree(folder, output, dirs_exist_ok=force)
         folder = output
     typer.echo(str(folder))

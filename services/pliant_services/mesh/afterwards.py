@@ -12,6 +12,7 @@ from pathlib import Path
 
 from pliant.config import recorded_config
 from pliant.errors import PliantError
+from pliant.files import put_in_place
 from pliant.recording.parts import PART, PART_RECORD, folder_of_parts, following_number
 from pliant.recording.reader import Recording
 from pliant.recording.summary import Summary, summarise
@@ -71,8 +72,7 @@ def mesh_into_recording(output: Path) -> None:
         folder / _PARTIAL, {**summary.metadata, PART_RECORD: {"number": str(number)}}
     ) as writer:
         run_on(_MESHING, inputs, config, writer)
-        writer.sync()
-    (folder / _PARTIAL).replace(folder / PART.format(number))
+    put_in_place(folder / _PARTIAL, folder / PART.format(number))
 
 
 def _can_be_meshed(summary: Summary) -> bool:

@@ -11,16 +11,18 @@ from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.meshing import BlockMesh
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, recorded_config
-from pliant.errors import RecordingError, ResultError
+from pliant.errors import RecordingError
+from pliant.files import write_whole
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.fusion.open3d_import import require_open3d
 from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Header, MeshPiece, MeshUpdate, Status
+from pliant.recording.parts import parts_of
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
-from pliant.results.folder import check_output
+from pliant.results.folder import keep_apart, written
 from pliant.results.mesh import mesh_report, meshes_of, write_meshes
 from pliant.results.run import folded_map
 from pliant_services.nodes import meshing
@@ -92,26 +94,22 @@ def run_mesh(
 ) -> Iterator[str]:
     """Mesh, write the files, and say what came of it.  Raises PliantError."""
     one_thread_each()
+    output = output or _beside(recording.resolve().parent)
+    keep_apart(output, [recording, *parts_of(recording)])
     config = recorded_config(summarise(recording).metadata, overrides)
     require_open3d()
-    folder = recording.resolve().parent
-    output = output or _beside(folder)
-    if output.resolve() == folder:
-        raise ResultError(f"{output} holds the recording itself: choose another --output")
-    check_output(output, force=force)
-    found = mesh_recording(recording, config)
-    yield from dict.fromkeys(found.notes)
-    history = folded_map(recording)
-    output.mkdir(parents=True, exist_ok=True)
-    write_all(output, found, history)
-    report = {
-        "mesh": mesh_report(found.pieces),
-        "seconds": found.seconds,
-        "counters": found.counters,
-        "notes": found.notes,
-        "config": config.meshing.model_dump(mode="json"),
-    }
-    (output / REPORT_NAME).write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    with written(output, force=force):
+        found = mesh_recording(recording, config)
+        yield from dict.fromkeys(found.notes)
+        write_all(output, found, folded_map(recording))
+        report = {
+            "mesh": mesh_report(found.pieces),
+            "seconds": found.seconds,
+            "counters": found.counters,
+            "notes": found.notes,
+            "config": config.meshing.model_dump(mode="json"),
+        }
+        write_whole(output / REPORT_NAME, json.dumps(report, indent=1) + "\n")
     for mesh in mesh_report(found.pieces):
         yield (
             f"segment {mesh['segment']}, {mesh['level']}: {mesh['triangles']} triangles, "

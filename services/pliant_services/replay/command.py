@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pliant.config import config_yaml, recorded_config
-from pliant.errors import RecordingError, ResultError
+from pliant.errors import RecordingError
 from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.recording.compare import check_tolerances, compare
+from pliant.recording.parts import parts_of
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
-from pliant.results.folder import RECORDING_NAME, check_output, prepare, run_metadata
+from pliant.results.folder import RECORDING_NAME, keep_apart, prepare, run_metadata, written
 from pliant.results.verdict import summary
 from pliant.results.write import write_results
 from pliant_services.replay.services import (
@@ -48,6 +49,14 @@ def comparable(made: Sequence[Topic], mode: str) -> list[Topic]:
 def run_replay(request: ReplayRequest) -> int:
     """Replay, write the results, compare; returns the exit code.  Raises PliantError."""
     one_thread_each()
+    folder = request.recording.resolve().parent
+    output = request.output or folder.with_name(f"{folder.name}_replay")
+    keep_apart(output, [request.recording, *parts_of(request.recording)])
+    with written(output, force=request.force):
+        return _replay_into(output, request)
+
+
+def _replay_into(output: Path, request: ReplayRequest) -> int:
     recorded = summarise(request.recording)
     services = replayable(request.services or recorded_services(recorded))
     if not recorded.has_index:
@@ -55,24 +64,18 @@ def run_replay(request: ReplayRequest) -> int:
             f"{request.recording}: not closed: `pliant recover` makes a recording that replays"
         )
     config = recorded_config(recorded.metadata, request.overrides)
-    folder = request.recording.resolve().parent
     require_inputs(recorded, services)
     replay = Replay(request.recording, recorded, services, config)
     check_tolerances(replay.made, request.tolerances)
-    output = request.output or folder.with_name(f"{folder.name}_replay")
-    check_output(output, force=request.force)
-    if output.resolve() == folder:
-        raise ResultError(f"{output} holds the recording itself: choose another --output")
     prepare(output, config_yaml(config))
     metadata = run_metadata(config_yaml(config))
     metadata["replay"] = {
         "of": str(request.recording),
         "services": ",".join(s.name for s in services),
     }
-    made = output / RECORDING_NAME
     for line in gaps(recorded, services):
         print(line, file=sys.stderr)
-    replay.run(made, metadata)
+    replay.run(output / RECORDING_NAME, metadata)
     report = write_results(output)
     has_map = topics.MAP_UPDATE in replay.made or topics.MAP_UPDATE.key not in replay.affected
     for line in summary(report, has_map=has_map):
@@ -82,7 +85,10 @@ def run_replay(request: ReplayRequest) -> int:
         return SAME
     compared = comparable(replay.made, report["mode"])
     differences = compare(
-        Recording(request.recording), Recording(made), compared, request.tolerances
+        Recording(request.recording),
+        Recording(output / RECORDING_NAME),
+        compared,
+        request.tolerances,
     )
     for difference in differences:
         print(

@@ -21,9 +21,11 @@ from pliant.results.folder import (
     CONFIG_NAME,
     RECORDING_NAME,
     STATE_FOLDER,
-    check_output,
     files_of,
+    files_read,
+    keep_apart,
     prepare,
+    written,
 )
 from pliant.results.verdict import grade, summary
 from pliant.results.write import write_results
@@ -66,15 +68,23 @@ def run_pipeline(request: RunRequest) -> int:
 
     Everything is checked before an earlier result is touched.
     """
-    config = load_config(request.config_file, request.overrides, seed=request.seed)
     output = request.output or Path("results") / _folder_name(request.source)
+    source = Path(request.source)
+    read = [source, *parts.parts_of(source)] if source.exists() else []
+    keep_apart(output, read)
+    if request.save is not None:
+        keep_apart(request.save, [*read, *files_read(output)], option="--save")
+    with written(output, force=request.force or request.resume):
+        return _run_into(output, request)
+
+
+def _run_into(output: Path, request: RunRequest) -> int:
+    config = load_config(request.config_file, request.overrides, seed=request.seed)
     profile = request.profile
     state = output / STATE_FOLDER if request.on_crash == "restart" or request.resume else None
     if request.resume:
         config = resumed_config(output, request)
         profile = _DEFORMABLE if (output / STATE_FOLDER / "surfels").is_dir() else profile
-    else:
-        check_output(output, force=request.force)
     if request.view or request.save:
         check_viewer(output, web=request.view == "web", save=request.save, force=request.force)
     if is_builtin(request.source):

@@ -7,14 +7,16 @@ then tells everybody that the session is over.
 
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 from pliant.bus.session import open_session
 from pliant.bus.zenoh_bus import OVER_KEY
 from pliant.config import Config, config_yaml
 from pliant.errors import ResultError, SessionOverError, SourceLostError
+from pliant.files import make_folder, put_in_place, write_whole
 from pliant.recording import parts
-from pliant.results.folder import CONFIG_NAME, RECORDING_NAME
+from pliant.results.folder import CONFIG_NAME, RECORDING_NAME, written
 from pliant.results.verdict import DONE, grade, summary
 from pliant.results.write import write_results
 from pliant_services.processes import BY_NAME, PROCESSES
@@ -37,16 +39,17 @@ def run_alone(name: str, config: Config, options: ServiceOptions, *, results: bo
     if not _is_done(name, options.state, recorded):
         if recorded is not None:
             _check_recording(recorded, options.state)
-        try:
-            run_service(name, config, options)
-        except SessionOverError as over:
-            print(over, file=sys.stderr)
-        except SourceLostError:  # what came before it is sent
-            _leave(options.state, name)
-            raise
-        if recorded is not None:
-            code = _write_results(recorded, config)
-            _join_parts(recorded)
+        with nullcontext() if recorded is None else written(recorded.parent, force=True):
+            try:
+                run_service(name, config, options)
+            except SessionOverError as over:
+                print(over, file=sys.stderr)
+            except SourceLostError:  # what came before it is sent
+                _leave(options.state, name)
+                raise
+            if recorded is not None:
+                code = _write_results(recorded, config)
+                _join_parts(recorded)
         _leave(options.state, name)
     else:
         print(f"{name}: its part of the session is done", file=sys.stderr)
@@ -110,9 +113,9 @@ def _check_recording(output: Path, state: Path | None) -> None:
     if parts.exists(output) and not (own is not None and own.is_dir()):
         raise ResultError(f"{output.parent} holds a recording already: choose another folder")
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(output.parent)
         if own is not None:
-            own.mkdir(parents=True, exist_ok=True)
+            make_folder(own)
     except OSError as error:
         raise ResultError(f"{output.parent}: cannot be written: {error.strerror}") from None
 
@@ -120,7 +123,7 @@ def _check_recording(output: Path, state: Path | None) -> None:
 def _write_results(output: Path, config: Config) -> int:
     """Write the results beside the recording, and say what came of it."""
     report = write_results(output.parent)
-    (output.parent / CONFIG_NAME).write_text(config_yaml(config), encoding="utf-8")
+    write_whole(output.parent / CONFIG_NAME, config_yaml(config))
     for line in summary(report):
         print(line, flush=True)
     return grade(report)
@@ -131,5 +134,5 @@ def _join_parts(output: Path) -> None:
     folder = parts.folder_of_parts(output)
     files = parts.parts_of(folder)
     if len(files) == 1 and not output.exists():
-        files[0].replace(output)
+        put_in_place(files[0], output)
         folder.rmdir()

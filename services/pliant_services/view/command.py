@@ -21,7 +21,7 @@ from pliant.messages.topics import Topic, by_key
 from pliant.messages.types import StreamEnd
 from pliant.recording import parts
 from pliant.recording.reader import Recording
-from pliant.results.folder import RECORDING_NAME
+from pliant.results.folder import RECORDING_NAME, files_read, keep_apart
 from pliant.viewers.canvas import Canvas
 from pliant.viewers.rerun import RerunCanvas, Where
 from pliant.viewers.scene import Scene
@@ -53,6 +53,8 @@ class ViewRequest:
 def run_view(request: ViewRequest) -> None:
     """Show it.  Raises PliantError."""
     where = place(web=request.web, save=request.save, force=request.force)
+    if request.save is not None and request.source is not None:
+        keep_apart(request.save, files_read(request.source), option="--save")
     endpoints, session = request.endpoints, request.session
     if not endpoints and request.source is not None and request.source.is_dir():
         endpoints, session = running_session(request.source)

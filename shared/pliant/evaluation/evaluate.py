@@ -16,6 +16,7 @@ from pliant.evaluation.report import (
     write_json,
 )
 from pliant.evaluation.result import evaluate_result
+from pliant.results.folder import files_read, keep_apart
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +40,10 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
     missing = [str(result) for result in request.results if not result.exists()]
     if missing:
         raise ResultError(f"{missing[0]}: no such result")
+    read = [file for result in request.results for file in [result, *files_read(result)]]
+    for option, path in (("--json", request.json), ("--plot", request.plot)):
+        if path is not None:
+            keep_apart(path, [*read, Path(request.groundtruth)], option=option)
     if request.surfels:
         yield from _evaluate_surfels(request)
         return

@@ -26,7 +26,7 @@ from pliant.pictures.movie import beside, write_animation, write_movie
 from pliant.pictures.overlay import OverlayFrame, TrackPainter, write_overlay_video
 from pliant.recording.parts import parts_in
 from pliant.recording.reader import Recording
-from pliant.results.folder import RECORDING_NAME
+from pliant.results.folder import RECORDING_NAME, files_read, keep_apart
 from pliant.results.run import read_run
 from pliant.results.surfels import has_surfels, surfel_trajectory
 from pliant.trajectory import Trajectory
@@ -68,10 +68,9 @@ def export_result(
     recording = Recording(result / RECORDING_NAME if folder is not None else result)
     name, write = EXPORTS[to]
     path = output or (result / name if folder is not None else _beside(result, name))
+    keep_apart(path, files_read(result))
     if path.exists() and not force:
         raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
-    if path.exists() and path.samefile(recording.files[0]):
-        raise ResultError(f"{path}: is the recording itself: choose another --output")
     fresh = not path.exists()
     try:
         if every is not None:

@@ -139,7 +139,7 @@ class RollingWriter:
 
     def _part(self) -> RecordingWriter:
         if not self._in_parts:
-            return RecordingWriter(self._path, self._metadata)
+            return RecordingWriter(self._path, self._metadata, replace=False)
         path = folder_of_parts(self._path) / PART.format(self._number)
         writer = RecordingWriter(
             path, {**self._metadata, PART_RECORD: {"number": str(self._number)}}, replace=False

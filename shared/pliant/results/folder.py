@@ -1,18 +1,22 @@
 """A result folder: the names of its files, who may write it, and what a run finds there."""
 
 import errno
+import fcntl
 import json
 import os
 import platform
 import shutil
 import subprocess
 import sys
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from pliant import __version__
 from pliant.errors import ResultError
+from pliant.files import make_folder, write_whole
 from pliant.recording import parts
 
 RECORDING_NAME = "recording.mcap"
@@ -31,7 +35,79 @@ _RIGID_FILES = (
 )
 SURFEL_FILES = (TRAJECTORY_NAME, SURFELS_NAME, REPORT_NAME)
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
+_LOCK_NAME = ".lock"
 _VERSIONS = ("eclipse-zenoh", "mcap", "msgpack", "numba", "numpy", "opencv-python-headless")
+
+
+def keep_apart(output: Path, read: Iterable[Path], *, option: str = "--output") -> None:
+    """Raise ResultError where what is written at a path would destroy what a command reads.
+
+    read: files and folders, which may not be the output nor lie in it, by what the paths resolve
+    to: links and ``..`` are seen through.  option: that names the output.
+    """
+    where = output.resolve()
+    for path in read:
+        # A link in the output is lost with it, though what it points to is not.
+        for found in (path.resolve(), path.parent.resolve() / path.name):
+            same = found.exists() and where.exists() and found.samefile(where)
+            if same or found == where or where in found.parents:
+                raise ResultError(f"{output}: {path} is read from there: choose another {option}")
+
+
+def files_read(result: Path) -> list[Path]:
+    """What a command may read of a result folder or a recording, or will write to one."""
+    names = (RECORDING_NAME, CONFIG_NAME, *_RIGID_FILES, *MESH_FILES, SURFELS_NAME)
+    return [*parts.parts_of(result), *(result / name for name in names)]
+
+
+@contextmanager
+def written(output: Path, *, force: bool) -> Generator[None]:
+    """Hold a result folder while results are written to it; made here, it goes if it stays empty.
+
+    The lock is the system's, so that of a process that died holds nobody up.  Raises ResultError
+    where the results cannot go there, or another process is writing them.
+    """
+    check_output(output, force=force)
+    missing = [folder for folder in (output, *output.parents) if not folder.exists()]
+    try:
+        make_folder(output)
+        lock = _locked(output)
+    except OSError as error:
+        raise _unwritable(output, error) from None
+    try:
+        check_output(output, force=force)  # another one may have been here meanwhile
+        yield
+    finally:
+        (output / _LOCK_NAME).unlink(missing_ok=True)
+        os.close(lock)
+        with suppress(OSError):
+            for folder in missing:
+                folder.rmdir()
+
+
+def _locked(output: Path) -> int:
+    """The descriptor of a lock file with our number in it."""
+    path = output / _LOCK_NAME
+    while True:
+        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.exists(path) and os.path.samestat(os.fstat(lock), os.stat(path)):
+                os.truncate(lock, 0)
+                os.write(lock, f"{os.getpid()}\n".encode())
+                return lock
+        except OSError as error:
+            if error.errno in (errno.ENOLCK, errno.ENOTSUP):  # a file system without locks
+                return lock
+            if error.errno not in (errno.EACCES, errno.EAGAIN):
+                raise
+            holder = os.read(lock, 20).decode().strip()
+            os.close(lock)
+            raise ResultError(
+                f"{output} is being written by process {holder or '?'}: "
+                "wait for its end, or choose another --output"
+            ) from None
+        os.close(lock)  # its holder left between our two looks, and took the file away
 
 
 def check_output(output: Path, *, force: bool) -> None:
@@ -39,7 +115,8 @@ def check_output(output: Path, *, force: bool) -> None:
     try:
         if output.exists() and not output.is_dir():
             raise ResultError(f"{output} is a file: choose another --output")
-        if output.is_dir() and any(output.iterdir()) and not force:
+        there = {each.name for each in output.iterdir()} if output.is_dir() else set[str]()
+        if there - {_LOCK_NAME} and not force:
             raise ResultError(
                 f"{output} exists: choose another --output, or --force to overwrite it"
             )
@@ -55,16 +132,15 @@ def check_output(output: Path, *, force: bool) -> None:
 def prepare(output: Path, config: str) -> None:
     """Make the folder, free of earlier results, with what the services read."""
     try:
-        (output / "logs").mkdir(parents=True, exist_ok=True)
+        make_folder(output / "logs")
         parts.remove(output / RECORDING_NAME)
         shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
         for name in (*_RIGID_FILES, *MESH_FILES, SURFELS_NAME):
             (output / name).unlink(missing_ok=True)
         for path in output.glob("*_segment_*"):
             path.unlink()
-        (output / CONFIG_NAME).write_text(config, encoding="utf-8")
-        metadata = json.dumps(run_metadata(config))
-        (output / "logs" / "metadata.json").write_text(metadata, encoding="utf-8")
+        write_whole(output / CONFIG_NAME, config)
+        write_whole(output / "logs" / "metadata.json", json.dumps(run_metadata(config)))
     except OSError as error:
         raise _unwritable(output, error) from None
 
@@ -82,7 +158,7 @@ def run_metadata(config: str) -> dict[str, dict[str, str]]:
     return {
         "pliant": {
             "version": __version__,
-            "commit": _commit(),
+            "commit": commit_of(Path(__file__).parents[1]),
             "command": " ".join(sys.argv),
             "python": platform.python_version(),
             "host": platform.node(),
@@ -94,12 +170,22 @@ def run_metadata(config: str) -> dict[str, dict[str, str]]:
     }
 
 
-def _commit() -> str:
-    """The commit of the checkout that runs; "" for an installed package."""
+def commit_of(package: Path) -> str:
+    """The commit of the checkout that a package is run from; "" for one that is installed.
+
+    A checkout of anything else may surround the place where it is installed.
+    """
+    git = ("git", "-C", package)
+    own = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+
+    def said(*arguments: str) -> str:
+        command = [*git, *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5, env=own)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
     try:
-        here = Path(__file__).parent
-        command = ["git", "-C", str(here), "rev-parse", "HEAD"]
-        return subprocess.run(command, capture_output=True, text=True, timeout=5).stdout.strip()
+        tracked = said("ls-files", "--full-name", "__init__.py")
+        return said("rev-parse", "HEAD") if tracked == "shared/pliant/__init__.py" else ""
     except (OSError, subprocess.SubprocessError):
         return ""
 

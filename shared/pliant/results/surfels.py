@@ -13,6 +13,7 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.surfels import SurfelState
 from pliant.config import recorded_config
 from pliant.errors import ResultError
+from pliant.files import move_all
 from pliant.formats.npz import NpzWriter
 from pliant.formats.tum import write_tum
 from pliant.messages import topics
@@ -78,8 +79,7 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
             report = _report(run, counts, len(followed))
             text = json.dumps(report, indent=1) + "\n"
             (folder / REPORT_NAME).write_text(text, encoding="utf-8")
-            for path in sorted(folder.iterdir()):
-                path.replace(output / path.name)
+            move_all(folder, output)
     except OSError as error:
         raise ResultError(
             f"{output}: cannot write the results ({error.strerror}); the recording is kept"

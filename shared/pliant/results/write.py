@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pliant.errors import ResultError
+from pliant.files import move_all
 from pliant.formats.ply import write_ply
 from pliant.formats.tum import write_tum
 from pliant.results.folder import RECORDING_NAME, REPORT_NAME
@@ -34,8 +35,7 @@ def _write_rigid_results(output: Path) -> dict[str, Any]:
     try:
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=output) as folder:
             _write_files(Path(folder), run, final, report)
-            for path in sorted(Path(folder).iterdir()):
-                path.replace(output / path.name)
+            move_all(Path(folder), output)
     except OSError as error:
         raise ResultError(
             f"{output}: cannot write the results ({error.strerror}); the recording is kept"
