@@ -122,7 +122,7 @@ def test_a_mistake_is_one_line(
     before = sorted(here.rglob("*"))
     monkeypatch.setattr(sys, "argv", ["pliant", *arguments])
     with pytest.raises(SystemExit) as ended:
-        cli.run_and_exit()
+        cli.run_and_exit(cli.app)
     output, errors = capsys.readouterr()
     assert ended.value.code == code
     assert len(errors.splitlines()) == 1, errors

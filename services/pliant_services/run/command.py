@@ -1,5 +1,6 @@
 """One run from the command line: check, compile, launch, wait, write the results."""
 
+import os
 import re
 import shutil
 import sys
@@ -70,7 +71,7 @@ def run_pipeline(request: RunRequest) -> int:
     """
     output = request.output or Path("results") / _folder_name(request.source)
     source = Path(request.source)
-    read = [source, *parts.parts_of(source)] if source.exists() else []
+    read = [source, *parts.parts_of(source)] if os.path.exists(request.source) else []
     keep_apart(output, read)
     if request.save is not None:
         keep_apart(request.save, [*read, *files_read(output)], option="--save")

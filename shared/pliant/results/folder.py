@@ -49,7 +49,7 @@ def keep_apart(output: Path, read: Iterable[Path], *, option: str = "--output") 
     for path in read:
         # A link in the output is lost with it, though what it points to is not.
         for found in (path.resolve(), path.parent.resolve() / path.name):
-            same = found.exists() and where.exists() and found.samefile(where)
+            same = os.path.exists(found) and os.path.exists(where) and found.samefile(where)
             if same or found == where or where in found.parents:
                 raise ResultError(f"{output}: {path} is read from there: choose another {option}")
 
