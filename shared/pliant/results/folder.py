@@ -70,18 +70,20 @@ def written(output: Path, *, force: bool) -> Generator[None]:
     check_output(output, force=force)
     missing = [folder for folder in (output, *output.parents) if not folder.exists()]
     try:
-        make_folder(output)
-        lock = _locked(output)
-    except OSError as error:
-        raise _unwritable(output, error) from None
-    try:
-        check_output(output, force=force)  # another one may have been here meanwhile
-        yield
+        try:
+            make_folder(output)
+            lock = _locked(output)
+        except OSError as error:
+            raise _unwritable(output, error) from None
+        try:
+            check_output(output, force=force)  # another one may have been here meanwhile
+            yield
+        finally:
+            (output / _LOCK_NAME).unlink(missing_ok=True)
+            os.close(lock)
     finally:
-        (output / _LOCK_NAME).unlink(missing_ok=True)
-        os.close(lock)
-        with suppress(OSError):
-            for folder in missing:
+        for folder in missing:
+            with suppress(OSError):
                 folder.rmdir()
 
 
