@@ -206,7 +206,10 @@ def _explain(error: ValidationError, file: Path | None) -> str:
 
 
 def recorded_config(metadata: Mapping[str, Mapping[str, str]], overrides: Sequence[str]) -> Config:
-    """The configuration in a recording's metadata with ``overrides`` on top."""
+    """The configuration in a recording's metadata with ``overrides`` on top.
+
+    Parameters that this release has no longer are passed over: all of a run can be said again.
+    """
     text = metadata.get("config", {}).get("yaml", "")
     try:
         content = yaml.safe_load(text) or {}
@@ -214,7 +217,9 @@ def recorded_config(metadata: Mapping[str, Mapping[str, str]], overrides: Sequen
         raise RecordingError("the configuration in the recording is damaged") from None
     if not isinstance(content, dict):
         raise RecordingError("the configuration in the recording is damaged")
-    return load_config(None, [*_flat(content), *overrides])
+    known = {name for name, _, _ in describe()}
+    recorded = [setting for setting in _flat(content) if setting.partition("=")[0] in known]
+    return load_config(None, [*recorded, *overrides])
 
 
 def _flat(content: Mapping[str, object], prefix: str = "") -> Iterator[str]:

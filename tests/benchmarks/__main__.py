@@ -130,7 +130,7 @@ def bundle(
 ) -> None:
     """Bundle adjustment beside Ceres (pyceres) and scipy: time to the same cost.  Ten minutes.
 
-    OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 scripts/bench bundle --problems bundle_adjustment
+    scripts/bench bundle --problems bundle_adjustment
     """
     from benchmarks.bundle import measure
 
@@ -145,7 +145,7 @@ def mesh_parts(
 ) -> None:
     """The parts of meshing on a synthetic keyframe, beside the paper's, and what NLTGV gains.
 
-    OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 scripts/bench mesh-parts
+    scripts/bench mesh-parts
     """
     from benchmarks.mesh_parts import measure
 

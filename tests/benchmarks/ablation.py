@@ -14,7 +14,6 @@ from pliant.evaluation.result import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
 from pliant.offline import Timers, process
-from pliant_services.runtime.host import one_thread_each
 
 _OFF = {
     "mutual check": ["tracking.mutual_check=false"],
@@ -43,7 +42,6 @@ VARIANTS: dict[str, list[str]] = {
 
 def measure(sources: Sequence[str]) -> Iterator[str]:
     """ATE (success rate where below 99 %) / median mapped inliers, a column for each source."""
-    one_thread_each()
     header = ["variant", *(Path(source).name for source in sources)]
     rows = []
     for name, overrides in VARIANTS.items():

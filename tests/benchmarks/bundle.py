@@ -7,10 +7,8 @@ from pathlib import Path
 from benchmarks.solvers import (
     compare_bundle_adjustment,
     plot_costs,
-    single_threaded,
 )
 from benchmarks.table import markdown
-from pliant.errors import PliantError
 
 _HEADER = (
     "problem",
@@ -25,8 +23,6 @@ _HEADER = (
 
 def measure(folder: Path | None, plot: Path | None) -> Iterator[str]:
     """Compare on the synthetic windows and, with a folder, on the public problems in it."""
-    if not single_threaded():
-        raise PliantError("set OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1: one thread for everybody")
     rows, comparisons = compare_bundle_adjustment(folder)
     reference = {row.problem: row.final_cost for row in rows if row.method.startswith("Ceres")}
     yield markdown(

@@ -13,7 +13,6 @@ from pliant.datasets import open_source
 from pliant.datasets.rectifier import Rectifier, decode, rectified
 from pliant.messages import codec
 from pliant.messages.types import Image
-from pliant_services.runtime.host import one_thread_each
 
 _PNG = (
     ("PNG, level 1", [cv2.IMWRITE_PNG_COMPRESSION, 1]),
@@ -30,7 +29,6 @@ _Work = tuple[Callable[[], bytes], Callable[[bytes], object]]
 
 def measure(source: str, frames: int) -> Iterator[str]:
     """Means over so many frames, evenly spread, of the better of two times each."""
-    one_thread_each()
     dataset = open_source(source)
     step = max(1, (dataset.frame_count or frames) // frames)
     rectifier = Rectifier(dataset.calibration)

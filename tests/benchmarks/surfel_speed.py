@@ -20,7 +20,6 @@ from pliant.errors import DatasetError
 from pliant.rendering.paths import SampledPath
 from pliant.rendering.render import CameraOptions, Renderer, SceneGeometry, paint_faces
 from pliant.rendering.scene import Material, Scene, Solid
-from pliant_services.runtime.host import one_thread_each
 
 KINDS: dict[str, dict[str, Any]] = {
     "static camera, each on its own": {"neighbours": 0},
@@ -37,7 +36,6 @@ def measure(source: str | None, frames: int, surfels: int) -> Iterator[str]:
     source: a folder with depth, or None for a board that moves 2 cm and 1 deg a frame.  Raises
     DatasetError where the first frame has no depth.
     """
-    one_thread_each()
     images, depth, camera = _board(frames + 1) if source is None else _film(source, frames + 1)
     rows: list[list[str]] = []
     stages: list[str] = []

@@ -12,7 +12,6 @@ from pliant.algorithms.tracking import ExtremaTracker
 from pliant.config import Config
 from pliant.datasets import Rectifier, open_source
 from pliant.datasets.rectifier import rectified
-from pliant_services.runtime.host import one_thread_each
 
 _WARM_FRAMES = 15
 _LK = {"winSize": (21, 21), "maxLevel": 3}
@@ -20,7 +19,6 @@ _LK = {"winSize": (21, 21), "maxLevel": 3}
 
 def measure(source: str, config: Config, frames: int) -> Iterator[str]:
     """Track ``frames`` frames on one core and print medians."""
-    one_thread_each()
     dataset = open_source(source)
     rectifier = Rectifier(dataset.calibration)
     camera = rectifier.camera

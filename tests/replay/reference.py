@@ -6,7 +6,7 @@ what a frame holds.
 
 import hashlib
 import json
-import os
+import platform
 import tempfile
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from pliant import arithmetic
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import config_yaml, load_config, recorded_config
 from pliant.datasets import open_source
@@ -25,7 +26,6 @@ from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
 from pliant_services.nodes import ingest, recorder
 from pliant_services.replay.services import Replay, replayable
-from pliant_services.runtime.host import one_thread_each
 from pliant_services.runtime.monitor import SilentMonitor
 
 INPUT, EXPECTED = "reference.mcap", "reference.json"
@@ -38,14 +38,9 @@ _PACKAGES = ("llvmlite", "numba", "numpy", "opencv-python-headless")
 
 
 def fingerprint() -> dict[str, str]:
-    """What the bytes depend on beside the input: the processor's features, packages' versions."""
-    import llvmlite.binding as llvm
-
-    features = ",".join(sorted(k for k, on in llvm.get_host_cpu_features().items() if on))
-    digest = hashlib.sha256(features.encode()).hexdigest()[:16]
-    cpu = {"cpu": llvm.get_host_cpu_name(), "cpu_features": digest}
-    blas = {"blas": os.environ.get("OPENBLAS_CORETYPE", "")}  # else what the processor can do
-    return {**cpu, **blas, **{name: version(name) for name in _PACKAGES}}
+    """What the bytes depend on beside the input: arithmetic, and whose."""
+    versions = {name: version(name) for name in _PACKAGES}
+    return {**arithmetic.in_force(), **versions, "libc": " ".join(platform.libc_ver())}
 
 
 def make_input(path: Path) -> None:
@@ -63,7 +58,6 @@ def make_input(path: Path) -> None:
 
 def replay(path: Path) -> dict[str, Any]:
     """Run the services on the recording: fingerprint, counts, hashes and medians by topic."""
-    one_thread_each()
     summary = summarise(path)
     again = Replay(path, summary, replayable(SERVICES), recorded_config(summary.metadata, []))
     with tempfile.TemporaryDirectory(prefix="pliant-reference-") as folder:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pliant.config import Config, config_yaml, describe, load_config
+from pliant.config import Config, config_yaml, describe, load_config, recorded_config
 from pliant.errors import ConfigError
 
 
@@ -58,3 +58,11 @@ def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
 def test_every_parameter_says_what_it_means() -> None:
     unexplained = [key for key, _, meaning in describe() if not meaning]
     assert not unexplained
+
+
+def test_a_recording_may_name_parameters_that_are_gone() -> None:
+    metadata = {"config": {"yaml": "seed: 4\nbus: {window: 7, gone: 1}\nleft: {out: [2]}\n"}}
+    config = recorded_config(metadata, ["bus.window=9"])
+    assert (config.seed, config.bus.window) == (4, 9)
+    with pytest.raises(ConfigError, match=r"unknown key bus\.gone"):
+        recorded_config(metadata, ["bus.gone=1"])

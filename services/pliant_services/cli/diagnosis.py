@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Literal
 
+from pliant import arithmetic
 from pliant.bus.session import free_endpoint, open_router, open_session
 from pliant.cache import cache_folder
 from pliant.errors import PliantError
@@ -40,6 +41,7 @@ def diagnose() -> list[Finding]:
         *(_package(distribution, module) for distribution, module in _PACKAGES.items()),
         _optional("matplotlib", "plots of `pliant eval`", "pip install 'pliant[plot]'"),
         _optional("open3d", "the mesh", "pip install 'pliant[mesh]' (needs libgl1 and libegl1)"),
+        _arithmetic(),
         _scratch(),
         _bus(),
     ]
@@ -67,6 +69,14 @@ def _optional(module: str, purpose: str, remedy: str) -> Finding:
         return Finding("ok", module, version(module))
     except (ImportError, OSError, PackageNotFoundError) as error:
         return Finding("warning", module, f"{_line(error)}; for {purpose}: {remedy}")
+
+
+def _arithmetic() -> Finding:
+    strays = arithmetic.strays()
+    if strays:
+        remedy = "other bytes than elsewhere; pip install --upgrade numpy opencv-python-headless"
+        return Finding("warning", "arithmetic", f"{', '.join(strays)}: {remedy}")
+    return Finding("ok", "arithmetic", arithmetic.target())
 
 
 def _scratch() -> Finding:

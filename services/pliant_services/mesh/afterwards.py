@@ -5,7 +5,6 @@ process that reads the recording and adds a part to it: as a whole, or, where it
 and then it is started again.
 """
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -21,7 +20,7 @@ from pliant.results.folder import RECORDING_NAME
 from pliant_services.processes import BY_NAME
 from pliant_services.replay.services import run_on
 from pliant_services.runtime.child import Child
-from pliant_services.runtime.host import ONE_THREAD, end_with_launcher, one_thread_each
+from pliant_services.runtime.host import end_with_launcher
 from pliant_services.runtime.launcher import MOST_DEATHS, ServiceDiedError
 
 _MESHING = BY_NAME["meshing"]
@@ -42,7 +41,6 @@ def add_mesh(output: Path) -> None:
             stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env={**os.environ, **ONE_THREAD},
             start_new_session=True,  # Ctrl-C reaches the launcher alone
         )
         child = Child(_MESHING.name, process, output / "logs" / f"{_MESHING.name}.log")
@@ -61,7 +59,6 @@ def add_mesh(output: Path) -> None:
 
 def mesh_into_recording(output: Path) -> None:
     """Mesh here and now; the recording has one part more.  Raises RecordingError, FusionError."""
-    one_thread_each()
     path = output / RECORDING_NAME
     recording, summary = Recording(path), summarise(path)
     folder = folder_of_parts(path)

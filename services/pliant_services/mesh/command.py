@@ -27,7 +27,6 @@ from pliant.results.mesh import mesh_report, meshes_of, write_meshes
 from pliant.results.run import folded_map
 from pliant_services.nodes import meshing
 from pliant_services.processes import BY_NAME
-from pliant_services.runtime.host import one_thread_each
 from pliant_services.runtime.monitor import StatusMonitor
 
 REPORT_NAME = "mesh.json"
@@ -93,7 +92,6 @@ def run_mesh(
     recording: Path, *, output: Path | None, force: bool, overrides: Sequence[str]
 ) -> Iterator[str]:
     """Mesh, write the files, and say what came of it.  Raises PliantError."""
-    one_thread_each()
     output = output or _beside(recording.resolve().parent)
     keep_apart(output, [recording, *parts_of(recording)])
     config = recorded_config(summarise(recording).metadata, overrides)

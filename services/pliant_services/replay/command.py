@@ -23,7 +23,6 @@ from pliant_services.replay.services import (
     replayable,
     require_inputs,
 )
-from pliant_services.runtime.host import one_thread_each
 
 SAME, DIFFERENT = 0, 1
 
@@ -48,7 +47,6 @@ def comparable(made: Sequence[Topic], mode: str) -> list[Topic]:
 
 def run_replay(request: ReplayRequest) -> int:
     """Replay, write the results, compare; returns the exit code.  Raises PliantError."""
-    one_thread_each()
     folder = request.recording.resolve().parent
     output = request.output or folder.with_name(f"{folder.name}_replay")
     keep_apart(output, [request.recording, *parts_of(request.recording)])
@@ -100,7 +98,10 @@ def _replay_into(output: Path, request: ReplayRequest) -> int:
         how = "the same within the tolerances" if request.tolerances else "the same bytes"
         print(f"{how} as recorded: {keys}")
         return SAME
-    before, now = recorded.metadata.get("packages", {}), metadata["packages"]
+    before, now = (
+        {**found.get("arithmetic", {}), **found.get("packages", {})}
+        for found in (recorded.metadata, metadata)
+    )
     for name in sorted(before.keys() & now.keys()):
         if before[name] != now[name]:
             print(f"recorded with {name} {before[name]}, here is {now[name]}")

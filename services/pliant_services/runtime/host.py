@@ -59,7 +59,6 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
 
     Raises SourceLostError, after everything before has been sent, for a source that failed.
     """
-    one_thread_each()
     process = processes.BY_NAME[name]
     module = importlib.import_module(process.module)
     arguments = dict(options.arguments)
@@ -177,23 +176,6 @@ def random_delays(largest_ms: float) -> Callable[[], None] | None:
             time.sleep(1e-3 * largest_ms * random.random())
 
     return wait
-
-
-def one_thread_each() -> None:
-    """One thread for OpenCV, so that results do not depend on threads.  See also ``ONE_THREAD``."""
-    import cv2
-
-    cv2.setNumThreads(1)
-    cv2.ocl.setUseOpenCL(False)
-
-
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
-}
-"""Environment of every service: BLAS and OpenMP read it when they are loaded."""
 
 
 def end_with_launcher() -> None:

@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pliant
+from pliant import arithmetic
 from pliant.cache import cache_folder
 from pliant.errors import PliantError
 from pliant_services.processes import BY_NAME, PROCESSES
@@ -77,7 +78,6 @@ def load_kernels(service: str) -> None:
 
 
 def _fingerprint() -> str:
-    import llvmlite.binding as llvm
     import numba
 
     digest = hashlib.sha256()
@@ -85,5 +85,5 @@ def _fingerprint() -> str:
     for path in sorted(root.rglob("*.py")):
         digest.update(f"{path.relative_to(root)} {path.stat().st_mtime_ns}".encode())
     where = f"{root} {numba.config.CACHE_DIR}"  # type: ignore[attr-defined]
-    digest.update(f"{where} {sys.version} {numba.__version__} {llvm.get_host_cpu_name()}".encode())
+    digest.update(f"{where} {sys.version} {numba.__version__} {arithmetic.target()}".encode())
     return digest.hexdigest()[:24]

@@ -24,7 +24,6 @@ from pliant.messages import codec, topics
 from pliant.messages.types import Status
 from pliant_services.processes import BY_NAME
 from pliant_services.runtime.child import Child
-from pliant_services.runtime.host import ONE_THREAD
 from pliant_services.runtime.relay import Relay
 
 READY_TIMEOUT_S = 120.0
@@ -176,7 +175,6 @@ class Fleet:
             stdin=subprocess.PIPE,  # never written: it closes when the launcher is gone
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env={**os.environ, **ONE_THREAD},
             start_new_session=True,  # Ctrl-C reaches the launcher alone
         )
         return Child(name, process, self._log_folder / f"{name}.log")

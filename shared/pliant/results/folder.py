@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pliant import __version__
+from pliant import __version__, arithmetic
 from pliant.errors import ResultError
 from pliant.files import make_folder, write_whole
 from pliant.recording import parts
@@ -167,6 +167,7 @@ def run_metadata(config: str) -> dict[str, dict[str, str]]:
             "machine": f"{platform.system()} {platform.machine()}",
             "cpu_count": str(os.cpu_count()),
         },
+        "arithmetic": {"target": arithmetic.target()},
         "packages": {name: version(name) for name in _VERSIONS},
         "config": {"yaml": config},
     }

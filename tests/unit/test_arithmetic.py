@@ -1,0 +1,74 @@
+"""The same bytes, whatever the processor can do beyond AVX2 and however many threads BLAS likes."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pliant import arithmetic
+
+TESTS = Path(__file__).parents[1]
+
+# A user's script: numpy first.
+_ADJUSTMENT = """
+import hashlib
+import numpy
+from bundle_scene import make_scene
+from pliant.algorithms.bundle import BundleParameters, solve_schur
+problem = make_scene(cameras=40, points=300, noise_px=0.5, visible=0.4).problem
+result = solve_schur(problem, BundleParameters())
+print(hashlib.sha256(result.T_world_camera.tobytes()).hexdigest())
+"""
+_REFERENCE = """
+import json, pliant, reference
+print(json.dumps(reference.replay(reference.Path("tests/data/reference/reference.mcap"))))
+"""
+# As if this were a processor with less, as far as libraries can be told.
+_LESSER = {
+    "NUMBA_CPU_NAME": "nehalem",
+    "NUMBA_CPU_FEATURES": "",
+    "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4",
+    "OPENBLAS_CORETYPE": "Nehalem",
+    "OPENCV_CPU_DISABLE": "AVX2",
+    "OPENCV_IPP": "sse42",
+}
+
+
+def _answer(code: str, environment: dict[str, str]) -> str:
+    """What a process prints that inherits nothing of what this one has set."""
+    ours = {"OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "NUMBA_DISABLE_INTEL_SVML"}
+    kept = {name: value for name, value in os.environ.items() if name not in {*_LESSER, *ours}}
+    paths = os.pathsep.join(str(TESTS / folder) for folder in ("unit", "replay"))
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**kept, "PYTHONPATH": paths, **environment},
+        cwd=TESTS.parent,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_threads_of_blas_change_nothing() -> None:
+    """An adjustment of some size: the factors of its reduced system once depended on them."""
+    answers = {_answer(_ADJUSTMENT, {"OPENBLAS_NUM_THREADS": threads}) for threads in ("1", "4")}
+    assert len(answers) == 1
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="of one target on x86-64 alone")
+def test_a_lesser_processor_makes_the_same_of_the_reference() -> None:
+    found: list[dict[str, Any]] = [json.loads(_answer(_REFERENCE, e)) for e in ({}, _LESSER)]
+    assert found[0] == found[1]
+
+
+@pytest.mark.skipif(arithmetic.target() != arithmetic.TARGET, reason="a processor without AVX2")
+def test_all_libraries_compute_for_the_target_unless_they_were_loaded_before() -> None:
+    assert arithmetic.strays() == []
+    code = "import numpy\nfrom pliant.arithmetic import strays\nprint(strays())"
+    assert "Nehalem x 1" in _answer(code, _LESSER)
