@@ -121,7 +121,7 @@ def latency_rows() -> Iterator[Sequence[str]]:
             two = stack.enter_context(hosts("robot", "rack"))
         except pytest.skip.Exception:
             return
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "certs"
         address = two.address(TWO["recorder"])
         make_certificates(folder, NAMES, [address])
         where = {"router": "rack", "reader": "rack", "sender": "robot"}

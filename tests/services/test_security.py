@@ -1,5 +1,9 @@
 """Certificates and access control over real TLS links on loopback."""
 
+import itertools
+import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import closing
@@ -9,13 +13,22 @@ import pytest
 
 pytest.importorskip("cryptography")
 
-from pliant.bus.session import Identity, free_endpoint, open_router, open_session
-from pliant.errors import BusError
+from cryptography.x509 import ExtendedKeyUsage, SubjectAlternativeName, load_pem_x509_certificate
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
+from pliant.bus.session import (
+    Identity,
+    free_endpoint,
+    is_beyond_loopback,
+    open_router,
+    open_session,
+)
+from pliant.errors import BusError, ResultError
 from pliant.messages import topics
 from pliant.recording.reader import Recording
 from pliant_services.runtime.relay import Relays
 from pliant_services.security.access import NAMES, OPERATOR, access_control, may_write
-from pliant_services.security.certificates import make_certificates
+from pliant_services.security.certificates import ROUTER, make_certificates
 
 PATIENCE_S = 20.0
 
@@ -43,15 +56,79 @@ def test_made_once_and_keys_are_secret(folder: Path) -> None:
     assert (folder / "tracking.key").stat().st_mode & 0o077 == 0
 
 
+def test_only_a_folder_that_nobody_mounts_has_the_key_that_signs(folder: Path) -> None:
+    assert not (folder / "ca.key").exists()
+    key = folder.with_name(f"{folder.name}-authority") / "ca.key"
+    assert key.stat().st_mode & 0o077 == key.parent.stat().st_mode & 0o077 == 0
+    with pytest.raises(ResultError, match="keep the authority elsewhere"):
+        make_certificates(folder, NAMES, [], authority=folder / "authority")
+
+
+def test_an_authority_that_is_elsewhere_is_asked_for(folder: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    (copy / "operator.key").unlink()
+    with pytest.raises(ResultError, match="--authority"):
+        make_certificates(copy, NAMES, [])
+    authority = folder.with_name(f"{folder.name}-authority")
+    assert make_certificates(copy, NAMES, [], authority=authority) == ["operator"]
+    (copy / "ca.key").write_bytes((authority / "ca.key").read_bytes())  # as it was until 0.1
+    with pytest.raises(ResultError, match="in another folder"):
+        make_certificates(copy, NAMES, [], authority=authority)
+
+
+def test_no_other_certificate_plays_the_router(folder: Path) -> None:
+    found = free_endpoint().replace("tcp/", "tls/")
+    with (
+        closing(open_router(found, identity=Identity.in_folder(folder, OPERATOR))),
+        pytest.raises(BusError, match="cannot reach"),
+    ):
+        open_session([found], Identity.in_folder(folder, "ingest"))
+
+
+def test_only_the_routers_certificate_proves_a_server(folder: Path) -> None:
+    for name in NAMES:
+        certificate = load_pem_x509_certificate((folder / f"{name}.pem").read_bytes())
+        usages = certificate.extensions.get_extension_for_class(ExtendedKeyUsage).value
+        assert (ExtendedKeyUsageOID.SERVER_AUTH in usages) == (name == ROUTER)
+        kinds = [type(extension.value) for extension in certificate.extensions]
+        assert (SubjectAlternativeName in kinds) == (name == ROUTER)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.1"])
+def test_a_router_that_anybody_reaches_says_so(host: str) -> None:
+    endpoint = free_endpoint().replace("127.0.0.1", host)
+    router = subprocess.Popen(
+        [sys.executable, "-m", "pliant_services.cli", "router", "--listen", endpoint],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with router:
+        assert router.stderr is not None
+        said = list(itertools.takewhile(lambda line: "router on" not in line, router.stderr))
+        router.terminate()
+    warned = [line for line in said if "WARNING" in line and "pliant certs" in line]
+    assert len(warned) == (host == "0.0.0.0")
+
+
+def test_which_endpoints_other_machines_reach() -> None:
+    assert not any(
+        map(is_beyond_loopback, ["tcp/localhost:1", "tcp/[::1]:1", "unixsock-stream//run/pliant"])
+    )
+    assert all(
+        map(is_beyond_loopback, ["tcp/[::]:1", "udp/10.0.0.2:1", "tcp/rack.local:1#iface=a"])
+    )
+
+
 def test_without_a_certificate_nobody_gets_in(endpoint: str) -> None:
     with pytest.raises(BusError, match="cannot reach"):
         open_session([endpoint])
 
 
 def test_a_certificate_of_another_authority_is_refused(endpoint: str, tmp_path: Path) -> None:
-    make_certificates(tmp_path, ["tracking"], [])
+    make_certificates(tmp_path / "theirs", ["tracking"], [])
     with pytest.raises(BusError, match="cannot reach"):
-        open_session([endpoint], Identity.in_folder(tmp_path, "tracking"))
+        open_session([endpoint], Identity.in_folder(tmp_path / "theirs", "tracking"))
 
 
 def test_a_service_publishes_its_own_topics_and_no_other(endpoint: str, folder: Path) -> None:

@@ -12,15 +12,21 @@ def certs(
         list[str] | None,
         typer.Option("--host", help="Name or address of the router's machine; may be repeated."),
     ] = None,
+    authority: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the key that signs them; by default FOLDER-authority."),
+    ] = None,
 ) -> None:
     """Make certificates for the router, every service and the operator.
 
     pliant certs certs --host rack.local --host 10.0.0.2
 
-    Give each machine ca.pem and the two files of each service that it runs; ca.key stays here.
+    Give each machine ca.pem and the two files of each service that it runs.  The key that signs
+    lies in a folder of its own: it is needed for nothing else, and stays here.
     """
     from pliant_services.security.access import NAMES
     from pliant_services.security.certificates import make_certificates
 
-    made = make_certificates(folder, NAMES, ["localhost", "127.0.0.1", *(hosts or [])])
+    names = ["localhost", "127.0.0.1", *(hosts or [])]
+    made = make_certificates(folder, NAMES, names, authority=authority)
     typer.echo(f"{folder}: made {', '.join(made)}" if made else f"{folder}: everything is there")

@@ -28,10 +28,11 @@ def router(
     import signal
     import threading
 
-    from pliant.bus.session import Identity, open_router
+    from pliant.bus.session import Identity, is_beyond_loopback, open_router
     from pliant.bus.zenoh_bus import OVER_KEY
     from pliant_services.runtime.relay import Relays
     from pliant_services.security.access import access_control
+    from pliant_services.security.certificates import ROUTER
 
     stopped = threading.Event()
 
@@ -42,9 +43,17 @@ def router(
         signal.signal(kind, on_signal)
     endpoints = listen or ["tcp/127.0.0.1:7447"]
     secure = tls is not None
+    open_to_all = [] if secure else [each for each in endpoints if is_beyond_loopback(each)]
+    if open_to_all:
+        typer.echo(
+            f"WARNING: {', '.join(open_to_all)} is not on this machine alone, and asks for no "
+            "certificate: whoever reaches it sees every image, and may send what they like. "
+            "See `pliant certs`.",
+            err=True,
+        )
     session = open_router(
         *endpoints,
-        identity=Identity.in_folder(tls, "router") if tls is not None else None,
+        identity=Identity.in_folder(tls, ROUTER) if tls is not None else None,
         access_control=access_control() if secure else None,
     )
 

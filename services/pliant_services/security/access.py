@@ -6,10 +6,11 @@ from typing import Any
 from pliant.bus.health import health_key
 from pliant.bus.zenoh_bus import OVER_KEY, STOP_KEY
 from pliant_services.processes import BY_NAME, PROCESSES, outputs_of
+from pliant_services.security.certificates import ROUTER
 
 OPERATOR = "operator"
 """May look at every session and end it; also the name of viewers' certificates."""
-NAMES = ("router", OPERATOR, *(process.name for process in PROCESSES))
+NAMES = (ROUTER, OPERATOR, *(process.name for process in PROCESSES))
 """Everybody who needs a certificate."""
 
 _READ = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query", "query"]

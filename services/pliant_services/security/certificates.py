@@ -10,41 +10,72 @@ from typing import Any
 
 from pliant.errors import PliantError, ResultError
 
+ROUTER = "router"
+_AUTHORITY = "pliant"
 _VALID = timedelta(days=825)  # the longest that common TLS libraries take
 _BACKDATED = timedelta(days=1)  # machines' clocks differ
 
 
-def make_certificates(folder: Path, names: Sequence[str], hosts: Sequence[str]) -> list[str]:
+def make_certificates(
+    folder: Path, names: Sequence[str], hosts: Sequence[str], *, authority: Path | None = None
+) -> list[str]:
     """Make what is missing of the authority and the named certificates; returns what was made.
 
-    hosts: names and addresses by which the router is reached.  Keys are readable by their owner
-    alone.  Raises PliantError without the package ``cryptography``, ResultError where the folder
-    cannot be written.
+    Only the one named ROUTER proves a server, with these ``hosts``, the names and addresses by
+    which it is reached; the others prove clients.  authority: the folder of the authority's own
+    key, beside the other unless it is given: whoever has that key is whoever they want to be, so it
+    is not where services look.  Keys are readable by their owner alone.  Raises PliantError without
+    the package ``cryptography``, ResultError where a folder cannot be written or does not fit.
     """
+    authority = authority or authority_of(folder)
+    _check(folder, authority)
     x509 = _module("x509")
     ec = _module("hazmat.primitives.asymmetric.ec")
     made: list[str] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / "ca.key").exists():
+        authority.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if not (authority / "ca.key").exists():
             key = ec.generate_private_key(ec.SECP256R1())
-            _write(folder, "ca", key, _sign(key, "pliant", key, "pliant", authority=True, hosts=()))
+            _write(authority, "ca", key, _sign(_authority_named(_AUTHORITY, key), key))
             made.append("ca")
-        authority = _load_key(folder / "ca.key")
-        issuer = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
-        del issuer  # read, so that a broken one is noticed before keys are made for it
+        signing = _load_key(authority / "ca.key")
+        issuer = (authority / "ca.pem").read_bytes()
+        x509.load_pem_x509_certificate(issuer)  # a broken one is noticed before keys are made
+        (folder / "ca.pem").write_bytes(issuer)
         for name in names:
             if (folder / f"{name}.key").exists():
                 continue
             key = ec.generate_private_key(ec.SECP256R1())
-            certificate = _sign(key, name, authority, "pliant", authority=False, hosts=hosts)
-            _write(folder, name, key, certificate)
+            certificate = _leaf_named(name, key, hosts if name == ROUTER else None)
+            _write(folder, name, key, _sign(certificate, signing))
             made.append(name)
     except OSError as error:
-        raise ResultError(f"{folder}: cannot be written: {error.strerror}") from None
+        where = error.filename or folder
+        raise ResultError(f"{where}: cannot be written: {error.strerror}") from None
     except ValueError as error:
-        raise ResultError(f"{folder}: a broken authority there: {error}") from None
+        raise ResultError(f"{authority}: a broken authority there: {error}") from None
     return made
+
+
+def authority_of(folder: Path) -> Path:
+    """Where the key of the authority of these certificates lies, unless it was put elsewhere."""
+    return folder.with_name(f"{folder.resolve().name}-authority")
+
+
+def _check(folder: Path, authority: Path) -> None:
+    if authority.resolve().is_relative_to(folder.resolve()):
+        raise ResultError(f"{authority}: services look into {folder}: keep the authority elsewhere")
+    if (folder / "ca.key").exists():
+        raise ResultError(
+            f"{folder}: made by an earlier release, where each certificate could pass for the "
+            "router's: make all of them again, in another folder"
+        )
+    if (folder / "ca.pem").exists() and not (authority / "ca.key").exists():
+        raise ResultError(
+            f"{authority / 'ca.key'}: not there, and {folder} has certificates of it: say with "
+            "--authority where it is"
+        )
 
 
 def _module(name: str) -> Any:
@@ -56,28 +87,44 @@ def _module(name: str) -> Any:
         ) from None
 
 
-def _sign(
-    key: Any, name: str, authority_key: Any, issuer: str, *, authority: bool, hosts: Sequence[str]
-) -> Any:
-    x509, hashes = _module("x509"), _module("hazmat.primitives.hashes")
-    now = datetime.now(UTC)
+def _authority_named(name: str, key: Any) -> Any:
+    x509 = _module("x509")
+    constraints = x509.BasicConstraints(ca=True, path_length=None)
+    return _builder(name, key).add_extension(constraints, critical=True)
+
+
+def _leaf_named(name: str, key: Any, hosts: Sequence[str] | None) -> Any:
+    """A server's for these hosts, or with None a client's."""
+    x509 = _module("x509")
+    usages = x509.oid.ExtendedKeyUsageOID
+    usage = usages.CLIENT_AUTH if hosts is None else usages.SERVER_AUTH
     builder = (
+        _builder(name, key)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([usage]), critical=True)
+    )
+    if hosts is None:
+        return builder
+    names = [_host(x509, host) for host in (name, *hosts)]
+    return builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+
+
+def _builder(name: str, key: Any) -> Any:
+    x509 = _module("x509")
+    now = datetime.now(UTC)
+    return (
         x509.CertificateBuilder()
         .subject_name(_name(name))
-        .issuer_name(_name(issuer))
+        .issuer_name(_name(_AUTHORITY))
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - _BACKDATED)
         .not_valid_after(now + _VALID)
-        .add_extension(x509.BasicConstraints(ca=authority, path_length=None), critical=True)
     )
-    if not authority:
-        names = [_host(x509, host) for host in (name, *hosts)]
-        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-        usages = x509.oid.ExtendedKeyUsageOID
-        usage = x509.ExtendedKeyUsage([usages.CLIENT_AUTH, usages.SERVER_AUTH])
-        builder = builder.add_extension(usage, critical=False)
-    return builder.sign(authority_key, hashes.SHA256())
+
+
+def _sign(builder: Any, authority_key: Any) -> Any:
+    return builder.sign(authority_key, _module("hazmat.primitives.hashes").SHA256())
 
 
 def _name(common_name: str) -> Any:
@@ -89,7 +136,7 @@ def _host(x509: Any, host: str) -> Any:
     try:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
-        return x509.DNSName(host.replace("_", "-"))
+        return x509.DNSName(host)
 
 
 def _load_key(path: Path) -> Any:

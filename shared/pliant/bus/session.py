@@ -4,6 +4,7 @@ import json
 import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,18 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def is_beyond_loopback(endpoint: str) -> bool:
+    """Whether other machines may reach an endpoint that is listened on, as far as it says."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol.startswith("unix"):
+        return False
+    host = address.partition("#")[0].rpartition(":")[0].strip("[]")
+    try:
+        return not ip_address(host).is_loopback
+    except ValueError:
+        return host != "localhost"
 
 
 def _first_line(error: Exception) -> str:
