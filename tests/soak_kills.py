@@ -35,9 +35,8 @@ from running import (
 from pliant.bus.session import free_endpoint, open_session
 from pliant.messages import codec, topics
 from pliant.messages.types import Status
-from pliant.results.folder import MESH_FILES, SURFELS_NAME
+from pliant.results.folder import MESH_FILES, SESSION_NAME, SURFELS_NAME
 from pliant_services.processes import PROFILES
-from pliant_services.view.command import SESSION_NAME
 
 TIMEOUT_S = 300.0
 LATER_S = 0.1

@@ -37,6 +37,7 @@ _CLASSES = {
 }
 """Those that are no records: neither dataclasses, nor named tuples, nor parameters."""
 _FUNCTIONS = {"no_stages"}
+
 _PLAIN = (type(None), bool, float, str, bytes)
 _LIMIT = 1 << 62
 
@@ -238,15 +239,17 @@ def _is_listed(thing: Any) -> bool:
     )
 
 
-def _schema(classes: Iterable[Any]) -> str:
+def _schema(classes: Iterable[type]) -> str:
     """Eight hexadecimal digits of the fields that records of these classes have."""
     lines: set[str] = set()
     for own in classes:
-        declared = {field.name: field.type for field in fields(own)} if is_dataclass(own) else {}
+        declared: Mapping[str, Any] = {}
         if issubclass(own, BaseModel):
             declared = {name: info.annotation for name, info in own.model_fields.items()}
         elif issubclass(own, tuple):
             declared = own.__annotations__
+        elif is_dataclass(own):
+            declared = {field.name: field.type for field in fields(own)}
         lines |= {f"{own.__module__}.{own.__name__}.{n}: {kind}" for n, kind in declared.items()}
     return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()[:8]
 

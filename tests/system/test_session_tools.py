@@ -1,5 +1,7 @@
 """A session from its parts: a router of its own, services started one by one, status and stop."""
 
+import json
+import stat
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -81,6 +83,29 @@ def test_an_empty_router_has_no_services_and_no_session(endpoint: str) -> None:
     assert (shown.returncode, "no services" in shown.stderr) == (1, True)
     stopped = call("stop", "--connect", endpoint, "--session", "none")
     assert (stopped.returncode, "no session none" in stopped.stderr) == (1, True)
+
+
+def test_a_run_is_found_by_its_result_folder(tmp_path: Path) -> None:
+    """Its router is at a socket that only its user reaches."""
+    (idle := tmp_path / "idle").mkdir()
+    for command in ("status", "stop"):
+        refused = call(command, str(idle))
+        assert (refused.returncode, "no run goes on there" in refused.stderr) == (1, True)
+    result = tmp_path / "room"
+    with start("run", "built-in:room", "--output", str(result)) as run:
+        rows: set[str] = set()
+        while not {"ingest", "recorder"} <= rows:
+            shown = call("status", str(result), "--seconds", "1.5")
+            rows = {line.split()[1] for line in shown.stdout.splitlines()[1:]}
+            assert run.poll() is None
+        endpoint = json.loads((result / "session.json").read_text())["endpoint"]
+        socket = Path(endpoint.removeprefix("unixsock-stream/"))
+        assert stat.S_ISSOCK(socket.stat().st_mode)
+        assert socket.parent.stat().st_mode & 0o777 == 0o700
+        stopped = call("stop", str(result))
+        assert stopped.returncode == 0, stopped.stderr
+        assert run.wait(120) in (0, 3)
+        assert not socket.parent.exists()
 
 
 def test_a_session_without_a_launcher_writes_its_results_and_ends_its_router(

@@ -11,6 +11,12 @@ if TYPE_CHECKING:
 Connect = Annotated[
     list[str], typer.Option("--connect", help="Router endpoint, e.g. tcp/host:7447.")
 ]
+ConnectToo = Annotated[
+    list[str] | None, typer.Option("--connect", help="Or a router endpoint, e.g. tcp/host:7447.")
+]
+Running = Annotated[
+    Path | None, typer.Argument(help="Result folder of a run that goes on.", show_default=False)
+]
 TlsFolder = Annotated[
     Path | None, typer.Option("--tls", help="Folder that `pliant certs` made, for tls/ endpoints.")
 ]
@@ -21,3 +27,23 @@ def identity_in(tls: Path | None, name: str) -> "Identity | None":
     from pliant.bus.session import Identity
 
     return Identity.in_folder(tls, name) if tls is not None else None
+
+
+def session_at(
+    result: Path | None, connect: list[str] | None, session: str
+) -> tuple[list[str], str]:
+    """Endpoints and name of a session: of the run that writes a result, or as they are given.
+
+    Raises ResultError where no run does, and without either.
+    """
+    from pliant.errors import ResultError
+    from pliant.results.folder import running_session
+
+    if result is None:
+        if not connect:
+            raise ResultError("which session? Give the result folder of a run, or --connect")
+        return connect, session
+    endpoints, name = running_session(result)
+    if not endpoints:
+        raise ResultError(f"{result}: no run goes on there")
+    return endpoints, name

@@ -4,16 +4,19 @@ from typing import Annotated
 
 import typer
 
-from pliant_services.cli.options import Connect, TlsFolder, identity_in
+from pliant_services.cli.options import ConnectToo, Running, TlsFolder, identity_in, session_at
 
 
 def stop(
-    connect: Connect,
+    result: Running = None,
+    connect: ConnectToo = None,
     session: Annotated[str, typer.Option(help="Name of the session to end.")] = "default",
     wait: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for its end.")] = 60.0,
     tls: TlsFolder = None,
 ) -> None:
     """End the source after the frame at hand; the others follow once they have read everything.
+
+    pliant stop results/room
 
     pliant stop --connect tcp/127.0.0.1:7447
     """
@@ -21,6 +24,7 @@ def stop(
     from pliant_services.runtime.status import stop_session
     from pliant_services.security.access import OPERATOR
 
-    left = stop_session(connect, session, wait, identity_in(tls, OPERATOR))
+    endpoints, session = session_at(result, connect, session)
+    left = stop_session(endpoints, session, wait, identity_in(tls, OPERATOR))
     if left:
         raise BusError(f"{', '.join(left)} still there after {wait:.0f} s")

@@ -73,13 +73,14 @@ def run(
             bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)
             bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
             counters = {"dropped": dropped, "broken": broken, "unmapped": pace.passed}
-            monitor.report(image, **counters, **drops.counters)
+            monitor.report(image, note="", **counters, **drops.counters)
             kept = (tuple(vars(pace).values()), (drops.counters,))
             bus.checkpoint(image.frame, (image.frame + 1, dropped, broken, *kept))
     except DatasetError as error:
         if image is None:
             raise
-        monitor.report(image, note=str(error), **counters, **drops.counters)
+        counters |= drops.counters
+        monitor.report(image, note=str(error), **counters)
         raise SourceLostError(str(error)) from None
 
 

@@ -143,6 +143,8 @@ def _go_through(
 ) -> tuple[bool, PliantError | None]:
     """Start the services and wait for their end: whether it was Ctrl-C, and what went wrong."""
     try:
+        if fleet.note:
+            progress.say(fleet.note)
         warm_up.compile_kernels(progress.say)  # whatever ends it, an earlier result is as it was
         if not request.resume:
             prepare(output, config_yaml(config))

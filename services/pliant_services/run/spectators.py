@@ -9,8 +9,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from pliant.errors import ResultError
+from pliant.results.folder import SESSION_NAME
 from pliant_services.runtime.launcher import Fleet
-from pliant_services.view.command import SESSION_NAME, place
+from pliant_services.view.command import place
 
 _START_S = 30.0  # a viewer imports Rerun, and may wait for a busy machine
 _WAIT_S = 120.0  # services compile before they are up

@@ -18,7 +18,7 @@ from pathlib import Path
 import zenoh
 
 from pliant.bus.peers import service_of
-from pliant.bus.session import free_endpoint, open_router
+from pliant.bus.session import LocalRouter
 from pliant.errors import BusError, MessageError, PliantError
 from pliant.messages import codec, topics
 from pliant.messages.types import Status
@@ -48,8 +48,9 @@ class Fleet:
         port: int | None = None,
         state: Path | None = None,
     ) -> None:
-        """Start the router.  ``state``: folder of checkpoints; with it, services that die are
-        started again.  Raises BusError when the port is in use."""
+        """Start the router.  ``port``: of it on loopback; else it is at a Unix socket where that
+        works.  ``state``: folder of checkpoints; with it, services that die are started again.
+        Raises BusError when the port is in use."""
         self._services = tuple(services)
         self._log_folder = log_folder
         self._children: list[Child] = []
@@ -58,9 +59,10 @@ class Fleet:
         self._arguments: Callable[[str], Sequence[str]] = lambda name: ()
         self._frames: dict[str, int] = {}  # that each service reported last
         self._deaths: dict[str, tuple[int, int]] = {}  # by service: at which frame, how often
-        self.endpoint = f"tcp/127.0.0.1:{port}" if port is not None else free_endpoint()
         self.session = f"run-{os.getpid()}"
-        self._router = open_router(self.endpoint)
+        self._local = LocalRouter(port)
+        self.endpoint, self.note = self._local.endpoint, self._local.note
+        self._router = self._local.session
         self._relay = Relay(self._router, self.session)
         self._ready: set[str] = set()
         prefix = f"pliant/{self.session}"
@@ -159,7 +161,7 @@ class Fleet:
                 child.close()
             self._relay.close()
             with suppress(zenoh.ZError):  # a viewer that was stopped does not answer: let it be
-                self._router.close()  # type: ignore[no-untyped-call]
+                self._local.close()
 
     def _spawn(self, name: str) -> Child:
         patience = [] if self._state is not None else ["--patience", "0"]  # who dies is not awaited

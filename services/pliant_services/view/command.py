@@ -1,6 +1,5 @@
 """Behind ``pliant view``: a running session or a recording, drawn by Rerun."""
 
-import json
 import os
 import sys
 import threading
@@ -21,13 +20,11 @@ from pliant.messages.topics import Topic, by_key
 from pliant.messages.types import StreamEnd
 from pliant.recording import parts
 from pliant.recording.reader import Recording
-from pliant.results.folder import RECORDING_NAME, files_read, keep_apart
+from pliant.results.folder import RECORDING_NAME, files_read, keep_apart, running_session
 from pliant.viewers.canvas import Canvas
 from pliant.viewers.rerun import RerunCanvas, Where
 from pliant.viewers.scene import Scene
 
-SESSION_NAME = "session.json"
-"""In the result folder while a run goes on: how to reach it."""
 _ENVELOPE_BYTES = 17
 _WAITING = 512  # messages between the network and the drawing; the oldest give way
 _WAITING_BYTES = 256 << 20
@@ -85,15 +82,6 @@ def run_view(request: ViewRequest) -> None:
         canvas.close()
     if request.save is not None:
         print(request.save)
-
-
-def running_session(result: Path) -> tuple[list[str], str]:
-    """The endpoint and name of the run that is writing this result; ([], "") if none is."""
-    try:
-        content = json.loads((result / SESSION_NAME).read_text(encoding="utf-8"))
-        return [str(content["endpoint"])], str(content["session"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return [], ""
 
 
 def follow(

@@ -1,7 +1,10 @@
 """Zenoh sessions as Pliant uses them: explicit endpoints, nothing found by scouting."""
 
 import json
+import os
+import shutil
 import socket
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from ipaddress import ip_address
@@ -15,6 +18,9 @@ from pliant.messages.topics import TOPICS
 
 CONNECT_TIMEOUT_S = 7.0  # with the start of Python, a user waits ten seconds at most
 _PATIENCE_MS = 60_000  # Zenoh's defaults lose messages after a stall of 5 to 10 s (its second line)
+_LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103
+_SOCKET = "unixsock-stream"
+_NO_SOCKET = "no Unix socket could be had: every user of this machine can reach the services"
 _MAX_BYTES = max(topic.max_bytes for topic in TOPICS) + (1 << 20)
 """Whoever announces more than our largest topic takes is cut off, before memory is taken for it."""
 
@@ -113,6 +119,51 @@ def _set_endpoints(config: zenoh.Config, what: str, endpoints: Sequence[str]) ->
         raise BusError(
             f"{', '.join(endpoints)}: not an endpoint; write it like tcp/127.0.0.1:7447"
         ) from None
+
+
+class LocalRouter:
+    """A router for the processes of one user: at a Unix socket in a folder of its own.
+
+    On a loopback port, which every user of the machine reaches, where one is given or no such
+    socket can be had: ``note`` says why then, and is "" else.
+    """
+
+    def __init__(self, port: int | None = None) -> None:
+        """Raises BusError when the port is in use."""
+        self.note = ""
+        self._folder = ""
+        if port is None:
+            self._folder, self.endpoint, self.note = _socket_folder()
+        else:
+            self.endpoint = f"tcp/127.0.0.1:{port}"
+        try:
+            self.session = open_router(self.endpoint)
+        except BusError as error:
+            if not self._folder:
+                raise
+            self.endpoint, self.note = free_endpoint(), f"{_NO_SOCKET} ({error})"
+            self.session = open_router(self.endpoint)
+
+    def close(self) -> None:
+        """Close it, and leave nothing behind.  Raises ZError where a client does not answer."""
+        try:
+            self.session.close()  # type: ignore[no-untyped-call]
+        finally:
+            if self._folder:
+                shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _socket_folder() -> tuple[str, str, str]:
+    """A new folder that only its owner may enter, the endpoint in it, and why there is none."""
+    try:
+        folder = tempfile.mkdtemp(prefix="pliant-")
+    except OSError as error:
+        return "", free_endpoint(), f"{_NO_SOCKET} ({error.strerror})"
+    path = f"{folder}/bus"
+    if len(os.fsencode(path)) > _LONGEST_SOCKET:
+        os.rmdir(folder)
+        return "", free_endpoint(), f"{_NO_SOCKET} ({path} is too long: set TMPDIR)"
+    return folder, f"{_SOCKET}/{path}", ""
 
 
 def free_endpoint() -> str:

@@ -24,6 +24,8 @@ CONFIG_NAME = "config.yaml"
 REPORT_NAME = "report.json"
 STATE_FOLDER = "state"
 """Checkpoints of the services, while a run goes on that may be started again."""
+SESSION_NAME = "session.json"
+"""While a run goes on: how to reach it."""
 TRAJECTORY_NAME = "trajectory.txt"
 SURFELS_NAME = "surfels.npz"
 _RIGID_FILES = (
@@ -110,6 +112,15 @@ def _locked(output: Path) -> int:
                 "wait for its end, or choose another --output"
             ) from None
         os.close(lock)  # its holder left between our two looks, and took the file away
+
+
+def running_session(result: Path) -> tuple[list[str], str]:
+    """The endpoint and name of the run that is writing this result; ([], "") if none is."""
+    try:
+        content = json.loads((result / SESSION_NAME).read_text(encoding="utf-8"))
+        return [str(content["endpoint"])], str(content["session"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return [], ""
 
 
 def check_output(output: Path, *, force: bool) -> None:
