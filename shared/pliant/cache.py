@@ -1,4 +1,4 @@
-"""Where Pliant keeps what it can make again: rendered sequences, stamps of compiled kernels."""
+"""Where Pliant keeps what it can make again: rendered sequences, compiled kernels."""
 
 import os
 from pathlib import Path
@@ -9,4 +9,6 @@ def cache_folder() -> Path:
     own = os.environ.get("PLIANT_CACHE_DIR")
     if own:
         return Path(own)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pliant"
+    home = os.path.expanduser("~")
+    home = "/" if home == "~" else home  # nobody knows it: who has none has the root's
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path(home, ".cache")) / "pliant"

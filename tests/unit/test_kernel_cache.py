@@ -4,10 +4,12 @@ and the same code in the process that compiled them and in all others."""
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import pliant
+from pliant import cache, errors
 from pliant.algorithms import kernel, kernel_cache, kernel_linking
 
 _KERNEL = """
@@ -44,16 +46,20 @@ def _package(root: Path) -> Path:
     for module in (kernel, kernel_cache, kernel_linking):
         source = Path(module.__file__)
         (package / source.name).write_bytes(source.read_bytes())
+    for module in (cache, errors):
+        source = Path(module.__file__)
+        (package.parent / source.name).write_bytes(source.read_bytes())
     for folder in (package, package.parent):
         (folder / "__init__.py").touch()
     return package
 
 
-def _call(root: Path, code: str = _CALL) -> str:
+def _call(
+    root: Path, code: str = _CALL, environment: Mapping[str, str] = MappingProxyType({})
+) -> str:
     command = [sys.executable, "-B", "-c", code]
-    done = subprocess.run(
-        command, env={"PYTHONPATH": str(root)}, capture_output=True, text=True, check=True
-    )
+    env = {"PYTHONPATH": str(root), **environment}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
 
@@ -72,7 +78,7 @@ def test_sources_are_followed_through_imports() -> None:
     algorithms = Path(pliant.__file__).parent / "algorithms"
     paths = kernel_cache.sources(algorithms / "tracking" / "advance.py")
     found = {str(path.relative_to(algorithms)) for path in paths}
-    assert {"tracking/advance.py", "tracking/patches.py", "kernel.py", "kernel_cache.py"} <= found
+    assert {"tracking/advance.py", "patch_alignment.py", "kernel.py", "kernel_cache.py"} <= found
     assert not any(name.startswith("bundle/") for name in found)
 
 
@@ -85,6 +91,35 @@ def test_a_kernel_calls_the_helpers_in_its_own_object_file(tmp_path: Path) -> No
     (file,) = package.rglob("helped.helped-*.nbc")
     found = [binding for name, binding in _functions(_object(file)) if "helper" in name]
     assert found == ["local"]
+
+
+def test_kernels_go_to_the_cache_folder_where_the_sources_are_not_to_be_written(
+    tmp_path: Path,
+) -> None:
+    package = _package(tmp_path)
+    (package / "constants.py").write_text("FACTOR = 3.0\n")
+    (package / "scaled.py").write_text(_KERNEL)
+    (package / "__pycache__").touch()  # no folder can be made there
+    there = {"PLIANT_CACHE_DIR": str(tmp_path / "cache")}
+    assert _call(tmp_path, environment=there) == "6.0 0"
+    assert _call(tmp_path, environment=there) == "6.0 1"
+    assert list((tmp_path / "cache" / "kernels").rglob("scaled*.nbc"))
+
+
+def test_one_line_says_that_kernels_can_be_kept_nowhere(tmp_path: Path) -> None:
+    package = _package(tmp_path)
+    (package / "constants.py").write_text("FACTOR = 3.0\n")
+    (package / "scaled.py").write_text(_KERNEL)
+    (package / "__pycache__").touch()
+    code = (
+        "from pliant.errors import PliantError\n"
+        "try: import pliant.algorithms.scaled\n"
+        "except PliantError as error: print(error)"
+    )
+    for nowhere in ({"PLIANT_CACHE_DIR": "/dev/null/here"}, {"HOME": "/dev/null"}):
+        line = _call(tmp_path, code, nowhere)
+        assert "set PLIANT_CACHE_DIR to a folder that can be written" in line
+        assert "\n" not in line
 
 
 def _object(file: Path) -> bytes:

@@ -4,6 +4,8 @@ Numba stamps a cached kernel with the text of the file that it stands in.  A hel
 from another file is compiled into the kernel all the same, so that after an edit or an upgrade an
 old kernel would go on running, silently.  Here the stamp covers every module of ours that the
 kernel's module imports, directly or not.
+
+Kernels are kept in NUMBA_CACHE_DIR, else beside their sources, else in Pliant's cache folder.
 """
 
 import hashlib
@@ -12,17 +14,47 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    InTreeCacheLocator,
+    UserProvidedCacheLocator,
+    UserWideCacheLocator,
+)
+
+from pliant.cache import cache_folder
+from pliant.errors import PliantError
 
 _PACKAGE = Path(__file__).parents[1]
 _IMPORT = re.compile(rb"^\s*from (pliant[\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 
 
+class _CacheFolder(UserWideCacheLocator):
+    def __init__(self, function: Any, file: str) -> None:
+        super().__init__(function, file)
+        folder = cache_folder() / "kernels" / self.get_suitable_cache_subpath(file)
+        self._cache_path = str(folder)
+
+
+class _Place(CompileResultCacheImpl):
+    _locator_classes = (UserProvidedCacheLocator, InTreeCacheLocator, _CacheFolder)
+
+
 class SourcesCache(FunctionCache):
     """The cache of one kernel, stamped with all the sources it is built from."""
 
+    _impl_class = _Place
+
     def __init__(self, function: Any) -> None:
-        super().__init__(function)
+        """Raises PliantError where no folder can be written."""
+        try:
+            super().__init__(function)
+        except RuntimeError:  # of Numba, where no place will do
+            raise PliantError(
+                f"compiled kernels can be kept neither beside {function.__code__.co_filename} nor "
+                f"in {cache_folder()}: set PLIANT_CACHE_DIR to a folder that can be written"
+            ) from None
         stamp = hashlib.sha256()
         for path in sources(Path(function.__code__.co_filename)):
             stamp.update(_digest(path))
@@ -47,14 +79,14 @@ def sources(path: Path) -> tuple[Path, ...]:
 
 @cache
 def _imports(path: Path) -> tuple[Path, ...]:
-    """The files of ours that a module names in its imports."""
+    """The files of ours that a module names in its imports, but for what holds no kernels."""
     files: list[Path] = []
     for module, names in _IMPORT.findall(path.read_bytes()):
         parts = module.decode().split(".")[1:]
         folder = _PACKAGE.joinpath(*parts)
         own = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
         submodules = [folder / f"{name}.py" for name in re.findall(r"\w+", names.decode())]
-        files += [file for file in (own, *submodules) if file.exists()]
+        files += [f for f in (own, *submodules) if f.exists() and f.parent != _PACKAGE]
     return tuple(files)
 
 
