@@ -1,7 +1,7 @@
 """What a user reads of a run: everything that went wrong is counted, named and said once."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -45,6 +45,7 @@ def record(
     note: str = "",
     complete: bool = True,
     counters: Mapping[str, float] = MappingProxyType({}),
+    ended: Sequence[Topic] = (topics.STREAM, topics.EXTREMA, topics.MAP_UPDATE),
 ) -> list[str]:
     """The summary of a recorded run without a map, with one frame for each of ``missing``."""
     mapper = Mapper(stream(0).camera, MappingParameters(), 0)
@@ -66,10 +67,11 @@ def record(
             seconds=np.zeros(0), counters=tuple(counters), values=np.array([*counters.values()]),
         )  # fmt: skip
         write(topics.status("ingest"), status)
-        end = StreamEnd(
-            frame=0, stamp_ns=0, frame_id="", topic="camera/image", messages=0, complete=complete
-        )
-        write(topics.STREAM_END, end)
+        for topic in ended:
+            end = StreamEnd(
+                frame=0, stamp_ns=0, frame_id="", topic=topic.key, messages=0, complete=complete
+            )
+            write(topics.STREAM_END, end)
     return summary(write_results(folder))
 
 
@@ -84,6 +86,26 @@ def test_dropped_and_broken_images_are_told_apart(tmp_path: Path) -> None:
     lines = record(tmp_path, why)
     assert "2 images dropped to keep up (live mode)" in lines
     assert "1 broken image: frame 2: the png image is cut off" in lines
+    lines = record(tmp_path, [*why, *("broken: frame 4: empty", "broken: frame 5: empty")])
+    told = "3 broken images: frame 2: the png image is cut off; the others are frames 4, 5"
+    assert told in lines
+    lines = record(tmp_path, ["broken: frame 0: empty"] * 20)
+    others = ", ".join(map(str, range(1, 11)))
+    told = f"20 broken images: frame 0: empty; the others are frames {others} and 9 more"
+    assert told in lines
+    assert "1 image dropped to keep up (live mode)" in record(tmp_path, ["", "dropped"])
+
+
+def test_one_is_not_many(tmp_path: Path) -> None:
+    assert record(tmp_path, [""])[0].startswith("1 frame at 0.0 frames/s, ")
+    assert record(tmp_path, ["", ""])[0].startswith("2 frames at ")
+
+
+def test_a_recorder_that_was_killed_did_not_cut_the_source_off(tmp_path: Path) -> None:
+    """The topic of the camera is closed before the first frame; those of the frames are open."""
+    lines = record(tmp_path, [""] * 4, announced=10, ended=[topics.STREAM])
+    assert not [line for line in lines if "ended early" in line]
+    assert json.loads((tmp_path / "report.json").read_text())["complete"] is False
 
 
 def test_whose_credit_was_missing_is_said_of_dropped_images(tmp_path: Path) -> None:
@@ -123,7 +145,9 @@ def test_a_video_that_is_cut_off_is_noticed(
     tmp_path: Path, announced: int, complete: bool, said: bool
 ) -> None:
     lines = record(tmp_path, [""] * 4, announced=announced, complete=complete)
-    assert ("the source ended early: 4 of 10 frames came; is the file cut off?" in lines) is said
+    assert (
+        "the source ended early: 4 of 10 frames came: the file is cut off or damaged" in lines
+    ) is said
 
 
 def test_a_run_that_was_interrupted_before_it_recorded_has_nothing_to_mesh(

@@ -1,5 +1,6 @@
 """Videos written here, and cameras that are simulated: there may be none on this machine."""
 
+import re
 from itertools import islice
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import yaml
 
 from pliant.datasets import CameraDevice, Rectifier, SourceOptions, open_source
+from pliant.datasets.base import BrokenFrame
 from pliant.datasets.camera_device import camera_index
 from pliant.datasets.video import quiet_opencv
 from pliant.errors import CalibrationError, DatasetError
@@ -17,14 +19,14 @@ WIDTH, HEIGHT = 64, 48
 CALIBRATION = {"width": WIDTH, "height": HEIGHT, "fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5}
 
 
-def video(folder: Path, frames: int = 6) -> Path:
-    file = folder / "clip.avi"
+def video(folder: Path, frames: int = 6, name: str = "clip.avi") -> Path:
+    file = folder / name
     with quiet_opencv():  # OpenCV decides at its first video whether FFmpeg may write to stderr
         writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (WIDTH, HEIGHT))
     if not writer.isOpened():
         pytest.skip("OpenCV cannot write a video here")
     for number in range(frames):
-        writer.write(np.full((HEIGHT, WIDTH, 3), 40 * number, np.uint8))
+        writer.write(np.full((HEIGHT, WIDTH, 3), 20 * number, np.uint8))
     writer.release()
     return file
 
@@ -41,8 +43,30 @@ def test_video(tmp_path: Path) -> None:
     for number, frame in enumerate(frames):
         assert (frame.encoding, frame.width, frame.height) == ("bgr8", WIDTH, HEIGHT)
         grey, rgb = rectifier.rectify(frame)
-        assert abs(float(grey.mean()) - 40 * number) < 5.0
+        assert abs(float(grey.mean()) - 20 * number) < 5.0
         assert rgb is not None
+
+
+def test_a_damaged_frame_is_named_and_ends_nothing(tmp_path: Path) -> None:
+    file = video(tmp_path, 12, "clip.mp4")
+    content = file.read_bytes()
+    starts = [found.start() for found in re.finditer(b"\xff\xd8\xff", content)]
+    assert len(starts) == 12
+    for first, last in ((5, 6), (5, 8), (5, 12)):
+        end = starts[last] if last < 12 else content.index(b"\xff\xd9", starts[-1]) + 2
+        damaged = bytearray(content)
+        damaged[starts[first] : end] = bytes(end - starts[first])
+        file.write_bytes(damaged)
+        dataset = open_source(str(file), fov_deg=60.0)
+        frames = list(dataset)
+        count = 12 if last < 12 else first  # behind the last whole one there is nothing
+        assert [frame.index for frame in frames] == list(range(count))
+        assert [frame.stamp_ns for frame in frames] == [i * 40_000_000 for i in range(count)]
+        if last == 12:
+            continue
+        assert [f.index for f in frames if not f.data] == list(range(first, last))
+        with pytest.raises(BrokenFrame, match=r"frame 5: empty: .* the video is damaged"):
+            Rectifier(dataset.calibration).rectify(frames[5])
 
 
 def test_calibration_of_a_video(tmp_path: Path) -> None:

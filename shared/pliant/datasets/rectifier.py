@@ -47,7 +47,7 @@ def decode(frame: SourceFrame) -> U8:
     if frame.encoding in RAW_BYTES:
         return _decode_raw(frame)
     if not frame.data:
-        raise BrokenFrame(f"frame {frame.index}: the image file is empty or gone")
+        raise BrokenFrame(f"frame {frame.index}: empty: its file is gone, or the video is damaged")
     if not _whole(frame):
         raise BrokenFrame(f"frame {frame.index}: the {frame.encoding} image is cut off")
     try:

@@ -2,6 +2,7 @@
 
 A file of the same name with the ending .yaml beside it is taken as its calibration.  Times are
 those of the container; where it has none, or they repeat, frames follow each other at its rate.
+A frame that does not decode is one without data, and those behind it come all the same.
 Frames are published as they leave the decoder, as raw BGR pixels.
 """
 
@@ -20,6 +21,8 @@ from pliant.datasets.images import SourceOptions, choose_calibration
 from pliant.errors import DatasetError
 
 _DEFAULT_FPS = 30.0
+_GIVE_UP = 600
+"""Frames that do not decode, one behind the other, before nothing more is expected."""
 
 
 class VideoFile:
@@ -47,14 +50,21 @@ class VideoFile:
         with _opened(self._file) as capture:
             fps = capture.get(cv2.CAP_PROP_FPS)
             step_ns = round(1e9 / (fps if 0.1 < fps < 1e4 else _DEFAULT_FPS))
-            index, previous_ns = 0, -step_ns
+            index, previous_ns, broken = 0, -step_ns, 0
             while True:
                 read, pixels = capture.read()
-                if not read:
-                    return
+                if not read:  # at its end, or a frame that is damaged: then the next may be whole
+                    broken += 1
+                    if broken > _GIVE_UP or index + broken >= (self.frame_count or 0):
+                        return
+                    continue
                 stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
                 if stamp_ns <= previous_ns:
-                    stamp_ns = previous_ns + step_ns
+                    stamp_ns = previous_ns + (broken + 1) * step_ns
+                between_ns = (stamp_ns - previous_ns) // (broken + 1)
+                for number in range(broken):
+                    yield _damaged(index + number, previous_ns + (number + 1) * between_ns)
+                index, broken = index + broken, 0
                 yield raw_frame(cast(U8, pixels), index, stamp_ns)
                 index, previous_ns = index + 1, stamp_ns
 
@@ -69,6 +79,12 @@ def raw_frame(pixels: U8, index: int, stamp_ns: int) -> SourceFrame:
         data=pixels.tobytes(),
         width=width,
         height=height,
+    )
+
+
+def _damaged(index: int, stamp_ns: int) -> SourceFrame:
+    return SourceFrame(
+        index=index, stamp_ns=stamp_ns, encoding="unknown", data=b"", width=0, height=0
     )
 
 

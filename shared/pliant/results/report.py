@@ -88,7 +88,7 @@ def ended_early(run: Run, came: int) -> str:
     # Containers of videos count their frames roughly.
     if announced - came <= max(2, _ROUGHLY * announced):
         return ""
-    return f"{came} of {announced} frames came; is the file cut off?"
+    return f"{came} of {announced} frames came: the file is cut off or damaged"
 
 
 def _well_observed(run: Run, final: dict[int, Any]) -> int:
@@ -112,6 +112,11 @@ def _correction(correction: tuple[float, ...]) -> dict[str, float] | None:
     s, k1, k2, readout = (*correction, 0.0)[:4]  # recordings from before the readout have three
     found = {"focal_factor": float(np.exp(s)), "k1": k1, "k2": k2, "readout": readout}
     return {name: round(value, 6) for name, value in found.items()}
+
+
+def counted(number: int, noun: str) -> str:
+    """A number of things in words: "1 frame", "2 frames"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _median(values: Any) -> float:

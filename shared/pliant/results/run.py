@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pliant.map_history import MapHistory
 from pliant.messages import topics
+from pliant.messages.topics import by_key
 from pliant.messages.types import (
     PASSED_OVER,
     CameraStream,
@@ -58,8 +59,13 @@ class Run:
 
     @property
     def complete(self) -> bool:
-        """Whether every topic was closed at the end of its source, not by an interruption."""
-        return bool(self.ends) and all(end.complete for end in self.ends.values())
+        """Whether every topic was closed at the end of its source, not by an interruption.
+
+        A topic of every frame without an end is that of a recording that was cut off itself.
+        """
+        framed = {key for key in self.recorded.topics if (by_key(key) or topics.STREAM).per_frame}
+        whole = bool(self.ends) and framed <= self.ends.keys()
+        return whole and all(end.complete for end in self.ends.values())
 
 
 def read_run(path: Path) -> Run:

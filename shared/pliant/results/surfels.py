@@ -20,7 +20,7 @@ from pliant.messages import topics
 from pliant.messages.types import WAITING_FOR_DEPTH, Surfels
 from pliant.recording.reader import Recording
 from pliant.results.folder import RECORDING_NAME, REPORT_NAME, SURFELS_NAME, TRAJECTORY_NAME
-from pliant.results.report import ended_early, process_figures
+from pliant.results.report import counted, ended_early, process_figures
 from pliant.results.run import Run, read_run
 from pliant.trajectory import Trajectory
 
@@ -109,7 +109,7 @@ def surfel_summary(report: dict[str, Any]) -> list[str]:
     """The report in a few lines."""
     alive, frames = report["alive_per_frame"], report["frames"]
     lines = [
-        f"{frames} frames at {report['frames_per_second']:.1f} frames/s, "
+        f"{counted(frames, 'frame')} at {report['frames_per_second']:.1f} frames/s, "
         f"{report['frames_with_pose']} followed ({100.0 * report['success_rate']:.1f} %), "
         f"{report['births']} surfels born",
         f"alive: {report['median_alive']:.0f} in the median frame, "

@@ -4,9 +4,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from pliant.messages.types import DROPPED
+from pliant.results.report import counted
 from pliant.results.surfels import surfel_summary
 
 DONE, INCOMPLETE = 0, 3
+_NAMED = 10  # broken images beside the first
 
 
 def grade(report: dict[str, Any]) -> int:
@@ -19,19 +21,20 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
     """The report in a few lines.  has_map: False where nobody was to make one, as in a replay."""
     if report.get("profile") == "deformable":
         return [*surfel_summary(report), *_faults(report)]
-    frames = report["frames"]
+    frames = counted(report["frames"], "frame")
     if not has_map:
         median = f"median per frame: {report['median_tracks_per_frame']:.0f} tracks"
-        return [f"{frames} frames, no map: bundle_adjustment was not replayed", median]
+        return [f"{frames}, no map: bundle_adjustment was not replayed", median]
     lines = [
-        f"{frames} frames at {report['frames_per_second']:.1f} frames/s, "
+        f"{frames} at {report['frames_per_second']:.1f} frames/s, "
         f"{report['frames_with_pose']} with a pose ({100.0 * report['success_rate']:.1f} %), "
-        f"{report['keyframes']} keyframes, {report['points']} points",
+        f"{counted(report['keyframes'], 'keyframe')}, {counted(report['points'], 'point')}",
         f"median per frame: {report['median_tracks_per_frame']:.0f} tracks, "
         f"{report['median_inliers_per_frame']:.0f} mapped inliers",
     ]
     lines += [
-        f"{mesh['level']} mesh: {mesh['triangles']} triangles from {mesh['keyframes']} keyframes"
+        f"{mesh['level']} mesh: {mesh['triangles']} triangles "
+        f"from {counted(mesh['keyframes'], 'keyframe')}"
         for mesh in report["mesh"]
         if mesh["level"] == "fine"
     ]
@@ -43,9 +46,10 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
     return lines
 
 
-def _broken(report: dict[str, Any]) -> list[str]:
-    """What is wrong with each broken image.  Those that live mode drops are no fault."""
-    return [why for why in report["frames_without_pixels"].values() if why != DROPPED]
+def _broken(report: dict[str, Any]) -> dict[str, str]:
+    """What is wrong with each broken image, by frame.  Those that live mode drops are no fault."""
+    missing: dict[str, str] = report["frames_without_pixels"]
+    return {frame: why for frame, why in missing.items() if why != DROPPED}
 
 
 def _faults(report: dict[str, Any]) -> list[str]:
@@ -55,13 +59,21 @@ def _faults(report: dict[str, Any]) -> list[str]:
     dropped = len(report["frames_without_pixels"]) - len(broken)
     if dropped:
         why = _why_dropped(report.get("counters", {}).get("ingest", {}))
-        lines.append(f"{dropped} images dropped to keep up (live mode){why and f': {why}'}")
+        lines.append(
+            f"{counted(dropped, 'image')} dropped to keep up (live mode){why and f': {why}'}"
+        )
     passed_over = len(report.get("frames_passed_over", ()))
     if passed_over:
-        lines.append(f"{passed_over} images tracked, but not mapped, to keep up (live mode)")
+        lines.append(
+            f"{counted(passed_over, 'image')} tracked, but not mapped, to keep up (live mode)"
+        )
     if broken:
-        first = broken[0].removeprefix("broken: ")
-        lines.append(f"{len(broken)} broken {'image' if len(broken) == 1 else 'images'}: {first}")
+        first, *others = broken
+        told = f"{counted(len(broken), 'broken image')}: {broken[first].removeprefix('broken: ')}"
+        if others:
+            more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+            told += f"; the others are frames {', '.join(others[:_NAMED])}{more}"
+        lines.append(told)
     if report["ended_early"]:
         lines.append(f"the source ended early: {report['ended_early']}")
     return lines
