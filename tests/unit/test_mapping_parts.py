@@ -1,12 +1,17 @@
 """The parts of the mapper, each alone: rows, links, grid, patches, re-acquisition, errors."""
 
+import re
+
 import cv2
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mapping_scene import CAMERA, Scene, looking
 
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.mapping import MappingParameters
 from pliant.algorithms.mapping.covisibility import missing_rows, near_keyframes, rows_of
 from pliant.algorithms.mapping.localisation import locate, refine
 from pliant.algorithms.mapping.map_store import (
@@ -22,6 +27,7 @@ from pliant.algorithms.mapping.observation_table import reprojection_errors, win
 from pliant.algorithms.mapping.parameters import LocalisationParameters, ReacquisitionParameters
 from pliant.algorithms.mapping.patches import cut_patches, sample_colours
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, reacquire
+from pliant.algorithms.mapping.start import WaitingFrame, find_start
 
 
 def test_rows_are_reused_and_ids_never():
@@ -243,3 +249,26 @@ def test_missing_points_are_mapped_have_no_track_and_wait_after_many_misses():
     assert missing_rows(rows, linked, state, misses, marks, 3).tolist() == [0]
     assert missing_rows(rows, linked, state, misses, marks, 5).tolist() == [0, 3]
     assert missing_rows(rows, linked[1:], state, misses, marks, 6).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("focal_px", [40.0, 400.0])
+@pytest.mark.parametrize("noise_px", [1.2, 1.6])
+def test_what_is_too_little_is_less_than_enough(focal_px: float, noise_px: float) -> None:
+    """A wide lens makes degrees of a pixel: the reason has the unit of what was decided by."""
+    random = np.random.default_rng(0)
+    camera = PinholeCamera(fx=focal_px, fy=focal_px, cx=320.0, cy=240.0, width=640, height=480)
+    points = random.uniform((20, 20), (620, 460), (300, 2))
+    waiting = [
+        WaitingFrame(
+            frame=frame,
+            ids=np.arange(300),
+            points_px=(points + random.normal(0.0, noise_px / 2, points.shape)).astype(np.float32),
+            kappas=np.ones(300, np.float32),
+        )
+        for frame in range(6)
+    ]
+    reason = find_start(waiting, camera, MappingParameters())
+    assert isinstance(reason, str)
+    told = re.fullmatch(r"too little parallax: (\S+) of (\S+) (px beside a turn|deg)", reason)
+    assert told, reason
+    assert float(told[1]) < float(told[2])

@@ -90,7 +90,7 @@ def find_start(
     if not pairs:
         return f"too few tracks: {_most_shared(waiting)} of {start.min_tracks}"
     if max(pair.residual_px for pair in pairs) < 2.0 * _NOISE_PX:
-        return _no_parallax(pairs, camera, start)
+        return _no_parallax(pairs)
     reason = ""
     # The more parallax the better; shared tracks count less, for there are many.
     pairs.sort(key=lambda pair: -pair.residual_px * len(pair.indices_newest) ** 0.5)
@@ -141,12 +141,15 @@ def _most_shared(waiting: list[WaitingFrame]) -> int:
     return len(np.intersect1d(waiting[0].ids, waiting[-1].ids, assume_unique=True))
 
 
-def _no_parallax(pairs: list[_Pair], camera: PinholeCamera, parameters: StartParameters) -> str:
+def _no_parallax(pairs: list[_Pair]) -> str:
     if max(pair.flow_px for pair in pairs) > 20.0 * _NOISE_PX:
         return "pure rotation: a turn explains all of the motion"
-    largest = max(pair.residual_px for pair in pairs)
-    parallax = float(np.degrees(largest / camera.fx))
-    return f"too little parallax: {parallax:.2f} of {parameters.min_parallax_deg:.2f} deg"
+    return _too_little(max(pair.residual_px for pair in pairs), 2.0 * _NOISE_PX, "px beside a turn")
+
+
+def _too_little(parallax: float, least: float, unit: str) -> str:
+    shown = np.floor(100.0 * parallax) / 100.0  # what falls short of it is not told as equal
+    return f"too little parallax: {shown:.2f} of {least:.2f} {unit}"
 
 
 def _start_from(
@@ -163,7 +166,7 @@ def _start_from(
         return f"too few tracks agree with one motion: {share:.0%} of {start.min_inlier_share:.0%}"
     parallax = float(np.degrees(np.median(two_views.parallax_rad[two_views.inliers])))
     if parallax < start.min_parallax_deg:
-        return f"too little parallax: {parallax:.2f} of {start.min_parallax_deg:.2f} deg"
+        return _too_little(parallax, start.min_parallax_deg, "deg")
     return _reconstruct(pair, two_views, waiting, camera, parameters)
 
 
