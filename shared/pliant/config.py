@@ -13,7 +13,7 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError
 
 from pliant.algorithms.mapping import MappingParameters
-from pliant.algorithms.meshing import MeshingParameters
+from pliant.algorithms.meshing.parameters import MeshingParameters
 from pliant.algorithms.parameters import Parameters
 from pliant.algorithms.surfels import SurfelParameters
 from pliant.algorithms.tracking import TrackingParameters

@@ -33,7 +33,6 @@ from pliant.results.write import write_results
 from pliant_services.mesh.afterwards import add_mesh
 from pliant_services.nodes.ingest import plays_live
 from pliant_services.processes import PROFILES, deformable_fleet, inputs_of, reads_depth
-from pliant_services.run.mesh_check import WITH_MESH, choose_profile
 from pliant_services.run.progress import Progress
 from pliant_services.run.spectators import announced, check_viewer, viewer
 from pliant_services.runtime import kernels as warm_up
@@ -101,12 +100,10 @@ def _run_into(output: Path, request: RunRequest) -> int:
     if profile == _DEFORMABLE:
         profile = deformable_fleet(config)
     else:
-        profile, without_mesh = choose_profile(config)
-        if without_mesh:
-            progress.say(without_mesh)
-        if profile == WITH_MESH:
+        profile = "rigid" if config.meshing.enabled else "points"
+        if profile == "rigid":
             check_voxel_sizes(Rectifier(dataset.calibration).camera, config.meshing.tsdf)
-    mesh_afterwards = state is not None and profile == WITH_MESH
+    mesh_afterwards = state is not None and profile == "rigid"
     services = PROFILES["points" if mesh_afterwards else profile]
     if request.resume and _has_ended(output, services, config):
         progress.say("the run had come to its end already: what follows from it is written again")

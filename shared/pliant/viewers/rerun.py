@@ -24,7 +24,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import matrix_to_pose, pose_to_matrix
-from pliant.algorithms.meshing import TriangleMesh
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.errors import ResultError
 from pliant.viewers.age_colours import track_colours
 from pliant.viewers.canvas import Moment
