@@ -12,6 +12,7 @@ from pliant import arithmetic
 from pliant.bus.session import free_endpoint, open_router, open_session
 from pliant.cache import cache_folder
 from pliant.errors import PliantError
+from pliant.export.open3d_import import OPEN3D_REMEDY
 
 _PACKAGES = {
     "eclipse-zenoh": "zenoh",
@@ -40,7 +41,7 @@ def diagnose() -> list[Finding]:
         _python(),
         *(_package(distribution, module) for distribution, module in _PACKAGES.items()),
         _optional("matplotlib", "plots of `pliant eval`", "pip install 'pliant[plot]'"),
-        _optional("open3d", "the mesh", "pip install 'pliant[mesh]' (needs libgl1 and libegl1)"),
+        _optional("open3d", "`pliant export --to glb`", OPEN3D_REMEDY),
         _arithmetic(),
         _scratch(),
         _bus(),
@@ -65,9 +66,9 @@ def _package(distribution: str, module: str) -> Finding:
 
 def _optional(module: str, purpose: str, remedy: str) -> Finding:
     try:
-        importlib.import_module(module)
-        return Finding("ok", module, version(module))
-    except (ImportError, OSError, PackageNotFoundError) as error:
+        # Not of its package: that of open3d may be named open3d-cpu.
+        return Finding("ok", module, str(importlib.import_module(module).__version__))
+    except (ImportError, OSError) as error:
         return Finding("warning", module, f"{_line(error)}; for {purpose}: {remedy}")
 
 

@@ -11,6 +11,7 @@ from pliant.errors import PliantError
 
 _PACKAGE = "pip install 'pliant[open3d]'"
 _LIBRARIES = "libegl1 libgl1 libx11-6 libusb-1.0-0"
+OPEN3D_REMEDY = f"{_PACKAGE}; on Debian and Ubuntu also apt-get install {_LIBRARIES}"
 
 
 class Open3dError(PliantError):
