@@ -24,12 +24,12 @@ def warm_up() -> None:
         keyframes=np.full(_POINTS, 9, np.int32),
     )
     surfaces = KeyframeSurfaces(camera, SurfaceParameters())
-    volume = TsdfVolume(_VOXEL, TsdfParameters())
+    surfaces.surface(np.eye(4), points)
+    found = surfaces.surface(np.eye(4), points).depth_map  # it starts from the first
+    assert found is not None
+    volume, pose = TsdfVolume(_VOXEL, TsdfParameters()), np.eye(4)
     colour = np.zeros((camera.height, camera.width, 3), np.uint8)
-    for _ in range(2):  # the second one starts from the first
-        found = surfaces.surface(np.eye(4), points).depth_map
-        assert found is not None
-        sight = (found.depths, found.weights, colour, camera, np.eye(4))
-        done = volume.integrate(*sight)
+    done = volume.integrate(found.depths, found.weights, colour, camera, pose)
     volume.extract_all()
-    volume.extract(volume.affected(volume.remove(done.serial, *sight)))
+    keys = volume.remove(done.serial, found.depths, found.weights, colour, camera, pose)
+    volume.extract(volume.affected(keys))
