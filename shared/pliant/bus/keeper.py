@@ -14,10 +14,9 @@ from pliant.bus.faults import FaultLog
 from pliant.bus.health import health_key, health_of
 from pliant.bus.links import IF_OLD, NOTHING, NOW, InLink, OutLink, Shared
 from pliant.bus.peers import Peers
-from pliant.bus.waiting import Waiting
+from pliant.bus.waiting import TICK_S, Waiting
 from pliant.messages import codec
 
-TICK_S = 1.0
 _ASK_AGAIN_S = 0.1  # what was asked for takes a while, and whoever sends nonsense asks for nothing
 
 
