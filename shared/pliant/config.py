@@ -50,6 +50,12 @@ class BusParameters(Parameters):
         le=4096,
         description="Messages of one topic on the way to its slowest reader; bounds memory.",
     )
+    window_mib: int = Field(
+        default=256,
+        ge=1,
+        le=65536,
+        description="And no more MiB than this; a larger message goes alone.",
+    )
     lag_messages: int = Field(
         default=128,
         ge=1,

@@ -6,7 +6,7 @@ thread of the bus has failed or the session is over.
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 from pliant.bus.links import InLink, OutLink, first_arrived
@@ -15,6 +15,7 @@ from pliant.errors import BusError
 
 TICK_S = 1.0
 _LAST_CREDITS_S = 2.0
+_SEEING_OFF_S = 5.0
 _WORTH_TELLING_S = 2.0  # shorter waits are what flow control is
 
 
@@ -109,3 +110,12 @@ class Waits:
                 self.now.begin(f"{what} from {whom}", now)
                 self.changed.wait(TICK_S if deadline is None else min(TICK_S, deadline - now))
             return first_arrived(entries)
+
+    def for_departures(self, senders: Collection[str]) -> None:
+        """Wait until all of them have left, some seconds at most."""
+        deadline = time.monotonic() + _SEEING_OFF_S
+        with self.changed:
+            while len(self.peers.missing(senders)) < len(senders):
+                if time.monotonic() >= deadline:
+                    return
+                self.changed.wait(TICK_S)  # the keeper tells our counts again meanwhile

@@ -19,6 +19,7 @@ Callbacks only append to queues and notify: no Zenoh call is ever made inside on
 own (``keeper.py``) tells counts once a second and sends again.
 """
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -32,7 +33,7 @@ from pliant.bus.keeper import Keeper
 from pliant.bus.links import DATA, END, InLink, OutLink, Shared
 from pliant.bus.peers import Peers, token_key
 from pliant.bus.session import Identity, open_session
-from pliant.bus.waiting import TICK_S, Waits
+from pliant.bus.waiting import Waits
 from pliant.errors import MessageError
 from pliant.messages import codec
 from pliant.messages.topics import Topic
@@ -41,7 +42,6 @@ from pliant.state import load_state, save_state
 
 STOP_KEY = "control/stop"
 OVER_KEY = "control/over"
-_SEEING_OFF_S = 5.0
 
 
 class ZenohBus:
@@ -56,6 +56,7 @@ class ZenohBus:
         inputs: Mapping[Topic, str],
         outputs: Mapping[Topic, Sequence[str]],
         window: int,
+        window_bytes: int = sys.maxsize,
         patience_s: float = 0.0,
         checkpoints: Checkpoints | None = None,
         keeps_books: bool = False,
@@ -73,7 +74,7 @@ class ZenohBus:
         session: name that keeps two runs on one network apart.     service: our own name.
         inputs: each topic that we read, with the service that publishes it.
         outputs: each topic that we publish, with the services that must read every message.
-        window: how many messages may be on the way to the slowest of those.
+        window, window_bytes: how much may be on the way to the slowest of those.
         patience_s: how long a peer may be away.
         checkpoints: where our state is kept; ``restore`` must come before the first message then.
         keeps_books: we know ourselves what we have; ``start_from`` must come first then.
@@ -89,9 +90,9 @@ class ZenohBus:
         Raises BusError when no endpoint answers.
         """
         lags = lags or {}
-        own_lag = lags[service].messages if service in lags else 0
+        own_lag = lags.get(service, Window(0, 0))
         # Who may lag is waited for by what it has told: it tells all.
-        self._tell_every = 1 if own_lag else max(1, window // 4)
+        self._tell_every = 1 if service in lags else max(1, window // 4)
         self._checkpoints = checkpoints
         self._packed = frozenset(packed)
         self._disturb = disturb or (lambda: None)
@@ -104,27 +105,25 @@ class ZenohBus:
         self._prefix = f"pliant/{session}"
         self.stop_requested = False
         """Whether somebody has asked the session to end (``pliant stop``)."""
-        shared = Shared(
-            self._session,
-            self._prefix,
-            self._changed,
-            self._wake,
-            self._peers.incarnation,
-            self._peers.is_known,
-        )
+        shared = Shared(self._session, self._prefix, self._changed, self._wake, self._peers)
         self._outputs = {
             topic.key: OutLink(
-                shared, topic, readers, window=window, windows=windows or {}, lags=lags
+                shared,
+                topic,
+                readers,
+                window=Window(window, window_bytes),
+                windows=windows or {},
+                lags=lags,
             )
             for topic, readers in outputs.items()
         }
+        limit = Window(2 * window + own_lag.messages, 2 * window_bytes + own_lag.size)
         self._inputs = {
-            topic.key: InLink(shared, topic, sender, reader=service, limit=2 * window + own_lag)
+            topic.key: InLink(shared, topic, sender, reader=service, limit=limit)
             for topic, sender in inputs.items()
         }
         self._keeper = Keeper(
             shared,
-            self._peers,
             self._waits.now,
             self._inputs,
             self._outputs,
@@ -230,13 +229,7 @@ class ZenohBus:
         """
         self.flush()
         self._keeper.all_is_safe()
-        deadline = time.monotonic() + _SEEING_OFF_S
-        senders = {entry.sender for entry in self._inputs.values()}
-        with self._changed:
-            while len(self._peers.missing(senders)) < len(senders):
-                if time.monotonic() >= deadline:
-                    return
-                self._changed.wait(TICK_S)  # the keeper tells our counts again meanwhile
+        self._waits.for_departures({entry.sender for entry in self._inputs.values()})
 
     def _send(
         self, output: OutLink, kind: int, payload: bytes, may_lag: Collection[str] = ()
