@@ -30,7 +30,7 @@ from pliant.viewers.age_colours import track_colours
 from pliant.viewers.canvas import Moment
 from pliant.viewers.foxglove import Z_UP_XYZW, world_name
 from pliant.viewers.point_blocks import PointBlocks
-from pliant.viewers.rerun_program import RerunProgram, address_of, listens
+from pliant.viewers.rerun_program import RerunProgram, address_of, free_port, listens
 from pliant.viewers.surfel_quads import SurfelPicture
 
 Where = Literal["window", "web"] | Path
@@ -45,6 +45,8 @@ _SURFEL_RADIUS = 2.5
 _OUTSIDE_IS_OPEN = "Front"  # a room is looked into from without
 _MEMORY_LIMIT = "1GiB"
 _WEB_PORT, _GRPC_PORT = 9090, 9876
+_CALLS_NOBODY = "notebook=1&hide_welcome_screen"
+"""For the page, which reads no environment: report no use, fetch no examples."""
 _LAYOUT = "pliant-2"
 """Rerun keeps a user's layout by this name: to be counted up when entities or views change."""
 _CAMERA = "map/camera"
@@ -67,9 +69,13 @@ class RerunCanvas:
     """A canvas that is a Rerun recording."""
 
     def __init__(
-        self, where: Where, *, name: str, web_port: int = _WEB_PORT, grpc_port: int = _GRPC_PORT
+        self, where: Where, *, name: str, web_port: int | None = None, grpc_port: int | None = None
     ) -> None:
-        """Open it.  Raises ResultError where Rerun is missing or the file cannot be written."""
+        """Open it.  Raises ResultError where Rerun is missing or the file cannot be written.
+
+        web_port: where a browser finds it.    grpc_port: where that takes its data.  By default
+        they are Rerun's own, or where these are taken others that are free.
+        """
         self._rr = rr = load_rerun()
         self._server: RerunProgram | None = None
         self._stream: Any = rr.RecordingStream(_LAYOUT, recording_id=name)
@@ -85,17 +91,20 @@ class RerunCanvas:
                 raise ResultError(f"{where}: cannot be written ({error.strerror})") from None
             self._stream.save(where, default_blueprint=blueprint)
         elif where == "web":
+            web_port = web_port or free_port(_WEB_PORT)
+            grpc_port = grpc_port or free_port(_GRPC_PORT)
             serving = ["--serve-web", "--web-viewer-port", str(web_port)]
             limit = ["--server-memory-limit", _MEMORY_LIMIT]
             self._server = RerunProgram([grpc_port, web_port], [*serving, *limit])
             address = address_of(grpc_port)
             self._stream.connect_grpc(address, default_blueprint=blueprint)
-            self.address = f"http://localhost:{web_port}/?url={quote(address, safe='')}"
+            query = f"url={quote(address, safe='')}&{_CALLS_NOBODY}"
+            self.address = f"http://localhost:{web_port}/?{query}"
         else:
             self._is_window = True
-            if not listens(grpc_port):  # else one is open already
-                RerunProgram([grpc_port], ["--hide-welcome-screen", "--memory-limit", "50%"])
-            self._stream.connect_grpc(address_of(grpc_port), default_blueprint=blueprint)
+            if not listens(_GRPC_PORT):  # else one is open already
+                RerunProgram([_GRPC_PORT], ["--hide-welcome-screen", "--memory-limit", "50%"])
+            self._stream.connect_grpc(address_of(_GRPC_PORT), default_blueprint=blueprint)
         self._place_world(0)
 
     address = ""
