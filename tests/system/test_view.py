@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import cast
+from urllib.request import urlopen
 
 import pytest
 from benchmarks.viewer_cost import run_with
@@ -120,7 +121,26 @@ def test_two_are_seen_in_browsers_at_once() -> None:
         one.close()
     assert len({one.address, two.address, three.address}) == 3
     assert f":{web_port}/" in three.address
-    assert "notebook=1" in three.address  # the page is not to report its use
+
+
+def test_a_browser_is_told_to_reach_this_machine_alone() -> None:
+    """Rerun's page would fetch fonts, look for updates and report its use."""
+    pytest.importorskip("rerun")
+    canvas = RerunCanvas("web", name="page")
+    try:
+        with urlopen(canvas.address) as page:
+            policy = page.headers["Content-Security-Policy"]
+            content = page.read()
+        with urlopen(canvas.address.partition("?")[0] + "re_viewer.js") as script:
+            assert "javascript" in script.headers["Content-Type"]
+    finally:
+        canvas.close()
+    assert b"re_viewer.js" in content
+    assert b'href="https://' not in content
+    assert "default-src 'none'" in policy
+    hosts = {word for word in policy.replace(";", " ").split() if "/" in word or "." in word}
+    assert len(hosts) == 1
+    assert hosts.pop().startswith("http://127.0.0.1:")
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from pliant.viewers.age_colours import track_colours
 from pliant.viewers.canvas import Moment
 from pliant.viewers.foxglove import Z_UP_XYZW, world_name
 from pliant.viewers.point_blocks import PointBlocks
+from pliant.viewers.rerun_page import RerunPage
 from pliant.viewers.rerun_program import RerunProgram, address_of, free_port, listens
 from pliant.viewers.surfel_quads import SurfelPicture
 
@@ -45,8 +46,6 @@ _SURFEL_RADIUS = 2.5
 _OUTSIDE_IS_OPEN = "Front"  # a room is looked into from without
 _MEMORY_LIMIT = "1GiB"
 _WEB_PORT, _GRPC_PORT = 9090, 9876
-_CALLS_NOBODY = "notebook=1&hide_welcome_screen"
-"""For the page, which reads no environment: report no use, fetch no examples."""
 _LAYOUT = "pliant-2"
 """Rerun keeps a user's layout by this name: to be counted up when entities or views change."""
 _CAMERA = "map/camera"
@@ -78,6 +77,7 @@ class RerunCanvas:
         """
         self._rr = rr = load_rerun()
         self._server: RerunProgram | None = None
+        self._page: RerunPage | None = None
         self._stream: Any = rr.RecordingStream(_LAYOUT, recording_id=name)
         self._segment = 0
         self._is_window = False
@@ -93,12 +93,18 @@ class RerunCanvas:
         elif where == "web":
             web_port = web_port or free_port(_WEB_PORT)
             grpc_port = grpc_port or free_port(_GRPC_PORT)
-            serving = ["--serve-web", "--web-viewer-port", str(web_port)]
+            behind = free_port()
+            serving = ["--serve-web", "--web-viewer-port", str(behind)]
             limit = ["--server-memory-limit", _MEMORY_LIMIT]
-            self._server = RerunProgram([grpc_port, web_port], [*serving, *limit])
+            self._server = RerunProgram([grpc_port, behind], [*serving, *limit])
+            try:
+                self._page = RerunPage(web_port, behind=behind, data=grpc_port)
+            except ResultError:
+                self._server.close()
+                raise
             address = address_of(grpc_port)
             self._stream.connect_grpc(address, default_blueprint=blueprint)
-            query = f"url={quote(address, safe='')}&{_CALLS_NOBODY}"
+            query = f"url={quote(address, safe='')}&hide_welcome_screen"  # it has examples
             self.address = f"http://localhost:{web_port}/?{query}"
         else:
             self._is_window = True
@@ -133,6 +139,8 @@ class RerunCanvas:
         """Send what is left, and finish a file; nothing can be seen in a browser any more."""
         self.send()
         self._stream.disconnect()
+        if self._page is not None:
+            self._page.close()
         if self._server is not None:
             self._server.close()
 
