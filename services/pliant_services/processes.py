@@ -51,7 +51,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "bundle_adjustment",
         "pliant_services.nodes.bundle_adjustment",
-        kernels=("pliant.algorithms.bundle", "pliant.algorithms.mapping"),
+        kernels=("pliant.algorithms.mapping",),
         finishing="adjusting the whole map",
         inputs=(topics.STREAM, topics.IMAGE, topics.EXTREMA),
         outputs=(topics.MAP_UPDATE, topics.MAP_FINAL, topics.KEYFRAME, topics.KEYFRAME_FINAL),
@@ -60,7 +60,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "meshing",
         "pliant_services.nodes.meshing",
-        kernels=("pliant.algorithms.meshing.warm_up",),
+        kernels=("pliant.algorithms.meshing", "pliant.fusion.warm_up"),
         finishing="fusing the final mesh",
         inputs=(
             topics.STREAM,

@@ -19,10 +19,9 @@ from pliant.algorithms.bundle import (
     BundleParameters,
     BundleProblem,
     BundleResult,
-    solve_schur,
-    solve_subspace,
-    warm_up,
 )
+from pliant.algorithms.bundle.schur import solve_schur
+from pliant.algorithms.bundle.subspace import solve_subspace
 from pliant.algorithms.geometry import so3_exp
 from pliant.errors import PliantError
 
@@ -77,7 +76,6 @@ def compare_bundle_adjustment(
     Ten minutes long: pyceres evaluates in Python.  Raises PliantError without pyceres, DatasetError
     for files that cannot be read.
     """
-    warm_up()
     if cases is None:
         cases = synthetic_cases() + (public_cases(folder) if folder is not None else [])
     rows: list[BundleRow] = []

@@ -52,7 +52,7 @@ def test_ceres_projects_with_distortion_as_we_do():
     intrinsics[:, 4:] = (-0.05, 0.01)
     distorted = dataclasses.replace(problem, intrinsics=intrinsics)
     theirs = solve_with_ceres(distorted, WINDOW)
-    from pliant.algorithms.bundle import solve_schur
+    from pliant.algorithms.bundle.schur import solve_schur
 
     ours = solve_schur(distorted, WINDOW)
     assert theirs.costs[0] == pytest.approx(ours.initial_cost, rel=1e-9)

@@ -6,16 +6,11 @@ import numpy as np
 import pytest
 from bundle_scene import make_scene, numeric_jacobian, project
 
-from pliant.algorithms.bundle import (
-    BundleParameters,
-    CalibrationUncertainty,
-    ideal_pixels,
-    solve_calibrating,
-    solve_schur,
-)
-from pliant.algorithms.bundle.calibration_kernels import PAIRS, UNKNOWNS, calibrated_system
-from pliant.algorithms.bundle.cost import limits_of
-from pliant.algorithms.bundle.layout import build_layout
+from pliant.algorithms.bundle import BundleParameters, CalibrationUncertainty
+from pliant.algorithms.bundle.calibration import SharedCalibration, ideal_pixels
+from pliant.algorithms.bundle.normal_equations import SHARED
+from pliant.algorithms.bundle.packed_layout import build_packed_layout
+from pliant.algorithms.bundle.schur import SchurSystem, solve_schur
 from pliant.algorithms.camera import PinholeCamera
 
 EXACT = BundleParameters(kernel_sigma_px=0.0, max_iterations=60, min_relative_decrease=1e-10)
@@ -36,54 +31,79 @@ def undistorted(problem):
     return with_lens(problem)
 
 
-def random_flow(problem):
-    """What a rolling shutter would do, here at random: (2, M, N) px."""
-    shape = (2, len(problem.T_world_camera), len(problem.points_world))
-    return np.random.default_rng(1).normal(0.0, 3.0, shape).astype(np.float32)
+def with_flow(problem):
+    """The problem with what a rolling shutter would do, here at random."""
+    shape = (len(problem.camera_index), 2)
+    flow = np.random.default_rng(1).normal(0.0, 3.0, shape).astype(np.float32)
+    return dataclasses.replace(problem, readout_flow=flow)
+
+
+def calibrating_system(problem, parameters, uncertainty):
+    layout = build_packed_layout(problem)
+    calibration = SharedCalibration(layout, problem.intrinsics[:, 4:], uncertainty)
+    return SchurSystem(layout, parameters, calibration)
+
+
+def calibration_jacobian(problem, q, step=1e-6):
+    """(2 O, SHARED) central differences of what is predicted, at the problem's poses and points."""
+
+    def predicted(q):
+        lens = with_lens(problem, *q[:3]).intrinsics
+        px = project(problem.T_world_camera, problem.points_world, lens)
+        at = (problem.camera_index, problem.point_index)
+        return (px[at] + q[3] * problem.readout_flow).reshape(-1)
+
+    sides = [(predicted(q + d), predicted(q - d)) for d in step * np.eye(SHARED)]
+    J = np.stack([(a - b) / (2.0 * step) for a, b in sides], axis=1)
+    return J, problem.points_px.astype(np.float64).reshape(-1) - predicted(q)
 
 
 @pytest.mark.parametrize("calibration", [(0.0, 0.0, 0.0, 0.0), (0.03, -0.2, 0.08, 0.4)])
 def test_the_blocks_are_those_of_finite_differences(calibration):
-    scene = make_scene(cameras=4, points=20, noise_px=1.0)
-    problem = with_lens(scene.problem, *calibration[:3])
-    layout = build_layout(problem)
-    flow = random_flow(scene.problem)
-    padded = np.zeros((2, *layout.u.shape), np.float32)
-    padded[:, :, layout.column] = flow
-    moved = np.float32(calibration[3]) * padded
-    lenses = np.ascontiguousarray(problem.intrinsics[:, 4:])
-    M, F = len(layout.cameras), int((layout.free >= 0).sum())
-    fixed = np.zeros_like(layout.movable)  # no point is eliminated: the plain blocks stand in b
-    S, b = np.zeros((6 * F + 6, 6 * F + 6)), np.zeros(6 * F + 6)
-    normal, cross = np.zeros((M, 27)), np.zeros((M, 6 * UNKNOWNS))
-    shared = np.zeros(PAIRS + UNKNOWNS)
-    w = np.concatenate([layout.w, layout.w.max(axis=0, keepdims=True)])
-    calibrated_system(
-        layout.cameras, layout.pinholes, lenses, layout.free, layout.points, fixed,
-        layout.u - moved[0], layout.v - moved[1], padded, w, layout.seen, limits_of(EXACT), 0.0,
-        S, b, normal, cross, shared,
-    )  # fmt: skip
-
-    def predicted(q):
-        lens = with_lens(scene.problem, *q[:3]).intrinsics
-        px = project(problem.T_world_camera, problem.points_world, lens)
-        return (px + q[3] * flow.transpose(1, 2, 0)).reshape(-1)
-
-    step = 1e-6
+    problem = with_flow(make_scene(cameras=4, points=20, noise_px=1.0, visible=0.8).problem)
     q = np.array(calibration)
-    J = np.stack(
-        [(predicted(q + d) - predicted(q - d)) / (2.0 * step) for d in step * np.eye(UNKNOWNS)],
-        axis=1,
+    system = calibrating_system(problem, EXACT, FREE)
+    layout = system.layout
+    state = system.linearise(layout.cameras.motion, layout.points, q)
+    J, r = calibration_jacobian(problem, q)
+    H, g, M = J.T @ J, J.T @ r, len(layout.free)
+    np.testing.assert_allclose(state.shared.own, np.tril(H), rtol=1e-5)
+    np.testing.assert_allclose(state.shared.gradient, g, rtol=1e-5, atol=1e-3)
+    other = -numeric_jacobian(with_lens(problem, *q[:3]))
+    cross = (J.T @ other[:, : 6 * M]).reshape(SHARED, M, 6).transpose(1, 0, 2).reshape(M, -1)
+    near = 1e-5 * np.abs(cross).max()
+    np.testing.assert_allclose(state.shared.cameras, cross, rtol=1e-5, atol=near)
+    cross = (J.T @ other[:, 6 * M :]).reshape(SHARED, -1, 3).transpose(1, 0, 2)
+    found = state.shared.points[layout.column]
+    near = 1e-5 * np.abs(cross).max()
+    np.testing.assert_allclose(found, cross.reshape(len(found), -1), rtol=1e-5, atol=near)
+
+
+def test_a_step_solves_the_whole_system():
+    """The bordered Eq. 9 and Eq. 10 together are the solution of the damped dense system."""
+    problem = with_flow(make_scene(cameras=5, points=30, noise_px=1.0, visible=0.8).problem)
+    uncertainty = CalibrationUncertainty(focal=0.01, k1=0.02, k2=0.0, readout=0.1, prior_px=30.0)
+    damping, M = 1e-3, 5
+    J = -np.concatenate(
+        [numeric_jacobian(problem), -calibration_jacobian(problem, np.zeros(SHARED))[0]], axis=1
     )
-    observed = problem.points_px.astype(np.float64).reshape(-1)
-    H = J.T @ J
-    np.testing.assert_allclose(shared[:PAIRS], H[np.tril_indices(UNKNOWNS)], rtol=1e-6)
-    np.testing.assert_allclose(
-        shared[PAIRS:], J.T @ (observed - predicted(q)), rtol=1e-5, atol=1e-3
-    )
-    B = -numeric_jacobian(problem)[:, : 6 * M]
-    expected = (J.T @ B).reshape(UNKNOWNS, M, 6).transpose(1, 0, 2).reshape(M, 6 * UNKNOWNS)
-    np.testing.assert_allclose(cross, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
+    r = calibration_jacobian(problem, np.zeros(SHARED))[1]
+    H, g = J.T @ J, J.T @ r
+    n = len(H) - SHARED
+    unknown = uncertainty.sigmas > 0.0
+    prior = np.where(unknown, 30.0 / np.where(unknown, uncertainty.sigmas, 1.0), 0.0) ** 2
+    H[n:, n:] += np.diag(prior)
+    moving = np.concatenate([np.arange(n) >= 12, unknown])
+    damped = H + damping * np.diag(np.diag(H))
+    expected = np.zeros(len(H))
+    expected[moving] = np.linalg.solve(damped[np.ix_(moving, moving)], g[moving])
+    system = calibrating_system(problem, EXACT, uncertainty)
+    start = system.start()
+    trial = system.step(start, damping)
+    assert trial is not None
+    np.testing.assert_allclose(trial.calibration, expected[n:], rtol=1e-3, atol=1e-9)
+    change = (trial.points - start.points)[:, system.layout.column].T
+    np.testing.assert_allclose(change.reshape(-1), expected[6 * M : n], rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +114,8 @@ def test_a_wrong_calibration_is_recovered_with_the_poses(truth):
     scene = make_scene(cameras=8, points=300, distortion=(k1, k2))
     # One who believes in a focal length that is too short by e^-s, and in no distortion.
     problem = with_lens(scene.problem, s=-s)
-    result, found = solve_calibrating(problem, EXACT, FREE)
+    result = solve_schur(problem, EXACT, uncertainty=FREE)
+    found = result.correction
     np.testing.assert_allclose(found[:3], truth, atol=2e-3)
     np.testing.assert_allclose(result.T_world_camera, scene.T_world_camera, atol=2e-3)
     blind = solve_schur(problem, EXACT)
@@ -104,7 +125,8 @@ def test_a_wrong_calibration_is_recovered_with_the_poses(truth):
 
 def test_the_cost_is_that_of_the_answer_with_its_lens():
     problem = undistorted(make_scene(cameras=6, points=200, distortion=(-0.05, 0.0)).problem)
-    result, found = solve_calibrating(problem, EXACT, FREE)
+    result = solve_schur(problem, EXACT, uncertainty=FREE)
+    found = result.correction
     corrected = dataclasses.replace(
         with_lens(problem, *found[:3]),
         T_world_camera=result.T_world_camera,
@@ -117,20 +139,20 @@ def test_the_cost_is_that_of_the_answer_with_its_lens():
 
 def test_the_readout_of_a_rolling_shutter_is_found():
     scene = make_scene(cameras=6, points=200)
-    flow = random_flow(scene.problem)
-    camera, point = scene.problem.camera_index, scene.problem.point_index
-    px = scene.problem.points_px + np.float32(0.7) * flow[:, camera, point].T
-    problem = dataclasses.replace(scene.problem, points_px=px)
-    result, found = solve_calibrating(problem, EXACT, FREE, flow=flow)
+    problem = with_flow(scene.problem)
+    moved = problem.points_px + np.float32(0.7) * problem.readout_flow
+    problem = dataclasses.replace(problem, points_px=moved)
+    result = solve_schur(problem, EXACT, uncertainty=FREE)
+    found = result.correction
     np.testing.assert_allclose(found, (0.0, 0.0, 0.0, 0.7), atol=2e-3)
     np.testing.assert_allclose(result.T_world_camera, scene.T_world_camera, atol=2e-3)
-    _, without = solve_calibrating(problem, EXACT, FREE)
-    assert without[3] == 0.0
+    problem = dataclasses.replace(problem, readout_flow=None)
+    assert solve_schur(problem, EXACT, uncertainty=FREE).correction[3] == 0.0
 
 
 def test_a_right_calibration_is_left_alone():
     problem = make_scene(cameras=8, points=1500, noise_px=0.3, outliers=0.03).problem
-    _, found = solve_calibrating(problem, ROBUST, CalibrationUncertainty())
+    found = solve_schur(problem, ROBUST, uncertainty=CalibrationUncertainty()).correction
     assert np.abs(found).max() < 2e-3
 
 
@@ -148,7 +170,9 @@ def test_the_prior_holds_what_the_motion_cannot_tell():
     problem = dataclasses.replace(
         scene.problem, T_world_camera=T, points_world=world, points_px=px[at].astype(np.float32)
     )
-    _, found = solve_calibrating(problem, EXACT, CalibrationUncertainty(focal=0.01, k1=0.0))
+    found = solve_schur(
+        problem, EXACT, uncertainty=CalibrationUncertainty(focal=0.01, k1=0.0)
+    ).correction
     assert abs(found[0]) < 2e-3
     assert found[1:].tolist() == [0.0, 0.0, 0.0]
 
@@ -156,8 +180,8 @@ def test_the_prior_holds_what_the_motion_cannot_tell():
 def test_sigmas_of_zero_give_what_is_found_without():
     problem = make_scene(noise_px=0.5).problem
     held = CalibrationUncertainty(focal=0.0, k1=0.0, k2=0.0)
-    result, found = solve_calibrating(problem, EXACT, held)
-    assert found.tolist() == [0.0, 0.0, 0.0, 0.0]
+    result = solve_schur(problem, EXACT, uncertainty=held)
+    assert result.correction.tolist() == [0.0, 0.0, 0.0, 0.0]
     plain = solve_schur(problem, EXACT)
     assert result.final_cost == pytest.approx(plain.final_cost, rel=1e-6)
     np.testing.assert_allclose(result.T_world_camera, plain.T_world_camera, atol=1e-4)
@@ -168,7 +192,7 @@ def test_cameras_with_different_lenses_are_refused():
     intrinsics = problem.intrinsics.copy()
     intrinsics[1, 4] = 0.1
     with pytest.raises(ValueError, match="of all cameras"):
-        solve_calibrating(dataclasses.replace(problem, intrinsics=intrinsics), EXACT, FREE)
+        solve_schur(dataclasses.replace(problem, intrinsics=intrinsics), EXACT, uncertainty=FREE)
 
 
 @pytest.mark.parametrize("correction", [(0.02, 0.0, 0.0), (-0.01, -0.05, 0.0), (0.0, 0.1, -0.03)])

@@ -5,10 +5,9 @@ import pytest
 from bundle_scene import cost, dense_normal_equations, make_scene, move, residuals
 
 from pliant.algorithms.bundle import BundleParameters
-from pliant.algorithms.bundle.camera_step import move_camera, solve_camera
-from pliant.algorithms.bundle.cost import float32_limits, limits_of, squared_residuals, total_cost
 from pliant.algorithms.bundle.layout import BLOCK, build_layout
-from pliant.algorithms.bundle.schur_kernels import back_substitute, reduced_system
+from pliant.algorithms.bundle.projection import limits_of, move_camera, solve_camera
+from pliant.algorithms.bundle.subspace import squared_residuals, total_cost
 from pliant.algorithms.bundle.subspace_kernels import linearise_camera, sweep_points
 from pliant.algorithms.geometry import inverse
 
@@ -23,8 +22,9 @@ def test_cost_and_residuals_agree_with_numpy(distortion, sigma):
     problem, parameters = scene.problem, BundleParameters(kernel_sigma_px=sigma)
     layout = build_layout(problem)
     expected = cost(problem, problem.T_world_camera, problem.points_world, parameters)
-    assert total_cost(layout, layout.cameras, layout.points, parameters) == pytest.approx(expected)
-    squared = squared_residuals(layout, layout.cameras, layout.points, parameters)
+    motion = layout.cameras.motion
+    assert total_cost(layout, motion, layout.points, parameters) == pytest.approx(expected)
+    squared = squared_residuals(layout, motion, layout.points, parameters)
     r = residuals(problem, problem.T_world_camera, problem.points_world)
     found = squared[problem.camera_index, layout.column[problem.point_index]]
     np.testing.assert_allclose(found, (r**2).sum(axis=1), rtol=1e-5)
@@ -37,57 +37,16 @@ def test_camera_blocks_agree_with_finite_differences(distortion):
     parameters = BundleParameters(kernel_sigma_px=8.0)
     layout = build_layout(problem)
     H, g = dense_normal_equations(problem, parameters)
-    for m in range(len(layout.cameras)):
+    for m in range(len(layout.free)):
         out = np.zeros(28)
         linearise_camera(
-            m, layout.cameras.astype(np.float32), layout.pinholes32, layout.lenses32,
-            layout.points.astype(np.float32), layout.u, layout.v, layout.w, layout.seen,
-            float32_limits(parameters), out,
+            m, layout.cameras.single(), layout.points.astype(np.float32), layout.table,
+            limits_of(parameters, np.float32), out,
         )  # fmt: skip
         block = H[6 * m : 6 * m + 6, 6 * m : 6 * m + 6]
         np.testing.assert_allclose(out[:21], block[LOWER], rtol=1e-3, atol=1e-4 * block.max())
         part = g[6 * m : 6 * m + 6]
         np.testing.assert_allclose(out[21:27], part, rtol=2e-3, atol=1e-3 * abs(part).max())
-
-
-@pytest.mark.parametrize("distortion", LENSES)
-def test_schur_step_solves_the_whole_system(distortion):
-    """Eq. 9 and 10 together are the solution of the damped dense system of Eq. 7."""
-    problem = make_scene(points=20, noise_px=1.0, distortion=distortion, visible=0.8).problem
-    parameters, damping = BundleParameters(kernel_sigma_px=8.0), 1e-3
-    layout = build_layout(problem)
-    M = len(layout.cameras)
-    H, g = dense_normal_equations(problem, parameters)
-    H[np.diag_indices(len(H))] *= 1.0 + damping
-    moving = np.arange(len(H)) >= 12
-    expected = np.zeros(len(H))
-    expected[moving] = np.linalg.solve(H[np.ix_(moving, moving)], g[moving])
-
-    F = int((layout.free >= 0).sum())
-    S, b, normal = np.zeros((6 * F, 6 * F)), np.zeros(6 * F), np.zeros((M, 27))
-    reduced_system(
-        layout.cameras, layout.pinholes, layout.lenses, layout.free, layout.points,
-        layout.movable, layout.u, layout.v, layout.w, layout.seen, limits_of(parameters), damping,
-        S, b, normal,
-    )  # fmt: skip
-    steps = expected[: 6 * M].reshape(M, 6)
-    for f in range(F):
-        block = np.zeros((6, 6))
-        block[LOWER] = normal[f + 2, :21]
-        block += np.tril(block, -1).T
-        block[np.diag_indices(6)] *= 1.0 + damping
-        S[6 * f : 6 * f + 6, 6 * f : 6 * f + 6] += block
-    S = np.tril(S) + np.tril(S, -1).T
-    b += normal[2:, 21:].reshape(-1)
-    np.testing.assert_allclose(np.linalg.solve(S, b), steps[2:].reshape(-1), rtol=1e-3, atol=1e-6)
-
-    moved = np.empty_like(layout.points)
-    back_substitute(
-        layout.cameras, layout.pinholes, layout.lenses, layout.points, layout.movable,
-        layout.u, layout.v, layout.w, layout.seen, limits_of(parameters), damping, steps, moved,
-    )  # fmt: skip
-    change = (moved - layout.points)[:, layout.column].T
-    np.testing.assert_allclose(change.reshape(-1), expected[6 * M :], rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("distortion", LENSES)
@@ -99,9 +58,8 @@ def test_point_sweep_takes_the_newton_step_of_every_point(distortion):
     M, N = len(problem.T_world_camera), len(problem.points_world)
     exact = layout.points.copy()
     before, after = sweep_points(
-        layout.cameras.astype(np.float32), layout.pinholes32, layout.lenses32,
-        layout.points.astype(np.float32), exact, layout.movable, layout.u, layout.v, layout.w,
-        layout.seen, float32_limits(parameters), np.float32(0.0),
+        layout.cameras.single(), layout.points.astype(np.float32), exact, layout.table,
+        limits_of(parameters, np.float32), np.float32(0.0),
     )  # fmt: skip
     expected = np.empty((N, 3))
     for n in range(N):
@@ -148,9 +106,9 @@ def test_camera_solve_refuses_a_singular_system():
 def test_layout_groups_points_and_pads_them():
     problem = make_scene(points=BLOCK + 5, visible=0.3).problem
     layout = build_layout(problem)
-    assert layout.u.shape == (5, 2 * BLOCK)
+    assert layout.table.u.shape == (5, 2 * BLOCK)
     assert sorted(layout.column) == list(range(BLOCK + 5))
-    assert (layout.w.sum(axis=1) == np.bincount(problem.camera_index)).all()
+    assert (layout.table.w.sum(axis=1) == np.bincount(problem.camera_index)).all()
     k = 17
     m, n = problem.camera_index[k], layout.column[problem.point_index[k]]
-    assert (layout.u[m, n], layout.v[m, n]) == tuple(problem.points_px[k])
+    assert (layout.table.u[m, n], layout.table.v[m, n]) == tuple(problem.points_px[k])

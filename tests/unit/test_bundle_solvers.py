@@ -10,10 +10,9 @@ from pliant.algorithms.bundle import (
     BundleParameters,
     BundleProblem,
     BundleWindow,
-    solve_schur,
-    solve_subspace,
 )
-from pliant.algorithms.bundle.packed import solve_packed
+from pliant.algorithms.bundle.schur import solve_schur
+from pliant.algorithms.bundle.subspace import solve_subspace
 from pliant.algorithms.geometry import so3_exp
 
 EXACT = BundleParameters(kernel_sigma_px=0.0, min_relative_decrease=1e-12)
@@ -21,7 +20,6 @@ ROBUST = BundleParameters(kernel_sigma_px=2.0, min_relative_decrease=1e-9)
 SWEEPS = BundleParameters(kernel_sigma_px=0.0, max_sweeps=400, min_relative_decrease=1e-7)
 SOLVERS = [
     pytest.param(solve_schur, EXACT, id="schur"),
-    pytest.param(solve_packed, EXACT, id="packed"),
     pytest.param(solve_subspace, SWEEPS, id="subspace"),
 ]
 
@@ -99,7 +97,7 @@ def test_outliers_do_not_move_the_answer():
     assert 0.05 < wrong.mean() < 0.15
 
 
-@pytest.mark.parametrize("solver", [solve_schur, solve_packed, solve_subspace])
+@pytest.mark.parametrize("solver", [solve_schur, solve_subspace])
 def test_fixed_cameras_keep_every_bit(solver):
     problem = make_scene(noise_px=1.0).problem
     result = solver(problem, ROBUST)
@@ -109,7 +107,7 @@ def test_fixed_cameras_keep_every_bit(solver):
     assert (result.points_world != problem.points_world).any(axis=1).all()
 
 
-@pytest.mark.parametrize("solver", [solve_schur, solve_packed, solve_subspace])
+@pytest.mark.parametrize("solver", [solve_schur, solve_subspace])
 def test_window_and_list_are_the_same_problem(solver):
     problem = make_scene(noise_px=1.0, visible=0.6).problem
     listed, dense = solver(problem, ROBUST), solver(to_window(problem), ROBUST)
@@ -121,7 +119,7 @@ def test_window_and_list_are_the_same_problem(solver):
     assert np.isfinite(dense.squared_residuals).sum() == len(problem.camera_index)
 
 
-@pytest.mark.parametrize("solver", [solve_schur, solve_packed, solve_subspace])
+@pytest.mark.parametrize("solver", [solve_schur, solve_subspace])
 def test_unobserved_points_and_cameras_stay(solver):
     problem = make_scene(noise_px=0.5).problem
     keep = (problem.camera_index != 3) & (problem.point_index != 7)
@@ -135,7 +133,7 @@ def test_unobserved_points_and_cameras_stay(solver):
     assert result.final_cost < result.initial_cost
 
 
-@pytest.mark.parametrize("solver", [solve_schur, solve_packed, solve_subspace])
+@pytest.mark.parametrize("solver", [solve_schur, solve_subspace])
 @pytest.mark.parametrize("sigma", [0.0, 2.0])
 def test_points_behind_and_broken_numbers_do_no_harm(solver, sigma):
     scene = make_scene(points=80, noise_px=0.3, disturbance=0.3)
@@ -163,7 +161,7 @@ def test_points_behind_and_broken_numbers_do_no_harm(solver, sigma):
         np.testing.assert_allclose(result.T_world_camera, scene.T_world_camera, atol=0.1)
 
 
-@pytest.mark.parametrize("solver", [solve_schur, solve_packed, solve_subspace])
+@pytest.mark.parametrize("solver", [solve_schur, solve_subspace])
 def test_problems_without_anything_to_do(solver):
     problem = make_scene().problem
     empty = dataclasses.replace(
@@ -195,7 +193,7 @@ def test_weights_scale_the_cost_and_zero_leaves_out():
     assert a.final_cost == pytest.approx(b.final_cost, rel=1e-9)
 
 
-@pytest.mark.parametrize("solver", [solve_schur, solve_packed, solve_subspace])
+@pytest.mark.parametrize("solver", [solve_schur, solve_subspace])
 def test_same_input_same_bytes(solver):
     problem = make_scene(noise_px=1.0, visible=0.7).problem
     a, b = solver(problem, ROBUST), solver(problem, ROBUST)

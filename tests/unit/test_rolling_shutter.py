@@ -57,15 +57,14 @@ def test_the_flow_is_what_the_readout_does_to_the_projection(t):
     def px(T_world_camera):
         return CAMERA.project((world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3])
 
-    v = px(pose(t))[None, :, 1].astype(np.float32)
-    seen = np.ones((1, 50), np.bool_)
-    seen[0, 7] = False
+    observed = px(pose(t)).astype(np.float32)
+    world[7] = [0.0, 0.0, -3.0]  # behind
     motion = np.concatenate([OMEGA, NU - t * np.cross(OMEGA, NU)])
-    columns = np.arange(50, dtype=np.int32)
-    flow = readout_flow(pose(t)[None], motion[None], world, v, seen, columns, CAMERA)
+    number, camera = np.arange(50, dtype=np.int32), np.zeros(50, np.int32)
+    flow = readout_flow(pose(t)[None], motion[None], world, camera, number, observed, CAMERA)
     step = 1e-4
     velocity = (px(pose(t + step)) - px(pose(t - step))) / (2.0 * step)
-    share = (v[0].astype(np.float64) - 239.5) / 480.0
+    share = (observed[:, 1].astype(np.float64) - 239.5) / 480.0
     expected = share[:, None] * velocity
     expected[7] = 0.0
-    np.testing.assert_allclose(flow[:, 0].T, expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(flow, expected, rtol=1e-3, atol=1e-3)

@@ -41,8 +41,6 @@ class Relay:
         self._viewers: set[str] = set()
         self._arrived = threading.Event()
         self._seen = threading.Event()
-        self._alone = threading.Event()
-        self._alone.set()
         self._stopping = threading.Event()
         self._camera: tuple[bytes, bytes] | None = None
         self._held: list[Any] = [
@@ -57,10 +55,6 @@ class Relay:
     def wait_for_viewer(self, timeout_s: float) -> bool:
         """Wait until the first viewer has come; False where none does in time."""
         return self._seen.wait(timeout_s)
-
-    def wait_for_last_viewer(self, timeout_s: float) -> bool:
-        """Wait until the last viewer has left; False where one is still there by then."""
-        return self._alone.wait(timeout_s)
 
     def know_camera(self, camera: tuple[bytes, bytes]) -> None:
         """What the session has told of its camera, as it came."""
@@ -84,12 +78,9 @@ class Relay:
         name = str(sample.key_expr)
         if sample.kind == zenoh.SampleKind.PUT:
             self._viewers.add(name)
-            self._alone.clear()
             self._seen.set()
         else:
             self._viewers.discard(name)
-            if not self._viewers:
-                self._alone.set()
         self._arrived.set()
 
     def _run(self) -> None:

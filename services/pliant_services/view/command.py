@@ -43,7 +43,7 @@ class ViewRequest:
     web: bool = False
     save: Path | None = None
     force: bool = False
-    web_port: int | None = None
+    web_port: int = 9090
     patience_s: float = 0.0
 
 

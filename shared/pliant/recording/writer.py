@@ -27,7 +27,8 @@ from pliant.messages import codec
 from pliant.messages.topics import Topic
 from pliant.recording import layout
 from pliant.recording.layout import CHUNK_BYTES
-from pliant.recording.sections import ChunkIndexes, OpenChunk, as_bytes, closing
+from pliant.recording.open_chunk import OpenChunk, as_bytes
+from pliant.recording.summary_section import ChunkIndexes, closing
 
 _AT_ONCE = 1024
 """Parts that the system takes in one call (IOV_MAX)."""

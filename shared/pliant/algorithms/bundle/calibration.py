@@ -1,163 +1,231 @@
-"""Bundle adjustment that corrects the calibration too (self-calibration).
+"""A calibration that all cameras share as a further unknown of bundle adjustment.
 
-Schur complement LM (Eq. 9-10) with more unknowns that all cameras share: the logarithm of the
-focal length's factor, the radial distortion that rectification left, and the readout of a rolling
-shutter; derivation in ``calibration_kernels``.  Several views tell the focal length from rotation,
-and from parallax that differs across the image.  Where they cannot (no rotation, one plane, forward
-motion) the prior holds it.
+The projection is ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx`` with r^2 = x^2 + y^2 on the plane
+z = 1, likewise for v, and the unknowns of the calibration are q = (s, k1, k2, readout).  The
+derivative by one of the first three is ``K (x, y)^T h_q`` with K = diag(fx e^s, fy e^s) and
+
+    h = (1 + k1 r^2 + k2 r^4,  r^2,  r^4)       for  s, k1, k2.
+
+The Jacobian of the lens is ``F = K D`` with ``D = d I + e (x, y)^T (x, y)``, where d is h_s and
+e = 2 k1 + 4 k2 r^2.  (x, y) is an eigenvector of D: ``D (x, y)^T = (d + e r^2) (x, y)^T``.
+So a calibration unknown moves the point on the plane z = 1 as if by
+
+    A_q = (x, y)^T rho_q,     rho_q = h_q / (1 + 3 k1 r^2 + 5 k2 r^4),     F A_q = d(u, v) / dq.
+
+The fourth unknown is the readout of a rolling shutter, as a share of the frame interval: it moves
+an observation by the readout times its flow, so that ``A = F^-1 flow``.  An unknown enters the
+Hessian of Eq. 7 like a column of B (see ``projection``): with M and e of that module its blocks are
+
+    H_qq = sum A^T M A     H_qc = sum A^T M B     H_qp = sum A^T M P     - g_q = sum A^T e.
+
+So the calibration is one more camera, which sees every point, and Eq. 9 becomes an arrow,
+
+    (S_cc  S_qc^T) (dx_c)   (b_c)
+    (S_qc  S_qq  ) (dx_q) = (b_q)     S = H + damping diag(H) - U U^T,  U_q = H_qp L^-T,
+
+as sparse as before, with one row and one column of blocks that are full.  A prior at the given
+calibration adds its precision to H_qq and pulls in b_q.
 """
 
-import dataclasses
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.bundle.calibration_kernels import (
-    PAIRS,
-    UNKNOWNS,
-    calibrated_substitution,
-    calibrated_system,
+from pliant.algorithms.arrays import F32, F64, I32
+from pliant.algorithms.bundle.layout import BLOCK
+from pliant.algorithms.bundle.normal_equations import RECORD, SHARED
+from pliant.algorithms.bundle.packed_layout import PackedLayout, Slots
+from pliant.algorithms.bundle.problem import CalibrationUncertainty
+from pliant.algorithms.bundle.projection import (
+    Cameras,
+    apply_metric,
+    couple,
+    motion_of,
+    pinhole_of,
+    point_rows,
 )
-from pliant.algorithms.bundle.camera_step import move_cameras
-from pliant.algorithms.bundle.cost import limits_of, total_cost
-from pliant.algorithms.bundle.damped import damped_iterations
-from pliant.algorithms.bundle.layout import Layout, build_layout
-from pliant.algorithms.bundle.problem import AnyProblem, BundleParameters, BundleResult
-from pliant.algorithms.bundle.reduced import add_cameras, solve_reduced
-from pliant.algorithms.bundle.result import OnIteration, make_result
-from pliant.algorithms.bundle.uncertainty import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.kernel import fast_kernel, inline_kernel
 
-_LOWER = np.tril_indices(UNKNOWNS)
+LOWER = np.tril_indices(SHARED)
 _NEWTON_STEPS = 8
 _LEAST_SLOPE = 0.1
 
 
-@dataclass(frozen=True)
-class _State:
+class SharedBlocks(NamedTuple):
+    """The blocks of a shared calibration in one state.
+
+    own: (SHARED, SHARED) lower triangle of H_qq, without the prior.     gradient: (SHARED,) -g_q.
+    cameras: (M, 6 SHARED) H_qc of each camera by rows.     points: (P, 3 SHARED) H_qp by rows.
+    """
+
+    own: F64
+    gradient: F64
     cameras: F64
     points: F64
-    calibration: F64
 
 
-def solve_calibrating(
-    problem: AnyProblem,
-    parameters: BundleParameters,
-    uncertainty: CalibrationUncertainty,
-    on_iteration: OnIteration | None = None,
-    flow: F32 | None = None,
-) -> tuple[BundleResult, F64]:
-    """``solve_schur`` with an unknown calibration.
+def no_shared_blocks() -> SharedBlocks:
+    """Of a calibration that is right as it is."""
+    return SharedBlocks(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 3 * SHARED)))
 
-    flow: (2, M, N) px by which a rolling shutter moves the observation of point n in camera m when
-    its readout fills the frame interval; None: there is none, and the readout stays 0.
-    Returns the result, whose costs include the prior, and (4,) the correction (s, k1, k2, readout):
-    the observations follow ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx + readout flow``.  k1 and k2
-    of the problem's intrinsics are the start and centre of the prior.  Raises ValueError for
-    cameras that differ in their lenses.
+
+class SharedCalibration:
+    """The calibration of one problem: where it starts, its prior, what it does to the layout.
+
+    unknown: (SHARED,) which of the unknowns there are; the others keep their values.
     """
-    lens = problem.intrinsics[:, 4:]
-    if len(lens) == 0 or (lens != lens[0]).any():
-        raise ValueError("an unknown calibration must be that of all cameras")
-    given = np.array([0.0, lens[0, 0], lens[0, 1], 0.0])
-    solver = _Solver(problem, parameters, uncertainty, given, flow)
-    state, costs, converged = damped_iterations(
-        solver.start(), solver.cost, solver.step, parameters, on_iteration
-    )
-    layout = solver.at(state.calibration)
-    result = make_result(problem, layout, state.cameras, state.points, costs, converged, parameters)
-    return result, state.calibration
 
-
-class _Solver:
-    def __init__(
-        self,
-        problem: AnyProblem,
-        parameters: BundleParameters,
-        uncertainty: CalibrationUncertainty,
-        given: F64,
-        flow: F32 | None,
-    ) -> None:
-        self.layout = build_layout(problem)
-        self.flow: F32 = np.zeros((2, *self.layout.u.shape), np.float32)
-        if flow is not None:
-            self.flow[:, :, self.layout.column] = flow
-        self.parameters = parameters
-        self.given = given
+    def __init__(self, layout: PackedLayout, lens: F64, uncertainty: CalibrationUncertainty):
+        """lens: (M, 2) k1, k2 as given.  Raises ValueError where cameras differ in it."""
+        if len(lens) == 0 or (lens != lens[0]).any():
+            raise ValueError("an unknown calibration must be that of all cameras")
         sigmas = uncertainty.sigmas
-        self.known = sigmas == 0.0
-        self.known[3] |= flow is None
-        self.precision = uncertainty.prior_px**2 / np.where(self.known, 1.0, sigmas) ** 2
-        w = self.layout.w
-        self.w: F32 = np.concatenate([w, w.max(axis=0, keepdims=True)])
+        self.layout = layout
+        self.given: F64 = np.array([0.0, lens[0, 0], lens[0, 1], 0.0])
+        self.unknown = sigmas > 0.0
+        self.unknown[3] &= layout.flow.size > 0
+        self.precision: F64 = np.zeros(SHARED)
+        self.precision[self.unknown] = (uncertainty.prior_px / sigmas[self.unknown]) ** 2
 
-    def start(self) -> _State:
-        return _State(self.layout.cameras, self.layout.points, self.given)
-
-    def at(self, calibration: F64) -> Layout:
-        """The layout with the cameras of a calibration."""
+    def at(self, q: F64) -> tuple[Cameras, Slots]:
+        """The cameras and observations of a calibration."""
         layout = self.layout
-        pinholes = layout.pinholes.copy()
-        pinholes[:, :2] *= np.exp(calibration[0])
-        lenses = np.tile(calibration[1:3], (len(pinholes), 1))
-        moved = np.float32(calibration[3]) * self.flow
-        return dataclasses.replace(
-            layout, pinholes=pinholes, lenses=lenses, u=layout.u - moved[0], v=layout.v - moved[1]
-        )
+        pinhole = layout.cameras.pinhole.copy()
+        pinhole[:, :2] *= np.exp(q[0])
+        lens = np.tile(q[1:3], (len(pinhole), 1))
+        cameras = layout.cameras._replace(pinhole=pinhole, lens=lens)
+        if not self.unknown[3]:
+            return cameras, layout.slots
+        moved = np.float32(q[3]) * layout.flow
+        slots = layout.slots
+        return cameras, slots._replace(u=slots.u - moved[0], v=slots.v - moved[1])
 
-    def cost(self, state: _State) -> float:
-        departure = state.calibration - self.given
-        seen = total_cost(self.at(state.calibration), state.cameras, state.points, self.parameters)
-        return seen + 0.5 * float(self.precision @ departure**2)
+    def prior_cost(self, q: F64) -> float:
+        """What departing from the given calibration costs, px^2."""
+        return 0.5 * float(self.precision @ (q - self.given) ** 2)
 
-    def step(self, state: _State, damping: float) -> _State | None:
-        layout, limits = self.at(state.calibration), limits_of(self.parameters)
-        moving = np.flatnonzero(layout.free >= 0)
-        M, F = len(layout.cameras), len(moving)
-        S, b = np.zeros((6 * F + 6, 6 * F + 6)), np.zeros(6 * F + 6)
-        normal, cross, shared = (
-            np.zeros((M, 27)),
-            np.zeros((M, 6 * UNKNOWNS)),
-            np.zeros(PAIRS + UNKNOWNS),
+    def linearise(self, cameras: Cameras, records: F64) -> SharedBlocks:
+        """The blocks in the state of the records."""
+        layout = self.layout
+        blocks = SharedBlocks(
+            own=np.zeros((SHARED, SHARED)),
+            gradient=np.zeros(SHARED),
+            cameras=np.zeros((len(layout.free), 6 * SHARED)),
+            points=np.zeros((layout.points.shape[1], 3 * SHARED)),
         )
-        calibrated_system(
-            state.cameras, layout.pinholes, layout.lenses, layout.free, state.points,
-            layout.movable, layout.u, layout.v, self.flow, self.w, layout.seen, limits, damping, S,
-            b, normal, cross, shared,
-        )  # fmt: skip
-        diagonal = np.zeros(6 * F + 6)
-        diagonal[: 6 * F] = add_cameras(S[: 6 * F, : 6 * F], b[: 6 * F], normal[moving])
-        at = slice(6 * F, 6 * F + UNKNOWNS)
-        own = np.diag(self.precision)
-        own[_LOWER] += shared[:PAIRS]
-        S[at, at] += own
-        S[at, : 6 * F] += (
-            cross[moving].reshape(F, UNKNOWNS, 6).transpose(1, 0, 2).reshape(UNKNOWNS, 6 * F)
-        )
-        b[at] += shared[PAIRS:] - self.precision * (state.calibration - self.given)
-        diagonal[at] = np.diag(own)
-        S[:] = np.tril(S) + np.tril(S, -1).T
-        held = 6 * F + np.flatnonzero(self.known)
-        S[held], S[:, held], b[held] = 0.0, 0.0, 0.0
-        solution = solve_reduced(S, b, damping * diagonal)
-        if solution is None:
-            return None
-        steps = np.zeros((M, 6))
-        steps[moving] = solution[: 6 * F].reshape(-1, 6)
-        change = np.ascontiguousarray(solution[at])
-        moved = np.empty_like(state.points)
-        calibrated_substitution(
-            state.cameras, layout.pinholes, layout.lenses, state.points, layout.movable, layout.u,
-            layout.v, self.flow, layout.w, layout.seen, limits, damping, steps, change, moved,
-        )  # fmt: skip
-        return _State(move_cameras(state.cameras, steps), moved, state.calibration + change)
+        _add_shared(cameras, layout.slots, layout.flow, self.unknown, records, blocks)
+        return blocks
+
+
+@fast_kernel
+def _add_shared(
+    cameras: Cameras, slots: Slots, flow: F32, unknown: Any, records: F64, blocks: SharedBlocks
+) -> None:
+    """Add up the blocks.  records: (O + 1, RECORD) of ``normal_equations``."""
+    local = np.empty(RECORD * BLOCK)
+    A = np.zeros(2 * SHARED * BLOCK)
+    for b in range(slots.camera.size):
+        m = slots.camera[b]
+        for i in range(BLOCK):
+            at = np.uint32(slots.place[b, i])
+            for k in range(RECORD):
+                local[k * BLOCK + i] = records[at, k]
+        _moves(cameras, m, local, A)
+        if unknown[3]:
+            _readout_moves(cameras, m, local, flow[0, b], flow[1, b], A)
+        for q in range(SHARED):
+            if not unknown[q]:
+                A[2 * q * BLOCK : 2 * (q + 1) * BLOCK] = 0.0
+        _add_own(local, A, blocks.own, blocks.gradient, blocks.cameras[m])
+        _add_points(cameras, m, slots.point[b], local, A, blocks.points)
+
+
+@inline_kernel
+def _shares(n2: Any, k1: Any, k2: Any) -> Any:
+    """rho of s, k1 and k2 at the squared radius n2."""
+    inverse = 1.0 / (1.0 + n2 * (3.0 * k1 + 5.0 * k2 * n2))
+    return (1.0 + n2 * (k1 + k2 * n2)) * inverse, n2 * inverse, n2 * n2 * inverse
+
+
+@fast_kernel
+def _moves(cameras: Cameras, m: int, local: F64, A: F64) -> None:
+    """Write A (SHARED x 2 x BLOCK) of one camera and block but for the readout."""
+    k1, k2 = cameras.lens[m, 0], cameras.lens[m, 1]
+    for i in range(BLOCK):
+        x, y = local[i], local[BLOCK + i]
+        s0, s1, s2 = _shares(x * x + y * y, k1, k2)
+        A[i], A[BLOCK + i] = s0 * x, s0 * y
+        A[2 * BLOCK + i], A[3 * BLOCK + i] = s1 * x, s1 * y
+        A[4 * BLOCK + i], A[5 * BLOCK + i] = s2 * x, s2 * y
+
+
+@fast_kernel
+def _readout_moves(cameras: Cameras, m: int, local: F64, fu: F32, fv: F32, A: F64) -> None:
+    """``A = D^-1 K^-1 flow``, the inverse by Sherman and Morrison."""
+    K, k1, k2 = pinhole_of(cameras, m), cameras.lens[m, 0], cameras.lens[m, 1]
+    for i in range(BLOCK):
+        x, y = local[i], local[BLOCK + i]
+        n2 = x * x + y * y
+        a, c = fu[i] / K[0], fv[i] / K[1]
+        d, e = 1.0 + n2 * (k1 + k2 * n2), 2.0 * k1 + 4.0 * k2 * n2
+        t = e * (x * a + y * c) / (d + e * n2)
+        A[6 * BLOCK + i] = (a - t * x) / d
+        A[7 * BLOCK + i] = (c - t * y) / d
+
+
+@fast_kernel
+def _add_own(local: F64, A: F64, own: F64, gradient: F64, cross: F64) -> None:
+    """Add ``A^T M A``, ``A^T e`` and ``A^T M B`` (SHARED x 6 by rows)."""
+    for q in range(SHARED):
+        Aq = A[2 * q * BLOCK :]
+        for p in range(q + 1):
+            Ap = A[2 * p * BLOCK :]
+            h = 0.0
+            for i in range(BLOCK):
+                m00, m01, m11 = local[3 * BLOCK + i], local[4 * BLOCK + i], local[5 * BLOCK + i]
+                a, c = apply_metric(m00, (m01,), m11, Ap[i], Ap[BLOCK + i])
+                h += Aq[i] * a + Aq[BLOCK + i] * c
+            own[q, p] += h
+        g = t0 = t1 = t2 = t3 = t4 = t5 = 0.0
+        for i in range(BLOCK):
+            x, y, iz = local[i], local[BLOCK + i], local[2 * BLOCK + i]
+            m00, m01, m11 = local[3 * BLOCK + i], local[4 * BLOCK + i], local[5 * BLOCK + i]
+            g += Aq[i] * local[6 * BLOCK + i] + Aq[BLOCK + i] * local[7 * BLOCK + i]
+            a, c = apply_metric(m00, (m01,), m11, Aq[i], Aq[BLOCK + i])
+            d0, d1, d2, d3, d4, d5 = couple(x, y, iz, a, c)
+            t0 += d0
+            t1 += d1
+            t2 += d2
+            t3 += d3
+            t4 += d4
+            t5 += d5
+        gradient[q] += g
+        sums = (t0, t1, t2, t3, t4, t5)
+        for k in range(6):
+            cross[6 * q + k] += sums[k]
+
+
+@fast_kernel
+def _add_points(cameras: Cameras, m: int, point: I32, local: F64, A: F64, points: F64) -> None:
+    """Add ``A^T M P`` (SHARED x 3 by rows) of one camera and block to its points."""
+    T = motion_of(cameras, m)
+    for i in range(BLOCK):
+        n = np.uint32(point[i])
+        m00, m01, m11 = local[3 * BLOCK + i], local[4 * BLOCK + i], local[5 * BLOCK + i]
+        p0, p1, p2, q0, q1, q2 = point_rows(T, local[i], local[BLOCK + i], local[2 * BLOCK + i])
+        for q in range(SHARED):
+            Aq = A[2 * q * BLOCK :]
+            a, c = apply_metric(m00, (m01,), m11, Aq[i], Aq[BLOCK + i])
+            points[n, 3 * q] += a * p0 + c * q0
+            points[n, 3 * q + 1] += a * p1 + c * q1
+            points[n, 3 * q + 2] += a * p2 + c * q2
 
 
 def ideal_pixels(u: F32, v: F32, camera: PinholeCamera, correction: F64) -> tuple[F32, F32]:
     """Move pixels (N,) of the image to where ``camera``, were it right, would have seen them.
 
-    correction: (4,) of ``solve_calibrating``; what the readout does is not undone here.  Newton's
+    correction: (4,) of ``solve_schur``; what the readout does is not undone here.  Newton's
     method on the radius, to rounding for corrections under which the radius still grows with the
     angle; elsewhere the nearest it gets.
     """

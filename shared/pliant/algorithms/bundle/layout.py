@@ -5,11 +5,13 @@ become SIMD code, and a table says which camera sees anything of which block.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.bundle.problem import AnyProblem, BundleProblem
+from pliant.algorithms.bundle.projection import Cameras
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.kernel import kernel
 
@@ -17,34 +19,25 @@ BLOCK = 128
 """Points in a block: W of ten cameras and one block (184 kB) stays in the L2 cache."""
 
 
-@dataclass(kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Unknowns:
     """Cameras and points of one problem, ready for the kernels.  P is the number of columns.
 
     column: (N,) where point n lies.
-    cameras: (M, 12) R_camera_world by rows, then t_camera_world; of the shifted world.
-    pinholes: (M, 4) fx, fy, cx, cy.        lenses: (M, 2) k1, k2; (0,) where none has distortion.
-    pinholes32, lenses32: the same in float32.
+    cameras: M of them.      free: (M,) 1 for a camera that moves.
     origin: (3,) subtracted from the world, so that float32 has small numbers to deal with.
-    points: (3, P) in the shifted world.      movable: (P,) 1 where the point may move.
-    free: (M,) position of the camera among the movable ones, -1 for a fixed one.
+    points: (3, P) in the shifted world.
     """
 
     column: I64
-    cameras: F64
-    pinholes: F64
-    lenses: F64
-    pinholes32: F32
-    lenses32: F32
+    cameras: Cameras
+    free: BoolArray
     origin: F64
     points: F64
-    movable: U8
-    free: I32
 
 
-@dataclass(kw_only=True)
-class Layout(Unknowns):
-    """The dense layout.  P is padded to whole blocks.
+class Table(NamedTuple):
+    """Dense observations of M cameras.  P is padded to whole blocks.
 
     u, v, w: (M, P) float32, w = 0 where nothing is seen.
     seen: (M, P / BLOCK) 1 where the camera sees a point of the block.
@@ -56,14 +49,19 @@ class Layout(Unknowns):
     seen: U8
 
 
+@dataclass(frozen=True, kw_only=True)
+class Layout(Unknowns):
+    """The dense layout."""
+
+    table: Table
+
+
 def build_layout(problem: AnyProblem) -> Layout:
     """Bring a problem into the dense layout.  Nothing in the problem is changed."""
     M, N = len(problem.T_world_camera), len(problem.points_world)
     P = max(1, -(-N // BLOCK)) * BLOCK
     column, usable = columns_of(problem), finite_points(problem.points_world)
-    u = np.zeros((M, P), np.float32)
-    v = np.zeros((M, P), np.float32)
-    w = np.zeros((M, P), np.float32)
+    u, v, w = np.zeros((3, M, P), np.float32)
     seen = np.zeros((M, P // BLOCK), np.uint8)
     if isinstance(problem, BundleProblem):
         _scatter(
@@ -73,7 +71,8 @@ def build_layout(problem: AnyProblem) -> Layout:
     else:
         _copy_dense(problem.u, problem.v, problem.weights, usable, u, v, w)
     _mark_blocks(w, seen)
-    return Layout(**vars(unknowns_of(problem, column, usable, P)), u=u, v=v, w=w, seen=seen)
+    table = Table(u, v, w, seen)
+    return Layout(**vars(unknowns_of(problem, column, usable, P)), table=table)
 
 
 @kernel
@@ -99,31 +98,25 @@ def unknowns_of(problem: AnyProblem, column: I64, usable: BoolArray, P: int) -> 
     origin = problem.T_world_camera[:, :3, 3].mean(axis=0) if M else np.zeros(3)
     points = np.zeros((3, P))
     _shift(problem.points_world, usable, column, origin, points)
-    movable = np.zeros(P, np.uint8)
-    movable[column] = usable
-    free = np.full(M, -1, np.int32)
-    moving = np.flatnonzero(~problem.fixed_cameras)
-    free[moving] = np.arange(len(moving), dtype=np.int32)
     T_camera_world = inverse(problem.T_world_camera)
-    cameras = np.empty((M, 12))
-    cameras[:, :9] = T_camera_world[:, :3, :3].reshape(M, 9)
-    cameras[:, 9:] = T_camera_world[:, :3, 3] + T_camera_world[:, :3, :3] @ origin
-    pinholes = np.ascontiguousarray(problem.intrinsics[:, :4])
-    lenses = np.ascontiguousarray(problem.intrinsics[:, 4:])
-    if not lenses.any():
-        lenses = np.zeros(0)
-    return Unknowns(
-        column=column, cameras=cameras, pinholes=pinholes, lenses=lenses,
-        pinholes32=pinholes.astype(np.float32), lenses32=lenses.astype(np.float32),
-        origin=origin, points=points, movable=movable, free=free,
-    )  # fmt: skip
+    motion = np.empty((M, 12))
+    motion[:, :9] = T_camera_world[:, :3, :3].reshape(M, 9)
+    motion[:, 9:] = T_camera_world[:, :3, 3] + T_camera_world[:, :3, :3] @ origin
+    lens = np.ascontiguousarray(problem.intrinsics[:, 4:])
+    cameras = Cameras(
+        motion=motion,
+        pinhole=np.ascontiguousarray(problem.intrinsics[:, :4]),
+        lens=lens if lens.any() else np.zeros(0),
+    )
+    free = ~problem.fixed_cameras
+    return Unknowns(column=column, cameras=cameras, free=free, origin=origin, points=points)
 
 
-def poses_of(layout: Unknowns, problem: AnyProblem, cameras: F64) -> F64:
-    """(M, 4, 4) T_world_camera of the layout's cameras; fixed ones exactly as they were."""
+def poses_of(layout: Unknowns, problem: AnyProblem, motion: F64) -> F64:
+    """(M, 4, 4) T_world_camera of (M, 12) motions; fixed ones exactly as they were."""
     T_camera_world = np.zeros_like(problem.T_world_camera)
-    T_camera_world[:, :3, :3] = cameras[:, :9].reshape(-1, 3, 3)
-    T_camera_world[:, :3, 3] = cameras[:, 9:]
+    T_camera_world[:, :3, :3] = motion[:, :9].reshape(-1, 3, 3)
+    T_camera_world[:, :3, 3] = motion[:, 9:]
     T_camera_world[:, 3, 3] = 1.0
     T_world_camera = inverse(T_camera_world)
     T_world_camera[:, :3, 3] += layout.origin

@@ -53,6 +53,43 @@ class BundleParameters(Parameters):
     )
 
 
+class CalibrationUncertainty(Parameters):
+    """How far the given calibration may be wrong: standard deviations of a prior at 0."""
+
+    focal: float = Field(
+        default=0.01,
+        ge=0.0,
+        description="Standard deviation of the focal length, as a share of it; 0 holds it",
+    )
+    k1: float = Field(
+        default=0.01,
+        ge=0.0,
+        description="Standard deviation of the radial distortion k1 after rectification; 0: held",
+    )
+    k2: float = Field(
+        default=0.0,
+        ge=0.0,
+        description="Standard deviation of the radial distortion k2 after rectification; 0: held",
+    )
+    readout: float = Field(
+        default=0.1,
+        ge=0.0,
+        description="Standard deviation of the readout of a rolling shutter, as a share of the "
+        "frame interval; 0: every row is taken at once",
+    )
+    prior_px: float = Field(
+        default=1.0,
+        gt=0.0,
+        description="Weight of this prior: one standard deviation costs as much as a residual of "
+        "this many px of one observation",
+    )
+
+    @property
+    def sigmas(self) -> F64:
+        """(4,) of the focal factor's logarithm, k1, k2 and the readout."""
+        return np.array([self.focal, self.k1, self.k2, self.readout])
+
+
 @dataclass(frozen=True, kw_only=True)
 class BundleProblem:
     """Cameras, points and a list of observations (VITAMIN-E Eq. 6).
@@ -65,6 +102,8 @@ class BundleProblem:
         ``u = fx (1 + k1 r^2 + k2 r^4) x + cx`` with x, y on the plane z = 1.
     fixed_cameras: cameras that do not move.  At least one, or the gauge is left to the damping.
     weights: factors of the observations' cost terms, 0 leaves one out; None: all 1.
+    readout_flow: (O, 2) px by which a rolling shutter moves each observation where its readout
+        fills the frame interval; None: every row of a frame is taken at once.
     """
 
     T_world_camera: Annotated[F64, Shape("M", 4, 4)]
@@ -75,15 +114,13 @@ class BundleProblem:
     intrinsics: Annotated[F64, Shape("M", 6)]
     fixed_cameras: Annotated[BoolArray, Shape("M")]
     weights: F32 | None = None
+    readout_flow: F32 | None = None
 
     def __post_init__(self) -> None:
         check_arrays(self)
-        weights = self.weights
-        if weights is not None and (weights.dtype, weights.shape) != (
-            np.dtype(np.float32),
-            self.camera_index.shape,
-        ):
-            raise ValueError(f"weights: one float32 an observation, got {weights.dtype}")
+        observations = len(self.camera_index)
+        _check_optional("weights", self.weights, (observations,))
+        _check_optional("readout_flow", self.readout_flow, (observations, 2))
         if len(self.camera_index):
             if self.camera_index.min() < 0 or self.camera_index.max() >= len(self.T_world_camera):
                 raise ValueError("camera_index: out of range")
@@ -128,6 +165,7 @@ class BundleResult:
     squared_residuals: px^2 without kernel or weight; inf where the point lies behind the camera.
         One for each observation of a ``BundleProblem`` (O,); (M, N) for a ``BundleWindow``, inf
         where nothing is observed.  Observations left out as not finite: inf.
+    correction: (4,) of the calibration, where it was unknown: see ``solve_schur``.
     """
 
     T_world_camera: F64
@@ -138,8 +176,14 @@ class BundleResult:
     converged: bool
     squared_residuals: F32
     costs: F64 = field(default_factory=lambda: np.zeros(0))
+    correction: F64 = field(default_factory=lambda: np.zeros(4))
 
 
 def shared_intrinsics(camera: PinholeCamera, count: int) -> F64:
     """(count, 6) rows ``fx, fy, cx, cy, 0, 0``: one camera without distortion for all frames."""
     return np.tile(np.array([camera.fx, camera.fy, camera.cx, camera.cy, 0.0, 0.0]), (count, 1))
+
+
+def _check_optional(name: str, value: F32 | None, shape: tuple[int, ...]) -> None:
+    if value is not None and (value.dtype != np.float32 or value.shape != shape):
+        raise ValueError(f"{name}: expected float32 {shape}, got {value.dtype} {value.shape}")

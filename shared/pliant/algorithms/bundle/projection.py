@@ -1,4 +1,4 @@
-"""One observation of one point: what every kernel of bundle adjustment has in common.
+"""One observation of one point, one step of one camera: what the kernels have in common.
 
 The residual is ``r = u - phi(T_camera_world p)``.  With x, y on the plane z = 1 and F the (2, 2)
 Jacobian of the lens (focal lengths, radial distortion), the Jacobians of phi are ``F P`` for the
@@ -17,46 +17,112 @@ is no distortion, ``lens`` and the off-diagonal of M are empty tuples; their len
 numba compiles, so that the code for distortion is dropped.
 """
 
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import DTypeLike
 
-from pliant.algorithms.kernel import inline_kernel
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.bundle.problem import BundleParameters
+from pliant.algorithms.kernel import inline_kernel, kernel
 
-_Number = Any
-_Camera = Any
+_Number: TypeAlias = Any
+_Camera: TypeAlias = Any
+
+_BEHIND_PX2 = 1e8
+"""Squared residual charged behind a camera without a kernel; above all real ones, and constant."""
+
+_SINGULAR = 1e-12
+_LEAST_DISTANCE = 1e-6
+"""Map units.  Where a point may lie behind, it must still not lie in the plane of the camera."""
+
+
+class Cameras(NamedTuple):
+    """The cameras of a problem, all in one precision.
+
+    motion: (M, 12) R_camera_world by rows, then t_camera_world; of the shifted world.
+    pinhole: (M, 4) fx, fy, cx, cy.      lens: (M, 2) k1, k2; (0,) where none has distortion.
+    """
+
+    motion: Any
+    pinhole: Any
+    lens: Any
+
+    def single(self) -> "Cameras":
+        """In float32."""
+        return Cameras(*(np.asarray(each, np.float32) for each in self))
+
+
+class Limits(NamedTuple):
+    """Of the robust kernel and the camera's front, in the precision of a kernel's arithmetic.
+
+    Geman-McClure: ``rho(s) = s / (1 + s / sigma^2)``, weight ``rho'(s) = 1 / (1 + s / sigma^2)^2``,
+    s the squared residual.  rho(s) ~ s near 0 and saturates at sigma^2, which is what a point
+    behind a camera costs.
+
+    inverse_sigma2: 1 / sigma^2, 1 / px^2.    behind: cost of a point behind its camera, px^2.
+    min_depth, min_distance: least depth, least distance from the camera's plane, map units.
+    """
+
+    inverse_sigma2: Any
+    behind: Any
+    min_depth: Any
+    min_distance: Any
+
+
+def limits_of(parameters: BundleParameters, dtype: DTypeLike = np.float64) -> Limits:
+    """What the kernels need of the parameters."""
+    number: Any = np.dtype(dtype).type
+    sigma2 = parameters.kernel_sigma_px**2
+    return Limits(
+        inverse_sigma2=number(1.0 / sigma2 if sigma2 > 0.0 else 0.0),
+        behind=number(sigma2 if sigma2 > 0.0 else _BEHIND_PX2),
+        min_depth=number(parameters.min_depth),
+        min_distance=number(_LEAST_DISTANCE),
+    )
 
 
 @inline_kernel
-def motion_of(cameras: Any, m: int) -> Any:
+def motion_of(cameras: Cameras, m: int) -> Any:
     """The 12 numbers of camera m, to stand in registers during a loop."""
-    c = cameras[m]
+    return row_of(cameras.motion[m])
+
+
+@inline_kernel
+def row_of(c: Any) -> Any:
+    """The 12 numbers of a motion (12,)."""
     return (c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9], c[10], c[11])
 
 
 @inline_kernel
-def pinhole_of(pinholes: Any, m: int) -> Any:
+def pinhole_of(cameras: Cameras, m: int) -> Any:
     """fx, fy, cx, cy of camera m."""
-    k = pinholes[m]
+    k = cameras.pinhole[m]
     return (k[0], k[1], k[2], k[3])
 
 
 @inline_kernel
-def lens_of(lenses: Any, m: int) -> Any:
-    """(k1, k2) of camera m; () where lenses is an empty one-dimensional array: no distortion."""
-    if lenses.ndim == 1:
+def lens_of(cameras: Cameras, m: int) -> Any:
+    """(k1, k2) of camera m; () where there is no distortion."""
+    return _lens_of(cameras.lens, m)
+
+
+@inline_kernel
+def _lens_of(lens: Any, m: int) -> Any:
+    # Of an argument numba knows the dimensions before it types the branches.
+    if lens.ndim == 1:
         return ()
-    return (lenses[m, 0], lenses[m, 1])
+    return (lens[m, 0], lens[m, 1])
 
 
 @inline_kernel
 def residual(
     one: _Number, T: _Camera, K: _Camera, lens: Any, X: Any, Y: Any, Z: Any, u: Any, v: Any,
-    limits: Any,
+    limits: Limits,
 ) -> Any:  # fmt: skip
     """(x, y, 1/z, in front, residual u, residual v); behind the camera: finite nonsense."""
     z = T[6] * X + T[7] * Y + T[8] * Z + T[11]
-    front = (z > limits[2]) & (abs(z) > limits[3])
+    front = (z > limits.min_depth) & (abs(z) > limits.min_distance)
     iz = one / (z if front else one)
     x = (T[0] * X + T[1] * Y + T[2] * Z + T[9]) * iz
     y = (T[3] * X + T[4] * Y + T[5] * Z + T[10]) * iz
@@ -68,22 +134,22 @@ def residual(
 
 
 @inline_kernel
-def robust_cost(one: _Number, du: Any, dv: Any, w: Any, front: Any, limits: Any) -> Any:
-    """w rho(r^2), Geman-McClure; limits: see ``cost.Limits``."""
+def robust_cost(one: _Number, du: Any, dv: Any, w: Any, front: Any, limits: Limits) -> Any:
+    """w rho(r^2), Geman-McClure."""
     s = du * du + dv * dv
-    return w * (s / (one + s * limits[0]) if front else limits[1])
+    return w * (s / (one + s * limits.inverse_sigma2) if front else limits.behind)
 
 
 @inline_kernel
 def observe(
     one: _Number, T: _Camera, K: _Camera, lens: Any, X: Any, Y: Any, Z: Any, u: Any, v: Any, w: Any,
-    limits: Any,
+    limits: Limits,
 ) -> Any:  # fmt: skip
     """(x, y, 1/z, m00, m01, m11, e0, e1, cost): one observation linearised, see the module."""
     x, y, iz, front, du, dv = residual(one, T, K, lens, X, Y, Z, u, v, limits)
     s = du * du + dv * dv
-    k = one / (one + s * limits[0])
-    cost = w * (s * k if front else limits[1])
+    k = one / (one + s * limits.inverse_sigma2)
+    cost = w * (s * k if front else limits.behind)
     weight = (w if front else one - one) * k * k
     if len(lens) == 0:
         gx, gy = weight * K[0], weight * K[1]
@@ -125,13 +191,20 @@ def point_rows(T: _Camera, x: Any, y: Any, iz: Any) -> Any:
 
 
 @inline_kernel
+def couple(x: Any, y: Any, iz: Any, a: Any, c: Any) -> Any:
+    """``B^T (a, c)``: the six numbers of a column of H_cp."""
+    e = x * a + y * c
+    return iz * a, iz * c, -iz * e, -c - y * e, a + x * e, x * c - y * a
+
+
+@inline_kernel
 def solve_point(
     one: _Number, v00: Any, v10: Any, v11: Any, v20: Any, v21: Any, v22: Any, g0: Any, g1: Any,
-    g2: Any, ok: Any, smallest: _Number,
+    g2: Any, smallest: _Number,
 ) -> Any:  # fmt: skip
-    """Solve a symmetric 3 x 3 system by Cholesky; 0 where not ok or not positive definite."""
+    """Solve a symmetric 3 x 3 system by Cholesky; 0 where not positive definite."""
     zero = one - one
-    ok = ok & (v00 > zero)
+    ok = v00 > zero
     i00 = one / np.sqrt(v00 if ok else one)
     l10, l20 = v10 * i00, v20 * i00
     d11 = v11 - l10 * l10
@@ -147,3 +220,72 @@ def solve_point(
     s1 = (y1 - l21 * s2) * i11
     s0 = (y0 - l10 * s1 - l20 * s2) * i00
     return s0 if ok else zero, s1 if ok else zero, s2 if ok else zero
+
+
+@kernel
+def solve_camera(normal: F64, damping: float, step: F64) -> bool:
+    """Solve ``(H + damping diag(H)) step = g``; False, and step 0, where there is no solution.
+
+    normal: (>= 27,) lower triangle of H by rows, then g.
+    """
+    L = np.empty((6, 6))
+    at = 0
+    for r in range(6):
+        for c in range(r + 1):
+            total = normal[at] * (1.0 + damping) if r == c else normal[at]
+            diagonal = total
+            for k in range(c):
+                total -= L[r, k] * L[c, k]
+            if r == c:
+                if not total > _SINGULAR * diagonal:
+                    step[:] = 0.0
+                    return False
+                L[r, r] = np.sqrt(total)
+            else:
+                L[r, c] = total / L[c, c]
+            at += 1
+    for r in range(6):
+        total = normal[21 + r]
+        for k in range(r):
+            total -= L[r, k] * step[k]
+        step[r] = total / L[r, r]
+    for r in range(5, -1, -1):
+        total = step[r]
+        for k in range(r + 1, 6):
+            total -= L[k, r] * step[k]
+        step[r] = total / L[r, r]
+    return True
+
+
+@kernel
+def move_camera(camera: F64, step: F64, out: F64) -> None:
+    """Left-multiply T_camera_world (12,) by ``(exp(theta), rho)``, step (6,) = (rho, theta)."""
+    a, b, c = step[3], step[4], step[5]
+    angle2 = a * a + b * b + c * c
+    if angle2 < 1e-12:
+        p, q = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+    else:
+        angle = np.sqrt(angle2)
+        p, q = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
+    e00, e01, e02 = 1.0 - q * (b * b + c * c), q * a * b - p * c, q * a * c + p * b
+    e10, e11, e12 = q * a * b + p * c, 1.0 - q * (a * a + c * c), q * b * c - p * a
+    e20, e21, e22 = q * a * c - p * b, q * b * c + p * a, 1.0 - q * (a * a + b * b)
+    for k in range(3):
+        r0, r1, r2 = camera[k], camera[3 + k], camera[6 + k]
+        out[k] = e00 * r0 + e01 * r1 + e02 * r2
+        out[3 + k] = e10 * r0 + e11 * r1 + e12 * r2
+        out[6 + k] = e20 * r0 + e21 * r1 + e22 * r2
+    t0, t1, t2 = camera[9], camera[10], camera[11]
+    out[9] = e00 * t0 + e01 * t1 + e02 * t2 + step[0]
+    out[10] = e10 * t0 + e11 * t1 + e12 * t2 + step[1]
+    out[11] = e20 * t0 + e21 * t1 + e22 * t2 + step[2]
+
+
+@kernel
+def move_cameras(cameras: F64, steps: F64) -> F64:
+    """``move_camera`` for (M, 12) cameras and (M, 6) steps; a step of 0 changes no bit."""
+    out = cameras.copy()
+    for m in range(cameras.shape[0]):
+        if np.any(steps[m] != 0.0):
+            move_camera(cameras[m], steps[m], out[m])
+    return out

@@ -1,48 +1,195 @@
-"""The reduced system of the cameras (Eq. 9): putting it together and solving it."""
+"""The reduced system of the cameras (Eq. 9): which of its blocks there are, and its solution.
+
+Two cameras meet in the system where they see a common point, so that of a long path few blocks are
+there.  A calibration that all cameras share is one more camera, which meets all of them: it borders
+the matrix, and is eliminated last.  ``S = L L^T`` by blocks, for the columns j in their order:
+
+    L_jj L_jj^T = S_jj      L_ij = S_ij L_jj^-T      S_ik -= L_ij L_kj^T   for all i >= k below j.
+
+The last step makes every pair of cameras meet that met camera j.  How many blocks that fills in is
+up to the order: next is always the camera that meets the fewest others (minimum degree, Tinney and
+Walker 1967; George and Liu 1989).  Everything is done by our own kernels, in one thread.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64
-from pliant.algorithms.kernel import leaf_kernel
+from pliant.algorithms.arrays import F64, I32, I64, BoolArray
+from pliant.algorithms.bundle.block_product import subtract_product6
+from pliant.algorithms.kernel import kernel, leaf_kernel
 
 LOWER = np.tril_indices(6)
+DIAGONAL = 7 * np.arange(6)
+"""Of a 6 x 6 block by rows."""
 
 
-def add_cameras(S: F64, b: F64, normal: F64) -> F64:
-    """Add every camera's own block to the lower triangle; returns the (6F,) diagonal of H_cc."""
-    at = 6 * np.arange(len(normal))[:, None]
-    S[at + LOWER[0], at + LOWER[1]] += normal[:, :21]
-    b += normal[:, 21:].reshape(-1)
-    return normal[:, np.flatnonzero(LOWER[0] == LOWER[1])].reshape(-1)
+class Pattern(NamedTuple):
+    """The blocks of L, which has room for those of S.
+
+    position: (F,) of each movable camera in the order of elimination.
+    block: (N, N) where the block of two positions lies, row >= column; -1 where there is none.
+    start: (N + 1,) blocks of each column, the one on the diagonal first.     row: of each block.
+    """
+
+    position: I32
+    block: I32
+    start: I64
+    row: I32
 
 
-def solve_reduced(S: F64, b: F64, damping: F64) -> F64 | None:
-    """Solve ``(S + diag(damping)) x = b``, None where S is not positive definite.
+def find_pattern(meetings: BoolArray, *, bordered: bool) -> Pattern:
+    """Order the F cameras.  meetings: (F, F) symmetric, whether two of them see a common point.
 
-    S: symmetric; its lower triangle is read, its diagonal changed.
+    bordered: one more position, the last, meets all of them.
+    """
+    F = len(meetings)
+    N = F + int(bordered)
+    filled = np.ones((N, N), np.bool_)
+    filled[:F, :F] = meetings
+    position = _order(filled, F)
+    block, start, row = _lay_out(filled, position)
+    return Pattern(position=position[:F], block=block, start=start, row=row)
+
+
+@kernel
+def _order(filled: BoolArray, F: int) -> I32:
+    """(N,) position of each camera; those that come to meet are marked in ``filled`` (N, N)."""
+    N = filled.shape[0]
+    degree = np.zeros(N, np.int64)
+    for m in range(N):
+        degree[m] = filled[m].sum()
+    position = np.full(N, -1, np.int32)
+    met = np.empty(N, np.int64)
+    for step in range(F):
+        best = -1
+        for m in range(F):
+            if position[m] < 0 and (best < 0 or degree[m] < degree[best]):
+                best = m
+        position[best] = step
+        count = 0
+        for m in range(N):
+            if position[m] < 0 and filled[best, m]:
+                met[count] = m
+                count += 1
+                degree[m] -= 1
+        for a in range(count):
+            for c in range(a):
+                i, k = met[a], met[c]
+                if not filled[i, k]:
+                    filled[i, k] = filled[k, i] = True
+                    degree[i] += 1
+                    degree[k] += 1
+    for m in range(F, N):
+        position[m] = m
+    return position
+
+
+@kernel
+def _lay_out(filled: BoolArray, position: I32) -> tuple[I32, I64, I32]:
+    """``block``, ``start`` and ``row`` of the pattern."""
+    N = position.size
+    camera = np.empty(N, np.int64)
+    for m in range(N):
+        camera[position[m]] = m
+    block = np.full((N, N), -1, np.int32)
+    start = np.zeros(N + 1, np.int64)
+    row = np.empty((filled.sum() + N) // 2 + N, np.int32)
+    at = 0
+    for j in range(N):
+        for i in range(j, N):
+            if i == j or filled[camera[i], camera[j]]:
+                block[i, j] = at
+                row[at] = i
+                at += 1
+        start[j + 1] = at
+    return block, start, row[:at].copy()
+
+
+def solve_reduced(pattern: Pattern, S: F64, b: F64, damping: F64) -> F64 | None:
+    """Solve ``(S + diag(damping)) x = b``: (N, 6), None where that is not positive definite.
+
+    S: (K, 36) blocks of the pattern by rows, those on the diagonal in their lower triangles; it is
+    overwritten.     b, damping: (N, 6).
     An unknown without observations has an empty row: the identity keeps it where it is.
     """
-    index = np.arange(len(b))
-    S[index, index] += np.where(S[index, index] == 0.0, 1.0, damping)
-    try:
-        L: F64 = np.linalg.cholesky(S).astype(np.float64, copy=False)
-    except np.linalg.LinAlgError:
+    at = pattern.start[:-1, None], DIAGONAL
+    S[at] += np.where(S[at] == 0.0, 1.0, damping)
+    if not _factor(pattern.start, pattern.row, pattern.block, S):
         return None
     x = b.copy()
-    _solve_triangles(L, x)
+    _substitute(pattern.start, pattern.row, S, x)
     return x if np.isfinite(x).all() else None
 
 
 @leaf_kernel
-def _solve_triangles(L: F64, x: F64) -> None:
-    """Solve ``L L^T x = b`` in place for a lower triangular L."""
-    for r in range(x.size):
-        total = x[r]
+def _factor(start: I64, row: I32, block: I32, S: F64) -> bool:
+    """Overwrite S with L: its blocks below the diagonal by columns; False where it has none."""
+    for j in range(start.size - 1):
+        first, last = start[j], start[j + 1]
+        D = S[first]
+        for r in range(6):
+            for c in range(r + 1):
+                total = D[6 * r + c]
+                for k in range(c):
+                    total -= D[6 * r + k] * D[6 * c + k]
+                if r > c:
+                    D[6 * r + c] = total * D[7 * c]
+                elif total > 0.0:
+                    D[7 * r] = 1.0 / np.sqrt(total)
+                else:
+                    return False
+        for at in range(first + 1, last):
+            _divide(S[at], D)
+        for upper in range(first + 1, last):
+            i = np.uintp(row[upper])
+            for lower in range(first + 1, upper + 1):
+                k = np.uintp(row[lower])
+                subtract_product6(S, np.uintp(block[i, k]), S, np.uintp(upper), np.uintp(lower))
+    return True
+
+
+@leaf_kernel
+def _divide(A: F64, D: F64) -> None:
+    """``A D^-T`` of a block by rows, written by columns.  D has its reciprocal diagonal."""
+    for r in range(6):
+        for c in range(6):
+            total = A[6 * r + c]
+            for k in range(c):
+                total -= A[6 * r + k] * D[6 * c + k]
+            A[6 * r + c] = total * D[7 * c]
+    for r in range(6):
         for c in range(r):
-            total -= L[r, c] * x[c]
-        x[r] = total / L[r, r]
-    for r in range(x.size - 1, -1, -1):
-        last = x[r] / L[r, r]
-        x[r] = last
-        for c in range(r):
-            x[c] -= L[r, c] * last
+            A[6 * r + c], A[6 * c + r] = A[6 * c + r], A[6 * r + c]
+
+
+@leaf_kernel
+def _substitute(start: I64, row: I32, L: F64, x: F64) -> None:
+    """Solve ``L L^T x = b`` in place."""
+    N = start.size - 1
+    for j in range(N):
+        own = L[start[j]]
+        for r in range(6):
+            total = x[j, r]
+            for k in range(r):
+                total -= own[6 * r + k] * x[j, k]
+            x[j, r] = total * own[7 * r]
+        for at in range(start[j] + 1, start[j + 1]):
+            i = row[at]
+            for k in range(6):
+                for r in range(6):
+                    x[i, r] -= L[at, 6 * k + r] * x[j, k]
+    for j in range(N - 1, -1, -1):
+        own = L[start[j]]
+        for at in range(start[j] + 1, start[j + 1]):
+            i = row[at]
+            for k in range(6):
+                total = 0.0
+                for r in range(6):
+                    total += L[at, 6 * k + r] * x[i, r]
+                x[j, k] -= total
+        for r in range(5, -1, -1):
+            total = x[j, r]
+            for k in range(r + 1, 6):
+                total -= own[6 * k + r] * x[j, k]
+            x[j, r] = total * own[7 * r]

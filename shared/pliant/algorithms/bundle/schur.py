@@ -1,98 +1,250 @@
-"""Bundle adjustment by Levenberg-Marquardt with an explicit Schur complement (Eq. 9-10)."""
+"""Bundle adjustment by Levenberg-Marquardt with the Schur complement (Eq. 9-10)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64
-from pliant.algorithms.bundle.camera_step import move_cameras
-from pliant.algorithms.bundle.cost import limits_of, total_cost
-from pliant.algorithms.bundle.damped import damped_iterations
-from pliant.algorithms.bundle.layout import Layout, build_layout
-from pliant.algorithms.bundle.packed import solve_packed
-from pliant.algorithms.bundle.packed_layout import is_sparse
-from pliant.algorithms.bundle.problem import AnyProblem, BundleParameters, BundleResult
-from pliant.algorithms.bundle.reduced import add_cameras, solve_reduced
-from pliant.algorithms.bundle.result import OnIteration, make_result
-from pliant.algorithms.bundle.schur_kernels import back_substitute, reduced_system
+from pliant.algorithms.arrays import F32, F64, I32, BoolArray
+from pliant.algorithms.bundle.calibration import (
+    LOWER,
+    SharedBlocks,
+    SharedCalibration,
+    no_shared_blocks,
+)
+from pliant.algorithms.bundle.layout import points_of, poses_of
+from pliant.algorithms.bundle.normal_equations import (
+    FACTOR,
+    RECORD,
+    SHARED,
+    eliminate_points,
+    linearise_observations,
+    scratch_for,
+    squared_residuals,
+    substitute,
+)
+from pliant.algorithms.bundle.packed_layout import (
+    PackedLayout,
+    Places,
+    build_packed_layout,
+    list_seen,
+)
+from pliant.algorithms.bundle.problem import (
+    AnyProblem,
+    BundleParameters,
+    BundleProblem,
+    BundleResult,
+    CalibrationUncertainty,
+)
+from pliant.algorithms.bundle.projection import limits_of, move_cameras
+from pliant.algorithms.bundle.reduced import LOWER as LOWER6
+from pliant.algorithms.bundle.reduced import find_pattern, solve_reduced
+from pliant.algorithms.kernel import kernel
+
+MIN_DAMPING, MAX_DAMPING = 1e-12, 1e8
+
+OnIteration: TypeAlias = Callable[[float], None]
+"""Called with the cost after each iteration, so that a benchmark can note the time."""
 
 
 def solve_schur(
     problem: AnyProblem,
     parameters: BundleParameters,
     on_iteration: OnIteration | None = None,
+    *,
+    uncertainty: CalibrationUncertainty | None = None,
 ) -> BundleResult:
     """Minimise Eq. 6 over all movable cameras and points by damped Gauss-Newton steps.
 
     Each step eliminates the points exactly.  float64 throughout.  A step is taken only if it
-    lowers the cost.
+    does not raise the cost.
+
+    uncertainty: of the calibration, which is then a further unknown that all cameras share; None:
+    it is right.  Of the result, ``correction`` (s, k1, k2, readout) says that the observations
+    follow ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx + readout flow``, likewise for v, and the
+    costs include the prior, at k1 and k2 of the problem's intrinsics.  Several views tell the focal
+    length from rotation, and from parallax that differs across the image.  Where they cannot (no
+    rotation, one plane, forward motion) the prior holds it.  Raises ValueError where cameras differ
+    in their lenses.
     """
-    if is_sparse(problem):
-        return solve_packed(problem, parameters, on_iteration)
-    layout = build_layout(problem)
-    cameras, points, costs, converged = schur_iterations(
-        layout, layout.cameras, layout.points, parameters, on_iteration
+    layout = build_packed_layout(problem)
+    calibration = None
+    if uncertainty is not None:
+        calibration = SharedCalibration(layout, problem.intrinsics[:, 4:], uncertainty)
+    system = SchurSystem(layout, parameters, calibration)
+    state, costs, converged = _iterate(system, parameters, on_iteration)
+    squared = system.squared_residuals(state)
+    if not isinstance(problem, BundleProblem):
+        listed, squared = squared, np.full(problem.u.shape, np.inf, np.float32)
+        squared[list_seen(problem.weights)] = listed
+    return BundleResult(
+        T_world_camera=poses_of(layout, problem, state.motion),
+        points_world=points_of(layout, problem, state.points),
+        initial_cost=costs[0],
+        final_cost=costs[-1],
+        iterations=len(costs) - 1,
+        converged=converged,
+        squared_residuals=squared,
+        costs=np.array(costs),
+        correction=state.calibration,
     )
-    return make_result(problem, layout, cameras, points, costs, converged, parameters)
 
 
-def schur_iterations(
-    layout: Layout,
-    cameras: F64,
-    points: F64,
-    parameters: BundleParameters,
-    on_iteration: OnIteration | None = None,
-) -> tuple[F64, F64, list[float], bool]:
-    """The iterations alone: (cameras, points, cost curve, converged)."""
-    (cameras, points), costs, converged = damped_iterations(
-        (cameras, points),
-        lambda state: total_cost(layout, *state, parameters),
-        lambda state, damping: _step(layout, *state, parameters, damping),
-        parameters,
-        on_iteration,
-    )
-    return cameras, points, costs, converged
+@dataclass(frozen=True)
+class State:
+    """Cameras (M, 12), points (3, P), a calibration (SHARED,), and all that no damping changes.
+
+    records, normal: see ``normal_equations``.    shared: see ``calibration``.
+    """
+
+    motion: F64
+    points: F64
+    calibration: F64
+    cost: float
+    records: F64
+    normal: F64
+    shared: SharedBlocks
 
 
-def _step(
-    layout: Layout,
-    cameras: F64,
-    points: F64,
-    parameters: BundleParameters,
-    damping: float,
-) -> tuple[F64, F64] | None:
-    """Cameras and points after one damped Gauss-Newton step; None where it has no solution."""
-    steps = camera_steps(layout, cameras, points, parameters, damping)
-    if steps is None:
-        return None
-    moved = np.empty_like(points)
-    back_substitute(
-        cameras, layout.pinholes, layout.lenses, points, layout.movable, layout.u, layout.v,
-        layout.w, layout.seen, limits_of(parameters), damping, steps, moved,
-    )  # fmt: skip
-    return move_cameras(cameras, steps), moved
+def _iterate(
+    system: "SchurSystem", parameters: BundleParameters, on_iteration: OnIteration | None
+) -> tuple[State, list[float], bool]:
+    """Iterate until the cost settles: (state, cost curve, converged)."""
+    state = system.start()
+    costs = [state.cost]
+    damping, growth = parameters.initial_damping, 2.0
+    for _ in range(parameters.max_iterations):
+        trial = system.step(state, damping)
+        decrease = -np.inf if trial is None else state.cost - trial.cost
+        if trial is not None and decrease >= 0.0:
+            state = trial
+            damping, growth = max(damping * 0.1, MIN_DAMPING), 2.0
+        else:
+            damping, growth = damping * growth, growth * 2.0
+        costs.append(state.cost)
+        if on_iteration is not None:
+            on_iteration(state.cost)
+        small = 0.0 <= decrease <= parameters.min_relative_decrease * state.cost
+        if small or damping > MAX_DAMPING:
+            return state, costs, True
+    return state, costs, False
 
 
-def camera_steps(
-    layout: Layout,
-    cameras: F64,
-    points: F64,
-    parameters: BundleParameters,
-    damping: float,
-) -> F64 | None:
-    """(M, 6) damped Gauss-Newton steps of the cameras (Eq. 9), None where there is no solution."""
-    moving = np.flatnonzero(layout.free >= 0)
-    steps = np.zeros((len(cameras), 6))
-    if moving.size == 0:
-        return steps
-    S = np.zeros((6 * moving.size, 6 * moving.size))
-    b = np.zeros(6 * moving.size)
-    normal = np.zeros((len(cameras), 27))
-    reduced_system(
-        cameras, layout.pinholes, layout.lenses, layout.free, points, layout.movable,
-        layout.u, layout.v, layout.w, layout.seen, limits_of(parameters), damping, S, b, normal,
-    )  # fmt: skip
-    diagonal = add_cameras(S, b, normal[moving])
-    solution = solve_reduced(S, b, damping * diagonal)
-    if solution is None:
-        return None
-    steps[moving] = solution.reshape(-1, 6)
-    return steps
+class SchurSystem:
+    """Linearises states of one problem and takes damped steps from them."""
+
+    def __init__(
+        self,
+        layout: PackedLayout,
+        parameters: BundleParameters,
+        calibration: SharedCalibration | None = None,
+    ) -> None:
+        self.layout = layout
+        self.limits = limits_of(parameters)
+        self.calibration = calibration
+        M = len(layout.free)
+        self._moving = np.flatnonzero(layout.free)
+        free = np.full(M, -1, np.int32)
+        free[self._moving] = np.arange(len(self._moving), dtype=np.int32)
+        met = _meetings(layout.places, free, len(self._moving))
+        self.pattern = find_pattern(met, bordered=calibration is not None)
+        self._position = free
+        self._position[self._moving] = self.pattern.position
+        # Two states live at a time: the current one and the trial.
+        self._records = [np.empty((len(layout.places.camera) + 1, RECORD)) for _ in range(2)]
+        self._factors = np.empty((layout.points.shape[1], FACTOR))
+        self._S = np.empty((len(self.pattern.row), 36))
+        self._scratch = scratch_for(M)
+
+    def start(self) -> State:
+        """The state that the problem starts from."""
+        given = np.zeros(SHARED) if self.calibration is None else self.calibration.given
+        return self.linearise(self.layout.cameras.motion, self.layout.points, given)
+
+    def linearise(self, motion: F64, points: F64, q: F64, other: F64 | None = None) -> State:
+        """The state of given cameras, points and calibration; ``other``: records that must stay."""
+        records = self._records[0] if other is not self._records[0] else self._records[1]
+        normal = np.empty((len(motion), 27))
+        cameras, slots = self.layout.cameras, self.layout.slots
+        if self.calibration is not None:
+            cameras, slots = self.calibration.at(q)
+        cameras = cameras._replace(motion=motion)
+        cost = linearise_observations(cameras, points, slots, self.limits, records, normal)
+        shared = no_shared_blocks()
+        if self.calibration is not None:
+            cost += self.calibration.prior_cost(q)
+            shared = self.calibration.linearise(cameras, records)
+        return State(motion, points, q, cost, records, normal, shared)
+
+    def step(self, state: State, damping: float) -> State | None:
+        """The state after one damped Gauss-Newton step; None where it has no solution."""
+        S, b, diagonal = self._reduced_system(state, damping)
+        solution = solve_reduced(self.pattern, S, b, damping * diagonal)
+        if solution is None:
+            return None
+        steps = np.zeros((len(state.motion), 6))
+        steps[self._moving] = solution[self._position[self._moving]]
+        change = np.zeros(SHARED)
+        if self.calibration is not None:
+            change = solution[-1, :SHARED].copy()
+        moved = np.empty_like(state.points)
+        substitute(
+            state.records, state.shared.points, self.layout.places, state.motion, steps, change,
+            self._factors, state.points, moved,
+        )  # fmt: skip
+        motion, q = move_cameras(state.motion, steps), state.calibration + change
+        return self.linearise(motion, moved, q, state.records)
+
+    def _reduced_system(self, state: State, damping: float) -> tuple[F64, F64, F64]:
+        """Of Eq. 9: S without damping, the right side (N, 6) and diag(H) (N, 6)."""
+        pattern, layout, S = self.pattern, self.layout, self._S
+        N = len(pattern.start) - 1
+        b, diagonal = np.zeros((2, N, 6))
+        S[:] = 0.0
+        eliminate_points(
+            state.records, state.shared.points, layout.places, self._position, state.motion,
+            damping, pattern.block, self._scratch, self._factors, S, b,
+        )  # fmt: skip
+        at, normal = self._position[self._moving], state.normal[self._moving]
+        S[pattern.start[at, None], 6 * LOWER6[0] + LOWER6[1]] += normal[:, :21]
+        b[at] += normal[:, 21:]
+        diagonal[at] = normal[:, np.flatnonzero(LOWER6[0] == LOWER6[1])]
+        if self.calibration is not None:
+            shared, prior = state.shared, self.calibration.precision
+            own = shared.own + np.diag(prior)
+            S[pattern.start[-2], 6 * LOWER[0] + LOWER[1]] += own[LOWER]
+            S[pattern.block[-1, at], : 6 * SHARED] += shared.cameras[self._moving]
+            departure = state.calibration - self.calibration.given
+            b[-1, :SHARED] += shared.gradient - prior * departure
+            diagonal[-1, :SHARED] = np.diag(own)
+        return S, b, diagonal
+
+    def squared_residuals(self, state: State) -> F32:
+        """px^2 of the problem's own observations; inf where left out, or behind the camera."""
+        cameras, slots = self.layout.cameras, self.layout.slots
+        if self.calibration is not None:
+            cameras, slots = self.calibration.at(state.calibration)
+        squared = np.full(len(state.records), np.inf, np.float32)
+        cameras = cameras._replace(motion=state.motion)
+        squared_residuals(cameras, state.points, slots, self.limits, squared)
+        squared[-1] = np.inf
+        return squared[self.layout.place]
+
+
+@kernel
+def _meetings(places: Places, free: I32, cameras: int) -> BoolArray:
+    """(F, F) whether two of the movable cameras see a common point."""
+    met = np.zeros((cameras, cameras), np.bool_)
+    for m in range(cameras):
+        met[m, m] = True
+    for n in range(places.start.size):
+        for a in range(places.start[n], places.stop[n]):
+            i = free[places.camera[a]]
+            if i < 0:
+                continue
+            for c in range(places.start[n], a):
+                k = free[places.camera[c]]
+                if k >= 0:
+                    met[i, k] = met[k, i] = True
+    return met

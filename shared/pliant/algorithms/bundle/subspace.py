@@ -1,24 +1,57 @@
-"""Bundle adjustment by the subspace Gauss-Newton method (VITAMIN-E section 3.2, Eq. 11-12).
+"""Bundle adjustment by halves: points for fixed cameras, cameras for fixed points.
 
-A sweep solves every point for fixed cameras and then every camera for fixed points: blocks of
-3 x 3 and 6 x 6 only.  Points do not meet in the Hessian, nor do cameras, so that a sweep is one
-exact block Gauss-Seidel pass, linearised afresh for each of its halves.
+The subspace Gauss-Newton method (VITAMIN-E section 3.2, Eq. 11-12) does both in turn.  A sweep
+solves every point for fixed cameras and then every camera for fixed points: blocks of 3 x 3 and
+6 x 6 only.  Points do not meet in the Hessian, nor do cameras, so that a sweep is one exact block
+Gauss-Seidel pass, linearised afresh for each of its halves.
 """
+
+import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64
-from pliant.algorithms.bundle.cost import float32_limits, total_cost
-from pliant.algorithms.bundle.layout import Layout, build_layout
-from pliant.algorithms.bundle.problem import AnyProblem, BundleParameters, BundleResult
-from pliant.algorithms.bundle.result import OnIteration, make_result
-from pliant.algorithms.bundle.subspace_kernels import sweep_cameras, sweep_points
+from pliant.algorithms.arrays import F32, F64, I64, BoolArray
+from pliant.algorithms.bundle.layout import (
+    BLOCK,
+    Layout,
+    Table,
+    build_layout,
+    columns_of,
+    points_of,
+    poses_of,
+    residuals_of,
+)
+from pliant.algorithms.bundle.problem import (
+    AnyProblem,
+    BundleParameters,
+    BundleProblem,
+    BundleResult,
+)
+from pliant.algorithms.bundle.projection import (
+    Cameras,
+    Limits,
+    lens_of,
+    limits_of,
+    motion_of,
+    pinhole_of,
+    residual,
+    robust_cost,
+)
+from pliant.algorithms.bundle.subspace_kernels import iterate_pose, sweep_cameras, sweep_points
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.kernel import fast_kernel, kernel
+
+_LOWER = np.tril_indices(6)
+
+_CHUNK = 4096
+"""Points of a list that are brought into the dense layout at a time."""
 
 
 def solve_subspace(
     problem: AnyProblem,
     parameters: BundleParameters,
-    on_iteration: OnIteration | None = None,
+    on_iteration: Callable[[float], None] | None = None,
 ) -> BundleResult:
     """Sweep until ``max_sweeps`` or until a sweep lowers the cost by too little.
 
@@ -26,46 +59,256 @@ def solve_subspace(
     for a window that is nearly converged: from a bad start use ``solve_schur``.
     """
     layout = build_layout(problem)
-    cameras, points, costs, converged = subspace_sweeps(
-        layout, layout.cameras, layout.points, parameters, parameters.max_sweeps, on_iteration
-    )
-    costs[-1] = total_cost(layout, cameras, points, parameters)
-    return make_result(problem, layout, cameras, points, costs, converged, parameters)
-
-
-def subspace_sweeps(
-    layout: Layout,
-    cameras: F64,
-    points: F64,
-    parameters: BundleParameters,
-    sweeps: int,
-    on_iteration: OnIteration | None = None,
-) -> tuple[F64, F64, list[float], bool]:
-    """The sweeps alone: (cameras, points, cost curve of float32 accuracy, converged)."""
-    cameras, points = cameras.copy(), points.copy()
-    cameras32, points32 = cameras.astype(np.float32), points.astype(np.float32)
-    movable = layout.free >= 0
-    limits, damping = float32_limits(parameters), np.float32(parameters.sweep_damping)
+    motion, points = layout.cameras.motion.copy(), layout.points.copy()
+    cameras, points32 = layout.cameras.single(), points.astype(np.float32)
+    limits, damping = limits_of(parameters, np.float32), np.float32(parameters.sweep_damping)
     costs: list[float] = []
-    for _ in range(sweeps):
-        before, after = sweep_points(
-            cameras32, layout.pinholes32, layout.lenses32, points32, points, layout.movable,
-            layout.u, layout.v, layout.w, layout.seen, limits, damping,
-        )  # fmt: skip
+    converged = False
+    for _ in range(parameters.max_sweeps):
+        before, after = sweep_points(cameras, points32, points, layout.table, limits, damping)
         if not costs:
             costs.append(before)
         cost = after - sweep_cameras(
-            cameras, cameras32, movable, layout.pinholes32, layout.lenses32, points32,
-            layout.u, layout.v, layout.w, layout.seen, limits, parameters.sweep_damping,
-        )  # fmt: skip
+            motion, cameras, layout.free, points32, layout.table, limits, parameters.sweep_damping
+        )
         costs.append(cost)
         if on_iteration is not None:
             on_iteration(cost)
-        if before - cost <= parameters.min_relative_decrease * cost:
-            return cameras, points, costs, True
-    return (
-        cameras,
-        points,
-        costs or [total_cost(layout, cameras, points, parameters)],
-        False,
+        converged = before - cost <= parameters.min_relative_decrease * cost
+        if converged:
+            break
+    last = total_cost(layout, motion, points, parameters)
+    costs = [*costs[:-1], last] if costs else [last]
+    return make_result(problem, layout, motion, points, costs, converged, parameters)
+
+
+def refine_pose(
+    T_world_camera: F64,
+    points_world: F64,
+    points_px: F32,
+    camera: PinholeCamera,
+    parameters: BundleParameters,
+    *,
+    inlier_px: float = 1.5,
+    iterations: int = 10,
+) -> tuple[F64, BoolArray, F64]:
+    """Robust Gauss-Newton on one pose, points fixed (Eq. 11 alone).
+
+    T_world_camera: (4, 4) start.  points_world: (N, 3).  points_px: (N, 2), NaN where not seen.
+    Returns the pose, (N,) whether the reprojection error is under inlier_px with the point in
+    front, and the (6, 6) Hessian in px^2 in the order (translation, rotation) of
+    ``T_camera_world = (exp(theta), rho) * T_camera_world``.  Without observations the pose stays.
+    """
+    start = np.ascontiguousarray(T_world_camera, np.float64)
+    layout = _one_camera(
+        start, np.asarray(points_world, np.float64), np.asarray(points_px, np.float32), camera
     )
+    before = layout.cameras.motion[0]
+    pose = before.copy()
+    normal = np.zeros(28)
+    iterate_pose(
+        pose, layout.cameras.single(), layout.points.astype(np.float32), layout.table,
+        limits_of(parameters, np.float32), parameters.initial_damping,
+        parameters.min_relative_decrease, iterations, normal,
+    )  # fmt: skip
+    squared = squared_residuals(layout, pose[None], layout.points, parameters)
+    H = np.zeros((6, 6))
+    H[_LOWER] = normal[:21]
+    H.T[_LOWER] = normal[:21]
+    moved = (pose != before).any()
+    return (
+        _motion(pose, layout.origin) if moved else start.copy(),
+        squared[0, : len(points_px)] < np.float32(inlier_px**2),
+        H,
+    )
+
+
+def _one_camera(
+    T_world_camera: F64, points_world: F64, points_px: F32, camera: PinholeCamera
+) -> Layout:
+    """The layout of a problem with one camera, without the detour over a ``BundleWindow``."""
+    N = len(points_world)
+    P = max(1, -(-N // BLOCK)) * BLOCK
+    R, origin = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    motion = np.zeros((1, 12))
+    motion[0, :9] = R.T.reshape(-1)
+    pinhole = np.array([[camera.fx, camera.fy, camera.cx, camera.cy]])
+    u, v, w = np.zeros((3, 1, P), np.float32)
+    table = Table(u, v, w, np.zeros((1, P // BLOCK), np.uint8))
+    points = np.zeros((3, P))
+    _fill(points_world, points_px, origin, table, points)
+    return Layout(
+        column=np.arange(N), cameras=Cameras(motion, pinhole, np.zeros(0)),
+        free=np.ones(1, np.bool_), origin=origin, points=points, table=table,
+    )  # fmt: skip
+
+
+@kernel
+def _fill(points_world: F64, points_px: F32, origin: F64, table: Table, points: F64) -> None:
+    for n in range(points_px.shape[0]):
+        finite = np.isfinite(points_px[n, 0]) and np.isfinite(points_px[n, 1])
+        for k in range(3):
+            finite = finite and np.isfinite(points_world[n, k])
+        if finite:
+            table.u[0, n] = points_px[n, 0]
+            table.v[0, n] = points_px[n, 1]
+            table.w[0, n] = 1.0
+            table.seen[0, n // BLOCK] = 1
+            for k in range(3):
+                points[k, n] = points_world[n, k] - origin[k]
+
+
+def _motion(camera: F64, origin: F64) -> F64:
+    """(4, 4) T_world_camera of a (12,) camera in the shifted world, on SE(3) to rounding.
+
+    Predictions extrapolate: a rotation slightly off SO(3) would grow threefold in every frame.
+    """
+    rotation = camera[:9].reshape(3, 3)
+    for _ in range(2):
+        # A Newton step to the polar factor: it is nearly a rotation.
+        rotation = 1.5 * rotation - 0.5 * (rotation @ rotation.T @ rotation)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = rotation.T
+    T_world_camera[:3, 3] = origin - rotation.T @ camera[9:]
+    return T_world_camera
+
+
+def refine_points(
+    problem: AnyProblem, parameters: BundleParameters, *, iterations: int = 10
+) -> BundleResult:
+    """Gauss-Newton on every point by itself, all cameras fixed (Eq. 12 alone).
+
+    A list of observations is worked through some points at a time, each part until it converges.
+    """
+    problem = dataclasses.replace(
+        problem, fixed_cameras=np.ones(len(problem.T_world_camera), np.bool_)
+    )
+    if not isinstance(problem, BundleProblem) or len(problem.points_world) <= _CHUNK:
+        return _refine_together(problem, parameters, iterations)
+    points, squared = problem.points_world.copy(), np.empty(len(problem.camera_index), np.float32)
+    costs, steps, converged = np.zeros(2), 0, True
+    column = columns_of(problem)
+    order = np.argsort(column[problem.point_index], kind="stable")
+    ends = np.searchsorted(column[problem.point_index][order], np.arange(len(column) + 1))
+    of_column = np.argsort(column)
+    for lo in range(0, len(column), _CHUNK):
+        hi = min(lo + _CHUNK, len(column))
+        chosen, some = of_column[lo:hi], order[ends[lo] : ends[hi]]
+        found = _refine_together(_part(problem, chosen, some), parameters, iterations)
+        points[chosen], squared[some] = found.points_world, found.squared_residuals
+        costs += found.initial_cost, found.final_cost
+        steps, converged = max(steps, found.iterations), converged and found.converged
+    return BundleResult(
+        T_world_camera=problem.T_world_camera, points_world=points, initial_cost=float(costs[0]),
+        final_cost=float(costs[1]), iterations=steps, converged=converged,
+        squared_residuals=squared, costs=costs,
+    )  # fmt: skip
+
+
+def _part(problem: BundleProblem, points: I64, observations: I64) -> BundleProblem:
+    """Some points with all their observations, and the cameras that see them."""
+    cameras, camera_index = np.unique(problem.camera_index[observations], return_inverse=True)
+    number = np.empty(len(problem.points_world), np.int32)
+    number[points] = np.arange(len(points), dtype=np.int32)
+    return BundleProblem(
+        T_world_camera=problem.T_world_camera[cameras],
+        points_world=problem.points_world[points],
+        camera_index=camera_index.astype(np.int32),
+        point_index=number[problem.point_index[observations]],
+        points_px=problem.points_px[observations],
+        intrinsics=problem.intrinsics[cameras],
+        fixed_cameras=problem.fixed_cameras[cameras],
+        weights=None if problem.weights is None else problem.weights[observations],
+    )
+
+
+def _refine_together(
+    problem: AnyProblem, parameters: BundleParameters, iterations: int
+) -> BundleResult:
+    layout = build_layout(problem)
+    cameras = layout.cameras.single()
+    points, points32 = layout.points.copy(), layout.points.astype(np.float32)
+    limits, damping = limits_of(parameters, np.float32), np.float32(parameters.sweep_damping)
+    costs = [total_cost(layout, layout.cameras.motion, points, parameters)]
+    converged = False
+    for _ in range(iterations):
+        before, after = sweep_points(cameras, points32, points, layout.table, limits, damping)
+        costs.append(after)
+        converged = before - after <= parameters.min_relative_decrease * after
+        if converged:
+            break
+    costs[-1] = total_cost(layout, layout.cameras.motion, points, parameters)
+    motion = layout.cameras.motion
+    return make_result(problem, layout, motion, points, costs, converged, parameters)
+
+
+def make_result(
+    problem: AnyProblem,
+    layout: Layout,
+    motion: F64,
+    points: F64,
+    costs: list[float],
+    converged: bool,
+    parameters: BundleParameters,
+) -> BundleResult:
+    """The answer in the terms of the problem."""
+    squared = squared_residuals(layout, motion, points, parameters)
+    return BundleResult(
+        T_world_camera=poses_of(layout, problem, motion),
+        points_world=points_of(layout, problem, points),
+        initial_cost=costs[0],
+        final_cost=costs[-1],
+        iterations=len(costs) - 1,
+        converged=converged,
+        squared_residuals=residuals_of(layout, problem, squared),
+        costs=np.array(costs),
+    )
+
+
+def total_cost(layout: Layout, motion: F64, points: F64, parameters: BundleParameters) -> float:
+    """``0.5 sum w rho(r^2)`` in px^2."""
+    cameras = layout.cameras._replace(motion=motion)
+    return float(_total_cost(cameras, points, layout.table, limits_of(parameters)))
+
+
+def squared_residuals(
+    layout: Layout, motion: F64, points: F64, parameters: BundleParameters
+) -> F32:
+    """(M, P) squared residuals, px^2; inf where nothing is seen or the point lies behind."""
+    cameras = layout.cameras._replace(motion=motion)
+    return _squared_residuals(cameras, points, layout.table, limits_of(parameters))
+
+
+@fast_kernel
+def _total_cost(cameras: Cameras, points: F64, table: Table, limits: Limits) -> float:
+    total = 0.0
+    for m in range(cameras.motion.shape[0]):
+        T, K, lens = motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m)
+        for b in range(table.seen.shape[1]):
+            if table.seen[m, b] == 0:
+                continue
+            lo = b * BLOCK
+            X, Y, Z = points[0, lo:], points[1, lo:], points[2, lo:]
+            um, vm, wm = table.u[m, lo:], table.v[m, lo:], table.w[m, lo:]
+            for i in range(BLOCK):
+                _, _, _, front, du, dv = residual(
+                    1.0, T, K, lens, X[i], Y[i], Z[i], um[i], vm[i], limits
+                )
+                total += robust_cost(1.0, du, dv, wm[i], front, limits)
+    return 0.5 * total
+
+
+@fast_kernel
+def _squared_residuals(cameras: Cameras, points: F64, table: Table, limits: Limits) -> F32:
+    out = np.empty(table.u.shape, np.float32)
+    for m in range(cameras.motion.shape[0]):
+        T, K, lens = motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m)
+        X, Y, Z = points[0], points[1], points[2]
+        um, vm, wm, om = table.u[m], table.v[m], table.w[m], out[m]
+        for i in range(X.size):
+            _, _, _, front, du, dv = residual(
+                1.0, T, K, lens, X[i], Y[i], Z[i], um[i], vm[i], limits
+            )
+            good = front & (wm[i] > 0.0)
+            om[i] = np.float32(du * du + dv * dv) if good else np.float32(np.inf)
+    return out

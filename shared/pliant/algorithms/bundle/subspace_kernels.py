@@ -4,20 +4,23 @@ from typing import Any
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, U8, BoolArray
-from pliant.algorithms.bundle.camera_step import move_camera, solve_camera
-from pliant.algorithms.bundle.cost import Limits
-from pliant.algorithms.bundle.layout import BLOCK
+from pliant.algorithms.arrays import F32, F64, BoolArray
+from pliant.algorithms.bundle.layout import BLOCK, Table
 from pliant.algorithms.bundle.projection import (
+    Cameras,
+    Limits,
     apply_metric,
     corner,
     lens_of,
     motion_of,
+    move_camera,
     observe,
     pinhole_of,
     point_rows,
     residual,
     robust_cost,
+    row_of,
+    solve_camera,
     solve_point,
 )
 from pliant.algorithms.kernel import fast_kernel, kernel
@@ -28,24 +31,20 @@ SINGULAR = np.float32(1e-6)
 
 @fast_kernel
 def _linearise_points(
-    cameras: F32,
-    pinholes: F32,
-    lenses: F32,
+    cameras: Cameras,
     m: int,
     lo: int,
     points: F32,
-    u: F32,
-    v: F32,
-    w: F32,
+    table: Table,
     limits: Limits,
     V: F32,
     cost: F32,
 ) -> None:
     """Add camera m's part to H_pp and the negative gradients (9 x BLOCK), and to the costs."""
-    T, K, lens = motion_of(cameras, m), pinhole_of(pinholes, m), lens_of(lenses, m)
+    T, K, lens = motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m)
     hi = lo + BLOCK
     X, Y, Z = points[0, lo:hi], points[1, lo:hi], points[2, lo:hi]
-    um, vm, wm = u[m, lo:hi], v[m, lo:hi], w[m, lo:hi]
+    um, vm, wm = table.u[m, lo:hi], table.v[m, lo:hi], table.w[m, lo:hi]
     for i in range(BLOCK):
         x, y, iz, m00, m01, m11, e0, e1, own = observe(
             ONE, T, K, lens, X[i], Y[i], Z[i], um[i], vm[i], wm[i], limits
@@ -68,21 +67,18 @@ def _linearise_points(
 
 @fast_kernel
 def _cost_of_points(
-    cameras: F32,
-    pinholes: F32,
-    lenses: F32,
+    cameras: Cameras,
     m: int,
     lo: int,
     points: F32,
-    u: F32,
-    v: F32,
-    w: F32,
+    table: Table,
     limits: Limits,
     cost: F32,
 ) -> None:
     """Add camera m's part to the costs of the points (3 x BLOCK)."""
-    T, K, lens = motion_of(cameras, m), pinhole_of(pinholes, m), lens_of(lenses, m)
-    um, vm, wm = u[m, lo : lo + BLOCK], v[m, lo : lo + BLOCK], w[m, lo : lo + BLOCK]
+    T, K, lens = motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m)
+    hi = lo + BLOCK
+    um, vm, wm = table.u[m, lo:hi], table.v[m, lo:hi], table.w[m, lo:hi]
     for i in range(BLOCK):
         _, _, _, front, du, dv = residual(
             ONE,
@@ -101,16 +97,10 @@ def _cost_of_points(
 
 @fast_kernel
 def sweep_points(
-    cameras: F32,
-    pinholes: F32,
-    lenses: F32,
+    cameras: Cameras,
     points: F32,
     exact: F64,
-    movable: U8,
-    u: F32,
-    v: F32,
-    w: F32,
-    seen: U8,
+    table: Table,
     limits: Limits,
     damping: Any,
 ) -> tuple[float, float]:
@@ -125,33 +115,27 @@ def sweep_points(
     before = np.empty(BLOCK, np.float32)
     after = np.empty(BLOCK, np.float32)
     grow = ONE + damping
-    for b in range(seen.shape[1]):
+    for b in range(table.seen.shape[1]):
         lo, hi = b * BLOCK, (b + 1) * BLOCK
         X, Y, Z = points[0, lo:hi], points[1, lo:hi], points[2, lo:hi]
         V[:] = ZERO
         before[:] = ZERO
         after[:] = ZERO
-        for m in range(cameras.shape[0]):
-            if seen[m, b] != 0:
-                _linearise_points(
-                    cameras, pinholes, lenses, m, lo, points, u, v, w, limits, V,
-                    before,
-                )  # fmt: skip
-        free = movable[lo:]
+        for m in range(cameras.motion.shape[0]):
+            if table.seen[m, b] != 0:
+                _linearise_points(cameras, m, lo, points, table, limits, V, before)
         for i in range(BLOCK):
             s0, s1, s2 = solve_point(
                 ONE, V[i] * grow, V[BLOCK + i], V[2 * BLOCK + i] * grow, V[3 * BLOCK + i],
                 V[4 * BLOCK + i], V[5 * BLOCK + i] * grow, V[6 * BLOCK + i], V[7 * BLOCK + i],
-                V[8 * BLOCK + i], free[i] != 0, SINGULAR,
+                V[8 * BLOCK + i], SINGULAR,
             )  # fmt: skip
             trial[i] = X[i] + s0
             trial[BLOCK + i] = Y[i] + s1
             trial[2 * BLOCK + i] = Z[i] + s2
-        for m in range(cameras.shape[0]):
-            if seen[m, b] != 0:
-                _cost_of_points(
-                    cameras, pinholes, lenses, m, lo, trial, u, v, w, limits, after,
-                )  # fmt: skip
+        for m in range(cameras.motion.shape[0]):
+            if table.seen[m, b] != 0:
+                _cost_of_points(cameras, m, lo, trial, table, limits, after)
         part_before, part_after = ZERO, ZERO
         for i in range(BLOCK):
             better = after[i] < before[i]
@@ -172,31 +156,26 @@ def sweep_points(
 @fast_kernel
 def linearise_camera(
     m: int,
-    cameras: F32,
-    pinholes: F32,
-    lenses: F32,
+    cameras: Cameras,
     points: F32,
-    u: F32,
-    v: F32,
-    w: F32,
-    seen: U8,
+    table: Table,
     limits: Limits,
     out: F64,
 ) -> None:
     """Write (28,) of camera m: H (lower triangle by rows), negative gradient, cost (Eq. 11)."""
-    T, K, lens = motion_of(cameras, m), pinhole_of(pinholes, m), lens_of(lenses, m)
+    T, K, lens = motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m)
     out[:] = 0.0
     b = 0
-    while b < seen.shape[1]:
-        if seen[m, b] == 0:
+    while b < table.seen.shape[1]:
+        if table.seen[m, b] == 0:
             b += 1
             continue
         lo = b * BLOCK
-        while b < seen.shape[1] and seen[m, b] != 0:
+        while b < table.seen.shape[1] and table.seen[m, b] != 0:
             b += 1
         hi = b * BLOCK
         X, Y, Z = points[0, lo:hi], points[1, lo:hi], points[2, lo:hi]
-        um, vm, wm = u[m, lo:hi], v[m, lo:hi], w[m, lo:hi]
+        um, vm, wm = table.u[m, lo:hi], table.v[m, lo:hi], table.w[m, lo:hi]
         total = ZERO
         h00 = h10 = h11 = h20 = h21 = h22 = h30 = h31 = h32 = h33 = ZERO
         h40 = h41 = h42 = h43 = h44 = h50 = h51 = h52 = h53 = h54 = h55 = ZERO
@@ -253,18 +232,15 @@ def linearise_camera(
 def camera_cost(
     camera: F32,
     m: int,
-    pinholes: F32,
-    lenses: F32,
+    cameras: Cameras,
     points: F32,
-    u: F32,
-    v: F32,
-    w: F32,
+    table: Table,
     limits: Limits,
 ) -> float:
-    """``sum w rho`` of camera m at the trial pose camera (1, 12)."""
-    T, K, lens = motion_of(camera, 0), pinhole_of(pinholes, m), lens_of(lenses, m)
+    """``sum w rho`` of camera m at the trial motion camera (12,)."""
+    T, K, lens = row_of(camera), pinhole_of(cameras, m), lens_of(cameras, m)
     X, Y, Z = points[0], points[1], points[2]
-    um, vm, wm = u[m], v[m], w[m]
+    um, vm, wm = table.u[m], table.v[m], table.w[m]
     total = ZERO
     for i in range(X.size):
         _, _, _, front, du, dv = residual(ONE, T, K, lens, X[i], Y[i], Z[i], um[i], vm[i], limits)
@@ -274,76 +250,67 @@ def camera_cost(
 
 @kernel
 def sweep_cameras(
-    cameras: F64,
-    cameras32: F32,
-    movable: BoolArray,
-    pinholes: F32,
-    lenses: F32,
+    exact: F64,
+    cameras: Cameras,
+    free: BoolArray,
     points: F32,
-    u: F32,
-    v: F32,
-    w: F32,
-    seen: U8,
+    table: Table,
     limits: Limits,
     damping: float,
 ) -> float:
     """One damped Gauss-Newton step of every movable camera, points fixed (Eq. 11).
 
-    cameras (M, 12) is the float64 master, cameras32 its copy; both are moved in place.  A camera
+    exact (M, 12) is the float64 master of the cameras' motion; both are moved in place.  A camera
     moves only if that lowers its own cost.  Returns the decrease of the cost.
     """
     normal = np.empty(28)
     step = np.empty(6)
     moved = np.empty(12)
-    trial = np.empty((1, 12), np.float32)
+    trial = np.empty(12, np.float32)
     decrease = 0.0
-    for m in range(cameras.shape[0]):
-        if not movable[m]:
+    for m in range(exact.shape[0]):
+        if not free[m]:
             continue
-        linearise_camera(m, cameras32, pinholes, lenses, points, u, v, w, seen, limits, normal)
+        linearise_camera(m, cameras, points, table, limits, normal)
         if not solve_camera(normal, damping, step):
             continue
-        move_camera(cameras[m], step, moved)
+        move_camera(exact[m], step, moved)
         for k in range(12):
-            trial[0, k] = np.float32(moved[k])
-        cost = camera_cost(trial, m, pinholes, lenses, points, u, v, w, limits)
+            trial[k] = np.float32(moved[k])
+        cost = camera_cost(trial, m, cameras, points, table, limits)
         if cost < normal[27]:
             decrease += 0.5 * (normal[27] - cost)
             for k in range(12):
-                cameras[m, k] = moved[k]
-                cameras32[m, k] = trial[0, k]
+                exact[m, k] = moved[k]
+                cameras.motion[m, k] = trial[k]
     return decrease
 
 
 @kernel
 def iterate_pose(
     camera: F64,
-    pinholes: F32,
-    lenses: F32,
+    cameras: Cameras,
     points: F32,
-    u: F32,
-    v: F32,
-    w: F32,
-    seen: U8,
+    table: Table,
     limits: Limits,
     damping: float,
     min_relative_decrease: float,
     iterations: int,
     normal: F64,
 ) -> int:
-    """Levenberg-Marquardt on one camera (12,), moved in place.  normal: (28,) at its end.
+    """Levenberg-Marquardt on the motion of one camera (12,), moved in place.
 
+    cameras: that one, whose motion is overwritten.     normal: (28,) at its end.
     Returns the number of evaluations.
     """
     trial = camera.copy()
-    trial32 = np.empty((1, 12), np.float32)
     step = np.zeros(6)
     fresh = np.empty(28)
     lowest = np.inf
     for iteration in range(iterations + 1):
         for k in range(12):
-            trial32[0, k] = np.float32(trial[k])
-        linearise_camera(0, trial32, pinholes, lenses, points, u, v, w, seen, limits, fresh)
+            cameras.motion[0, k] = np.float32(trial[k])
+        linearise_camera(0, cameras, points, table, limits, fresh)
         if fresh[27] <= lowest:
             small = lowest - fresh[27] <= min_relative_decrease * fresh[27]
             lowest = fresh[27]

@@ -17,6 +17,7 @@ from pliant.algorithms.mapping.covisibility import (
     rows_of,
     seen_by_none,
 )
+from pliant.algorithms.mapping.final_adjustment import adjust_keyframes
 from pliant.algorithms.mapping.map_store import (
     CANDIDATE,
     MAPPED,
@@ -362,21 +363,18 @@ class ActiveMap:
         self._nearby = rows_of(older, self.window.rows, len(self.points.state))
 
     def adjust_all(self, path: Path) -> F64:
-        """Adjust all but the first keyframe; returns ``Window.adjust``'s correction."""
-        sizes = self.parameters.window
-        self.window = self._window(self.keyframes, fixed=1, outside=0)
-        correction = self.window.adjust(
-            self.camera, self.parameters,
-            iterations=sizes.final_iterations,
-            points_per_keyframe=sizes.final_points_per_keyframe,
-            uncertainty=self.parameters.calibration,
-            motions=path.motions(self.keyframes),
-        )  # fmt: skip
-        self.points.base_keyframes[self.window.rows] = 0
-        self.points.base_parallax_rad[self.window.rows] = 0.0
-        self.remove_outliers()
-        self.window.update_statistics(self.camera)
+        """Adjust all but the first keyframe; returns ``adjust_keyframes``' correction."""
+        motions = path.motions(self.keyframes)
+        correction, gone = adjust_keyframes(
+            self.keyframes, self.points, self.camera, self.parameters, motions
+        )
+        self._remove(gone)
         return correction
+
+    def mapped_rows(self) -> I32:
+        """Rows of all points of the segment, oldest first."""
+        rows = self.points.mapped(self.segment)
+        return rows[np.argsort(self.points.first_keyframe[rows], kind="stable")]
 
     def _cull(self, keyframe: Keyframe) -> None:
         """The map forgets a keyframe, and the points that only this one saw."""
@@ -398,9 +396,11 @@ class ActiveMap:
         rows = window.rows[columns]
         remaining = count_cameras(columns, window.seen, 0, len(window.seen))
         remaining += self.points.base_keyframes[rows]
-        gone = rows[remaining < 2]
-        self._note_removed(gone)
-        # As candidates they may come back while their track lives, and are garbage afterwards.
-        self.points.state[gone] = CANDIDATE
-        self.points.ids[gone] = -1
-        self.points.published_xyz[gone] = np.nan
+        self._remove(rows[remaining < 2])
+
+    def _remove(self, rows: I32) -> None:
+        """Points go.  As candidates they may come back while their track lives."""
+        self._note_removed(rows)
+        self.points.state[rows] = CANDIDATE
+        self.points.ids[rows] = -1
+        self.points.published_xyz[rows] = np.nan

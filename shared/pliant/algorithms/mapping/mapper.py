@@ -114,13 +114,14 @@ class Mapper:
         if self._map is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         correction: tuple[float, ...] = ()
-        if self._finishes(self._map):
+        whole = self._finishes(self._map)
+        if whole:
             self._map.collect_garbage()
             found = self._map.adjust_all(self._path)
             if self._parameters.calibration.sigmas.any():
                 correction = tuple(found.tolist())
         self._keyframe_changes.settle(self._map.keyframes)
-        delta = self._publish(TRACKING, "", 0, snapshot=True)
+        delta = self._publish(TRACKING, "", 0, snapshot=True, whole=whole)
         return dataclasses.replace(delta, calibration_correction=correction)
 
     def _finishes(self, active: ActiveMap) -> bool:
@@ -303,7 +304,14 @@ class Mapper:
             return True
         return self._since_keyframe >= limits.max_frames and flow > limits.min_flow_px * unit
 
-    def _publish(self, state: int, reason: str, inliers: int, snapshot: bool = False) -> MapDelta:
+    def _publish(
+        self,
+        state: int,
+        reason: str,
+        inliers: int,
+        snapshot: bool = False,
+        whole: bool = False,
+    ) -> MapDelta:
         # Now and then everything active is published, for those who came late.
         self._timer = no_stages  # the frame is done: nothing of its caller stays with the map
         self._published_frames += 1
@@ -313,10 +321,12 @@ class Mapper:
             keyframes: list[Keyframe] = []
             rows, centre = np.zeros(0, np.int32), np.zeros(3)
         else:
-            keyframes = active.window.keyframes
+            keyframes = active.keyframes if whole else active.window.keyframes
             # Between keyframes only points that the frame sees can move or be new.
             everything = snapshot or self._since_keyframe <= 1
             rows = active.window.rows if everything else active.window.current_rows()
+            if whole:
+                rows = active.mapped_rows()
             centre = active.keyframes[-1].T_world_camera[:3, 3].copy()
             self._changes.remove_points(active.take_removed())
         return self._changes.publish(

@@ -10,13 +10,34 @@ from pliant.algorithms.geometry import inverse
 from pliant.algorithms.kernel import inline_kernel, kernel
 
 
+def weigh(points_px: F32, camera: PinholeCamera, lens_radius: float) -> F32:
+    """(n,) weights of observations at points_px (n, 2).
+
+    No calibration is perfect, and what it misses grows with the distance from the axis: an
+    observation at the lens radius, on the plane z = 1, counts half.
+    """
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, lens_radius], np.float32)
+    return _weigh(points_px, lens)
+
+
+@kernel
+def _weigh(points_px: F32, lens: F32) -> F32:
+    weights = np.empty(points_px.shape[0], np.float32)
+    scale = np.float32(1.0) / (lens[4] * lens[4])
+    for i in range(points_px.shape[0]):
+        x, y = (points_px[i, 0] - lens[2]) / lens[0], (points_px[i, 1] - lens[3]) / lens[1]
+        share = (x * x + y * y) * scale
+        weights[i] = np.float32(1.0) / (np.float32(1.0) + share * share)
+    return weights
+
+
 @kernel
 def observe(
     rows: I32,
     points_px: F32,
+    weights: F32,
     column_of: I32,
     slot: int,
-    lens: F32,
     u: F32,
     v: F32,
     w: F32,
@@ -25,17 +46,12 @@ def observe(
     """Write the observations of one camera, rows (n,) at points_px (n, 2), into its slot.
 
     column_of: (capacity,) column of each row, negative where it is not in the table.
-    lens: (5,) fx, fy, cx, cy and the lens radius.  No calibration is perfect, and what it misses
-    grows with the distance from the axis: an observation at the lens radius counts half.
     """
-    scale = np.float32(1.0) / (lens[4] * lens[4])
     for i in range(rows.size):
         column = column_of[rows[i]]
         if column >= 0:
             u[slot, column], v[slot, column] = points_px[i, 0], points_px[i, 1]
-            x, y = (points_px[i, 0] - lens[2]) / lens[0], (points_px[i, 1] - lens[3]) / lens[1]
-            share = (x * x + y * y) * scale
-            w[slot, column] = np.float32(1.0) / (np.float32(1.0) + share * share)
+            w[slot, column] = weights[i]
             seen[slot, column] = True
 
 
@@ -195,6 +211,22 @@ def window_errors(
     return errors
 
 
+def list_errors(
+    T_world_camera: F64,
+    points_world: F64,
+    camera_index: I32,
+    point_index: I32,
+    points_px: F32,
+    camera: PinholeCamera,
+) -> F32:
+    """(O,) errors in px of a list of observations; inf for points behind their camera."""
+    errors = np.empty(len(points_px), np.float32)
+    T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:, :3])
+    K = _intrinsics(camera)
+    _list_errors(T_camera_world, points_world, camera_index, point_index, points_px, K, errors)
+    return errors
+
+
 def _intrinsics(camera: PinholeCamera) -> F64:
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
@@ -213,6 +245,15 @@ def _error(T: F64, X: F64, u: float, v: float, K: F64) -> float:
 def _errors(T: F64, points_world: F64, points_px: F32, K: F64, errors: F32) -> None:
     for n in range(points_world.shape[0]):
         errors[n] = _error(T, points_world[n], points_px[n, 0], points_px[n, 1], K)
+
+
+@kernel
+def _list_errors(
+    T: F64, points_world: F64, camera: I32, point: I32, points_px: F32, K: F64, errors: F32
+) -> None:
+    for o in range(errors.size):
+        X = points_world[point[o]]
+        errors[o] = _error(T[camera[o]], X, points_px[o, 0], points_px[o, 1], K)
 
 
 @kernel

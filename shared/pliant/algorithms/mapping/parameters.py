@@ -2,8 +2,7 @@
 
 from pydantic import Field
 
-from pliant.algorithms.bundle.problem import BundleParameters
-from pliant.algorithms.bundle.uncertainty import CalibrationUncertainty
+from pliant.algorithms.bundle import BundleParameters, CalibrationUncertainty
 from pliant.algorithms.parameters import Parameters
 
 

@@ -8,7 +8,7 @@ residuals that hardly grow.
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, BoolArray
+from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log
 from pliant.algorithms.kernel import kernel
@@ -59,20 +59,20 @@ def readout_flow(
     T_world_camera: F64,
     motions: F64,
     points_world: F64,
-    v: F32,
-    seen: BoolArray,
-    columns: I32,
+    camera_index: I32,
+    point_index: I32,
+    points_px: F32,
     camera: PinholeCamera,
 ) -> F32:
-    """(2, M, C) px by which a readout of one frame interval moves each observation.
+    """(O, 2) px by which a readout of one frame interval moves each observation.
 
-    T_world_camera: (M, 4, 4) and motions (M, 6) of the cameras.   points_world: (C, 3), those in
-    ``columns`` of the table v, seen (M, N).   0 where nothing is seen, or behind the camera.
+    T_world_camera: (M, 4, 4) and motions (M, 6) of the cameras.   points_world: (N, 3).
+    camera_index, point_index, points_px: as in ``BundleProblem``.   0 behind the camera.
     """
-    flow = np.zeros((2, len(motions), len(columns)), np.float32)
+    flow = np.zeros((len(points_px), 2), np.float32)
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:, :3])
     K = np.array([camera.fx, camera.fy, camera.height])
-    _flow(T_camera_world, motions, points_world, v, seen, columns, K, flow)
+    _flow(T_camera_world, motions, points_world, camera_index, point_index, points_px, K, flow)
     return flow
 
 
@@ -81,27 +81,24 @@ def _flow(
     T_camera_world: F64,
     motions: F64,
     points_world: F64,
-    v: F32,
-    seen: BoolArray,
-    columns: I32,
+    camera: I32,
+    point: I32,
+    points_px: F32,
     K: F64,
     flow: F32,
 ) -> None:
     middle = 0.5 * (K[2] - 1.0)
-    for m in range(motions.shape[0]):
-        T, motion = T_camera_world[m], motions[m]
-        for i in range(columns.size):
-            n = columns[i]
-            X = points_world[i]
-            z = T[2, 0] * X[0] + T[2, 1] * X[1] + T[2, 2] * X[2] + T[2, 3]
-            if not seen[m, n] or z < _MIN_DEPTH:
-                continue
-            x = (T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2] + T[0, 3]) / z
-            y = (T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2] + T[1, 3]) / z
-            # The velocity of the point over its depth.
-            a = motion[1] - motion[2] * y + motion[3] / z
-            b = motion[2] * x - motion[0] + motion[4] / z
-            c = motion[0] * y - motion[1] * x + motion[5] / z
-            share = (v[m, n] - middle) / K[2]
-            flow[0, m, i] = share * K[0] * (a - x * c)
-            flow[1, m, i] = share * K[1] * (b - y * c)
+    for o in range(camera.size):
+        T, motion, X = T_camera_world[camera[o]], motions[camera[o]], points_world[point[o]]
+        z = T[2, 0] * X[0] + T[2, 1] * X[1] + T[2, 2] * X[2] + T[2, 3]
+        if z < _MIN_DEPTH:
+            continue
+        x = (T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2] + T[0, 3]) / z
+        y = (T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2] + T[1, 3]) / z
+        # The velocity of the point over its depth.
+        a = motion[1] - motion[2] * y + motion[3] / z
+        b = motion[2] * x - motion[0] + motion[4] / z
+        c = motion[0] * y - motion[1] * x + motion[5] / z
+        share = (points_px[o, 1] - middle) / K[2]
+        flow[o, 0] = share * K[0] * (a - x * c)
+        flow[o, 1] = share * K[1] * (b - y * c)

@@ -3,17 +3,9 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, BoolArray
-from pliant.algorithms.bundle import (
-    BundleResult,
-    BundleWindow,
-    CalibrationUncertainty,
-    ideal_pixels,
-    refine_points,
-    shared_intrinsics,
-    solve_calibrating,
-    solve_schur,
-    solve_subspace,
-)
+from pliant.algorithms.bundle import BundleResult, BundleWindow, shared_intrinsics
+from pliant.algorithms.bundle.schur import solve_schur
+from pliant.algorithms.bundle.subspace import refine_points, solve_subspace
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import (
@@ -24,10 +16,10 @@ from pliant.algorithms.mapping.observation_table import (
     gather,
     observe,
     seen_in_state,
+    weigh,
     window_errors,
 )
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.rolling_shutter import readout_flow
 from pliant.algorithms.triangulation import spread_of_rays
 
 OUTSIDE = -1
@@ -63,6 +55,7 @@ class Window:
         self.lens: F32 = np.array(
             [camera.fx, camera.fy, camera.cx, camera.cy, lens_radius], np.float32
         )
+        self._camera, self._lens_radius = camera, lens_radius
         self.columns: I32 = np.full(len(points.state), OUTSIDE, np.int32)
         for keyframe in keyframes:
             self.columns[keyframe.rows] = 0
@@ -82,7 +75,10 @@ class Window:
             self._observe(slot, keyframe.rows, keyframe.points_px)
 
     def _observe(self, slot: int, rows: I32, points_px: F32) -> None:
-        observe(rows, points_px, self.columns, slot, self.lens, self.u, self.v, self.w, self.seen)
+        weights = weigh(points_px, self._camera, self._lens_radius)
+        observe(
+            rows, points_px, weights, self.columns, slot, self.u, self.v, self.w, self.seen
+        )  # fmt: skip
 
     def see(self, T_world_camera: F64, rows: I32, points_px: F32) -> None:
         """Put the current frame into the last slot."""
@@ -112,54 +108,17 @@ class Window:
         *,
         iterations: int,
         points_per_keyframe: int,
-        uncertainty: CalibrationUncertainty | None = None,
-        motions: F64 | None = None,
-    ) -> F64:
-        """Schur LM over the keyframes and the best observed points, then the other points alone.
-
-        uncertainty: of the calibration, which is corrected with them; None or zeros: it is right.
-        motions: (M, 6) of the keyframes, see ``Path``; None: no rolling shutter is looked for.
-        Returns the correction (4,), see ``solve_calibrating``.  The window's u and v become those
-        of ``camera``, so that all that follows goes on with a pinhole camera.
-        """
+    ) -> None:
+        """Schur LM over the keyframes and the best observed points, then the other points alone."""
         columns = self.mapped_columns()
         count = count_cameras(columns, self.seen, 0, len(self.seen))
         columns, count = columns[count >= 2], count[count >= 2]
         best = self._best_observed(columns, count, points_per_keyframe)
         bundle = parameters.bundle.model_copy(update={"max_iterations": iterations})
-        chosen = columns[best]
-        problem, correction = self._problem(chosen, camera), np.zeros(4)
-        if uncertainty is None or not uncertainty.sigmas.any():
-            result = solve_schur(problem, bundle)
-        else:
-            flow = None if motions is None else self._readout_flow(columns, motions, camera)
-            part = None if flow is None else flow[:, :, best]
-            result, correction = solve_calibrating(problem, bundle, uncertainty, flow=part)
-            if flow is not None:
-                self.u[:, columns] -= np.float32(correction[3]) * flow[0]
-                self.v[:, columns] -= np.float32(correction[3]) * flow[1]
-        self._take(chosen, result)
-        if correction.any():
-            seen = self.seen
-            self.u[seen], self.v[seen] = ideal_pixels(
-                self.u[seen], self.v[seen], camera, correction
-            )
+        self._take(columns[best], solve_schur(self._problem(columns[best], camera), bundle))
         others = columns[~best]
         found = refine_points(self._problem(others, camera), bundle, iterations=_POINT_STEPS)
         self._take(others, found)
-        return correction
-
-    def _readout_flow(self, columns: I32, motions: F64, camera: PinholeCamera) -> F32:
-        still = np.zeros((1, 6))  # the current frame's slot
-        return readout_flow(
-            self.T_world_camera,
-            np.concatenate([motions, still]),
-            self.points.xyz[self.rows[columns]],
-            self.v,
-            self.seen,
-            columns,
-            camera,
-        )
 
     def _best_observed(self, columns: I32, observations: I32, wanted: int) -> BoolArray:
         """Mask of ``columns`` that gives every keyframe its ``wanted`` most observed points."""

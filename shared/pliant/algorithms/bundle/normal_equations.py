@@ -1,4 +1,4 @@
-"""Kernels of the Schur complement solver for problems in which most cameras see few of the points.
+"""Kernels of the Schur complement solver: observations linearised, points taken out, points moved.
 
 An observation is linearised once for a state, into a record of eight numbers: x, y, 1/z, m00, m01,
 m11, e0, e1 of ``projection``.  Everything else follows from the record and the rotation of its
@@ -11,24 +11,27 @@ So another damping costs no projection.  With ``L L^T = H_pp + damping diag(H_pp
 
     (H_cc + damping diag(H_cc) - U U^T) dx_c = - g_c - U y        L^T dx_p = y - U^T dx_c.
 
-The step lowers the linearised cost by ``0.5 dx^T (damping diag(H) dx - g)``, whose part of a point
-is ``0.5 (y^T (y - U^T dx_c) + damping dx_p^T diag(H_pp) dx_p)``.
+A calibration that all cameras share is one more camera c with the rows ``A^T M P`` of
+``calibration``; it sees every point, so that its H_cp is kept summed up, one block a point.
 
 Linearisation goes camera by camera, in SIMD over blocks of observations; elimination goes point by
 point, over the records of each point in ascending order of their cameras.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, U8
-from pliant.algorithms.bundle.cost import Limits
+from pliant.algorithms.arrays import F32, F64, I32, I64
+from pliant.algorithms.bundle.block_product import subtract_product3
 from pliant.algorithms.bundle.layout import BLOCK
-from pliant.algorithms.bundle.outer_product import subtract_product
+from pliant.algorithms.bundle.packed_layout import Places, Slots
 from pliant.algorithms.bundle.projection import (
+    Cameras,
+    Limits,
     apply_metric,
     corner,
+    couple,
     lens_of,
     motion_of,
     observe,
@@ -36,52 +39,60 @@ from pliant.algorithms.bundle.projection import (
     point_rows,
     residual,
 )
-from pliant.algorithms.bundle.schur_kernels import SINGULAR, camera_block
 from pliant.algorithms.kernel import fast_kernel, inline_kernel, leaf_kernel
 
-RECORD = 8
-FACTOR = 12
-"""Numbers kept of each point: 1/l00, l10, 1/l11, l20, l21, 1/l22, y (3), diag(H_pp) (3)."""
+RECORD, FACTOR = 8, 9
+"""Numbers kept of an observation, and of a point."""
+SHARED = 4
+"""Unknowns of a shared calibration: see ``calibration``."""
+_SINGULAR = 1e-14
+
+
+class Scratch(NamedTuple):
+    """Room for one point: what its cameras see, their U, their positions."""
+
+    seen: F64
+    U: F64
+    rows: I64
+
+
+def scratch_for(cameras: int) -> Scratch:
+    """Room for points that at most so many cameras see, and a shared calibration."""
+    size = cameras + 1
+    return Scratch(np.empty((size, 9)), np.empty((size, 18)), np.empty(size, np.int64))
 
 
 @fast_kernel
 def linearise_observations(
-    cameras: F64,
-    pinholes: F64,
-    lenses: F64,
+    cameras: Cameras,
     points: F64,
-    block_camera: I32,
-    points_seen: I32,
-    place: I32,
-    u: F32,
-    v: F32,
-    w: F32,
+    slots: Slots,
     limits: Limits,
     records: F64,
     normal: F64,
 ) -> float:
     """Write the records and every camera's own part; returns the cost, px^2.
 
-    points_seen, place, u, v, w: (B, BLOCK) of ``PackedLayout``.     records: (O + 1, 8).
+    points: (3, P).     records: (O + 1, RECORD), the last one a dump.
     normal: (M, 27) lower triangle of each H_cc by rows, then the negative gradient.
     """
     local = np.empty(RECORD * BLOCK)
     near = np.empty((3, BLOCK))
     normal[:] = 0.0
     total = 0.0
-    for b in range(block_camera.size):
-        m = block_camera[b]
+    for b in range(slots.camera.size):
+        m = slots.camera[b]
         for i in range(BLOCK):
-            n = np.uint32(points_seen[b, i])
+            n = np.uint32(slots.point[b, i])
             for k in range(3):
                 near[k, i] = points[k, n]
         total += _linearise(
-            motion_of(cameras, m), pinhole_of(pinholes, m), lens_of(lenses, m),
-            near[0], near[1], near[2], u[b], v[b], w[b], limits, local,
+            motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m),
+            near[0], near[1], near[2], slots.u[b], slots.v[b], slots.w[b], limits, local,
         )  # fmt: skip
         camera_block(local, normal[m])
         for i in range(BLOCK):
-            at = np.uint32(place[b, i])
+            at = np.uint32(slots.place[b, i])
             for k in range(RECORD):
                 records[at, k] = local[k * BLOCK + i]
     return 0.5 * total
@@ -110,70 +121,120 @@ def _linearise(
 
 
 @fast_kernel
-def squared_residuals_of_blocks(
-    cameras: F64,
-    pinholes: F64,
-    lenses: F64,
+def squared_residuals(
+    cameras: Cameras,
     points: F64,
-    block_camera: I32,
-    points_seen: I32,
-    place: I32,
-    u: F32,
-    v: F32,
-    w: F32,
+    slots: Slots,
     limits: Limits,
     out: F32,
 ) -> None:
     """(O + 1,) squared residuals, px^2; inf where the point lies behind the camera."""
-    for b in range(block_camera.size):
-        m = block_camera[b]
-        T, K, lens = motion_of(cameras, m), pinhole_of(pinholes, m), lens_of(lenses, m)
+    for b in range(slots.camera.size):
+        m = slots.camera[b]
+        T, K, lens = motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m)
         for i in range(BLOCK):
-            n = points_seen[b, i]
+            n = slots.point[b, i]
             _, _, _, front, du, dv = residual(
-                1.0, T, K, lens, points[0, n], points[1, n], points[2, n], u[b, i], v[b, i], limits
-            )
-            good = front & (w[b, i] > 0.0)
-            out[place[b, i]] = np.float32(du * du + dv * dv) if good else np.float32(np.inf)
+                1.0, T, K, lens, points[0, n], points[1, n], points[2, n], slots.u[b, i],
+                slots.v[b, i], limits,
+            )  # fmt: skip
+            good = front & (slots.w[b, i] > 0.0)
+            out[slots.place[b, i]] = np.float32(du * du + dv * dv) if good else np.float32(np.inf)
+
+
+@fast_kernel
+def camera_block(local: F64, normal: F64) -> None:
+    """Add ``B^T M B`` (21 numbers, lower triangle by rows) and ``B^T e`` of one block."""
+    h00 = h10 = h11 = h20 = h21 = h22 = h30 = h31 = h32 = h33 = 0.0
+    h40 = h41 = h42 = h43 = h44 = h50 = h51 = h52 = h53 = h54 = h55 = 0.0
+    g0 = g1 = g2 = g3 = g4 = g5 = 0.0
+    for i in range(BLOCK):
+        x, y, iz = local[i], local[BLOCK + i], local[2 * BLOCK + i]
+        m00, m01, m11, e0, e1 = (
+            local[3 * BLOCK + i],
+            local[4 * BLOCK + i],
+            local[5 * BLOCK + i],
+            local[6 * BLOCK + i],
+            local[7 * BLOCK + i],
+        )
+        a2, b2 = -x * iz, -y * iz
+        a3, b3 = -x * y, -(1.0 + y * y)
+        a4, b4 = 1.0 + x * x, x * y
+        a5, b5 = -y, x
+        p2, q2 = m00 * a2 + m01 * b2, m01 * a2 + m11 * b2
+        p3, q3 = m00 * a3 + m01 * b3, m01 * a3 + m11 * b3
+        p4, q4 = m00 * a4 + m01 * b4, m01 * a4 + m11 * b4
+        p5, q5 = m00 * a5 + m01 * b5, m01 * a5 + m11 * b5
+        h00 += m00 * iz * iz
+        h10 += m01 * iz * iz
+        h11 += m11 * iz * iz
+        h20 += p2 * iz
+        h21 += q2 * iz
+        h22 += p2 * a2 + q2 * b2
+        h30 += p3 * iz
+        h31 += q3 * iz
+        h32 += p3 * a2 + q3 * b2
+        h33 += p3 * a3 + q3 * b3
+        h40 += p4 * iz
+        h41 += q4 * iz
+        h42 += p4 * a2 + q4 * b2
+        h43 += p4 * a3 + q4 * b3
+        h44 += p4 * a4 + q4 * b4
+        h50 += p5 * iz
+        h51 += q5 * iz
+        h52 += p5 * a2 + q5 * b2
+        h53 += p5 * a3 + q5 * b3
+        h54 += p5 * a4 + q5 * b4
+        h55 += p5 * a5 + q5 * b5
+        g0 += e0 * iz
+        g1 += e1 * iz
+        g2 += e0 * a2 + e1 * b2
+        g3 += e0 * a3 + e1 * b3
+        g4 += e0 * a4 + e1 * b4
+        g5 += e0 * a5 + e1 * b5
+    sums = (
+        h00, h10, h11, h20, h21, h22, h30, h31, h32, h33, h40, h41, h42, h43, h44,
+        h50, h51, h52, h53, h54, h55, g0, g1, g2, g3, g4, g5,
+    )  # fmt: skip
+    for r in range(27):
+        normal[r] += sums[r]
 
 
 @leaf_kernel
 def eliminate_points(
     records: F64,
-    start: I64,
-    stop: I64,
-    camera: I32,
+    shared: F64,
+    places: Places,
     free: I32,
-    cameras: F64,
-    movable: U8,
+    motion: F64,
     damping: float,
-    seen: F64,
-    U: F64,
-    rows: I64,
+    block: I32,
+    scratch: Scratch,
     factors: F64,
     S: F64,
     b: F64,
 ) -> None:
     """Factor every point's block and take the points out of the system of the F movable cameras.
 
-    start, stop: (P,) records of each point.     camera: (O,) their cameras, ascending for a point.
-    seen: (M, 9), U: (M, 18), rows: (M,) room for one point; column k of U at ``6 k``.
-    factors: (P, FACTOR) are written, 0 for a point that may not move or has no information.
-    S: (F F, 36) blocks of the lower triangle: ``- U U^T`` is added.  b: (F, 6): ``- U y``.
+    shared: (P, SHARED 3) H_cp of the shared calibration by rows, whose position is the last;
+    (0, ...): there is none.     free: (M,) position of each camera, -1 for a fixed one.
+    motion: (M, 12).     block: (N, N) of ``Pattern``.
+    factors: (P, FACTOR) are written, 0 for a point without information.
+    S: (K, 36): ``- U U^T`` is added.     b: (N, 6): ``- U y`` is added.
     """
     grow = 1.0 + damping
-    F = b.shape[0]
-    for point in range(start.size):
+    seen, U, rows = scratch.seen, scratch.U, scratch.rows
+    for point in range(places.start.size):
         n = np.uintp(point)
         v00 = v10 = v11 = v20 = v21 = v22 = g0 = g1 = g2 = 0.0
         count = 0
-        for position in range(start[n], stop[n]):
+        for position in range(places.start[n], places.stop[n]):
             o = np.uintp(position)
-            m = np.uintp(camera[o])
+            m = np.uintp(places.camera[o])
             x, y, iz = records[o, 0], records[o, 1], records[o, 2]
             m00, m01, m11 = records[o, 3], records[o, 4], records[o, 5]
             e0, e1 = records[o, 6], records[o, 7]
-            p0, p1, p2, q0, q1, q2 = point_rows(cameras[m], x, y, iz)
+            p0, p1, p2, q0, q1, q2 = point_rows(motion[m], x, y, iz)
             a0, c0 = apply_metric(m00, (m01,), m11, p0, q0)
             a1, c1 = apply_metric(m00, (m01,), m11, p1, q1)
             a2, c2 = apply_metric(m00, (m01,), m11, p2, q2)
@@ -194,7 +255,7 @@ def eliminate_points(
                 seen[q, 3], seen[q, 4], seen[q, 5] = a0, a1, a2
                 seen[q, 6], seen[q, 7], seen[q, 8] = c0, c1, c2
         i00, l10, i11, l20, l21, i22 = factor_point(
-            1.0, grow * v00, v10, grow * v11, v20, v21, grow * v22, movable[n] != 0, SINGULAR
+            1.0, grow * v00, v10, grow * v11, v20, v21, grow * v22, _SINGULAR
         )
         y0 = g0 * i00
         y1 = (g1 - l10 * y0) * i11
@@ -202,7 +263,6 @@ def eliminate_points(
         factors[n, 0], factors[n, 1], factors[n, 2] = i00, l10, i11
         factors[n, 3], factors[n, 4], factors[n, 5] = l20, l21, i22
         factors[n, 6], factors[n, 7], factors[n, 8] = y0, y1, y2
-        factors[n, 9], factors[n, 10], factors[n, 11] = v00, v11, v22
         if i00 == 0.0:
             continue
         for first in range(count):
@@ -229,23 +289,34 @@ def eliminate_points(
             b[at, 5] -= d5
             for second in range(first + 1):
                 c = np.uintp(second)
-                subtract_product(S, np.uintp(row * F + rows[c]), U, a, c)
-
-
-@inline_kernel
-def couple(x: Any, y: Any, iz: Any, a: Any, c: Any) -> Any:
-    """``B^T (a, c)``: the six numbers of a column of H_cp."""
-    e = x * a + y * c
-    return iz * a, iz * c, -iz * e, -c - y * e, a + x * e, x * c - y * a
+                if row >= rows[c]:
+                    subtract_product3(S, np.uintp(block[at, np.uintp(rows[c])]), U, a, c)
+                else:
+                    subtract_product3(S, np.uintp(block[np.uintp(rows[c]), at]), U, c, a)
+        if shared.shape[0] == 0:
+            continue
+        last, a = np.uintp(b.shape[0] - 1), np.uintp(count)
+        rows[a] = last
+        for q in range(6):
+            e0 = e1 = e2 = 0.0
+            if q < SHARED:
+                e0 = shared[n, 3 * q] * i00
+                e1 = (shared[n, 3 * q + 1] - l10 * e0) * i11
+                e2 = (shared[n, 3 * q + 2] - l20 * e0 - l21 * e1) * i22
+            U[a, q], U[a, 6 + q], U[a, 12 + q] = e0, e1, e2
+            b[last, q] -= e0 * y0 + e1 * y1 + e2 * y2
+        for second in range(count + 1):
+            c = np.uintp(second)
+            subtract_product3(S, np.uintp(block[last, np.uintp(rows[c])]), U, a, c)
 
 
 @inline_kernel
 def factor_point(
-    one: Any, d00: Any, v10: Any, d11: Any, v20: Any, v21: Any, d22: Any, ok: Any, smallest: Any
+    one: Any, d00: Any, v10: Any, d11: Any, v20: Any, v21: Any, d22: Any, smallest: Any
 ) -> Any:
-    """1/l00, l10, 1/l11, l20, l21, 1/l22; all 0 where not ok or not positive definite."""
+    """1/l00, l10, 1/l11, l20, l21, 1/l22; all 0 where not positive definite."""
     zero = one - one
-    ok = ok & (d00 > zero)
+    ok = d00 > zero
     i00 = one / np.sqrt(d00 if ok else one)
     l10, l20 = v10 * i00, v20 * i00
     rest = d11 - l10 * l10
@@ -263,25 +334,24 @@ def factor_point(
 @leaf_kernel
 def substitute(
     records: F64,
-    start: I64,
-    stop: I64,
-    camera: I32,
-    cameras: F64,
+    shared: F64,
+    places: Places,
+    motion: F64,
     steps: F64,
+    change: F64,
     factors: F64,
-    damping: float,
     points: F64,
     out: F64,
-) -> float:
-    """Move the points (Eq. 10); returns their part of twice the decrease that is foretold.
+) -> None:
+    """Move the points (Eq. 10).
 
-    steps: (M, 6) of every camera, 0 where fixed.     points, out: (3, P).
+    steps: (M, 6) of every camera, 0 where fixed.     change: (SHARED,) of the shared calibration.
+    points, out: (3, P).
     """
-    foretold = 0.0
-    for n in range(start.size):
+    for n in range(places.start.size):
         t0 = t1 = t2 = 0.0
-        for o in range(start[n], stop[n]):
-            m = camera[o]
+        for o in range(places.start[n], places.stop[n]):
+            m = places.camera[o]
             x, y, iz = records[o, 0], records[o, 1], records[o, 2]
             m00, m01, m11 = records[o, 3], records[o, 4], records[o, 5]
             d = steps[m]
@@ -289,10 +359,14 @@ def substitute(
             mu = (d[0] - x * d[2]) * iz - x * y * d[3] + (1.0 + x * x) * d[4] - y * d[5]
             mv = (d[1] - y * d[2]) * iz - (1.0 + y * y) * d[3] + x * y * d[4] + x * d[5]
             a, c = apply_metric(m00, (m01,), m11, mu, mv)
-            p0, p1, p2, q0, q1, q2 = point_rows(cameras[m], x, y, iz)
+            p0, p1, p2, q0, q1, q2 = point_rows(motion[m], x, y, iz)
             t0 += a * p0 + c * q0
             t1 += a * p1 + c * q1
             t2 += a * p2 + c * q2
+        for q in range(SHARED if shared.shape[0] else 0):
+            t0 += shared[n, 3 * q] * change[q]
+            t1 += shared[n, 3 * q + 1] * change[q]
+            t2 += shared[n, 3 * q + 2] * change[q]
         f = factors[n]
         s0 = t0 * f[0]
         s1 = (t1 - f[1] * s0) * f[2]
@@ -304,6 +378,3 @@ def substitute(
         out[0, n] = points[0, n] + h0
         out[1, n] = points[1, n] + h1
         out[2, n] = points[2, n] + h2
-        foretold += f[6] * r0 + f[7] * r1 + f[8] * r2
-        foretold += damping * (f[9] * h0 * h0 + f[10] * h1 * h1 + f[11] * h2 * h2)
-    return foretold

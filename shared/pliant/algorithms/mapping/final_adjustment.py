@@ -1,0 +1,199 @@
+"""The final adjustment of a segment: all its keyframes together, and the calibration.
+
+Everything works on the list of observations, so that time and memory grow with their number.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
+from pliant.algorithms.bundle import BundleProblem, BundleResult, shared_intrinsics
+from pliant.algorithms.bundle.calibration import ideal_pixels
+from pliant.algorithms.bundle.schur import solve_schur
+from pliant.algorithms.bundle.subspace import refine_points
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.observation_table import choose, list_errors, weigh
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.rolling_shutter import readout_flow
+from pliant.algorithms.triangulation import spread_of_rays
+
+_POINT_STEPS = 3
+"""Gauss-Newton steps of the points that Schur LM leaves out: they start near their optimum."""
+
+_CHUNK = 4096
+"""Points whose rays are compared at a time: bounds a dense table of keyframes x points."""
+
+
+@dataclass(kw_only=True)
+class _Seen:
+    """What the keyframes see of the map, keyframe by keyframe, and the state of both.
+
+    rows: (N,) of the points.     xyz: (N, 3).     T_world_camera: (M, 4, 4).
+    camera, point: (O,) of each observation.    px: (O, 2).   weights: (O,).   flow: (O, 2) px.
+    """
+
+    rows: I32
+    xyz: F64
+    T_world_camera: F64
+    camera: I32
+    point: I32
+    px: F32
+    weights: F32
+    flow: F32 | None = None
+
+
+def adjust_keyframes(
+    keyframes: list[Keyframe],
+    points: PointRows,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    motions: F64,
+) -> tuple[F64, I32]:
+    """Schur LM over all but the first keyframe, the best observed points and the calibration.
+
+    The other points follow alone.  Observations that then miss their point are forgotten.
+    motions: (M, 6) of the keyframes, see ``Path``.
+    Returns the correction (4,), see ``solve_schur``, and the rows of points that too few keyframes
+    see; what is said of the others is brought up to date.
+    """
+    seen = _list(keyframes, points, camera, parameters.window.lens_radius)
+    count = np.bincount(seen.point, minlength=len(seen.rows))
+    best = _best_observed(seen, count, parameters.window.final_points_per_keyframe)
+    bundle = parameters.bundle.model_copy(
+        update={"max_iterations": parameters.window.final_iterations}
+    )
+    calibrating = bool(parameters.calibration.sigmas.any())
+    if calibrating:
+        seen.flow = readout_flow(
+            seen.T_world_camera, motions, seen.xyz, seen.camera, seen.point, seen.px, camera
+        )
+    uncertainty = parameters.calibration if calibrating else None
+    found = solve_schur(_problem(seen, best, camera), bundle, uncertainty=uncertainty)
+    _take(seen, best, found)
+    _correct(seen, camera, found.correction)
+    others = (count >= 2) & ~best
+    problem = _problem(seen, others, camera)
+    _take(seen, others, refine_points(problem, bundle, iterations=_POINT_STEPS))
+    points.xyz[seen.rows] = seen.xyz
+    for slot, keyframe in enumerate(keyframes):
+        keyframe.T_world_camera = seen.T_world_camera[slot]
+    good = _forget_outliers(seen, keyframes, points, camera, parameters.window.outlier_px)
+    count = np.bincount(seen.point[good], minlength=len(seen.rows))
+    _update_statistics(seen, good, count, points, camera)
+    return found.correction, seen.rows[count < 2]
+
+
+def _list(
+    keyframes: list[Keyframe], points: PointRows, camera: PinholeCamera, lens_radius: float
+) -> _Seen:
+    mapped = [points.state[keyframe.rows] == MAPPED for keyframe in keyframes]
+    listed = [k.rows[each] for k, each in zip(keyframes, mapped, strict=True)]
+    px = np.concatenate([k.points_px[each] for k, each in zip(keyframes, mapped, strict=True)])
+    sizes = np.array([len(rows) for rows in listed])
+    rows, point = np.unique(np.concatenate(listed), return_inverse=True)
+    # Oldest first, which decides among points that are observed as often.
+    order = np.argsort(points.first_keyframe[rows], kind="stable")
+    rank = np.empty(len(rows), np.int32)
+    rank[order] = np.arange(len(rows), dtype=np.int32)
+    rows = rows[order]
+    return _Seen(
+        rows=rows,
+        xyz=points.xyz[rows],
+        T_world_camera=np.array([keyframe.T_world_camera for keyframe in keyframes]),
+        camera=np.repeat(np.arange(len(keyframes), dtype=np.int32), sizes),
+        point=rank[point],
+        px=px,
+        weights=weigh(px, camera, lens_radius),
+    )
+
+
+def _best_observed(seen: _Seen, count: I64, wanted: int) -> BoolArray:
+    """(N,) mask that gives every keyframe its ``wanted`` most observed points, of two or more."""
+    order = np.argsort(-count, kind="stable")
+    order = order[count[order] >= 2]
+    chosen, columns = np.zeros(len(count), np.bool_), np.arange(len(count), dtype=np.int32)
+    ends = np.cumsum(np.bincount(seen.camera, minlength=len(seen.T_world_camera)))
+    for slot in range(len(ends) - 1, -1, -1):
+        sees = np.zeros(len(count), np.bool_)
+        sees[seen.point[ends[slot - 1] if slot else 0 : ends[slot]]] = True
+        choose(order, columns, sees, wanted, chosen)
+    return chosen
+
+
+def _problem(seen: _Seen, chosen: BoolArray, camera: PinholeCamera) -> BundleProblem:
+    """Of the chosen points; the first keyframe does not move."""
+    kept = chosen[seen.point]
+    number = np.cumsum(chosen, dtype=np.int32) - 1
+    M = len(seen.T_world_camera)
+    return BundleProblem(
+        T_world_camera=seen.T_world_camera,
+        points_world=seen.xyz[chosen],
+        camera_index=seen.camera[kept],
+        point_index=number[seen.point[kept]].astype(np.int32),
+        points_px=seen.px[kept],
+        intrinsics=shared_intrinsics(camera, M),
+        fixed_cameras=np.arange(M) == 0,
+        weights=seen.weights[kept],
+        readout_flow=None if seen.flow is None else seen.flow[kept],
+    )
+
+
+def _take(seen: _Seen, chosen: BoolArray, result: BundleResult) -> None:
+    seen.xyz[chosen] = result.points_world
+    seen.T_world_camera = result.T_world_camera
+
+
+def _correct(seen: _Seen, camera: PinholeCamera, correction: F64) -> None:
+    """Let the observations be those of ``camera``: what follows goes on with a pinhole camera."""
+    if not correction.any():
+        return
+    if seen.flow is not None:
+        seen.px = seen.px - (correction[3] * seen.flow).astype(np.float32)
+    u, v = (np.ascontiguousarray(each) for each in seen.px.T)
+    seen.px = np.stack(ideal_pixels(u, v, camera, correction), axis=1)
+
+
+def _forget_outliers(
+    seen: _Seen,
+    keyframes: list[Keyframe],
+    points: PointRows,
+    camera: PinholeCamera,
+    outlier_px: float,
+) -> BoolArray:
+    """(O,) mask of the observations that hit their point; the keyframes forget the others."""
+    errors = list_errors(seen.T_world_camera, seen.xyz, seen.camera, seen.point, seen.px, camera)
+    good = errors <= outlier_px
+    ends = np.cumsum(np.bincount(seen.camera, minlength=len(keyframes)))
+    for slot, keyframe in enumerate(keyframes):
+        keep = np.ones(len(keyframe.rows), np.bool_)
+        mapped = points.state[keyframe.rows] == MAPPED
+        keep[mapped] = good[ends[slot - 1] if slot else 0 : ends[slot]]
+        keyframe.keep(keep)
+    return good
+
+
+def _update_statistics(
+    seen: _Seen, good: BoolArray, count: I64, points: PointRows, camera: PinholeCamera
+) -> None:
+    """Keyframes, parallax and uncertainty of the points, as ``MapDelta`` defines them."""
+    rows, N = seen.rows, len(seen.rows)
+    points.base_keyframes[rows], points.base_parallax_rad[rows] = 0, 0.0
+    points.keyframes[rows] = count
+    order = np.flatnonzero(good)
+    order = order[np.argsort(seen.point[order], kind="stable")]
+    ends = np.cumsum(count)
+    for lo in range(0, N, _CHUNK):
+        hi = min(lo + _CHUNK, N)
+        some = order[(ends[lo - 1] if lo else 0) : ends[hi - 1]]
+        table = np.zeros((len(seen.T_world_camera), hi - lo), np.bool_)
+        table[seen.camera[some], seen.point[some] - lo] = True
+        parallax, sigmas = spread_of_rays(
+            seen.T_world_camera, table, np.arange(hi - lo), seen.xyz[lo:hi], focal_px=camera.fx
+        )
+        points.parallax_rad[rows[lo:hi]] = parallax
+        known = np.isfinite(sigmas)
+        points.sigmas[rows[lo:hi][known]] = sigmas[known]
+        rest = rows[lo:hi][~known]
+        points.sigmas[rest] = np.maximum(points.sigmas[rest], 1e-3)
