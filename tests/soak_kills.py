@@ -159,7 +159,7 @@ def mesher_killed(
     with running(*kind.arguments, *SETTINGS, "--output", output) as run:
         run.wait_for("meshing what was recorded")
         threading.Event().wait(frame / kind.frames * 2.0 + later)
-        meshers = children(run.process.pid, "mesh_afterwards")
+        meshers = children(run.process.pid, "mesh.afterwards")
         killed = _kill(dict(zip((victim,), meshers, strict=False)), (victim,))
         code, _, errors = run.finish()
     if code != 0:

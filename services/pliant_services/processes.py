@@ -60,7 +60,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "meshing",
         "pliant_services.nodes.meshing",
-        kernels=("pliant.algorithms.meshing", "pliant.fusion.warm_up"),
+        kernels=("pliant.algorithms.meshing.warm_up",),
         finishing="fusing the final mesh",
         inputs=(
             topics.STREAM,

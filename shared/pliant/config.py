@@ -13,7 +13,7 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError
 
 from pliant.algorithms.mapping import MappingParameters
-from pliant.algorithms.meshing import MeshingParameters
+from pliant.algorithms.meshing.parameters import MeshingParameters
 from pliant.algorithms.parameters import Parameters
 from pliant.algorithms.surfels import SurfelParameters
 from pliant.algorithms.tracking import TrackingParameters
@@ -49,6 +49,12 @@ class BusParameters(Parameters):
         ge=1,
         le=4096,
         description="Messages of one topic on the way to its slowest reader; bounds memory.",
+    )
+    window_mib: int = Field(
+        default=256,
+        ge=1,
+        le=65536,
+        description="And no more MiB than this; a larger message goes alone.",
     )
     lag_messages: int = Field(
         default=128,

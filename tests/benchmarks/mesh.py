@@ -5,18 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.poisson import poisson_mesh
 from benchmarks.table import markdown
 from pliant.algorithms.geometry import pose_to_matrix
-from pliant.algorithms.meshing import TriangleMesh
-from pliant.algorithms.meshing import warm_up as warm_up_meshing
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.algorithms.meshing.warm_up import warm_up
 from pliant.config import recorded_config
 from pliant.datasets.builtin import builtin_folder, is_builtin
 from pliant.errors import ResultError
 from pliant.evaluation.mesh_truth import Mesh
 from pliant.evaluation.recorded_mesh import compare_mesh
 from pliant.evaluation.result import evaluate_result
-from pliant.fusion.poisson import poisson_mesh
-from pliant.fusion.warm_up import warm_up as warm_up_fusion
 from pliant.map_history import MapHistory
 from pliant.messages.mesh_pieces import joined
 from pliant.recording.summary import summarise
@@ -59,8 +58,7 @@ def measure(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterato
 def measure_live(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterator[str]:
     """A table of both ways in which the live mesh can follow the map, and of the final one."""
     compared = _Compared(result, groundtruth)
-    warm_up_meshing()
-    warm_up_fusion()
+    warm_up()
     rows: list[list[str]] = []
     for name, kind in _CORRECTIONS.items():
         found = compared.make([*overrides, f"meshing.corrections={kind}"])

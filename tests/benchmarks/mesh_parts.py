@@ -8,12 +8,20 @@ import numpy as np
 
 from benchmarks.smoothing_scene import Scene, make_scene, rmse
 from benchmarks.table import markdown
-from pliant.algorithms import meshing
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing.laplacian import laplacian
-from pliant.fusion.open3d_import import FusionError
-from pliant.fusion.volume import TsdfVolume
+from pliant.algorithms.meshing.delaunay import triangulate
+from pliant.algorithms.meshing.keyframe_surface import filter_triangles, laplacian
+from pliant.algorithms.meshing.mesh_blocks import BlockMesh
+from pliant.algorithms.meshing.nltgv import NltgvResult, smooth
+from pliant.algorithms.meshing.parameters import (
+    NltgvParameters,
+    TriangleFilterParameters,
+    TsdfParameters,
+)
+from pliant.algorithms.meshing.rendering import DepthMap, render_depth
+from pliant.algorithms.meshing.tsdf_volume import TsdfVolume
+from pliant.algorithms.meshing.warm_up import warm_up
 
 _CAMERA = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 _MANY_SEEN = 9
@@ -25,18 +33,18 @@ _Result = TypeVar("_Result")
 
 def measure(vertices: int = 10_000, repeats: int = 10, seeds: int = 8) -> Iterator[str]:
     """Least CPU time of all threads over the repeats, then errors over the seeds."""
-    meshing.warm_up()
+    warm_up()
     scene = make_scene(vertices, 0)
-    delaunay, _ = _least_ms(lambda: meshing.triangulate(scene.points_px), repeats)
+    delaunay, _ = _least_ms(lambda: triangulate(scene.points_px), repeats)
     nltgv, smoothed = _least_ms(lambda: _smooth(scene), repeats)
     camera, count = _CAMERA, np.full(len(scene.data), _MANY_SEEN, np.int32)
 
-    def render() -> meshing.DepthMap:
-        kept = meshing.filter_triangles(
+    def render() -> DepthMap:
+        kept = filter_triangles(
             scene.mesh.triangles, scene.points_px, smoothed.inverse_depths, scene.sigmas, count,
-            camera, meshing.TriangleFilterParameters(),
+            camera, TriangleFilterParameters(),
         )  # fmt: skip
-        return meshing.render_depth(
+        return render_depth(
             scene.mesh.triangles[kept], scene.points_px, smoothed.inverse_depths, scene.sigmas,
             camera,
         )  # fmt: skip
@@ -48,36 +56,28 @@ def measure(vertices: int = 10_000, repeats: int = 10, seeds: int = 8) -> Iterat
         ["Delaunay + NLTGV", f"{delaunay + nltgv:.1f}", "45"],
         ["depth map", f"{rendering:.1f}", ""],
     ]
-    note = ""
-    try:
-        rows += _volumes(depth_map, 1.0 / float(np.median(scene.true)), repeats)
-    except FusionError as error:
-        note = f"no TSDF: {error}"
+    rows += _volumes(depth_map, 1.0 / float(np.median(scene.true)), repeats)
     header = [f"640x480, {len(scene.data)} vertices, CPU ms", "ours", "paper"]
     yield markdown(header, rows)
-    if note:
-        yield note
     yield ""
     yield from _gains(vertices, seeds)
 
 
-def _smooth(scene: Scene) -> meshing.NltgvResult:
-    return meshing.smooth(
-        scene.points_px, scene.data, scene.sigmas, scene.mesh.edges, meshing.NltgvParameters()
-    )
+def _smooth(scene: Scene) -> NltgvResult:
+    return smooth(scene.points_px, scene.data, scene.sigmas, scene.mesh.edges, NltgvParameters())
 
 
-def _volumes(depth_map: meshing.DepthMap, median_depth: float, repeats: int) -> Iterator[list[str]]:
+def _volumes(depth_map: DepthMap, median_depth: float, repeats: int) -> Iterator[list[str]]:
     """Rows of both resolutions: keyframes side by side, the first not counted.
 
     Every keyframe is taken in and what it changed is meshed again.
     """
-    parameters = meshing.TsdfParameters()
+    parameters = TsdfParameters()
     colour = np.full((*depth_map.depths.shape, 3), 128, np.uint8)
     sizes = (("coarse", parameters.coarse_voxel, "175"), ("fine", parameters.fine_voxel, "4000"))
     for name, size, paper in sizes:
         volume = TsdfVolume(size * median_depth, parameters)
-        held = meshing.BlockMesh()
+        held = BlockMesh()
         update, extraction = [], []
         for k in range(repeats + 1):
             pose = np.eye(4)

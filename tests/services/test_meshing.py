@@ -9,7 +9,7 @@ import pytest
 
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import matrix_to_pose
-from pliant.algorithms.meshing import BlockMesh
+from pliant.algorithms.meshing.mesh_blocks import BlockMesh
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import load_config
 from pliant.fusion.keyframe_spool import KeyframeSpool
@@ -26,8 +26,6 @@ from pliant.messages.types import (
 )
 from pliant_services.nodes import meshing
 from pliant_services.runtime.monitor import SilentMonitor
-
-pytest.importorskip("open3d", reason="meshing needs open3d: pip install 'pliant[mesh]'")
 
 CAMERA = PinholeCamera(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 POINTS = 1500
@@ -288,12 +286,43 @@ def test_no_keyframes_no_mesh() -> None:
     assert run(empty) == {}
 
 
-def test_a_volume_too_small_is_said_and_the_run_goes_on() -> None:
+def test_a_volume_too_small_is_said_with_what_all_keyframes_need() -> None:
+    def made(fine_voxel: float, limit_mb: int) -> tuple[set[str], list[str]]:
+        monitor, bus = Notes(), ReplayBus(inputs())
+        sets = (f"fine_voxel={fine_voxel}", "coarse_voxel=0.1", f"max_memory_mb={limit_mb}")
+        config = load_config(None, [f"meshing.tsdf.{each}" for each in sets])
+        meshing.run(bus, config, monitor)
+        pieces = bus.outputs.get(topics.MESH_FINAL, [])
+        return {m.level for m in pieces if isinstance(m, MeshPiece)}, monitor.notes
+
+    limit = 12  # the first keyframe fits
+    levels, notes = made(0.006, limit)
+    assert levels == {"coarse"}
+    (told,) = [note for note in notes if "no fine mesh" in note]
+    assert "meshing.tsdf.fine_voxel=0.006 needs 13 MB for segment 0, the limit is 12 MB" in told
+    assert made(0.006, 14)[0] == {"coarse", "fine"}
+    # It is what all keyframes need, however few of them there was room for.
+    (worse,) = [note for note in made(0.006, 3)[1] if "no fine mesh" in note]
+    assert "needs 13 MB for segment 0, the limit is 3 MB" in worse
+    for note, size in ((told, limit), (worse, 3)):
+        fitting = float(note.split("about ")[1].split()[0])
+        assert fitting > 0.006
+        assert made(fitting, size)[0] == {"coarse", "fine"}
+
+
+def test_where_no_keyframe_has_a_surface_it_is_said_why() -> None:
     monitor = Notes()
-    bus = ReplayBus(inputs())
-    config = load_config(None, ["meshing.tsdf.max_memory_mb=1", "meshing.tsdf.fine_voxel=0.001"])
-    meshing.run(bus, config, monitor)
-    assert any("no fine mesh" in note for note in monitor.notes)
+    nothing = replace(keyframe(FRAMES - 1, -1, []), keyframe_ids=np.arange(2, dtype=np.int64),
+                      settled=np.ones(2, np.bool_), counts=np.zeros(2, np.int32))  # fmt: skip
+    given = {
+        **inputs(),
+        topics.KEYFRAME: [keyframe(frame, -1, []) for frame in range(FRAMES)],
+        topics.KEYFRAME_FINAL: [nothing],
+    }
+    assert topics.MESH_FINAL not in run(given, monitor)
+    assert monitor.notes[-1] == (
+        "no keyframe of segment 0 has a surface (keyframe 1: 0 points with depth)"
+    )
 
 
 def test_a_mesh_is_the_same_after_its_pieces(outputs: dict[Topic, list[Header]]) -> None:

@@ -154,7 +154,6 @@ def test_a_run_that_was_interrupted_before_it_recorded_has_nothing_to_mesh(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pipeline, "_go_through", lambda *_: (True, None))
-    monkeypatch.setattr(pipeline, "choose_profile", lambda _: (pipeline.WITH_MESH, ""))
     monkeypatch.setattr(pipeline, "Fleet", lambda *_, **options: None)
     source = "built-in:tiny?frames=8"
     with pytest.raises(KeyboardInterrupt):

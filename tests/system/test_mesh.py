@@ -16,7 +16,6 @@ pytestmark = pytest.mark.system
 
 @pytest.fixture
 def result(tiny_run: Path) -> Path:
-    pytest.importorskip("open3d", reason="meshing needs open3d: pip install 'pliant[mesh]'")
     assert "fine mesh:" in (tiny_run / "logs" / "stdout").read_text()
     return tiny_run
 
@@ -55,7 +54,7 @@ def test_a_mesher_that_is_killed_fuses_again_and_the_mesh_is_that_of_an_ordinary
     output = tmp_path / "restartable"
     with running(TINY, "--on-crash", "restart", "--output", output) as run:
         run.wait_for("meshing what was recorded")
-        while not (meshers := children(run.process.pid, "mesh_afterwards")):
+        while not (meshers := children(run.process.pid, "mesh.afterwards")):
             assert run.process.poll() is None
         os.kill(meshers[0], signal.SIGKILL)
         code, written, errors = run.finish()
@@ -109,16 +108,13 @@ def test_the_service_replays_to_the_same_bytes(result: Path, tmp_path: Path) -> 
     assert "the same bytes as recorded: mesh/blocks, mesh/final" in done.stdout
 
 
-def test_without_open3d_a_run_says_so_in_one_line_and_goes_on(tmp_path: Path) -> None:
+def test_a_run_makes_its_mesh_without_open3d(tmp_path: Path) -> None:
     hidden = tmp_path / "hidden" / "open3d"
     hidden.mkdir(parents=True)
-    (hidden / "__init__.py").write_text("raise ImportError('libGL.so.1: cannot open')")
+    (hidden / "__init__.py").write_text("raise SystemExit('open3d was imported')")
     environment = {"PYTHONPATH": str(hidden.parent)}
     arguments = ("--output", tmp_path / "result", "--set", "ingest.mode=lossless")
     done = pliant("run", f"{TINY}?frames=12", *arguments, env=environment)
-    told = [line for line in done.stderr.splitlines() if "no mesh" in line]
-    assert len(told) == 1, done.stderr
-    assert "apt-get install libegl1" in told[0]
-    assert "Traceback" not in done.stderr
-    assert (tmp_path / "result" / "trajectory.txt").exists()
-    assert not (tmp_path / "result" / "mesh.ply").exists()
+    assert done.returncode == 0, done.stderr
+    assert "fine mesh: " in done.stdout
+    assert (tmp_path / "result" / "mesh.ply").exists()

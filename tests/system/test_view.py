@@ -1,11 +1,13 @@
 """`pliant view` and `pliant run --save`, on a machine without a display."""
 
+import itertools
 import signal
 import socket
 import subprocess
 import sys
 from pathlib import Path
 from typing import cast
+from urllib.request import urlopen
 
 import pytest
 from benchmarks.viewer_cost import run_with
@@ -106,6 +108,59 @@ def test_a_taken_port_is_one_line() -> None:
             RerunCanvas("web", name="taken", web_port=web_port, grpc_port=grpc_port)
 
 
+def test_two_are_seen_in_browsers_at_once() -> None:
+    pytest.importorskip("rerun")
+    one = RerunCanvas("web", name="one")
+    try:
+        two = RerunCanvas("web", name="two")
+        two.close()
+        web_port = int(free_endpoint().rsplit(":", 1)[1])
+        three = RerunCanvas("web", name="three", web_port=web_port)
+        three.close()
+    finally:
+        one.close()
+    assert len({one.address, two.address, three.address}) == 3
+    assert f":{web_port}/" in three.address
+
+
+def test_a_browser_is_told_to_reach_this_machine_alone() -> None:
+    """Rerun's page would fetch fonts, look for updates and report its use."""
+    pytest.importorskip("rerun")
+    canvas = RerunCanvas("web", name="page")
+    try:
+        with urlopen(canvas.address) as page:
+            policy = page.headers["Content-Security-Policy"]
+            content = page.read()
+        with urlopen(canvas.address.partition("?")[0] + "re_viewer.js") as script:
+            assert "javascript" in script.headers["Content-Type"]
+    finally:
+        canvas.close()
+    assert b"re_viewer.js" in content
+    assert b'href="https://' not in content
+    assert "default-src 'none'" in policy
+    hosts = {word for word in policy.replace(";", " ").split() if "/" in word or "." in word}
+    assert len(hosts) == 1
+    assert hosts.pop().startswith("http://127.0.0.1:")
+
+
+@pytest.mark.slow
+def test_a_run_that_a_browser_looks_on_at_gives_its_results_and_stays(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    command = [sys.executable, "-m", "pliant_services.cli", "run", "built-in:tiny", "--view", "web"]
+    with subprocess.Popen(
+        [*command, "--output", tmp_path / "tiny"], stderr=subprocess.PIPE, text=True
+    ) as run:
+        assert run.stderr is not None
+        said = list(itertools.takewhile(lambda line: "until Ctrl-C" not in line, run.stderr))
+        try:
+            assert run.poll() is None, "".join(said)
+            assert (tmp_path / "tiny" / "report.json").is_file()
+            assert not (tmp_path / "tiny" / "session.json").exists()
+        finally:
+            run.send_signal(signal.SIGINT)
+    assert run.returncode == 0
+
+
 def test_rerun_listens_on_this_machine_alone_and_leaves_with_us() -> None:
     """Its own library would listen to everybody."""
     pytest.importorskip("rerun")
@@ -157,8 +212,9 @@ def test_a_viewer_that_does_not_leave_is_not_awaited(monkeypatch: pytest.MonkeyP
         monkeypatch.setattr(spectators.subprocess, "Popen", lambda *_, **options: stubborn)
         for name in ("_LAST_WORDS_S", "_LEAVE_S"):
             monkeypatch.setattr(spectators, name, 0.0)
-        with spectators.viewer(cast(Fleet, Looking()), web=False, save=None):
-            pass
+        with spectators.Viewer(web=False, save=None) as viewer:
+            viewer.start(cast(Fleet, Looking()))
+            viewer.see_the_end(cast(Fleet, Looking()))
     assert stubborn.returncode == -signal.SIGKILL
 
 

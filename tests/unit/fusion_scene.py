@@ -6,7 +6,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing import TriangleMesh
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 
 CAMERA = PinholeCamera(width=128, height=96, fx=105.0, fy=105.0, cx=63.5, cy=47.5)
 # normal n towards the cameras and d: n . X = d on the plane.

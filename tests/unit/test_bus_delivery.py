@@ -20,7 +20,7 @@ WINDOW = 4
 
 
 def deliver(inbox: Inbox, message: Numbered) -> None:
-    if inbox.is_next(message.sequence):
+    if inbox.is_next(message.sequence, len(message.payload)):
         inbox.put(Received(topics.IMAGE, 0, message.sequence, False, message.payload))
 
 
@@ -143,6 +143,26 @@ def test_a_reader_that_makes_safe_seldom_bounds_messages_and_bytes() -> None:
     assert outbox.full(0)
     outbox.credit("disk", 1, 3, 3)
     assert not outbox.full(1000)  # nothing is kept: larger than the window may pass alone
+
+
+def test_what_is_on_the_way_and_what_waits_is_bounded_in_bytes() -> None:
+    """One larger than that goes alone."""
+    outbox, inbox = Outbox("t", ["a"], window=9, window_bytes=25), Inbox(9, limit_bytes=25)
+    assert not outbox.full(100)
+    for _ in range(2):
+        deliver(inbox, outbox.add(0, b"0123456789"))
+    assert not outbox.full(5)
+    assert outbox.full(6) == ["a"]
+    assert inbox.is_next(2, 5)
+    assert not inbox.is_next(2, 6)
+    assert inbox.refused == 1
+    inbox.take()
+    outbox.credit("a", 1, 1, 1)
+    assert not outbox.full(15)
+    assert inbox.is_next(2, 15)
+    assert not inbox.is_next(2, 16)
+    inbox.take()
+    assert inbox.is_next(2, 100)
 
 
 def test_messages_with_which_a_reader_may_lag_take_no_room_in_its_window() -> None:

@@ -7,27 +7,22 @@ import numpy as np
 import pytest
 from fusion_scene import BALL, CAMERA, RADIUS, edge_uses, make_view, surface_errors
 
-from pliant.algorithms.meshing import BlockMesh, TriangleMesh, TsdfParameters
-from pliant.errors import PliantError
-from pliant.fusion import open3d_import
+from pliant.algorithms.meshing.mesh_blocks import BlockMesh, TriangleMesh
+from pliant.algorithms.meshing.parameters import TsdfParameters
+from pliant.algorithms.meshing.tsdf_blocks import BlockPool, find_rows
+from pliant.algorithms.meshing.tsdf_integrate import blocks_in_band, pixel_planes
+from pliant.algorithms.meshing.tsdf_volume import TsdfVolume, VolumeFullError
 from pliant.fusion.memory import (
     BLOCK_BYTES,
     SCENE_VIEWS,
     VoxelSizeError,
     check_voxel_sizes,
+    too_fine,
     view_bytes,
 )
-from pliant.fusion.open3d_import import FusionError, require_open3d
-from pliant.fusion.volume import TsdfVolume, VolumeMemoryError
 
 VOXEL = 0.05
 PARAMETERS = TsdfParameters()
-try:
-    require_open3d()
-    MISSING = ""
-except FusionError as error:
-    MISSING = str(error)
-needs_open3d = pytest.mark.skipif(bool(MISSING), reason=MISSING)
 
 
 def fused(steps: range, parameters: TsdfParameters = PARAMETERS) -> TsdfVolume:
@@ -44,7 +39,46 @@ def assert_same(first: Any, second: Any) -> None:
         )
 
 
-@needs_open3d
+def test_a_pool_keeps_what_is_in_its_blocks_as_others_come_and_go() -> None:
+    generator = np.random.default_rng(0)
+    pool = BlockPool(most=2000)
+    held: dict[tuple[int, ...], int] = {}
+
+    def check() -> None:
+        assert len(pool.keys) == len(pool.births) == len(held)
+        keys = np.array(sorted(held), np.int32).reshape(-1, 3)
+        rows = find_rows(pool.table, keys)
+        assert sorted(rows.tolist()) == list(range(len(held)))
+        for sums in pool.sums:
+            found = sums[rows].reshape(len(rows), sums[0].size)
+            assert np.array_equal(found.min(axis=1), [held[key] for key in sorted(held)])
+            assert np.array_equal(found.max(axis=1), [held[key] for key in sorted(held)])
+
+    for step in range(1, 15):
+        keys = np.array([(step, k, 0) for k in range(180)], np.int32)
+        used = len(held)
+        if used + len(keys) > pool.most:
+            with pytest.raises(ValueError, match="there is room for 2000"):
+                pool.add(keys, step)
+            check()
+            continue
+        pool.add(keys, step)
+        assert all(not sums[used : used + len(keys)].any() for sums in pool.sums)
+        for sums in pool.sums:
+            sums[used : used + len(keys)] = step
+        held.update(dict.fromkeys(map(tuple, keys.tolist()), step))
+        check()
+        gone = generator.permutation(len(held))[: 40 * (step % 3)].astype(np.int32)
+        for key in pool.keys[gone].tolist():
+            del held[tuple(key)]
+        pool.remove(gone)
+        check()
+        assert np.array_equal(pool.births, pool.keys[:, 0])
+    assert pool.room <= pool.most
+    pool.remove(np.arange(len(pool.keys), dtype=np.int32))
+    assert len(pool.keys) == 0
+
+
 def test_surfaces_lie_where_they_are_with_their_normals() -> None:
     mesh = fused(range(5)).extract_all()
     distance, angle = surface_errors(mesh)
@@ -56,46 +90,42 @@ def test_surfaces_lie_where_they_are_with_their_normals() -> None:
     assert np.percentile(angle, 90) < 5.0
 
 
-@needs_open3d
 def test_the_mesh_is_a_manifold_that_turns_outwards_with_short_triangles() -> None:
     volume = fused(range(4))
     mesh = volume.extract_all()
     assert edge_uses(mesh.triangles).max() == 2
     corners = mesh.positions[mesh.triangles].astype(np.float64)
     sides = corners - np.roll(corners, 1, axis=1)
-    assert np.linalg.norm(sides, axis=2).max() < volume.truncation
+    assert np.linalg.norm(sides, axis=2).max() < volume.scale.truncation
     turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert np.linalg.norm(turned, axis=1).min() > 0.0
     agreement = np.sum(turned * mesh.normals[mesh.triangles[:, 0]], axis=1)
     assert np.mean(agreement > 0.0) > 0.99
 
 
-@needs_open3d
 def test_what_is_taken_back_leaves_no_trace() -> None:
     volume = fused(range(3))
-    before, blocks = volume.extract_all(), volume.block_count
+    before, blocks = volume.extract_all(), len(volume.keys)
     view = make_view(12)
     one = volume.integrate(*view.arguments())
     between = make_view(14)
     two = volume.integrate(*between.arguments())
-    assert volume.block_count > blocks
+    assert len(volume.keys) > blocks
     volume.remove(one.serial, *view.arguments())
     volume.remove(two.serial, *between.arguments())
-    assert volume.block_count == blocks
+    assert len(volume.keys) == blocks
     assert_same(volume.extract_all(), before)
 
 
-@needs_open3d
 def test_everything_taken_back_leaves_nothing() -> None:
     volume = TsdfVolume(VOXEL, PARAMETERS)
     serials = [volume.integrate(*make_view(step).arguments()).serial for step in range(4)]
     for step in (2, 0, 3, 1):
         volume.remove(serials[step], *make_view(step).arguments())
-    assert volume.block_count == 0
+    assert len(volume.keys) == 0
     assert len(volume.extract_all().triangles) == 0
 
 
-@needs_open3d
 def test_messages_rebuild_the_mesh_that_is_held() -> None:
     volume, service, viewer = TsdfVolume(VOXEL, PARAMETERS), BlockMesh(), BlockMesh()
     late = BlockMesh()
@@ -121,7 +151,6 @@ def test_messages_rebuild_the_mesh_that_is_held() -> None:
     assert min(sent) > 0
 
 
-@needs_open3d
 def test_neither_the_place_nor_the_order_of_blocks_changes_the_mesh() -> None:
     volume = fused(range(4))
     again = TsdfVolume(VOXEL, PARAMETERS.model_copy(update={"free_space": False}))
@@ -138,7 +167,6 @@ def test_neither_the_place_nor_the_order_of_blocks_changes_the_mesh() -> None:
     assert_same(volume.extract_all(), fused(range(4)).extract_all())
 
 
-@needs_open3d
 def test_what_is_seen_through_is_cleared() -> None:
     def ghosts(parameters: TsdfParameters) -> int:
         volume = TsdfVolume(VOXEL, parameters)
@@ -152,34 +180,33 @@ def test_what_is_seen_through_is_cleared() -> None:
     assert ghosts(PARAMETERS.model_copy(update={"free_space": False})) > 50
 
 
-@needs_open3d
 def test_a_voxel_that_needs_too_much_memory_is_refused_with_one_that_fits() -> None:
     view = make_view(0)
-    small = PARAMETERS.model_copy(update={"max_memory_mb": 1})
+    small = PARAMETERS.model_copy(update={"max_memory_mb": 1, "fine_voxel": VOXEL})
     volume = TsdfVolume(VOXEL, small)
-    with pytest.raises(VolumeMemoryError, match="would fit") as caught:
+    with pytest.raises(VolumeFullError) as caught:
         volume.integrate(*view.arguments())
-    assert volume.block_count == 0
+    assert len(volume.keys) == 0
     assert volume.memory_bytes <= 1e6
-    fits = caught.value.voxel_size_that_fits
+    said = too_fine("fine", small, caught.value.needed_bytes, "this view")
+    needed = caught.value.needed_bytes / 1e6
+    assert said.startswith(f"meshing.tsdf.fine_voxel=0.05 needs {needed:.0f} MB for this view, ")
+    assert "the limit is 1 MB (meshing.tsdf.max_memory_mb): about " in said
+    fits = float(said.split("about ")[1].split()[0])
     assert fits > VOXEL
     coarser = TsdfVolume(fits, small)
     coarser.integrate(*view.arguments())
     assert coarser.memory_bytes <= 1e6
-    with pytest.raises(VolumeMemoryError):
-        volume.check_memory(volume.blocks_needed(view.depth, view.camera, view.T_world_camera))
 
 
-@needs_open3d
-@needs_open3d
 def test_what_a_view_needs_is_known_before() -> None:
     depth = np.ones((CAMERA.height, CAMERA.width), np.float32)
     for voxel in (1 / 40, 1 / 120, 1 / 400):
-        volume = TsdfVolume(voxel, PARAMETERS)
+        scale = TsdfVolume(voxel, PARAMETERS).scale
         # Wherever the wall stands in the grid, on average.
         counts = [
-            len(volume.blocks_needed(depth + np.float32(0.21 * k * voxel), CAMERA, np.eye(4)))
-            for k in range(8)
+            len(blocks_in_band(pixel_planes(at, np.ones_like(at), CAMERA), np.eye(4), scale))
+            for at in (depth + np.float32(0.21 * k * voxel) for k in range(8))
         ]
         known = view_bytes(voxel, CAMERA, PARAMETERS) / BLOCK_BYTES
         assert 0.6 < known / np.mean(counts) < 1.1
@@ -200,15 +227,14 @@ def test_a_voxel_that_one_view_cannot_have_is_refused_before_the_work() -> None:
 def test_memory_grows_with_the_surface_and_not_with_the_time() -> None:
     volume = TsdfVolume(VOXEL, PARAMETERS)
     volume.integrate(*make_view(0).arguments())
-    blocks, memory = volume.block_count, volume.memory_bytes
+    blocks, memory = len(volume.keys), volume.memory_bytes
     for _ in range(10):
         volume.integrate(*make_view(0).arguments())
-    assert (volume.block_count, volume.memory_bytes) == (blocks, memory)
+    assert (len(volume.keys), volume.memory_bytes) == (blocks, memory)
     volume.integrate(*make_view(20).arguments())
-    assert volume.block_count > blocks
+    assert len(volume.keys) > blocks
 
 
-@needs_open3d
 def test_depth_that_is_no_depth_is_no_surface() -> None:
     view = make_view(0)
     volume = TsdfVolume(VOXEL, PARAMETERS)
@@ -216,10 +242,9 @@ def test_depth_that_is_no_depth_is_no_surface() -> None:
         done = volume.integrate(np.full_like(view.depth, value), *view.arguments()[1:])
         assert len(done.keys) == 0
     nothing: TriangleMesh = volume.extract_all()
-    assert len(nothing.positions) == len(nothing.triangles) == volume.block_count == 0
+    assert len(nothing.positions) == len(nothing.triangles) == len(volume.keys) == 0
 
 
-@needs_open3d
 def test_sizes_that_differ_are_refused() -> None:
     view = make_view(0)
     volume = TsdfVolume(VOXEL, PARAMETERS)
@@ -231,23 +256,3 @@ def test_sizes_that_differ_are_refused() -> None:
         volume.integrate(
             view.depth[:-1], view.weight, view.colour, view.camera, view.T_world_camera
         )
-
-
-@pytest.mark.parametrize(
-    ("raised", "said"),
-    [
-        (ModuleNotFoundError("no", name="open3d"), r"not installed: pip install 'pliant\[mesh\]'"),
-        (ModuleNotFoundError("no", name="dash"), "lacks dash"),
-        (OSError("libGL.so.1: cannot open shared object file"), "libGL.so.1.*libgl1"),
-    ],
-)
-def test_without_open3d_the_remedy_is_named(
-    raised: Exception, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(name: str) -> None:
-        raise raised
-
-    require_open3d.cache_clear()
-    monkeypatch.setattr(open3d_import.importlib, "import_module", fail)
-    with pytest.raises(PliantError, match=said):
-        require_open3d()

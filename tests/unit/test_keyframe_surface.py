@@ -6,8 +6,9 @@ import pytest
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
-from pliant.algorithms.meshing import KeyframeSurfaces, SeenPoints, SurfaceParameters
 from pliant.algorithms.meshing.corrected_view import CorrectedView
+from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
+from pliant.algorithms.meshing.parameters import SurfaceParameters
 
 CAMERA = PinholeCamera(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 NOISE = 0.01

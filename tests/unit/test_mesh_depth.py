@@ -7,13 +7,11 @@ from hypothesis import strategies as st
 
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing import (
-    TriangleFilterParameters,
-    filter_triangles,
-    render_depth,
-    triangulate,
-    warm_up,
-)
+from pliant.algorithms.meshing.delaunay import triangulate
+from pliant.algorithms.meshing.keyframe_surface import filter_triangles
+from pliant.algorithms.meshing.parameters import TriangleFilterParameters
+from pliant.algorithms.meshing.rendering import render_depth
+from pliant.algorithms.meshing.warm_up import warm_up
 
 CAMERA = PinholeCamera(width=80, height=60, fx=70.0, fy=75.0, cx=38.5, cy=31.0)
 LOOSE = TriangleFilterParameters(

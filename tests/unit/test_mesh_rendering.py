@@ -4,7 +4,7 @@ import numpy as np
 
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
-from pliant.algorithms.meshing import view_mesh
+from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.evaluation.criteria import Similarity
 from pliant.evaluation.mesh_truth import Mesh, MeshEvaluation, format_mesh
 from pliant.evaluation.surface_distance import sample_surface, share_within, thin_out

@@ -7,15 +7,9 @@ from scipy.optimize import linprog
 
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.meshing.delaunay import triangulate
-from pliant.algorithms.meshing.nltgv import (
-    NltgvParameters,
-    NltgvResult,
-    NltgvStart,
-    carry_duals,
-    smooth,
-)
-from pliant.algorithms.meshing.nltgv_start import rings
-from pliant.algorithms.meshing.nltgv_steps import choose_sides
+from pliant.algorithms.meshing.nltgv import NltgvResult, NltgvStart, carry_duals, smooth
+from pliant.algorithms.meshing.nltgv_start import Graph, choose_sides, rings
+from pliant.algorithms.meshing.parameters import NltgvParameters
 
 CONVEX = {"edge_sigmas": 0.0, "data_sigmas": 0.0, "reweightings": 1}
 EXACT = {"min_change_sigmas": 0.0, "max_iterations": 40_000}
@@ -167,11 +161,11 @@ def test_vertices_without_data_come_to_the_side_of_a_step_on_which_they_lie() ->
     state[:, 0], state[:, 1:3] = np.where(swapped, wrong, right), slope
     sigma = np.where(lost, np.inf, 1.0).astype(np.float32)
     data = np.where(lost, 0.0, right).astype(np.float32)
-    bounds, neighbours = rings(mesh.edges, len(points))
     scaled = points / np.float32(10.0)
     u, v = scaled[:, 0].copy(), scaled[:, 1].copy()
+    graph = Graph(u, v, data, sigma, *rings(mesh.edges, len(points)))
     state[:, 1:3] *= 10.0
-    moved = choose_sides(u, v, state, data, sigma, bounds, neighbours, 3.0)
+    moved = choose_sides(graph, state, 3.0)
     assert moved == pytest.approx(np.count_nonzero(swapped), rel=0.01)
     # Vertices are 10 px apart, and a third of them is lost.
     doubtful = lost & (np.abs(beyond) > 2.0) & (np.abs(beyond) < 8.0)

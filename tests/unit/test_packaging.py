@@ -4,11 +4,15 @@ import json
 import os
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
+
+from pliant import __version__
 
 ROOT = Path(__file__).parents[2]
 HEAVY = {"cv2", "matplotlib", "numba", "open3d", "scipy", "zenoh"}
@@ -69,7 +73,32 @@ def test_the_wheel_is_any_python_3_and_carries_its_licence(wheel: Path) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     text = archive.read(metadata).decode()
     assert "License-Expression: Apache-2.0" in text
-    assert f"Version: {project['version']}" in text
+    assert f"Version: {__version__}" in text
+    assert project["dynamic"] == ["version"]  # it stands in one place
+
+
+def test_the_archive_of_the_sources_gives_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
+    build = (sys.executable, "-m", "hatchling", "build", "-d", tmp_path, "--target")
+    run(*build, "sdist", cwd=ROOT)
+    (archive,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(archive) as packed:
+        packed.extractall(tmp_path, filter="data")
+    sources = tmp_path / archive.name.removesuffix(".tar.gz")
+    named = ("README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")
+    assert all((sources / name).is_file() for name in named)
+    run(
+        sys.executable, "-m", "hatchling", "build", "--target", "wheel", "-d", tmp_path, cwd=sources
+    )
+    (again,) = tmp_path.glob("*.whl")
+    assert again.read_bytes() == wheel.read_bytes()
+
+
+def test_who_cites_it_finds_how() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert citation["license"] == project["license"]
+    assert [a["name"] for a in citation["authors"]] == [a["name"] for a in project["authors"]]
 
 
 def test_help_of_the_installed_wheel_loads_nothing_heavy(installed: Path, tmp_path: Path) -> None:

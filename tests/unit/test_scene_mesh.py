@@ -9,8 +9,15 @@ import pytest
 
 from pliant.algorithms.arrays import F32
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing import BlockMesh, MeshBlocks, TriangleMesh, TsdfParameters
-from pliant.algorithms.meshing.mesh_blocks import LAST_KEY, no_blocks
+from pliant.algorithms.meshing.mesh_blocks import (
+    LAST_KEY,
+    BlockMesh,
+    MeshBlocks,
+    TriangleMesh,
+    no_blocks,
+)
+from pliant.algorithms.meshing.parameters import TsdfParameters
+from pliant.fusion.live_mesh import LiveMesh
 from pliant.messages.mesh_pieces import split
 from pliant.messages.types import Header, MeshPiece, MeshUpdate
 from pliant.viewers.canvas import Canvas, Moment
@@ -116,9 +123,6 @@ def test_whoever_came_late_or_missed_some_has_all_after_a_turn(missed: slice) ->
 
 
 def test_a_turn_of_the_service_brings_all_and_takes_away_what_is_gone() -> None:
-    pytest.importorskip("open3d", reason="meshing needs open3d: pip install 'pliant[mesh]'")
-    from pliant.fusion.live_mesh import LiveMesh
-
     camera = PinholeCamera(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
     service = LiveMesh(0.1, camera, TsdfParameters(), again=3)
     _, service.held = grown()

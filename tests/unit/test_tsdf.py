@@ -6,23 +6,33 @@ from fusion_scene import CAMERA, PLANES, edge_uses, make_view, pose, rays, true_
 
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.meshing.marching_cubes_table import edge_corners, triangle_table
-from pliant.algorithms.meshing.mesh_blocks import TriangleMesh, weld
-from pliant.algorithms.meshing.tsdf_blocks import (
+from pliant.algorithms.meshing.marching_cubes import Tsdf, cube_table, extract_blocks
+from pliant.algorithms.meshing.mesh_blocks import (
     SIDE,
-    blocks_in_band,
-    find_rows,
-    make_table,
+    TriangleMesh,
     pack,
     sorted_keys,
     unpack,
+    weld,
+)
+from pliant.algorithms.meshing.tsdf_blocks import (
+    Scale,
+    VoxelSums,
+    find_rows,
+    make_table,
     with_neighbours,
 )
-from pliant.algorithms.meshing.tsdf_extract import TsdfArrays, extract_blocks
-from pliant.algorithms.meshing.tsdf_integrate import DISTANCE_UNITS, add_sight, blocks_in_view
-from pliant.algorithms.meshing.tsdf_pixels import WEIGHT_UNITS, intrinsics_of, pixel_planes
+from pliant.algorithms.meshing.tsdf_integrate import (
+    DISTANCE_UNITS,
+    WEIGHT_UNITS,
+    add_sight,
+    blocks_in_band,
+    blocks_in_view,
+    pixel_planes,
+)
 
 VOXEL, TRUNCATION = 0.05, 0.2
+SCALE = Scale(VOXEL, TRUNCATION)
 
 
 def lattice(keys: I32) -> F64:
@@ -44,12 +54,9 @@ def meshed(field: F64, weights: I32 | None = None) -> TriangleMesh:
 
     sums = np.rint(np.clip(field, -1.0, 1.0) * DISTANCE_UNITS * 1000).astype(np.int32)
     given = np.full(field.shape, 1000, np.int32) if weights is None else weights * 1000
-    tsdf = TsdfArrays(
-        table=make_table(keys), slots=np.arange(len(keys), dtype=np.int32),
-        distance_sums=blocks(sums), weight_sums=blocks(given.astype(np.int32)),
-        colour_sums=np.ones((len(keys), SIDE, SIDE, SIDE, 4), np.int32),
-        voxel=1.0, truncation=4.0, min_weight=1,
-    )  # fmt: skip
+    colours = np.ones((len(keys), SIDE, SIDE, SIDE, 4), np.int32)
+    held = VoxelSums(blocks(sums), blocks(given.astype(np.int32)), colours)
+    tsdf = Tsdf(make_table(keys), held, Scale(1.0, 4.0), min_weight=1)
     return weld(extract_blocks(keys[order], tsdf))
 
 
@@ -91,16 +98,16 @@ def test_each_pixel_is_the_plane_that_it_shows() -> None:
 def test_sums_are_those_of_plain_numpy(free_space: bool) -> None:
     view = make_view(3)
     pixels = pixel_planes(view.depth, view.weight, CAMERA)
-    K, T = intrinsics_of(CAMERA), view.T_world_camera
-    keys = with_neighbours(blocks_in_band(pixels.planes, pixels.depths, K, T, VOXEL, TRUNCATION))
+    T = view.T_world_camera
+    keys = with_neighbours(blocks_in_band(pixels, T, SCALE))
     N = len(keys)
     sums = np.zeros((N, 8, 8, 8), np.int32), np.zeros((N, 8, 8, 8), np.int32)
     colours = np.zeros((N, 8, 8, 8, 4), np.int32)
-    slots = np.random.default_rng(0).permutation(N).astype(np.int32)
+    rows = np.random.default_rng(0).permutation(N)
 
     def add(sign: int) -> None:
-        add_sight(keys, slots, inverse(T), K, pixels.planes, pixels.weights, view.colour,
-                  VOXEL, TRUNCATION, free_space, sign, *sums, colours)  # fmt: skip
+        add_sight(sign, keys, rows, pixels, view.colour, inverse(T), SCALE, free_space,
+                  VoxelSums(*sums, colours))  # fmt: skip
 
     add(1)
     points = transform(inverse(T), lattice(keys).reshape(-1, 3))
@@ -123,14 +130,14 @@ def test_sums_are_those_of_plain_numpy(free_space: bool) -> None:
     share = np.abs(px % 1.0 - 0.5).min(axis=1)
     close = (share < 1e-3) | (np.abs(np.abs(distance) - TRUNCATION) < 1e-4)
     close |= np.abs(behind - 2 * TRUNCATION) < 1e-3
-    weight_of = sums[1][slots].reshape(-1)
+    weight_of = sums[1][rows].reshape(-1)
     np.testing.assert_array_equal(weight_of[~close], weight[~close])
-    off = np.abs(sums[0][slots].reshape(-1) - weight * level)
+    off = np.abs(sums[0][rows].reshape(-1) - weight * level)
     assert np.all(off[~close] <= weight[~close])
     assert np.mean(off[~close] > 0) < 0.01
     near = np.where(distance < TRUNCATION, weight, 0)
     expected = near[:, None] * np.column_stack([view.colour[v, u], np.ones(len(u))])
-    np.testing.assert_array_equal(colours[slots].reshape(-1, 4)[~close], expected[~close])
+    np.testing.assert_array_equal(colours[rows].reshape(-1, 4)[~close], expected[~close])
     assert close.mean() < 0.05
     assert np.count_nonzero(weight) > 10_000
     add(-1)
@@ -142,26 +149,23 @@ def test_sums_are_those_of_plain_numpy(free_space: bool) -> None:
 def test_the_band_and_the_view_leave_out_no_voxel_near_the_surface() -> None:
     view = make_view(2)
     pixels = pixel_planes(view.depth, view.weight, CAMERA)
-    K, T = intrinsics_of(CAMERA), view.T_world_camera
-    band = blocks_in_band(pixels.planes, pixels.depths, K, T, VOXEL, TRUNCATION)
+    T = view.T_world_camera
+    band = blocks_in_band(pixels, T, SCALE)
     # The points of the surface, and those half a truncation in front and behind.
     for share in (-0.5, 0.0, 0.5):
         depth = view.depth + share * TRUNCATION * 0.7
         points = transform(T, (rays(CAMERA) * depth[..., None]).reshape(-1, 3))
         keys = sorted_keys(np.floor(points / VOXEL / SIDE + 0.5 / SIDE).astype(np.int32))
         assert np.mean(find_rows(make_table(band), keys) < 0) < 0.02
-    seen = blocks_in_view(band, inverse(T), K, pixels.furthest, CAMERA.width, CAMERA.height,
-                          VOXEL, TRUNCATION)  # fmt: skip
+    seen = blocks_in_view(band, pixels, inverse(T), SCALE)
     assert seen.all()
     turned = T @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    behind = blocks_in_view(band, inverse(turned), K, pixels.furthest, CAMERA.width,
-                            CAMERA.height, VOXEL, TRUNCATION)  # fmt: skip
+    behind = blocks_in_view(band, pixels, inverse(turned), SCALE)
     assert behind.mean() < 0.05
 
 
 def test_every_case_of_the_cube_joins_the_edges_that_it_cuts() -> None:
-    counts, triangles = triangle_table()
-    corners = edge_corners()
+    counts, triangles, corners = cube_table()
     for case in range(256):
         cut = {e for e in range(12) if (case >> corners[e, 0] ^ case >> corners[e, 1]) & 1}
         used = triangles[case, : counts[case]]

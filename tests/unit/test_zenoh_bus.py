@@ -151,7 +151,9 @@ def test_who_was_waited_for_is_known_and_for_how_long(endpoint: str) -> None:
         before_s = dict(sender.waited_s)
         thread, result = in_thread(lambda: sender.publish(topics.IMAGE, image(WINDOW)))
         with sender._changed:
-            waits = sender._changed.wait_for(lambda: "tracking" in sender._waiting.text, PATIENCE_S)
+            waits = sender._changed.wait_for(
+                lambda: "tracking" in sender._waits.now.text, PATIENCE_S
+            )
         assert waits
         taken = slow.receive(topics.IMAGE)
         for _ in range(WINDOW + 1):

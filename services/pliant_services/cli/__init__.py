@@ -6,26 +6,43 @@ import os
 import signal
 import sys
 from contextlib import suppress
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import typer
 
+from pliant import __version__
 from pliant.errors import PliantError, SourceLostError
 
 app = typer.Typer(
     name="pliant",
     no_args_is_help=True,
     add_completion=False,
+    context_settings={"max_content_width": 100},
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode=None,  # it would take [the defaults] in help texts for markup
     help="Trajectory, dense map and deforming surfaces from the video of one camera.\n\n"
-    "[bold]Examples[/bold]\n\n"
     "  pliant run built-in:room --output results/room\n\n"
     "  pliant run path/to/tum_sequence\n\n"
     "  pliant eval results/room --groundtruth path/to/groundtruth.txt\n\n"
     "Exit codes: 0 done, 1 error or failed check, 2 wrong usage, 3 finished without a map or with "
     "frames broken or missing, 130 interrupted.",
 )
+
+
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"pliant {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", is_eager=True, callback=_say_version, help="Say which it is."),
+    ] = False,
+) -> None:
+    """Take what comes before a command."""
 
 
 _FAILED, _USAGE, _INCOMPLETE, _INTERRUPTED = 1, 2, 3, 130

@@ -20,7 +20,10 @@ def view(
     session: Annotated[str, typer.Option(help="Name of the session at --connect.")] = "",
     tls: TlsFolder = None,
     web: Annotated[bool, typer.Option("--web", help="In a browser instead of a window.")] = False,
-    web_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of --web.")] = 9090,
+    web_port: Annotated[
+        int | None,
+        typer.Option(min=1, max=65535, help="Port of --web [9090, or one that is free]."),
+    ] = None,
     save: Annotated[Path | None, typer.Option(help="Into an .rrd file instead.")] = None,
     patience: Annotated[
         float, typer.Option(hidden=True, help="Seconds to wait for a session that is to start.")

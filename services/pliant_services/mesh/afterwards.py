@@ -58,7 +58,7 @@ def add_mesh(output: Path) -> None:
 
 
 def mesh_into_recording(output: Path) -> None:
-    """Mesh here and now; the recording has one part more.  Raises RecordingError, FusionError."""
+    """Mesh here and now; the recording has one part more.  Raises RecordingError."""
     path = output / RECORDING_NAME
     recording, summary = Recording(path), summarise(path)
     folder = folder_of_parts(path)

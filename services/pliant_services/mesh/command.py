@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from pliant.algorithms.geometry import pose_to_matrix
-from pliant.algorithms.meshing import BlockMesh
+from pliant.algorithms.meshing.mesh_blocks import BlockMesh
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, recorded_config
 from pliant.errors import RecordingError
 from pliant.files import write_whole
 from pliant.fusion.memory import check_voxel_sizes
-from pliant.fusion.open3d_import import require_open3d
 from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.topics import Topic
@@ -95,7 +94,6 @@ def run_mesh(
     output = output or _beside(recording.resolve().parent)
     keep_apart(output, [recording, *parts_of(recording)])
     config = recorded_config(summarise(recording).metadata, overrides)
-    require_open3d()
     with written(output, force=force):
         found = mesh_recording(recording, config)
         yield from dict.fromkeys(found.notes)
@@ -114,9 +112,8 @@ def run_mesh(
             f"{mesh['vertices']} vertices, voxel {mesh['voxel_size']:.4g}"
         )
     if not found.pieces:
-        raise RecordingError(
-            f"{recording}: no keyframe has a surface: {' '.join(found.notes[-1:])}"
-        )
+        why = found.notes[-1] if found.notes else "it has no keyframes"
+        raise RecordingError(f"{recording}: no mesh: {why}")
     yield f"results in {output}/"
 
 

@@ -14,7 +14,6 @@ from pliant.bus.base import Bus, join, receive, receive_one
 from pliant.config import Config
 from pliant.fusion.keyframe_spool import KeyframeSpool
 from pliant.fusion.mesher import LiveChange, Mesher
-from pliant.fusion.open3d_import import require_open3d
 from pliant.messages import topics
 from pliant.messages.mesh_pieces import split
 from pliant.messages.types import (
@@ -30,7 +29,6 @@ from pliant_services.runtime.monitor import Monitor
 
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     """Mesh until the map ends."""
-    require_open3d()
     stream = receive_one(bus, topics.STREAM, CameraStream)
     is_live = stream.mode == "live"
     with KeyframeSpool() as spool:

@@ -33,9 +33,8 @@ from pliant.results.write import write_results
 from pliant_services.mesh.afterwards import add_mesh
 from pliant_services.nodes.ingest import plays_live
 from pliant_services.processes import PROFILES, deformable_fleet, inputs_of, reads_depth
-from pliant_services.run.mesh_check import WITH_MESH, choose_profile
 from pliant_services.run.progress import Progress
-from pliant_services.run.spectators import announced, check_viewer, viewer
+from pliant_services.run.spectators import Viewer, announced, check_viewer
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.launcher import Fleet
 
@@ -75,11 +74,16 @@ def run_pipeline(request: RunRequest) -> int:
     keep_apart(output, read)
     if request.save is not None:
         keep_apart(request.save, [*read, *files_read(output)], option="--save")
-    with written(output, force=request.force or request.resume):
-        return _run_into(output, request)
+    web, looked_on = request.view == "web", bool(request.view or request.save)
+    with Viewer(web=web, save=request.save) if looked_on else nullcontext() as viewer:
+        with written(output, force=request.force or request.resume):
+            code = _run_into(output, request, viewer)
+        if viewer is not None and code != INTERRUPTED:
+            viewer.stay()  # the results are there
+        return code
 
 
-def _run_into(output: Path, request: RunRequest) -> int:
+def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
     config = load_config(request.config_file, request.overrides, seed=request.seed)
     profile = request.profile
     state = output / STATE_FOLDER if request.on_crash == "restart" or request.resume else None
@@ -101,12 +105,10 @@ def _run_into(output: Path, request: RunRequest) -> int:
     if profile == _DEFORMABLE:
         profile = deformable_fleet(config)
     else:
-        profile, without_mesh = choose_profile(config)
-        if without_mesh:
-            progress.say(without_mesh)
-        if profile == WITH_MESH:
+        profile = "rigid" if config.meshing.enabled else "points"
+        if profile == "rigid":
             check_voxel_sizes(Rectifier(dataset.calibration).camera, config.meshing.tsdf)
-    mesh_afterwards = state is not None and profile == WITH_MESH
+    mesh_afterwards = state is not None and profile == "rigid"
     services = PROFILES["points" if mesh_afterwards else profile]
     if request.resume and _has_ended(output, services, config):
         progress.say("the run had come to its end already: what follows from it is written again")
@@ -124,7 +126,7 @@ def _run_into(output: Path, request: RunRequest) -> int:
             port=request.port,
             state=state,
         )
-        interrupted, failure = _go_through(request, config, output, fleet, progress)
+        interrupted, failure = _go_through(request, config, output, fleet, progress, viewer)
     if failure is None and mesh_afterwards and parts.exists(output / RECORDING_NAME):
         progress.say("meshing what was recorded ...")
         try:
@@ -139,7 +141,12 @@ def _run_into(output: Path, request: RunRequest) -> int:
 
 
 def _go_through(
-    request: RunRequest, config: Config, output: Path, fleet: Fleet, progress: Progress
+    request: RunRequest,
+    config: Config,
+    output: Path,
+    fleet: Fleet,
+    progress: Progress,
+    viewer: Viewer | None,
 ) -> tuple[bool, PliantError | None]:
     """Start the services and wait for their end: whether it was Ctrl-C, and what went wrong."""
     try:
@@ -148,16 +155,16 @@ def _go_through(
         warm_up.compile_kernels(progress.say)  # whatever ends it, an earlier result is as it was
         if not request.resume:
             prepare(output, config_yaml(config))
-        looking_on = (
-            viewer(fleet, web=request.view == "web", save=request.save)
-            if request.view or request.save
-            else nullcontext()
-        )
         try:
-            with announced(output, fleet.endpoint, fleet.session), looking_on, progress:
+            with announced(output, fleet.endpoint, fleet.session), progress:
+                if viewer is not None:
+                    viewer.start(fleet)
                 fleet.start(lambda name: service_arguments(name, request, output))
                 progress.say(f"services are up; look on: pliant view {output}")
-                return _wait(fleet, progress), None
+                interrupted = _wait(fleet, progress)
+                if viewer is not None:
+                    viewer.see_the_end(fleet)
+                return interrupted, None
         except KeyboardInterrupt:
             return True, None
         except PliantError as error:

@@ -44,34 +44,55 @@ def check_viewer(output: Path, *, web: bool, save: Path | None, force: bool) -> 
         raise ResultError("Rerun is not installed: pip install 'pliant[view]'")
 
 
-@contextmanager
-def viewer(fleet: Fleet, *, web: bool, save: Path | None) -> Generator[None]:
-    """A ``pliant view`` of its own that is there before the first frame.
+class Viewer:
+    """A ``pliant view`` of its own.  A context manager: leaving it ends the viewer."""
 
-    One in a browser stays when the run is over, until Ctrl-C.  Raises ResultError where it does
-    not come up.
-    """
-    command = [
-        *(sys.executable, "-m", "pliant_services.cli", "view"),
-        *("--connect", fleet.endpoint, "--session", fleet.session, "--patience", str(_WAIT_S)),
-        *(["--web"] if web else []),
-        *(["--save", str(save), "--force"] if save is not None else []),
-    ]
-    # In a session of its own: Ctrl-C is for the launcher, and the viewer sees the run to its end.
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
-    try:
+    def __init__(self, *, web: bool, save: Path | None) -> None:
+        self._web = web
+        self._where = ["--web"] if web else []
+        self._where += ["--save", str(save), "--force"] if save is not None else []
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> "Viewer":
+        return self
+
+    def start(self, fleet: Fleet) -> None:
+        """Start it and wait until it is there: before the first frame.
+
+        Raises ResultError where it does not come up.
+        """
+        command = [
+            *(sys.executable, "-m", "pliant_services.cli", "view"),
+            *("--connect", fleet.endpoint, "--session", fleet.session, "--patience", str(_WAIT_S)),
+            *self._where,
+        ]
+        # In a session of its own: Ctrl-C is for the launcher, and it sees the run to its end.
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
         waited = 0.0
         while not fleet.wait_for_viewer(0.2):
             waited += 0.2
-            if process.poll() is not None or waited > _START_S:
+            if self._process.poll() is not None or waited > _START_S:
                 raise ResultError("the viewer did not start; what it said stands above")
-        yield
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(None if web else _LAST_WORDS_S)
-    finally:
-        if process.poll() is None:
-            process.terminate()
+
+    def see_the_end(self, fleet: Fleet) -> None:
+        """Wait until it has drawn what the services said last, and has written its file."""
+        if self._web:
+            fleet.wait_for_last_viewer(_LAST_WORDS_S)
+        elif self._process is not None:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(_LAST_WORDS_S)
+
+    def stay(self) -> None:
+        """Leave what a browser shows where it is until Ctrl-C; a window stays by itself."""
+        if self._web and self._process is not None and self._process.poll() is None:
+            with suppress(KeyboardInterrupt):
+                print("the browser's view stays until Ctrl-C", file=sys.stderr, flush=True)
+                self._process.wait()
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
             with suppress(subprocess.TimeoutExpired):  # one that is stopped would never leave
-                process.wait(_LEAVE_S)
-            process.kill()
-            process.wait()
+                self._process.wait(_LEAVE_S)
+            self._process.kill()
+            self._process.wait()

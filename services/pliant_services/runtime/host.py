@@ -89,6 +89,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
         inputs=processes.inputs_of(name, options.fleet, images=images),
         outputs=processes.readers_of(name, options.fleet, images=images),
         window=config.bus.window,
+        window_bytes=config.bus.window_mib << 20,
         patience_s=config.bus.patience_s if options.patience_s is None else options.patience_s,
         checkpoints=checkpoints,
         keeps_books=process.observer and restartable,

@@ -111,6 +111,10 @@ class Fleet:
         """Wait until somebody looks on, or the time is over."""
         return self._relay.wait_for_viewer(timeout_s)
 
+    def wait_for_last_viewer(self, timeout_s: float) -> bool:
+        """Wait until nobody looks on any more, or the time is over."""
+        return self._relay.wait_for_last_viewer(timeout_s)
+
     @property
     def pids(self) -> dict[str, int]:
         """Process ids by name, of those that have been started."""

@@ -41,6 +41,8 @@ class Relay:
         self._viewers: set[str] = set()
         self._arrived = threading.Event()
         self._seen = threading.Event()
+        self._alone = threading.Event()
+        self._alone.set()
         self._stopping = threading.Event()
         self._camera: tuple[bytes, bytes] | None = None
         self._held: list[Any] = [
@@ -55,6 +57,10 @@ class Relay:
     def wait_for_viewer(self, timeout_s: float) -> bool:
         """Wait until the first viewer has come; False where none does in time."""
         return self._seen.wait(timeout_s)
+
+    def wait_for_last_viewer(self, timeout_s: float) -> bool:
+        """Wait until the last viewer has left; False where one is still there by then."""
+        return self._alone.wait(timeout_s)
 
     def know_camera(self, camera: tuple[bytes, bytes]) -> None:
         """What the session has told of its camera, as it came."""
@@ -78,9 +84,12 @@ class Relay:
         name = str(sample.key_expr)
         if sample.kind == zenoh.SampleKind.PUT:
             self._viewers.add(name)
+            self._alone.clear()
             self._seen.set()
         else:
             self._viewers.discard(name)
+            if not self._viewers:
+                self._alone.set()
         self._arrived.set()
 
     def _run(self) -> None:

@@ -43,7 +43,7 @@ class ViewRequest:
     web: bool = False
     save: Path | None = None
     force: bool = False
-    web_port: int = 9090
+    web_port: int | None = None
     patience_s: float = 0.0
 
 

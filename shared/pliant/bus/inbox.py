@@ -5,6 +5,7 @@ one that comes too early is passed over too, and asked for again.  A state machi
 clock.
 """
 
+import sys
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -17,13 +18,15 @@ _WHY_CHARACTERS = 120
 class Inbox:
     """The messages of one topic that wait to be taken.
 
-    taken: messages taken so far, and so the number of the next.     limit: of messages that wait;
-    a sender never has more than its window on the way, so more are not from one of ours.
+    taken: messages taken so far, and so the number of the next.     limit, limit_bytes: of messages
+    that wait, one alone may be larger; a sender never has more than its window on the way, so more
+    are not from one of ours.
     repeated, early, refused: counts of messages passed over.     why: the last was refused.
     gap: something is missing, to be asked for.
     """
 
     limit: int
+    limit_bytes: int = sys.maxsize
     taken: int = 0
     repeated: int = 0
     early: int = 0
@@ -31,20 +34,24 @@ class Inbox:
     why: str = ""
     gap: bool = False
     waiting: deque[Received] = field(default_factory=deque[Received])
+    _bytes: int = 0
 
     @property
     def next_sequence(self) -> int:
         """The number of the message that fits behind those that wait."""
         return self.taken + len(self.waiting)
 
-    def is_next(self, sequence: int) -> bool:
-        """Whether a message with this number is the one to ``put``; others are counted."""
+    def is_next(self, sequence: int, size: int) -> bool:
+        """Whether a message with this number, of so many bytes, is the one to ``put``; others are
+        counted."""
         if sequence < self.next_sequence:
             self.repeated += 1
         elif sequence > self.next_sequence:
             self.early += 1
             self.gap = True
-        elif len(self.waiting) >= self.limit:
+        elif self.waiting and (
+            len(self.waiting) >= self.limit or self._bytes + size > self.limit_bytes
+        ):
             self.refuse("beyond its credit")
         else:
             return True
@@ -59,16 +66,19 @@ class Inbox:
         """The first that waits is not what it must be: what really has its number comes again."""
         self.refuse(why)
         self.waiting.clear()
+        self._bytes = 0
         self.gap = True
 
     def put(self, received: Received) -> None:
         """Append the next message."""
         self.waiting.append(received)
+        self._bytes += len(received.data)
         self.gap = False
 
     def take(self) -> Received:
         """The next message."""
         received = self.waiting.popleft()
+        self._bytes -= len(received.data)
         self.taken += 1
         return received
 
@@ -76,4 +86,5 @@ class Inbox:
         """Go on behind ``taken`` messages; what waited will come again."""
         self.taken = taken
         self.waiting.clear()
+        self._bytes = 0
         self.gap = False

@@ -13,11 +13,9 @@ from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.bus.faults import FaultLog
 from pliant.bus.health import health_key, health_of
 from pliant.bus.links import IF_OLD, NOTHING, NOW, InLink, OutLink, Shared
-from pliant.bus.peers import Peers
-from pliant.bus.waiting import Waiting
+from pliant.bus.waiting import TICK_S, Waiting
 from pliant.messages import codec
 
-TICK_S = 1.0
 _ASK_AGAIN_S = 0.1  # what was asked for takes a while, and whoever sends nonsense asks for nothing
 
 
@@ -30,7 +28,6 @@ class Keeper:
     """
 
     shared: Shared
-    peers: Peers
     waiting: Waiting
     inputs: Mapping[str, InLink]
     outputs: Mapping[str, OutLink]
@@ -45,7 +42,7 @@ class Keeper:
     _place: Place = field(default_factory=lambda: Place(-1, {}, {}))
 
     def __post_init__(self) -> None:
-        self._fault_log = FaultLog(self.peers.service)
+        self._fault_log = FaultLog(self.shared.peers.service)
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
@@ -71,7 +68,7 @@ class Keeper:
     def tell(self, entry: InLink, ask: int = NOTHING) -> None:
         """Tell a sender our counts."""
         if self.restored:  # before that, what we took is not ours
-            entry.tell(self.shared.incarnation, ask)
+            entry.tell(self.shared.peers.incarnation, ask)
 
     def all_is_safe(self) -> None:
         """We are done: no sender needs to keep anything for us."""
@@ -92,15 +89,15 @@ class Keeper:
             self.on_fault(fault)
 
     def _strangers(self) -> list[str]:
-        told, self._strangers_told = self._strangers_told, len(self.peers.strangers)
-        return list(self.peers.strangers.values())[told:]
+        told, self._strangers_told = self._strangers_told, len(self.shared.peers.strangers)
+        return list(self.shared.peers.strangers.values())[told:]
 
     def _run(self) -> None:
         try:
             self._keep()
         except Exception as error:  # whatever it is: the service's thread raises it
             with self.shared.changed:
-                self.peers.failure = error
+                self.shared.peers.failure = error
                 self.shared.changed.notify_all()
 
     def _keep(self) -> None:
@@ -135,7 +132,9 @@ class Keeper:
         shared = self.shared
         with shared.changed:
             waiting = self.waiting.told(time.monotonic())
-            health = health_of(self.peers.service, shared.incarnation, waiting, inputs, outputs)
+            health = health_of(
+                self.shared.peers.service, shared.peers.incarnation, waiting, inputs, outputs
+            )
         self.tell_faults()
         shared.session.put(f"{shared.prefix}/{health_key(health.service)}", codec.encode(health))
 

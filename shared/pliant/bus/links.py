@@ -13,6 +13,7 @@ import zenoh
 from pliant.bus.base import Received, Window
 from pliant.bus.inbox import Inbox
 from pliant.bus.outbox import Numbered, Outbox
+from pliant.bus.peers import Peers
 from pliant.errors import MessageError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
@@ -31,7 +32,6 @@ class Shared:
     """What the links of one bus share.
 
     changed: the lock, and who waits for something to change.     wake: rouses the keeper.
-    incarnation: our own.    is_known: whether a service has been announced with an incarnation.
     arrivals: messages that have come, over all topics.
     """
 
@@ -39,8 +39,7 @@ class Shared:
     prefix: str
     changed: threading.Condition
     wake: threading.Event
-    incarnation: int
-    is_known: Callable[[str, int], bool]
+    peers: Peers
     arrivals: int = 0
 
 
@@ -53,10 +52,10 @@ class InLink:
     asked_at: when we asked for what is missing.
     """
 
-    def __init__(self, shared: Shared, topic: Topic, sender: str, *, reader: str, limit: int):
+    def __init__(self, shared: Shared, topic: Topic, sender: str, *, reader: str, limit: Window):
         self.topic = topic
         self.sender = sender
-        self.box = Inbox(limit)
+        self.box = Inbox(limit.messages, limit.size)
         self.safe = self.told = 0
         self.asked_at = float("-inf")
         self.wanted = self.arrived = self.ended = False
@@ -85,11 +84,11 @@ class InLink:
             self._refuse(f"kind {kind}, {size} bytes")
             return
         with shared.changed:
-            if not shared.is_known(self.sender, incarnation):
+            if not shared.peers.is_known(self.sender, incarnation):
                 self.box.refuse("of a start of its sender that was not announced")
                 return
             known_gap = self.box.gap
-            if not self.box.is_next(sequence):
+            if not self.box.is_next(sequence, size):
                 if self.box.gap and not known_gap:
                     shared.wake.set()
                 return
@@ -123,12 +122,19 @@ class OutLink:
         topic: Topic,
         readers: Sequence[str],
         *,
-        window: int,
+        window: Window,
         windows: Mapping[str, Window],
         lags: Mapping[str, Window],
     ) -> None:
         self.topic = topic
-        self.box = Outbox(topic.key, readers, window=window, windows=windows, lags=lags)
+        self.box = Outbox(
+            topic.key,
+            readers,
+            window=window.messages,
+            window_bytes=window.size,
+            windows=windows,
+            lags=lags,
+        )
         self.ended = False
         self.sent_at_tick = 0
         self._sending = threading.Lock()
@@ -155,7 +161,7 @@ class OutLink:
                 self._put(message)
 
     def _put(self, message: Numbered) -> None:
-        attachment = ENVELOPE.pack(message.sequence, self._shared.incarnation, message.kind)
+        attachment = ENVELOPE.pack(message.sequence, self._shared.peers.incarnation, message.kind)
         self._publisher.put(message.payload, attachment=attachment)
 
     def _on_credit(self, sample: zenoh.Sample) -> None:
@@ -168,7 +174,7 @@ class OutLink:
                 self.box.refused += 1
                 return
             incarnation, taken, safe, ask = _CREDIT.unpack(payload)
-            if ask > NOW or not shared.is_known(reader, incarnation):
+            if ask > NOW or not shared.peers.is_known(reader, incarnation):
                 self.box.refused += 1
                 return
             came_back = self.box.credit(reader, incarnation, taken, safe)

@@ -8,6 +8,7 @@ restarts from a checkpoint says the position of that checkpoint; the recorder sa
 disk.  A state machine: no socket, no clock.
 """
 
+import sys
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
@@ -49,12 +50,15 @@ class Outbox:
         readers: Sequence[str],
         *,
         window: int,
+        window_bytes: int = sys.maxsize,
         windows: Mapping[str, Window] | None = None,
         lags: Mapping[str, Window] | None = None,
     ) -> None:
-        """window: messages on the way to a reader.  windows: of readers that make safe seldom,
-        by name, what is kept for each of them.  lags: of readers with messages that take no room
-        in the window, what may be on the way to them with these.
+        """window, window_bytes: on the way to a reader; one larger goes alone.
+
+        windows: of readers that make safe seldom, by name, what is kept for each of them.
+        lags: of readers with messages that take no room in the window, what may be on the way to
+        them with these.
         """
         self.topic = topic
         self.readers = {name: Reader() for name in readers}
@@ -62,7 +66,7 @@ class Outbox:
         self.refused = 0
         """Credits that no reader of ours can have given."""
         self._bytes = 0  # of all messages so far
-        self._window = window
+        self._window, self._window_bytes = window, window_bytes
         self._windows = {name: w for name, w in (windows or {}).items() if name in self.readers}
         self._lags = {name: lag for name, lag in (lags or {}).items() if name in self.readers}
         self._kept: deque[Numbered] = deque()
@@ -135,11 +139,11 @@ class Outbox:
 
     def _is_behind(self, name: str, size: int, may_lag: Collection[str]) -> bool:
         reader, behind = self.readers[name], self.untaken(name)
+        on_the_way = self._bytes_from(reader.taken) + size if behind else 0
         if name not in may_lag or name not in self._lags:
-            return behind - self._light(reader) >= self._window
+            return behind - self._light(reader) >= self._window or on_the_way > self._window_bytes
         lag = self._lags[name]
-        too_large = behind > 0 and self._bytes_from(reader.taken) + size > lag.size
-        return too_large or behind >= max(lag.messages, self._window)
+        return on_the_way > lag.size or behind >= max(lag.messages, self._window)
 
     def _bytes_from(self, sequence: int) -> int:
         """Bytes kept of the messages from a number on: in every send, so no sum over them."""

@@ -19,6 +19,7 @@ Callbacks only append to queues and notify: no Zenoh call is ever made inside on
 own (``keeper.py``) tells counts once a second and sends again.
 """
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -28,12 +29,12 @@ import zenoh
 
 from pliant.bus.base import Received, Window
 from pliant.bus.checkpoints import Checkpoints, Place
-from pliant.bus.keeper import TICK_S, Keeper
-from pliant.bus.links import DATA, END, InLink, OutLink, Shared, first_arrived
+from pliant.bus.keeper import Keeper
+from pliant.bus.links import DATA, END, InLink, OutLink, Shared
 from pliant.bus.peers import Peers, token_key
 from pliant.bus.session import Identity, open_session
-from pliant.bus.waiting import Waiting
-from pliant.errors import BusError, MessageError
+from pliant.bus.waiting import Waits
+from pliant.errors import MessageError
 from pliant.messages import codec
 from pliant.messages.topics import Topic
 from pliant.messages.types import Header, StreamEnd
@@ -41,8 +42,6 @@ from pliant.state import load_state, save_state
 
 STOP_KEY = "control/stop"
 OVER_KEY = "control/over"
-_LAST_CREDITS_S = 2.0
-_SEEING_OFF_S = 5.0
 
 
 class ZenohBus:
@@ -57,6 +56,7 @@ class ZenohBus:
         inputs: Mapping[Topic, str],
         outputs: Mapping[Topic, Sequence[str]],
         window: int,
+        window_bytes: int = sys.maxsize,
         patience_s: float = 0.0,
         checkpoints: Checkpoints | None = None,
         keeps_books: bool = False,
@@ -74,7 +74,7 @@ class ZenohBus:
         session: name that keeps two runs on one network apart.     service: our own name.
         inputs: each topic that we read, with the service that publishes it.
         outputs: each topic that we publish, with the services that must read every message.
-        window: how many messages may be on the way to the slowest of those.
+        window, window_bytes: how much may be on the way to the slowest of those.
         patience_s: how long a peer may be away.
         checkpoints: where our state is kept; ``restore`` must come before the first message then.
         keeps_books: we know ourselves what we have; ``start_from`` must come first then.
@@ -89,48 +89,42 @@ class ZenohBus:
         here yet, for whom we would wait for ever.
         Raises BusError when no endpoint answers.
         """
-        self._patience_s = patience_s
         lags = lags or {}
-        own_lag = lags[service].messages if service in lags else 0
+        own_lag = lags.get(service, Window(0, 0))
         # Who may lag is waited for by what it has told: it tells all.
-        self._tell_every = 1 if own_lag else max(1, window // 4)
+        self._tell_every = 1 if service in lags else max(1, window // 4)
         self._checkpoints = checkpoints
         self._packed = frozenset(packed)
         self._disturb = disturb or (lambda: None)
-        self._interrupted = interrupted or (lambda: False)
         self._changed = threading.Condition()
         self._wake = threading.Event()
-        self._waiting = Waiting()
         needed = {name for readers in outputs.values() for name in readers} | set(inputs.values())
         self._peers = Peers(service, time.time_ns(), needed)
+        self._waits = Waits(self._changed, self._peers, patience_s, interrupted or (lambda: False))
         self._session = open_session(endpoints, identity)
         self._prefix = f"pliant/{session}"
         self.stop_requested = False
         """Whether somebody has asked the session to end (``pliant stop``)."""
-        self.waited_s: dict[str, float] = {}
-        """How long each reader was waited for, by its name."""
-        shared = Shared(
-            self._session,
-            self._prefix,
-            self._changed,
-            self._wake,
-            self._peers.incarnation,
-            self._peers.is_known,
-        )
+        shared = Shared(self._session, self._prefix, self._changed, self._wake, self._peers)
         self._outputs = {
             topic.key: OutLink(
-                shared, topic, readers, window=window, windows=windows or {}, lags=lags
+                shared,
+                topic,
+                readers,
+                window=Window(window, window_bytes),
+                windows=windows or {},
+                lags=lags,
             )
             for topic, readers in outputs.items()
         }
+        limit = Window(2 * window + own_lag.messages, 2 * window_bytes + own_lag.size)
         self._inputs = {
-            topic.key: InLink(shared, topic, sender, reader=service, limit=2 * window + own_lag)
+            topic.key: InLink(shared, topic, sender, reader=service, limit=limit)
             for topic, sender in inputs.items()
         }
         self._keeper = Keeper(
             shared,
-            self._peers,
-            self._waiting,
+            self._waits.now,
             self._inputs,
             self._outputs,
             checkpoints,
@@ -171,10 +165,15 @@ class ZenohBus:
         with self._changed:
             return self._outputs[topic.key].box.untaken(reader)
 
+    @property
+    def waited_s(self) -> Mapping[str, float]:
+        """How long each reader was waited for so far, by its name."""
+        return self._waits.spent_s
+
     def wait_until_taken(self, topic: Topic) -> None:
         """Wait until all readers, but those that may lag, have taken all that was sent."""
         output = self._outputs[topic.key]
-        self._wait_for_readers(output, output.box.behind)
+        self._waits.for_readers(output, output.box.behind)
 
     def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
         """Send one message, once every required reader is within the window.
@@ -220,7 +219,7 @@ class ZenohBus:
         """Wait until the required readers will never ask for any of what was sent."""
         for output in self._outputs.values():
             if output.box.sent:
-                self._wait_for_readers(output, output.box.not_safe)
+                self._waits.for_readers(output, output.box.not_safe)
 
     def see_off(self) -> None:
         """Once all that we sent is safe, stay until our senders have left, some seconds at most.
@@ -230,13 +229,7 @@ class ZenohBus:
         """
         self.flush()
         self._keeper.all_is_safe()
-        deadline = time.monotonic() + _SEEING_OFF_S
-        senders = {entry.sender for entry in self._inputs.values()}
-        with self._changed:
-            while len(self._peers.missing(senders)) < len(senders):
-                if time.monotonic() >= deadline:
-                    return
-                self._changed.wait(TICK_S)  # the keeper tells our counts again meanwhile
+        self._waits.for_departures({entry.sender for entry in self._inputs.values()})
 
     def _send(
         self, output: OutLink, kind: int, payload: bytes, may_lag: Collection[str] = ()
@@ -244,37 +237,8 @@ class ZenohBus:
         if output.ended:
             raise ValueError(f"{output.topic.key} was published after its end")
         self._disturb()
-        self._wait_for_readers(output, lambda: output.box.full(len(payload), may_lag))
+        self._waits.for_readers(output, lambda: output.box.full(len(payload), may_lag))
         output.send(kind, payload, may_lag)
-
-    def _wait_for_readers(self, output: OutLink, lacking: Callable[[], list[str]]) -> None:
-        """Wait while there is a reader that lacks something."""
-        readers = output.box.readers.keys()
-        with self._changed:
-            while True:
-                self._peers.raise_if_refused()
-                here = self._peers.seen(readers)
-                names = lacking() if here else self._peers.missing(readers)
-                if here and not names:
-                    self._waiting.end()
-                    return
-                patience_s = max(self._patience_s, _LAST_CREDITS_S)  # credits may be on the way
-                lost = self._peers.lost(readers, patience_s=patience_s, now=time.monotonic())
-                if here and lost:
-                    raise BusError(
-                        f"{lost[0]} went away with {output.box.on_the_way()} messages of "
-                        f"{output.topic.key} unread"
-                    )
-                whom = self._peers.absent(readers) or ", ".join(names)
-                self._waiting.begin(f"{whom} to take {output.topic.key}", time.monotonic())
-                # Those who are there already are seen within a tick.
-                waits_long = time.monotonic() - self._waiting.since >= TICK_S
-                if not here and waits_long and self._interrupted():
-                    raise KeyboardInterrupt
-                began = time.monotonic()
-                self._changed.wait(TICK_S)
-                for name in names:
-                    self.waited_s[name] = self.waited_s.get(name, 0.0) + time.monotonic() - began
 
     # -- receiving -----------------------------------------------------------------------------
 
@@ -337,7 +301,7 @@ class ZenohBus:
         self._disturb()
         deadline = time.monotonic() + timeout_s if timeout_s is not None else None
         while True:
-            entry = self._wait_for_message(entries, deadline)
+            entry = self._waits.for_message(entries, deadline)
             if entry is None:
                 return None
             try:
@@ -348,33 +312,11 @@ class ZenohBus:
                 self._wake.set()
                 continue
             with self._changed:
-                self._waiting.end()
+                self._waits.now.end()
                 for other in entries:
                     other.wanted = False
                 entry.box.take()
             return received
-
-    def _wait_for_message(self, entries: Sequence[InLink], deadline: float | None) -> InLink | None:
-        """The input whose message came first; None where none comes in time.  Raises BusError."""
-        with self._changed:
-            self._peers.raise_if_failed()
-            while not any(entry.box.waiting for entry in entries):
-                self._peers.raise_if_refused()
-                senders = [entry.sender for entry in entries]
-                now = time.monotonic()
-                lost = self._peers.lost(senders, patience_s=self._patience_s, now=now)
-                if lost:
-                    keys = ", ".join(e.topic.key for e in entries if e.sender == lost[0])
-                    raise BusError(f"{lost[0]} went away before the end of {keys}")
-                if deadline is not None and now >= deadline:
-                    return None
-                for entry in entries:
-                    entry.wanted = True
-                whom = self._peers.absent(senders) or ", ".join(dict.fromkeys(senders))
-                what = entries[0].topic.key if len(entries) == 1 else f"{len(entries)} topics"
-                self._waiting.begin(f"{what} from {whom}", now)
-                self._changed.wait(TICK_S if deadline is None else min(TICK_S, deadline - now))
-            return first_arrived(entries)
 
     # -- checkpoints ---------------------------------------------------------------------------
 
@@ -390,7 +332,7 @@ class ZenohBus:
             with self._changed:
                 self._peers.expect((r for o in outputs for r in o.box.readers), time.monotonic())
         for output in outputs:
-            self._wait_for_readers(output, output.box.silent)
+            self._waits.for_readers(output, output.box.silent)
         with self._changed:
             place = self._checkpoints.usable({o.topic.key: o.box.safe() for o in outputs})
         state = None

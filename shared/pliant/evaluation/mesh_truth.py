@@ -6,7 +6,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing import view_mesh
+from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.evaluation.criteria import Similarity
 from pliant.evaluation.surface_distance import sample_surface, share_within, thin_out
 from pliant.evaluation.visible_depth import DepthView

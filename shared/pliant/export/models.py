@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import U8
-from pliant.algorithms.meshing import TriangleMesh
 from pliant.algorithms.meshing.corrected_view import corrected_view
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.datasets import Rectifier, calibration_from_yaml
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import Calibration, calibration_yaml

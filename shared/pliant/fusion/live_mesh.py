@@ -10,10 +10,11 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.meshing import BlockMesh, DepthMap, MeshBlocks, TsdfParameters
-from pliant.algorithms.meshing.mesh_blocks import LAST_KEY, no_blocks
+from pliant.algorithms.meshing.mesh_blocks import LAST_KEY, BlockMesh, MeshBlocks, no_blocks
+from pliant.algorithms.meshing.parameters import TsdfParameters
+from pliant.algorithms.meshing.rendering import DepthMap
+from pliant.algorithms.meshing.tsdf_volume import TsdfVolume
 from pliant.algorithms.stages import StageTimer
-from pliant.fusion.volume import TsdfVolume
 
 _SPARSE = 8
 """Every so many pixels give a keyframe's median depth."""
@@ -52,7 +53,7 @@ class LiveMesh:
     ) -> None:
         """Put a keyframe in, in place of its preview where there is one.
 
-        Raises VolumeMemoryError where there is no room; the keyframe is not in the volume then.
+        Raises VolumeFullError where there is no room; the keyframe is not in the volume then.
         """
         self.take_out(keyframe)
         put = self.volume.integrate(
@@ -85,7 +86,7 @@ class LiveMesh:
             # A turn by an angle moves what lies at that depth by the chord.
             chord = math.sqrt(max(0.0, 3.0 - float(np.trace(T_old_new[:3, :3]))))
             off = float(np.linalg.norm(T_old_new[:3, 3])) + preview.median_depth * chord
-            if off >= self.volume.voxel_size:
+            if off >= self.volume.scale.voxel:
                 found.append(keyframe)
         return found
 

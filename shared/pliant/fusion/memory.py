@@ -1,4 +1,4 @@
-"""What a volume will need at the least, known from the camera alone before anything is fused.
+"""What a volume needs: at the least, from the camera alone before anything is fused; and in all.
 
 Voxels are shares of the scene's median depth, so the scale of the scene does not matter: a keyframe
 sees, at the median depth 1, an area of (width / fx) x (height / fy), and surface takes the blocks
@@ -8,17 +8,20 @@ of SIDE voxels through the band of the truncation.
 import math
 
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing.tsdf_blocks import SIDE
-from pliant.algorithms.meshing.tsdf_parameters import TsdfParameters
-from pliant.fusion.open3d_import import FusionError
+from pliant.algorithms.meshing.mesh_blocks import SIDE
+from pliant.algorithms.meshing.parameters import TsdfParameters
+from pliant.algorithms.meshing.tsdf_blocks import BLOCK_BYTES
+from pliant.errors import PliantError
 
-BLOCK_BYTES = SIDE**3 * 4 * 6
-"""Six int32 a voxel: see ``tsdf_integrate``."""
+_GROWTH = 0.6
+"""Of surface, blocks grow with one over the voxel squared; at its borders more slowly."""
+_MARGIN = 1.05
+"""On a voxel that is said to fit."""
 SCENE_VIEWS = 20
 """Views' worth of blocks of a scene: the built-in ones and RedKitchen take 9 to 20."""
 
 
-class VoxelSizeError(FusionError):
+class VoxelSizeError(PliantError):
     """A voxel size that one keyframe's view alone cannot have within the memory limit."""
 
 
@@ -51,6 +54,18 @@ def check_voxel_sizes(camera: PinholeCamera, parameters: TsdfParameters) -> None
                 f"(meshing.tsdf.max_memory_mb): {fitting:g} would fit, also for a scene of "
                 f"{SCENE_VIEWS} such views"
             )
+
+
+def too_fine(level: str, parameters: TsdfParameters, needed_bytes: int, what: str) -> str:
+    """One line: voxels of that level, "fine" or "coarse", need more than the limit for ``what``."""
+    voxel: float = getattr(parameters, f"{level}_voxel")
+    excess = needed_bytes / (parameters.max_memory_mb * 1e6)
+    fitting = _rounded_up(_MARGIN * voxel * excess**_GROWTH)
+    return (
+        f"meshing.tsdf.{level}_voxel={voxel:.4g} needs {needed_bytes / 1e6:.0f} MB for {what}, the "
+        f"limit is {parameters.max_memory_mb} MB (meshing.tsdf.max_memory_mb): "
+        f"about {fitting:g} would fit"
+    )
 
 
 def _columns(voxel: float, camera: PinholeCamera) -> float:

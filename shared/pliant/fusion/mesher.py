@@ -16,22 +16,22 @@ from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
-from pliant.algorithms.meshing import (
-    KeyframeSurfaces,
-    MeshBlocks,
-    MeshingParameters,
-    SeenPoints,
-    Surface,
-    TriangleMesh,
-)
 from pliant.algorithms.meshing.corrected_view import CorrectedView
+from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints, Surface
+from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, TriangleMesh, sorted_keys
+from pliant.algorithms.meshing.parameters import MeshingParameters, TsdfParameters
+from pliant.algorithms.meshing.rendering import DepthMap
+from pliant.algorithms.meshing.tsdf_blocks import BLOCK_BYTES
+from pliant.algorithms.meshing.tsdf_integrate import blocks_in_band, pixel_planes
+from pliant.algorithms.meshing.tsdf_volume import TsdfVolume, VolumeFullError
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.fusion.keyframe_spool import KeyframeSpool
 from pliant.fusion.live_mesh import LiveMesh
-from pliant.fusion.volume import TsdfVolume, VolumeMemoryError
+from pliant.fusion.memory import too_fine
 from pliant.map_history import CurrentMap
 
 _MAX_NOTE = 200
+_NO_IMAGE = "it has no image"
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,41 @@ class FinalMesh:
     mesh: TriangleMesh
 
 
+class _FinalVolume:
+    """A volume for a final mesh.  Once it is full it is empty, and counts what it would take."""
+
+    def __init__(self, voxel_size: float, camera: PinholeCamera, tsdf: TsdfParameters) -> None:
+        self.volume = TsdfVolume(voxel_size, tsdf)
+        self.is_full = False
+        self._camera = camera
+        self._tsdf = tsdf
+        self._needed = np.zeros((0, 3), np.int32)
+
+    @property
+    def needed_bytes(self) -> int:
+        """What all that was put in takes, where it is full."""
+        return len(self._needed) * BLOCK_BYTES
+
+    def put(self, depth_map: DepthMap, colour: U8, T_world_camera: F64) -> None:
+        """Fuse a keyframe, or count its blocks."""
+        depths, weights = depth_map.depths, depth_map.weights
+        if not self.is_full:
+            try:
+                self.volume.integrate(depths, weights, colour, self._camera, T_world_camera)
+                return
+            except VolumeFullError:
+                self.is_full, self._needed = True, self.volume.keys
+                self.volume = TsdfVolume(self.volume.scale.voxel, self._tsdf)
+        pixels = pixel_planes(depths, weights, self._camera)
+        band = blocks_in_band(pixels, T_world_camera, self.volume.scale)
+        self._needed = sorted_keys(np.concatenate([self._needed, band]))
+
+
 class Mesher:
     """A function of what it is given; it holds no image but those of keyframes in the window.
 
-    counts: what has been done so far, for the report.    note: the last problem, "" without.
+    counts: what has been done so far, for the report.    note: the last problem, or all of those
+    of the final meshes; "" without.
     """
 
     def __init__(
@@ -132,13 +163,13 @@ class Mesher:
         live = self._live.volume if self._live is not None else None
         return {
             "volume_mib": live.memory_bytes / 2**20 if live is not None else 0.0,
-            "blocks": float(live.block_count) if live is not None else 0.0,
+            "blocks": float(len(live.keys)) if live is not None else 0.0,
             "spool_mib": self._spool.size_bytes / 2**20,
         }
 
     def finish(self, *, timer: StageTimer = no_stages) -> Iterator[FinalMesh]:
         """The meshes of every segment, fine and coarse, from the map as it is now."""
-        self._live = None
+        self.note, self._live = "", None
         self._surfaces = KeyframeSurfaces(self._camera, self._parameters.surface)
         by_segment: dict[int, list[int]] = {}
         for keyframe in self._spool.keyframes():
@@ -150,7 +181,7 @@ class Mesher:
         colour = self._colour(keyframe)
         surface = self._surface(keyframe, timer)
         if surface.depth_map is None or colour is None:
-            self._pass_over(keyframe, surface.problem or "it has no image")
+            self._pass_over(keyframe, surface.problem or _NO_IMAGE)
             if self._live is not None:
                 self._live.take_out(keyframe)
             return
@@ -163,8 +194,9 @@ class Mesher:
                 self._live.put(
                     keyframe, surface.depth_map, colour, self._pose(keyframe), settled=settled
                 )
-        except VolumeMemoryError as error:
-            self._pass_over(keyframe, str(error))
+        except VolumeFullError as error:
+            needed = error.needed_bytes
+            self._pass_over(keyframe, too_fine("coarse", tsdf, needed, "what was seen so far"))
             return
         self.counts["settled" if settled else "fused"] += 1
 
@@ -173,31 +205,33 @@ class Mesher:
     ) -> Iterator[FinalMesh]:
         unit = self._median_depth(keyframes)
         tsdf = self._parameters.tsdf
-        sizes = {"fine": tsdf.fine_voxel * unit, "coarse": tsdf.coarse_voxel * unit}
-        volumes: dict[str, TsdfVolume] = {}
-        fused = 0
+        volumes = {
+            level: _FinalVolume(share * unit, self._camera, tsdf)
+            for level, share in (("fine", tsdf.fine_voxel), ("coarse", tsdf.coarse_voxel))
+        }
+        fused, problem = 0, ""
         for keyframe in keyframes:
             colour = self._colour(keyframe)
             surface = self._surface(keyframe, timer)
             if surface.depth_map is None or colour is None:
+                problem = f"keyframe {keyframe}: {surface.problem or _NO_IMAGE}"
                 continue
-            volumes = volumes or {k: TsdfVolume(size, tsdf) for k, size in sizes.items()}
-            for level, volume in list(volumes.items()):
-                try:
-                    with timer(f"final {level} fusion"):
-                        volume.integrate(
-                            surface.depth_map.depths, surface.depth_map.weights, colour,
-                            self._camera, self._pose(keyframe),
-                        )  # fmt: skip
-                except VolumeMemoryError as error:
-                    self.note = f"no {level} mesh: {error}"
-                    del volumes[level]
+            for level, volume in volumes.items():
+                with timer(f"final {level} fusion"):
+                    volume.put(surface.depth_map, colour, self._pose(keyframe))
             fused += 1
+        if fused == 0:
+            self._tell(f"no keyframe of segment {segment} has a surface ({problem})")
+            return
         for level, volume in volumes.items():
-            self.counts[f"final_{level}_mib"] = volume.memory_bytes / 2**20
+            if volume.is_full:
+                what = f"segment {segment}"
+                self._tell(f"no {level} mesh: {too_fine(level, tsdf, volume.needed_bytes, what)}")
+                continue
+            self.counts[f"final_{level}_mib"] = volume.volume.memory_bytes / 2**20
             with timer(f"final {level} meshing"):
-                mesh = volume.extract_all()
-            yield FinalMesh(segment, level, sizes[level], fused, mesh)
+                mesh = volume.volume.extract_all()
+            yield FinalMesh(segment, level, volume.volume.scale.voxel, fused, mesh)
 
     def _median_depth(self, keyframes: list[int]) -> float:
         """Of the points that the keyframes see, the median of their medians."""
@@ -241,13 +275,16 @@ class Mesher:
         self.counts["without_surface"] += 1
         self.note = f"keyframe {keyframe} is passed over: {why}"[:_MAX_NOTE]
 
+    def _tell(self, problem: str) -> None:
+        self.note = f"{self.note}; {problem}" if self.note else problem
+
     def _changes(self, timer: StageTimer) -> list[LiveChange]:
         if self._live is None:
             return []
         blocks = self._live.changes(timer)
         if blocks is None:
             return []
-        size = self._live.volume.voxel_size
+        size = self._live.volume.scale.voxel
         again, span = self._live.again()
         return [
             LiveChange(self._segment, size, blocks),

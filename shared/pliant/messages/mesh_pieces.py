@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from pliant.algorithms.meshing import TriangleMesh
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.errors import MessageError
 from pliant.messages.types import WORLD_FRAME_ID, Header, MeshPiece
 

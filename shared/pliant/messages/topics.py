@@ -38,7 +38,7 @@ class Topic:
     max_bytes: int = 16 * _MIB
     """A larger message is refused before memory is taken for it."""
     compression: str = "zstd"
-    """How its chunks of a recording are stored: "" as they are, "lz4" or "zstd"."""
+    """How its chunks of a recording are stored: "" as they are, or "zstd"."""
 
 
 STREAM = Topic("camera/stream", CameraStream, per_frame=False, max_bytes=_MIB)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
-from pliant.algorithms.meshing import MeshBlocks
+from pliant.algorithms.meshing.mesh_blocks import MeshBlocks
 from pliant.algorithms.surfels.states import SurfelFrame
 from pliant.algorithms.tracks import FrameTracks
 

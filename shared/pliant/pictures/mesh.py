@@ -7,7 +7,8 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing import TriangleMesh, view_mesh
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.pictures.map import BACKGROUND, FOCAL, MapView, choose_view
 
 _SUPERSAMPLE = 2

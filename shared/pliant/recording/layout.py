@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from io import BytesIO
 from typing import Any, BinaryIO, Protocol
 
-import lz4.frame
 import zstandard
 
 from pliant.messages import zstd
@@ -18,7 +17,7 @@ BLOCK_BYTES = 1 << 18
 """What is read at a time of what does not fit a chunk."""
 RECORD_LIMIT = 16 << 20
 """Largest metadata, attachment, channel or schema record that is read, in bytes."""
-COMPRESSIONS = ("", "lz4", "zstd")
+COMPRESSIONS = ("", "zstd")
 
 RECORD = struct.Struct("<BQ")  # opcode, length
 CHUNK_START = struct.Struct("<QQQII")  # start, end, size, checksum, length of the compression
@@ -41,13 +40,7 @@ class Source(Protocol):
 
 def compress(data: bytes, compression: str) -> bytes:
     """The stored form of a chunk's records."""
-    if compression == "zstd":
-        return zstd.compress(data, _ZSTD_LEVEL)
-    if compression == "lz4":
-        packed = lz4.frame.compress(data)
-        assert isinstance(packed, bytes)
-        return packed
-    return data
+    return zstd.compress(data, _ZSTD_LEVEL) if compression else data
 
 
 class Span:
@@ -69,10 +62,9 @@ class Span:
 class Inflated:
     """What compressed bytes hold, as far as they go.  Memory: a block, and what is asked for."""
 
-    def __init__(self, stored: Source, compression: str, limit: int) -> None:
+    def __init__(self, stored: Source, limit: int) -> None:
         """``limit``: nothing is inflated beyond what the chunk says that it holds."""
-        blocks = _lz4_blocks(stored) if compression == "lz4" else _zstd_blocks(stored)
-        self._blocks = iter(blocks)
+        self._blocks = _zstd_blocks(stored)
         self._left = limit
         self._block = BytesIO()
 
@@ -102,20 +94,6 @@ def _zstd_blocks(stored: Source) -> Iterator[bytes]:
         while block := reader.read(BLOCK_BYTES):
             yield block
     except (zstandard.ZstdError, MemoryError, ValueError):
-        return
-
-
-def _lz4_blocks(stored: Source) -> Iterator[bytes]:
-    unpacker = lz4.frame.LZ4FrameDecompressor()
-    try:
-        while not unpacker.eof:
-            packed = stored.read(BLOCK_BYTES) if unpacker.needs_input else b""
-            if unpacker.needs_input and not packed:
-                return
-            block = unpacker.decompress(packed, max_length=BLOCK_BYTES)
-            if block:
-                yield block
-    except (RuntimeError, MemoryError, ValueError, EOFError):
         return
 
 

@@ -234,7 +234,7 @@ class _Walk:
     def _records(self, chunk: _Chunk) -> Source:
         """What a chunk holds, from its beginning."""
         stored = Span(self._file, chunk.data, min(chunk.end, self._size))
-        return Inflated(stored, chunk.compression, chunk.size) if chunk.compression else stored
+        return Inflated(stored, chunk.size) if chunk.compression else stored
 
     def _chunk(self, chunk: _Chunk) -> Iterator[Item]:
         whole = chunk.end <= self._size

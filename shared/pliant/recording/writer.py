@@ -27,8 +27,7 @@ from pliant.messages import codec
 from pliant.messages.topics import Topic
 from pliant.recording import layout
 from pliant.recording.layout import CHUNK_BYTES
-from pliant.recording.open_chunk import OpenChunk, as_bytes
-from pliant.recording.summary_section import ChunkIndexes, closing
+from pliant.recording.sections import ChunkIndexes, OpenChunk, as_bytes, closing
 
 _AT_ONCE = 1024
 """Parts that the system takes in one call (IOV_MAX)."""

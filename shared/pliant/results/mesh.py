@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.meshing import TriangleMesh
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.formats.ply import write_ply
 from pliant.messages.mesh_pieces import joined
 from pliant.messages.types import MeshPiece

@@ -5,7 +5,7 @@ from typing import Protocol
 
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing import TriangleMesh
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.viewers.point_blocks import PointBlocks
 from pliant.viewers.surfel_quads import SurfelPicture
 

@@ -23,7 +23,7 @@ from mcap.writer import CompressionType, Writer
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing import TriangleMesh
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.errors import ResultError
 from pliant.viewers.age_colours import age_buckets
 from pliant.viewers.canvas import Moment

@@ -7,9 +7,7 @@ the whole mesh again with each keyframe would cost with the map and not with the
 import numpy as np
 
 from pliant.algorithms.arrays import I32
-from pliant.algorithms.meshing import BlockMesh, TriangleMesh
-from pliant.algorithms.meshing.mesh_blocks import unwelded
-from pliant.algorithms.meshing.tsdf_blocks import pack
+from pliant.algorithms.meshing.mesh_blocks import BlockMesh, TriangleMesh, pack, unwelded
 from pliant.messages.types import MeshUpdate
 
 GROUP_BLOCKS = 4

@@ -24,13 +24,14 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import matrix_to_pose, pose_to_matrix
-from pliant.algorithms.meshing import TriangleMesh
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.errors import ResultError
 from pliant.viewers.age_colours import track_colours
 from pliant.viewers.canvas import Moment
 from pliant.viewers.foxglove import Z_UP_XYZW, world_name
 from pliant.viewers.point_blocks import PointBlocks
-from pliant.viewers.rerun_program import RerunProgram, address_of, listens
+from pliant.viewers.rerun_page import RerunPage
+from pliant.viewers.rerun_program import RerunProgram, address_of, free_port, listens
 from pliant.viewers.surfel_quads import SurfelPicture
 
 Where = Literal["window", "web"] | Path
@@ -67,11 +68,16 @@ class RerunCanvas:
     """A canvas that is a Rerun recording."""
 
     def __init__(
-        self, where: Where, *, name: str, web_port: int = _WEB_PORT, grpc_port: int = _GRPC_PORT
+        self, where: Where, *, name: str, web_port: int | None = None, grpc_port: int | None = None
     ) -> None:
-        """Open it.  Raises ResultError where Rerun is missing or the file cannot be written."""
+        """Open it.  Raises ResultError where Rerun is missing or the file cannot be written.
+
+        web_port: where a browser finds it.    grpc_port: where that takes its data.  By default
+        they are Rerun's own, or where these are taken others that are free.
+        """
         self._rr = rr = load_rerun()
         self._server: RerunProgram | None = None
+        self._page: RerunPage | None = None
         self._stream: Any = rr.RecordingStream(_LAYOUT, recording_id=name)
         self._segment = 0
         self._is_window = False
@@ -85,17 +91,26 @@ class RerunCanvas:
                 raise ResultError(f"{where}: cannot be written ({error.strerror})") from None
             self._stream.save(where, default_blueprint=blueprint)
         elif where == "web":
-            serving = ["--serve-web", "--web-viewer-port", str(web_port)]
+            web_port = web_port or free_port(_WEB_PORT)
+            grpc_port = grpc_port or free_port(_GRPC_PORT)
+            behind = free_port()
+            serving = ["--serve-web", "--web-viewer-port", str(behind)]
             limit = ["--server-memory-limit", _MEMORY_LIMIT]
-            self._server = RerunProgram([grpc_port, web_port], [*serving, *limit])
+            self._server = RerunProgram([grpc_port, behind], [*serving, *limit])
+            try:
+                self._page = RerunPage(web_port, behind=behind, data=grpc_port)
+            except ResultError:
+                self._server.close()
+                raise
             address = address_of(grpc_port)
             self._stream.connect_grpc(address, default_blueprint=blueprint)
-            self.address = f"http://localhost:{web_port}/?url={quote(address, safe='')}"
+            query = f"url={quote(address, safe='')}&hide_welcome_screen"  # it has examples
+            self.address = f"http://localhost:{web_port}/?{query}"
         else:
             self._is_window = True
-            if not listens(grpc_port):  # else one is open already
-                RerunProgram([grpc_port], ["--hide-welcome-screen", "--memory-limit", "50%"])
-            self._stream.connect_grpc(address_of(grpc_port), default_blueprint=blueprint)
+            if not listens(_GRPC_PORT):  # else one is open already
+                RerunProgram([_GRPC_PORT], ["--hide-welcome-screen", "--memory-limit", "50%"])
+            self._stream.connect_grpc(address_of(_GRPC_PORT), default_blueprint=blueprint)
         self._place_world(0)
 
     address = ""
@@ -124,6 +139,8 @@ class RerunCanvas:
         """Send what is left, and finish a file; nothing can be seen in a browser any more."""
         self.send()
         self._stream.disconnect()
+        if self._page is not None:
+            self._page.close()
         if self._server is not None:
             self._server.close()
 

@@ -67,6 +67,14 @@ def address_of(port: int) -> str:
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
+def free_port(preferred: int | None = None) -> int:
+    """A port of this machine that is free now: this one, or else another."""
+    if preferred is not None and not listens(preferred):
+        return preferred
+    with socket.create_server((LOOPBACK, 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
 def listens(port: int) -> bool:
     """Whether something on this machine takes connections at a port."""
     try:

@@ -3,8 +3,7 @@
 import numpy as np
 
 from pliant.algorithms.arrays import I32
-from pliant.algorithms.meshing import TriangleMesh
-from pliant.algorithms.meshing.mesh_blocks import no_blocks, unwelded
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh, no_blocks, unwelded
 from pliant.errors import MessageError
 from pliant.messages.mesh_pieces import PIECE_TRIANGLES, joined
 from pliant.messages.types import MeshPiece, MeshUpdate

@@ -6,7 +6,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing import TriangleMesh
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
 
 QUAD_PX = 11.0

@@ -1,26 +1,19 @@
 """The surface that one keyframe sees: from its points to a depth map (VITAMIN-E, section 4)."""
 
+import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from pliant.algorithms.arrays import F32, F64, I32, I64
+from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
+from pliant.algorithms.kernel import kernel
 from pliant.algorithms.meshing.delaunay import Triangulation, triangulate
-from pliant.algorithms.meshing.depth_rendering import DepthMap, render_depth
-from pliant.algorithms.meshing.laplacian import laplacian
-from pliant.algorithms.meshing.nltgv import (
-    NltgvParameters,
-    NltgvResult,
-    NltgvStart,
-    carry_duals,
-    smooth,
-)
-from pliant.algorithms.meshing.triangle_filter import TriangleFilterParameters, filter_triangles
-from pliant.algorithms.parameters import Parameters
+from pliant.algorithms.meshing.nltgv import NltgvResult, NltgvStart, carry_duals, smooth
+from pliant.algorithms.meshing.parameters import SurfaceParameters, TriangleFilterParameters
+from pliant.algorithms.meshing.rendering import DepthMap, render_depth
 from pliant.algorithms.stages import StageTimer, no_stages
 
 _MIN_POINTS = 3
@@ -28,24 +21,8 @@ _MIN_SHARED = 0.3
 """Share of the vertices that must live on for the last surface to be worth starting from."""
 _MAX_DIFFERENCE = 0.2
 """Share of the inverse depth by which the last surface may differ from a point that it meets."""
-
-
-class SurfaceParameters(Parameters):
-    """How the points of a keyframe become a surface."""
-
-    smoothing: Literal["nltgv", "laplacian", "none"] = Field(
-        default="nltgv", description="How inverse depth is smoothed; the others are to compare."
-    )
-    max_error_px: float = Field(
-        default=2.0, gt=0.0, description="Points that project farther from where they are seen, px"
-    )
-    noise_px: float = Field(
-        default=0.5,
-        gt=0.0,
-        description="Standard deviation of an observation, px: scales the uncertainty of points.",
-    )
-    nltgv: NltgvParameters = NltgvParameters(data_weight=1.0)
-    triangles: TriangleFilterParameters = TriangleFilterParameters()
+_LAPLACIAN_ROUNDS = 10
+_LAPLACIAN_STEP = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,3 +184,82 @@ class KeyframeSurfaces:
         rays = camera.normalise(pixels)
         planes[:, 2] = result.inverse_depths - (planes[:, :2] * rays).sum(axis=1)
         self._last = _Last(ids, T, planes, result.duals, edges)
+
+
+def filter_triangles(
+    triangles: I32,
+    points_px: F32,
+    inverse_depths: F32,
+    sigmas: F32,
+    observations: I32,
+    camera: PinholeCamera,
+    parameters: TriangleFilterParameters,
+) -> BoolArray:
+    """Which of the (T, 3) triangles to keep.
+
+    points_px: (M, 2) vertices.    inverse_depths, sigmas: (M,) inverse depth along z and its
+    standard deviation; not finite or not positive: the vertex is not used.    observations: (M,)
+    frames that saw the vertex.
+    """
+    usable = (
+        np.isfinite(points_px).all(axis=1)
+        & np.isfinite(inverse_depths)
+        & (inverse_depths > 0.0)
+        & (sigmas <= parameters.max_relative_sigma * inverse_depths)
+        & (observations >= parameters.min_observations)
+    )
+    rays = np.ones((len(points_px), 3))
+    rays[:, 0] = (points_px[:, 0] - camera.cx) / camera.fx
+    rays[:, 1] = (points_px[:, 1] - camera.cy) / camera.fy
+    points = rays / np.where(usable, inverse_depths, 1.0)[:, None]
+    min_cosine = math.cos(math.radians(parameters.max_slant_deg))
+    return _kept(
+        triangles, points_px, points, usable,
+        parameters.max_edge_px, parameters.max_depth_ratio, min_cosine,
+    )  # fmt: skip
+
+
+@kernel
+def _kept(
+    triangles: I32, pixels: F32, points: F64, usable: BoolArray,
+    max_edge_px: float, max_ratio: float, min_cosine: float,
+) -> BoolArray:  # fmt: skip
+    kept = np.zeros(len(triangles), np.bool_)
+    for t in range(len(triangles)):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        if not (usable[a] and usable[b] and usable[c]):
+            continue
+        longest = 0.0
+        for i, j in ((a, b), (b, c), (c, a)):
+            du, dv = pixels[j, 0] - pixels[i, 0], pixels[j, 1] - pixels[i, 1]
+            longest = max(longest, du * du + dv * dv)
+        if longest > max_edge_px * max_edge_px:
+            continue
+        near = min(points[a, 2], points[b, 2], points[c, 2])
+        far = max(points[a, 2], points[b, 2], points[c, 2])
+        if far > max_ratio * near:
+            continue
+        p, q, r = points[a], points[b], points[c]
+        e0, e1, e2 = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+        f0, f1, f2 = r[0] - p[0], r[1] - p[1], r[2] - p[2]
+        n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
+        m0, m1, m2 = p[0] + q[0] + r[0], p[1] + q[1] + r[1], p[2] + q[2] + r[2]
+        dot = abs(n0 * m0 + n1 * m1 + n2 * m2)
+        norms = math.sqrt((n0 * n0 + n1 * n1 + n2 * n2) * (m0 * m0 + m1 * m1 + m2 * m2))
+        kept[t] = norms > 0.0 and dot >= min_cosine * norms
+    return kept
+
+
+def laplacian(inverse_depths: F32, edges: I32) -> F32:
+    """(M,) inverse depths after ten rounds, each half way to the mean of the neighbours.
+
+    With it NLTGV is compared: it rounds steps and creases off.
+    """
+    count = np.bincount(edges.ravel(), minlength=len(inverse_depths))
+    values: Any = inverse_depths.astype(np.float64)
+    for _ in range(_LAPLACIAN_ROUNDS):
+        total = np.bincount(edges[:, 0], values[edges[:, 1]], len(values))
+        total += np.bincount(edges[:, 1], values[edges[:, 0]], len(values))
+        mean = np.where(count > 0, total / np.maximum(count, 1), values)
+        values = values + _LAPLACIAN_STEP * (mean - values)
+    return values.astype(np.float32)

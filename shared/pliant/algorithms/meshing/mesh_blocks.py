@@ -1,13 +1,21 @@
-"""The mesh as blocks that change: what the mesher sends, and what it and its viewers hold."""
+"""The mesh as blocks that change: what the mesher sends, and what it and its viewers hold.
+
+No kernels: whoever reads messages loads this.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, I32, U8, BoolArray, Shape
-from pliant.algorithms.meshing.tsdf_blocks import SIDE, pack, unpack
+from pliant.algorithms.arrays import F32, I32, I64, U8, BoolArray, Shape
 
+SIDE = 8
+"""Voxels along the side of a block."""
+KEY_LIMIT = 1 << 20
+"""Keys beyond this have no number: such blocks are passed over."""
+KEY_BITS = 21
+_KEY_MASK = (1 << KEY_BITS) - 1
 LATTICE = SIDE + 1
 """Lattice points along the side of a block's cubes."""
 LAST_KEY = (1 << 63) - 1
@@ -45,6 +53,23 @@ class TriangleMesh:
     normals: Annotated[F32, Shape("V", 3)]
     colours: Annotated[U8, Shape("V", 3)]
     triangles: Annotated[I32, Shape("T", 3)]
+
+
+def pack(keys: I32) -> I64:
+    """(N,) numbers in the order of the (N, 3) keys (by x, then y, then z)."""
+    shifted = keys.astype(np.int64) + KEY_LIMIT
+    return (shifted[:, 0] << 2 * KEY_BITS) | (shifted[:, 1] << KEY_BITS) | shifted[:, 2]
+
+
+def unpack(packed: I64) -> I32:
+    """The inverse of ``pack``."""
+    columns = [packed >> 2 * KEY_BITS, packed >> KEY_BITS & _KEY_MASK, packed & _KEY_MASK]
+    return (np.stack(columns, axis=1) - KEY_LIMIT).astype(np.int32)
+
+
+def sorted_keys(keys: I32) -> I32:
+    """Distinct keys, ascending."""
+    return unpack(np.unique(pack(keys)))
 
 
 def no_blocks() -> MeshBlocks:

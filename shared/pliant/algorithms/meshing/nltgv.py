@@ -32,60 +32,29 @@ the error would be theirs.  The result is the optimum for the last weights, whic
 """
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from pliant.algorithms.arrays import F32, I32, BoolArray, Shape
-from pliant.algorithms.meshing.nltgv_kernels import (
-    iterate,
-    out_edges,
-    weigh,
+from pliant.algorithms.arrays import F32, I32, I64, BoolArray, Shape
+from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.algorithms.meshing.nltgv_start import (
+    Graph,
+    change_sides,
+    choose_sides,
+    rings,
+    settle,
+    start,
+    usual_rise,
 )
-from pliant.algorithms.meshing.nltgv_start import rings, settle, start, usual_rise
-from pliant.algorithms.meshing.nltgv_steps import change_sides, choose_sides
-from pliant.algorithms.parameters import Parameters
+from pliant.algorithms.meshing.parameters import NltgvParameters
 
 _MIN_SHIFT_SIGMAS = 3.0
-
-
-class NltgvParameters(Parameters):
-    """What a user may change about smoothing.  Weights have no unit; see the module."""
-
-    data_weight: float = Field(
-        default=0.5, gt=0.0, description="Weight of the data against the smoothness (lambda)."
-    )
-    slope_weight: float = Field(
-        default=3.0, gt=0.0, description="Weight of changes of slope against those of depth."
-    )
-    huber_sigmas: float = Field(
-        default=1.0, ge=0.0, description="Data deviate squared up to so many sigmas, then linearly."
-    )
-    edge_sigmas: float = Field(
-        default=5.0,
-        ge=0.0,
-        description="An edge that misses the surface by so many sigmas weighs half.  0: all alike.",
-    )
-    data_sigmas: float = Field(
-        default=5.0,
-        ge=0.0,
-        description="Data off the surface by so many sigmas weigh half.  0: all alike.",
-    )
-    reweightings: int = Field(
-        default=2, ge=1, le=50, description="How often weights are taken from the residuals."
-    )
-    max_iterations: int = Field(
-        default=200, ge=1, description="Most primal-dual iterations for one set of weights."
-    )
-    min_change_sigmas: float = Field(
-        default=0.04,
-        ge=0.0,
-        description="Stop when an iteration changes inverse depth less (rms, in median sigmas).",
-    )
-    relaxation: float = Field(
-        default=1.9, ge=1.0, lt=2.0, description="Over-relaxation of the iteration (rho)."
-    )
+_HALF_U, _HALF_V, _FIRST, _SECOND, _FIRST_STEP, _SECOND_STEP = range(6)
+_MIN_LENGTH = 0.2
+"""Edges shorter than this (in mean edges) weigh no more: their slopes are noise."""
+_MIN_WEIGHT = 1e-3
+"""The least share of its weight that an edge keeps, so that nothing is left without a surface."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +88,26 @@ class NltgvResult:
     converged: bool
 
 
+class _Edges(NamedTuple):
+    """pairs: ascending.    ends: their second vertices, those of vertex i from ``starts[i]`` on."""
+
+    pairs: Annotated[I32, Shape("E", 2)]
+    starts: Annotated[I64, Shape("N")]
+    ends: Annotated[I32, Shape("E")]
+
+
+class _Weights(NamedTuple):
+    """table: of edges: half its u, half its v, weight of the first order, of the second order, dual
+    step of the first order, of the second order.    steps: primal, three used.    data: weights.
+    bend: residual at which the data term turns from square to absolute.
+    """
+
+    table: Annotated[F32, Shape("E", 6)]
+    steps: Annotated[F32, Shape("M", 4)]
+    data: Annotated[F32, Shape("M")]
+    bend: Annotated[F32, Shape("M")]
+
+
 def smooth(
     points_px: F32,
     inverse_depths: F32,
@@ -150,28 +139,29 @@ def smooth(
         return _unchanged(inverse_depths, known, E)
     unit = float(np.median(sigmas[known]))
     u, v, table, length = _geometry(points_px, edges)
+    bounds, neighbours = rings(edges, M)
     data = np.where(known, inverse_depths / unit, 0.0).astype(np.float32)
     sigma = np.where(known, sigmas / unit, np.inf).astype(np.float32)
-    bounds, neighbours = rings(edges, M)
-    usual = usual_rise(data, sigma, bounds, neighbours)
+    graph = Graph(u, v, data, sigma, bounds, neighbours)
+    usual = usual_rise(graph)
     state, duals, unknown = _start_state(start_from, M, E, unit, length)
-    start(u, v, data, sigma, usual, bounds, neighbours, unknown, state)
-    settle(u, v, data, sigma, usual, bounds, neighbours, unknown, state)
+    start(graph, usual, unknown, state)
+    settle(graph, usual, unknown, state)
 
     bend = np.where(known, parameters.huber_sigmas * sigma, 0.0).astype(np.float32)
     steps, weight = np.zeros((M, 4), np.float32), np.zeros(M, np.float32)
-    starts, ends = out_edges(edges, M), np.ascontiguousarray(edges[:, 1])
+    weights = _Weights(table, steps, weight, bend)
+    directed = _Edges(edges, _out_edges(edges, M), np.ascontiguousarray(edges[:, 1]))
     total, change = 0, np.inf
     for _ in range(parameters.reweightings if start_from is None else 1):
-        change_sides(state, edges, table, data, sigma, _MIN_SHIFT_SIGMAS)
-        choose_sides(u, v, state, data, sigma, bounds, neighbours, _MIN_SHIFT_SIGMAS)
-        weigh(
-            state, edges, table, steps, data, sigma, weight,
-            parameters.edge_sigmas, parameters.data_sigmas,
+        change_sides(graph, edges, table, state, _MIN_SHIFT_SIGMAS)
+        choose_sides(graph, state, _MIN_SHIFT_SIGMAS)
+        _weigh(
+            graph, directed, weights, state, parameters.edge_sigmas, parameters.data_sigmas,
             parameters.data_weight, parameters.slope_weight,
         )  # fmt: skip
-        done, change = iterate(
-            state, duals, starts, ends, table, steps, data, bend, weight,
+        done, change = _iterate(
+            data, directed, weights, state, duals,
             parameters.relaxation, parameters.min_change_sigmas, parameters.max_iterations,
         )  # fmt: skip
         total += done
@@ -243,3 +233,136 @@ def _unchanged(inverse_depths: F32, known: BoolArray, edges: int) -> NltgvResult
         iterations=0,
         converged=True,
     )
+
+
+@kernel
+def _out_edges(edges: I32, count: int) -> I64:
+    """(M + 1,) where the edges of each first vertex begin; edges must be ascending."""
+    starts = np.zeros(count + 1, np.int64)
+    for e in range(len(edges)):
+        starts[edges[e, 0] + 1] += 1
+    for i in range(count):
+        starts[i + 1] += starts[i]
+    return starts
+
+
+@fast_kernel
+def _residual(state: F32, edge: F32, i: int, j: int) -> np.float32:
+    """How far the inverse depth of j lies off the surface that goes through i."""
+    rise = edge[_HALF_U] * (state[i, 1] + state[j, 1]) + edge[_HALF_V] * (state[i, 2] + state[j, 2])
+    return state[j, 0] - state[i, 0] - rise
+
+
+@fast_kernel
+def _weigh(
+    graph: Graph, edges: _Edges, weights: _Weights, state: F32,
+    edge_sigmas: float, data_sigmas: float, data_weight: float, slope_weight: float,
+) -> None:  # fmt: skip
+    """Set the weights for where the surface is now, and with them the preconditioned steps.
+
+    edge_sigmas, data_sigmas: 0: all weigh alike.  A vertex without data joins a surface as if its
+    sigma were the median.
+    """
+    data, sigma, pairs = graph.data, graph.sigma, edges.pairs
+    table, steps, weight = weights.table, weights.steps, weights.data
+    steps[:] = 0.0
+    for e in range(len(pairs)):
+        i, j = pairs[e, 0], pairs[e, 1]
+        hu, hv = abs(table[e, _HALF_U]), abs(table[e, _HALF_V])
+        length = max(2.0 * np.sqrt(hu * hu + hv * hv), _MIN_LENGTH)
+        share = 1.0
+        if edge_sigmas > 0.0:
+            sigma_i = sigma[i] if sigma[i] < np.inf else 1.0
+            sigma_j = sigma[j] if sigma[j] < np.inf else 1.0
+            spread = 0.5 * (sigma_i + sigma_j)
+            off = _residual(state, table[e], i, j) / (edge_sigmas * spread)
+            share = max(1.0 / (1.0 + off * off), _MIN_WEIGHT)
+        first, second = share / length, share * slope_weight
+        table[e, _FIRST], table[e, _SECOND] = first, second
+        table[e, _FIRST_STEP] = first / (2.0 + 2.0 * (hu + hv))
+        table[e, _SECOND_STEP] = second / 2.0
+        for k in (i, j):
+            steps[k, 0] += first
+            steps[k, 1] += first * hu + second
+            steps[k, 2] += first * hv + second
+    for i in range(len(state)):
+        for c in range(3):
+            steps[i, c] = 1.0 / max(steps[i, c], 1e-6)
+        weight[i] = 0.0
+        if sigma[i] < np.inf:
+            off = 0.0
+            if data_sigmas > 0.0:
+                off = (state[i, 0] - data[i]) / (data_sigmas * sigma[i])
+            weight[i] = data_weight / (sigma[i] * (1.0 + off * off))
+
+
+@fast_kernel
+def _iterate(
+    data: F32, edges: _Edges, weights: _Weights, state: F32, duals: F32,
+    relaxation: float, min_change: float, max_iterations: int,
+) -> tuple[int, float]:  # fmt: skip
+    """Primal-dual iterations in place; how many, and the last change of inverse depth (rms).
+
+    duals: (E, 4), three used.
+    """
+    starts, ends = edges.starts, edges.ends
+    table, steps, weight, bend = weights
+    M = len(state)
+    ahead = state.copy()
+    pull = np.zeros((M, 4), np.float32)
+    rho = np.float32(relaxation)
+    for j in range(len(ends)):
+        for c in range(3):
+            limit = table[j, _FIRST] if c == 0 else table[j, _SECOND]
+            duals[j, c] = min(max(duals[j, c], -limit), limit)
+    change = np.inf
+    done = 0
+    while done < max_iterations and change > min_change:
+        pull[:] = 0.0
+        for i in range(M):
+            x, s, t = ahead[i, 0], ahead[i, 1], ahead[i, 2]
+            p0, p1, p2 = pull[i, 0], pull[i, 1], pull[i, 2]
+            for e in range(starts[i], starts[i + 1]):
+                j = np.uint32(ends[e])
+                hu, hv = table[e, _HALF_U], table[e, _HALF_V]
+                first, second = table[e, _FIRST], table[e, _SECOND]
+                q0, q1, q2 = duals[e, 0], duals[e, 1], duals[e, 2]
+                sj, tj = ahead[j, 1], ahead[j, 2]
+                off = ahead[j, 0] - x - hu * (s + sj) - hv * (t + tj)
+                n0 = min(max(q0 + table[e, _FIRST_STEP] * off, -first), first)
+                n1 = min(max(q1 + table[e, _SECOND_STEP] * (sj - s), -second), second)
+                n2 = min(max(q2 + table[e, _SECOND_STEP] * (tj - t), -second), second)
+                q0 += rho * (n0 - q0)
+                q1 += rho * (n1 - q1)
+                q2 += rho * (n2 - q2)
+                duals[e, 0], duals[e, 1], duals[e, 2] = q0, q1, q2
+                lever_u, lever_v = hu * q0, hv * q0
+                p0 -= q0
+                p1 -= lever_u + q1
+                p2 -= lever_v + q2
+                pull[j, 0] += q0
+                pull[j, 1] += q1 - lever_u
+                pull[j, 2] += q2 - lever_v
+            pull[i, 0], pull[i, 1], pull[i, 2] = p0, p1, p2
+        total = 0.0
+        for i in range(M):
+            step = steps[i, 0]
+            force = step * weight[i]
+            d = state[i, 0] - step * pull[i, 0] - data[i]
+            if abs(d) <= bend[i] + force:
+                d = d * bend[i] / max(bend[i] + force, np.float32(1e-20))
+            else:
+                d -= force if d > 0.0 else -force
+            c = data[i] + d - state[i, 0]
+            total += c * c
+            ahead[i, 0] = state[i, 0] + np.float32(2.0) * c
+            state[i, 0] += rho * c
+            c = -steps[i, 1] * pull[i, 1]
+            ahead[i, 1] = state[i, 1] + np.float32(2.0) * c
+            state[i, 1] += rho * c
+            c = -steps[i, 2] * pull[i, 2]
+            ahead[i, 2] = state[i, 2] + np.float32(2.0) * c
+            state[i, 2] += rho * c
+        change = np.sqrt(total / M)
+        done += 1
+    return done, change

@@ -1,89 +1,132 @@
-"""Blocks of voxels: their keys, a table from key to row, and which of them a depth map touches.
+"""Blocks of voxels: the pool that holds them, and a table from key to row.
 
 Voxel (i, j, k) stands at the lattice point (i, j, k) * voxel; block (a, b, c) has the voxels from
-8 (a, b, c) on.  Rows are whatever the owner of the blocks numbers them by.
+8 (a, b, c) on.
 """
 
-import math
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, Shape
+from pliant.algorithms.arrays import I32, I64, Shape
 from pliant.algorithms.kernel import kernel
+from pliant.algorithms.meshing.mesh_blocks import (
+    KEY_BITS,
+    KEY_LIMIT,
+    SIDE,
+    pack,
+    unpack,
+)
 
-SIDE = 8
-"""Voxels along the side of a block."""
-KEY_LIMIT = 1 << 20
-"""Keys beyond this have no place in a table: such blocks are passed over."""
-_BITS = 21
-_MASK = (1 << _BITS) - 1
-_EMPTY = -1
+BLOCK_BYTES = SIDE**3 * 4 * 6
+"""Six int32 a voxel: see ``VoxelSums``."""
+_FIRST_BLOCKS = 512
+EMPTY = -1
+"""In a table of packed keys: a free place."""
 _MIX = 0x9E3779B97F4A7C15
-_MAX_STRIDE_PX = 8
-_RAYS_PER_BLOCK = 6
-"""Rays side by side that meet the most distant block, so that none is missed."""
-_MAX_STRETCH = 2.0
-"""The band along a ray is the truncation over the cosine of the slant, up to so many times."""
 
 
-@dataclass(frozen=True)
-class BlockTable:
+class BlockTable(NamedTuple):
     """An open-addressed table: packed keys (-1: free) and their rows, twice as many as used."""
 
     packed: Annotated[I64, Shape("S")]
     rows: Annotated[I32, Shape("S")]
 
 
+class VoxelSums(NamedTuple):
+    """What is summed up in the voxels of each block, indexed (row, z, y, x); see ``add_sight``.
+
+    colours: red, green, blue, weight, within the truncation only.
+    """
+
+    distances: Annotated[I32, Shape("B", SIDE, SIDE, SIDE)]
+    weights: Annotated[I32, Shape("B", SIDE, SIDE, SIDE)]
+    colours: Annotated[I32, Shape("B", SIDE, SIDE, SIDE, 4)]
+
+
+class Scale(NamedTuple):
+    """Side of a voxel, and the distance up to which distances are kept; in scene units."""
+
+    voxel: float
+    truncation: float
+
+
+class BlockPool:
+    """The blocks of a volume and room for more.
+
+    Rows 0 to N - 1 are taken, without gaps, in an order that follows from the calls alone.
+
+    keys: (N, 3).    births: (N,) as told.    table: from key to row.    sums: of at least N rows,
+    elsewhere in memory after each ``add``.
+    """
+
+    def __init__(self, most: int) -> None:
+        """most: blocks that there is ever room for."""
+        self.most = most
+        self.keys = np.zeros((0, 3), np.int32)
+        self.births = np.zeros(0, np.int64)
+        self.table = make_table(self.keys)
+        lattice = (min(_FIRST_BLOCKS, most), SIDE, SIDE, SIDE)
+        self._sums = [np.empty((*lattice, *last), np.int32) for last in ((), (), (4,))]
+
+    @property
+    def sums(self) -> VoxelSums:
+        """What the voxels hold, to be read and written in place."""
+        return VoxelSums(*self._sums)
+
+    @property
+    def room(self) -> int:
+        """Blocks that there is memory for now."""
+        return len(self._sums[0])
+
+    def add(self, keys: I32, birth: int) -> None:
+        """Take in (K, 3) keys that are not here, with voxels of zeros.
+
+        Raises ValueError where they are more than there is ever room for; nothing has changed then.
+        """
+        used, total = len(self.keys), len(self.keys) + len(keys)
+        if total > self.most:
+            raise ValueError(f"{total} blocks, there is room for {self.most}")
+        if total > self.room:
+            room = min(2 * total, self.most)
+            for k, old in enumerate(self._sums):
+                # One after the other, so that at no time all are there twice.
+                self._sums[k] = np.empty((room, *old.shape[1:]), np.int32)
+                self._sums[k][:used] = old[:used]
+        for sums in self._sums:
+            sums[used:total] = 0
+        self.keys = np.concatenate([self.keys, keys])
+        self.births = np.concatenate([self.births, np.full(len(keys), birth, np.int64)])
+        self.table = make_table(self.keys)
+
+    def remove(self, rows: I32) -> None:
+        """Let go of distinct rows: the last ones move into their places."""
+        left = len(self.keys) - len(rows)
+        gone = np.zeros(len(self.keys), np.bool_)
+        gone[rows] = True
+        holes, movers = np.flatnonzero(gone[:left]), left + np.flatnonzero(~gone[left:])
+        for array in (self.keys, self.births, *self._sums):
+            array[holes] = array[movers]
+        self.keys, self.births = self.keys[:left].copy(), self.births[:left].copy()
+        self.table = make_table(self.keys)
+
+
 def make_table(keys: I32) -> BlockTable:
     """The table of (N, 3) distinct keys, whose rows are 0 to N - 1."""
     size = 1 << max(4, (2 * len(keys) + 1).bit_length())
-    packed, rows = np.full(size, _EMPTY, np.int64), np.zeros(size, np.int32)
+    packed, rows = np.full(size, EMPTY, np.int64), np.zeros(size, np.int32)
     _insert_all(pack(keys), packed, rows)
     return BlockTable(packed, rows)
 
 
 def find_rows(table: BlockTable, keys: I32) -> I32:
     """(N,) rows of (N, 3) keys, -1 where there is none."""
-    return _find_all(table.packed, table.rows, np.ascontiguousarray(keys))
-
-
-def pack(keys: I32) -> I64:
-    """(N,) numbers in the order of the keys (by x, then y, then z)."""
-    shifted = keys.astype(np.int64) + KEY_LIMIT
-    return (shifted[:, 0] << 2 * _BITS) | (shifted[:, 1] << _BITS) | shifted[:, 2]
-
-
-def unpack(packed: I64) -> I32:
-    """The inverse of ``pack``."""
-    columns = [packed >> 2 * _BITS, packed >> _BITS & _MASK, packed & _MASK]
-    return (np.stack(columns, axis=1) - KEY_LIMIT).astype(np.int32)
-
-
-def sorted_keys(keys: I32) -> I32:
-    """Distinct keys, ascending."""
-    return unpack(np.unique(pack(keys)))
+    return _find_all(table, np.ascontiguousarray(keys))
 
 
 def with_neighbours(keys: I32) -> I32:
     """The keys and the 26 around each, ascending: whose cubes or gradients read these blocks."""
     return unpack(np.sort(_dilate(pack(keys))))
-
-
-def blocks_in_band(
-    planes: F32, depth: F32, intrinsics: F64, T_world_camera: F64, voxel: float, truncation: float
-) -> I32:
-    """(K, 3) keys of the blocks within the truncation of the surface that a depth map shows.
-
-    planes, depth: (H, W, 4), (H, W); see ``tsdf_pixels``.    intrinsics: (4,) fx, fy, cx, cy.
-    As many pixels are looked at as it takes to meet the most distant block _RAYS_PER_BLOCK times.
-    """
-    furthest = max(float(depth.max(initial=0.0)), 1e-9)
-    across = SIDE * voxel * float(intrinsics[:2].min()) / furthest
-    stride = int(np.clip(across / _RAYS_PER_BLOCK, 1, _MAX_STRIDE_PX))
-    packed = _band(planes, depth, intrinsics, T_world_camera, voxel, truncation, stride)
-    return unpack(np.sort(packed))
 
 
 @kernel
@@ -92,7 +135,7 @@ def slot_of(packed: I64, key: Any) -> Any:
     mask = len(packed) - 1
     mixed = np.uint64(key) * np.uint64(_MIX)
     at = np.int64(mixed >> np.uint64(40)) & mask
-    while packed[at] != _EMPTY and packed[at] != key:
+    while packed[at] != EMPTY and packed[at] != key:
         at = (at + 1) & mask
     return at
 
@@ -101,17 +144,17 @@ def slot_of(packed: I64, key: Any) -> Any:
 def pack_one(x: Any, y: Any, z: Any) -> Any:
     """One key as a number."""
     return (
-        ((np.int64(x) + KEY_LIMIT) << (2 * _BITS))
-        | ((np.int64(y) + KEY_LIMIT) << _BITS)
+        ((np.int64(x) + KEY_LIMIT) << (2 * KEY_BITS))
+        | ((np.int64(y) + KEY_LIMIT) << KEY_BITS)
         | (np.int64(z) + KEY_LIMIT)
     )
 
 
 @kernel
-def row_of(packed: I64, rows: I32, key: Any) -> Any:
+def row_of(table: BlockTable, key: Any) -> Any:
     """The row of a packed key, -1 where it is not in the table."""
-    at = slot_of(packed, key)
-    return rows[at] if packed[at] == key else -1
+    at = slot_of(table.packed, key)
+    return table.rows[at] if table.packed[at] == key else -1
 
 
 @kernel
@@ -123,28 +166,30 @@ def _insert_all(keys: I64, packed: I64, rows: I32) -> None:
 
 
 @kernel
-def _find_all(packed: I64, rows: I32, keys: I32) -> I32:
+def _find_all(table: BlockTable, keys: I32) -> I32:
     found = np.empty(len(keys), np.int32)
     for i in range(len(keys)):
-        found[i] = row_of(packed, rows, pack_one(keys[i, 0], keys[i, 1], keys[i, 2]))
+        found[i] = row_of(table, pack_one(keys[i, 0], keys[i, 1], keys[i, 2]))
     return found
 
 
 @kernel
-def _grown(packed: I64) -> I64:
-    larger = np.full(2 * len(packed), _EMPTY, np.int64)
+def grown(packed: I64) -> I64:
+    """The same keys in a table of twice the size."""
+    larger = np.full(2 * len(packed), EMPTY, np.int64)
     for key in packed:
-        if key != _EMPTY:
+        if key != EMPTY:
             larger[slot_of(larger, key)] = key
     return larger
 
 
 @kernel
-def _used(packed: I64, count: int) -> I64:
+def used_keys(packed: I64, count: int) -> I64:
+    """(count,) the keys of a table, in its order."""
     keys = np.empty(count, np.int64)
     n = 0
     for key in packed:
-        if key != _EMPTY:
+        if key != EMPTY:
             keys[n] = key
             n += 1
     return keys
@@ -152,60 +197,17 @@ def _used(packed: I64, count: int) -> I64:
 
 @kernel
 def _dilate(keys: I64) -> I64:
-    packed = np.full(1024, _EMPTY, np.int64)
+    packed = np.full(1024, EMPTY, np.int64)
     count = 0
     for key in keys:
         for dx in range(-1, 2):
             for dy in range(-1, 2):
                 for dz in range(-1, 2):
-                    near = key + (dx << (2 * _BITS)) + (dy << _BITS) + dz
+                    near = key + (dx << (2 * KEY_BITS)) + (dy << KEY_BITS) + dz
                     at = slot_of(packed, near)
-                    if packed[at] == _EMPTY:
+                    if packed[at] == EMPTY:
                         packed[at] = near
                         count += 1
         if 2 * (count + 27) > len(packed):
-            packed = _grown(packed)
-    return _used(packed, count)
-
-
-@kernel
-def _band(
-    planes: F32, depth: F32, intrinsics: F64, T: F64, voxel: float, truncation: float, stride: int
-) -> I64:  # fmt: skip
-    height, width = depth.shape
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    block = SIDE * voxel
-    packed = np.full(1024, _EMPTY, np.int64)
-    count = 0
-    last = np.int64(_EMPTY)
-    for v in range(0, height, stride):
-        for u in range(0, width, stride):
-            z = depth[v, u]
-            if not z > 0.0:
-                continue
-            x, y = (u - cx) / fx, (v - cy) / fy
-            length = math.sqrt(x * x + y * y + 1.0)
-            stretch = min(z / (planes[v, u, 3] * length), _MAX_STRETCH)
-            reach = truncation * stretch / length
-            steps = math.ceil(4.0 * truncation * stretch / block) + 1
-            rx = T[0, 0] * x + T[0, 1] * y + T[0, 2]
-            ry = T[1, 0] * x + T[1, 1] * y + T[1, 2]
-            rz = T[2, 0] * x + T[2, 1] * y + T[2, 2]
-            for s in range(steps):
-                at_z = max(z - reach + 2.0 * reach * s / (steps - 1), 0.0)
-                bx = math.floor((T[0, 3] + rx * at_z) / block + 0.5 / SIDE)
-                by = math.floor((T[1, 3] + ry * at_z) / block + 0.5 / SIDE)
-                bz = math.floor((T[2, 3] + rz * at_z) / block + 0.5 / SIDE)
-                if not max(abs(bx), abs(by), abs(bz)) < KEY_LIMIT - 1:
-                    continue
-                key = pack_one(int(bx), int(by), int(bz))
-                if key == last:
-                    continue
-                last = key
-                at = slot_of(packed, key)
-                if packed[at] == _EMPTY:
-                    packed[at] = key
-                    count += 1
-                    if 2 * count > len(packed):
-                        packed = _grown(packed)
-    return _used(packed, count)
+            packed = grown(packed)
+    return used_keys(packed, count)

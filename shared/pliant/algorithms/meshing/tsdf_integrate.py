@@ -5,30 +5,188 @@ holds the sums, in int32: of w d, w, and of w r, w g, w b, w over the sights wit
 with w in WEIGHT_UNITS and d in DISTANCE_UNITS of the truncation.  Whole numbers add in any order to
 the same sum, and what was added can be taken away without a trace.  The sum holds
 2**31 / (WEIGHT_UNITS * DISTANCE_UNITS) = 32 768 sights of full weight.
+
+A depth map is taken as small planes, one for every pixel.  In a plane n . X = d the inverse depth
+along z is affine in the image, n . ray / d.  So its slope between neighbouring pixels gives the
+plane, and with it the distance of any voxel near the ray: at right angles to the surface, and
+without the steps that the nearest pixel's depth has on slants.
 """
+
+import math
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray, Shape
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.kernel import fast_kernel, kernel
-from pliant.algorithms.meshing.tsdf_blocks import SIDE
-from pliant.algorithms.meshing.tsdf_pixels import TILE_PX
+from pliant.algorithms.meshing.mesh_blocks import KEY_LIMIT, SIDE, unpack
+from pliant.algorithms.meshing.tsdf_blocks import (
+    EMPTY,
+    Scale,
+    VoxelSums,
+    grown,
+    pack_one,
+    slot_of,
+    used_keys,
+)
 
+WEIGHT_UNITS = 128
+"""A weight of 1."""
 DISTANCE_UNITS = 512
 """Of one truncation."""
+TILE_PX = 16
+_MIN_COSINE = 0.1
+"""A surface more slanted than this is a step: it is taken at right angles to the view."""
 _MAX_BEHIND = 2.0
 """Truncations behind the surface along z beyond which a grazed plane says nothing."""
 _NEAR = 1e-3
+_MAX_STRIDE_PX = 8
+_RAYS_PER_BLOCK = 6
+"""Rays side by side that meet the most distant block, so that none is missed."""
+_MAX_STRETCH = 2.0
+"""The band along a ray is the truncation over the cosine of the slant, up to so many times."""
+
+
+class PixelPlanes(NamedTuple):
+    """planes: unit normal (camera frame, away from the camera) and offset: n . X = offset.
+
+    depths: along z, 0 where there is nothing.    weights: of WEIGHT_UNITS, 0 likewise.
+    furthest: the largest depth in each tile of TILE_PX pixels.    intrinsics: fx, fy, cx, cy.
+    """
+
+    planes: Annotated[F32, Shape("H", "W", 4)]
+    depths: Annotated[F32, Shape("H", "W")]
+    weights: Annotated[U8, Shape("H", "W")]
+    furthest: Annotated[F32, Shape("A", "B")]
+    intrinsics: Annotated[F64, Shape(4)]
+
+
+def pixel_planes(depth: F32, weight: F32, camera: PinholeCamera) -> PixelPlanes:
+    """depth: (H, W) along z, 0 or not finite where there is none.    weight: (H, W) in [0, 1].
+
+    Raises ValueError where they are not of the camera's size.
+    """
+    shape = (camera.height, camera.width)
+    if depth.shape != shape or weight.shape != shape:
+        raise ValueError(f"depth and weight: expected {shape}, got {depth.shape}, {weight.shape}")
+    planes, depths = np.zeros((*shape, 4), np.float32), np.zeros(shape, np.float32)
+    weights = np.zeros(shape, np.uint8)
+    tiles = (-(-camera.height // TILE_PX), -(-camera.width // TILE_PX))
+    furthest = np.zeros(tiles, np.float32)
+    inverse = np.zeros(shape, np.float32)
+    usable = np.isfinite(depth) & (depth > 0.0) & (weight > 0.0)
+    np.divide(np.float32(1.0), depth, out=inverse, where=usable)
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    pixels = PixelPlanes(planes, depths, weights, furthest, intrinsics)
+    _fit(inverse, weight.astype(np.float32), pixels)
+    return pixels
+
+
+def blocks_in_band(pixels: PixelPlanes, T_world_camera: F64, scale: Scale) -> I32:
+    """(K, 3) keys of the blocks within the truncation of the surface that a depth map shows.
+
+    As many pixels are looked at as it takes to meet the most distant block _RAYS_PER_BLOCK times.
+    """
+    furthest = max(float(pixels.depths.max(initial=0.0)), 1e-9)
+    across = SIDE * scale.voxel * float(pixels.intrinsics[:2].min()) / furthest
+    stride = int(np.clip(across / _RAYS_PER_BLOCK, 1, _MAX_STRIDE_PX))
+    return unpack(np.sort(_band(pixels, T_world_camera, scale, stride)))
+
+
+@fast_kernel
+def _fit(inverse: F32, weight: F32, pixels: PixelPlanes) -> None:
+    planes, depths, weights, furthest, K = pixels
+    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    height, width = inverse.shape
+    for v in range(height):
+        for u in range(width):
+            here = inverse[v, u]
+            if not here > 0.0:
+                continue
+            before = inverse[v, u - 1] if u > 0 else np.float32(0.0)
+            behind = inverse[v, u + 1] if u + 1 < width else np.float32(0.0)
+            above = inverse[v - 1, u] if v > 0 else np.float32(0.0)
+            below = inverse[v + 1, u] if v + 1 < height else np.float32(0.0)
+            nx, ny = fx * _slope(before, here, behind), fy * _slope(above, here, below)
+            x, y = (u - cx) / fx, (v - cy) / fy
+            nz = here - nx * x - ny * y
+            norm = np.sqrt(nx * nx + ny * ny + nz * nz)
+            length = np.sqrt(x * x + y * y + 1.0)
+            if here < _MIN_COSINE * norm * length:
+                nx, ny, nz = here * x / length**2, here * y / length**2, here / length**2
+                norm = here / length
+            planes[v, u, 0], planes[v, u, 1], planes[v, u, 2] = nx / norm, ny / norm, nz / norm
+            planes[v, u, 3] = 1.0 / norm
+            depths[v, u] = 1.0 / here
+            share = min(weight[v, u], np.float32(1.0)) * WEIGHT_UNITS
+            weights[v, u] = max(int(share + 0.5), 1)
+            tile_v, tile_u = v // TILE_PX, u // TILE_PX
+            furthest[tile_v, tile_u] = max(furthest[tile_v, tile_u], depths[v, u])
+
+
+@fast_kernel
+def _slope(before: np.float32, here: np.float32, behind: np.float32) -> np.float32:
+    """The smaller of the slopes to both sides: the other one may cross a step.  0: no neighbour."""
+    first, second = here - before, behind - here
+    if not before > 0.0:
+        return second if behind > 0.0 else np.float32(0.0)
+    if not behind > 0.0:
+        return first
+    return first if abs(first) < abs(second) else second
+
+
+@kernel
+def _band(pixels: PixelPlanes, T: F64, scale: Scale, stride: int) -> I64:
+    planes, depth, intrinsics = pixels.planes, pixels.depths, pixels.intrinsics
+    height, width = depth.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    block, truncation = SIDE * scale.voxel, scale.truncation
+    packed = np.full(1024, EMPTY, np.int64)
+    count = 0
+    last = np.int64(EMPTY)
+    for v in range(0, height, stride):
+        for u in range(0, width, stride):
+            z = depth[v, u]
+            if not z > 0.0:
+                continue
+            x, y = (u - cx) / fx, (v - cy) / fy
+            length = math.sqrt(x * x + y * y + 1.0)
+            stretch = min(z / (planes[v, u, 3] * length), _MAX_STRETCH)
+            reach = truncation * stretch / length
+            steps = math.ceil(4.0 * truncation * stretch / block) + 1
+            rx = T[0, 0] * x + T[0, 1] * y + T[0, 2]
+            ry = T[1, 0] * x + T[1, 1] * y + T[1, 2]
+            rz = T[2, 0] * x + T[2, 1] * y + T[2, 2]
+            for s in range(steps):
+                at_z = max(z - reach + 2.0 * reach * s / (steps - 1), 0.0)
+                bx = math.floor((T[0, 3] + rx * at_z) / block + 0.5 / SIDE)
+                by = math.floor((T[1, 3] + ry * at_z) / block + 0.5 / SIDE)
+                bz = math.floor((T[2, 3] + rz * at_z) / block + 0.5 / SIDE)
+                if not max(abs(bx), abs(by), abs(bz)) < KEY_LIMIT - 1:
+                    continue
+                key = pack_one(int(bx), int(by), int(bz))
+                if key == last:
+                    continue
+                last = key
+                at = slot_of(packed, key)
+                if packed[at] == EMPTY:
+                    packed[at] = key
+                    count += 1
+                    if 2 * count > len(packed):
+                        packed = grown(packed)
+    return used_keys(packed, count)
 
 
 @kernel
 def blocks_in_view(
-    keys: I32, T_camera_world: F64, intrinsics: F64, furthest: F32, width: int, height: int,
-    voxel: float, truncation: float,
+    keys: I32, pixels: PixelPlanes, T_camera_world: F64, scale: Scale
 ) -> BoolArray:  # fmt: skip
-    """(N,) which blocks may have voxels in view and not wholly behind the surface."""
+    """(N,) which of the (N, 3) blocks may have voxels in view and not wholly behind the surface."""
     seen = np.zeros(len(keys), np.bool_)
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    K, furthest, (height, width) = pixels.intrinsics, pixels.furthest, pixels.depths.shape
+    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
+    voxel, truncation = scale.voxel, scale.truncation
     T = T_camera_world
     half = 0.5 * (SIDE - 1) * voxel
     radius = 1.7321 * half
@@ -60,17 +218,17 @@ def blocks_in_view(
 
 @fast_kernel
 def add_sight(
-    keys: I32, slots: I32, T_camera_world: F64, intrinsics: F64, planes: F32, weights: U8,
-    colours: U8, voxel: float, truncation: float, free_space: bool, sign: int,
-    distance_sums: I32, weight_sums: I32, colour_sums: I32,
+    sign: int, keys: I32, rows: I64, pixels: PixelPlanes, colours: U8, T_camera_world: F64,
+    scale: Scale, free_space: bool, sums: VoxelSums,
 ) -> BoolArray:  # fmt: skip
     """Add (sign 1) or take away (sign -1) one sight in the blocks given; which of them it changed.
 
-    keys, slots: (N, 3), (N,) blocks and where they stand in the sums.    planes, weights: see
-    PixelPlanes.    colours: (H, W, 3).    distance_sums, weight_sums: (S, 8, 8, 8) indexed
-    (slot, z, y, x).    colour_sums: (S, 8, 8, 8, 4) red, green, blue, weight.
+    keys, rows: (N, 3), (N,) blocks and where they stand in the sums.    colours: (H, W, 3).
     """
     changed = np.zeros(len(keys), np.bool_)
+    planes, weights, intrinsics = pixels.planes, pixels.weights, pixels.intrinsics
+    distance_sums, weight_sums, colour_sums = sums
+    voxel, truncation = scale.voxel, scale.truncation
     height, width = weights.shape
     T = T_camera_world.astype(np.float32)
     fx, fy = np.float32(intrinsics[0]), np.float32(intrinsics[1])
@@ -78,7 +236,7 @@ def add_sight(
     units = np.float32(DISTANCE_UNITS / truncation)
     band = np.float32(truncation)
     for i in range(len(keys)):
-        slot = slots[i]
+        row = rows[i]
         # In double precision once: float32 would lose what is far from the origin.
         ox, oy, oz = keys[i, 0] * SIDE * voxel, keys[i, 1] * SIDE * voxel, keys[i, 2] * SIDE * voxel
         W = T_camera_world
@@ -116,14 +274,14 @@ def add_sight(
                     if distance >= band:
                         if not free_space:
                             continue
-                        distance_sums[slot, z, y, x] += w * np.int32(DISTANCE_UNITS)
+                        distance_sums[row, z, y, x] += w * np.int32(DISTANCE_UNITS)
                     else:
                         level = np.int32(np.floor(distance * units + np.float32(0.5)))
-                        distance_sums[slot, z, y, x] += w * level
+                        distance_sums[row, z, y, x] += w * level
                         for k in range(3):
-                            colour_sums[slot, z, y, x, k] += w * np.int32(colours[v, u, k])
-                        colour_sums[slot, z, y, x, 3] += w
-                    weight_sums[slot, z, y, x] += w
+                            colour_sums[row, z, y, x, k] += w * np.int32(colours[v, u, k])
+                        colour_sums[row, z, y, x, 3] += w
+                    weight_sums[row, z, y, x] += w
                     touched = True
         changed[i] = touched
     return changed

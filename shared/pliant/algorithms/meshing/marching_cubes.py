@@ -3,20 +3,33 @@
 A cube is meshed where all of its corners were seen and no edge that it cuts changes faster than a
 distance can: where that happens, sights of different surfaces meet, as behind an edge of a thing,
 and there is no surface.
+
+The triangles of a cube are worked out from the cube itself (Lorensen and Cline 1987).  Corner c of
+a cube stands at (c & 1, c >> 1 & 1, c >> 2): x, y, z.  A case is the set of corners inside (tsdf <
+0), bit c for corner c.  Edge 4 * axis + i runs along the axis from its i-th corner without that
+bit.  On each face the crossings are joined so that corners inside which share no edge of the face
+are kept apart; both cubes at the face see the same, so that the surfaces of neighbours meet.  The
+joints of a cube form loops, one crossing each, and a loop is cut into triangles whose inner edges
+run through the cube and not along a face, where the neighbour could have the same.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, I32, I64, U8
+from pliant.algorithms.arrays import F32, I32, U8
 from pliant.algorithms.kernel import fast_kernel, kernel
-from pliant.algorithms.meshing.marching_cubes_table import edge_corners, triangle_table
-from pliant.algorithms.meshing.mesh_blocks import LATTICE, MeshBlocks
-from pliant.algorithms.meshing.tsdf_blocks import SIDE, BlockTable, pack_one, row_of
+from pliant.algorithms.meshing.mesh_blocks import LATTICE, SIDE, MeshBlocks
+from pliant.algorithms.meshing.tsdf_blocks import BlockTable, Scale, VoxelSums, pack_one, row_of
 from pliant.algorithms.meshing.tsdf_integrate import DISTANCE_UNITS
 
+MAX_TRIANGLES = 5
+_FACES = (  # Corners in the order of their outline, anticlockwise from outside.
+    (0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6),
+)  # fmt: skip
+_EDGES = tuple((c, c | 1 << axis) for axis in range(3) for c in range(8) if not c & 1 << axis)
 _PAD = SIDE + 3
 """Voxels of a block, one before and two behind it: what its cubes and their gradients read."""
 _END = np.float32(0.01)
@@ -27,32 +40,37 @@ _VERTEX = 9
 """Values of a vertex: position, normal, colour."""
 
 
-@dataclass(frozen=True)
-class TsdfArrays:
-    """The sums of ``tsdf_integrate``, where the blocks stand in them, and their scale."""
+class Tsdf(NamedTuple):
+    """The sums of a volume's blocks, and their scale.
+
+    min_weight: voxels of less, in WEIGHT_UNITS, were not seen.
+    """
 
     table: BlockTable
-    slots: I32
-    distance_sums: I32
-    weight_sums: I32
-    colour_sums: I32
-    voxel: float
-    truncation: float
+    sums: VoxelSums
+    scale: Scale
     min_weight: int
 
 
-def extract_blocks(keys: I32, tsdf: TsdfArrays) -> MeshBlocks:
+class CubeTable(NamedTuple):
+    """counts: (256,) how many triangles a case has.    triangles: (256, MAX_TRIANGLES, 3) the edges
+    of their corners, anticlockwise seen from outside the surface (tsdf > 0).    corners: (12, 2) of
+    each edge, the smaller first.
+    """
+
+    counts: I32
+    triangles: I32
+    corners: I32
+
+
+def extract_blocks(keys: I32, tsdf: Tsdf) -> MeshBlocks:
     """The surface in the cubes that start in the (B, 3) blocks given, in their order.
 
     Blocks that are not in the table have no surface.
     """
-    counts, triangles_of = triangle_table()
-    max_jump = _MAX_STEPS * tsdf.voxel / tsdf.truncation
     vertex_counts, triangle_counts, edges, values, triangles = _march(
-        np.ascontiguousarray(keys), tsdf.table.packed, tsdf.table.rows, tsdf.slots,
-        tsdf.distance_sums, tsdf.weight_sums, tsdf.colour_sums, tsdf.voxel, tsdf.min_weight,
-        max_jump, counts, triangles_of, edge_corners(),
-    )  # fmt: skip
+        np.ascontiguousarray(keys), tsdf, cube_table()
+    )
     return MeshBlocks(
         keys=keys.copy(),
         vertex_counts=vertex_counts,
@@ -65,12 +83,81 @@ def extract_blocks(keys: I32, tsdf: TsdfArrays) -> MeshBlocks:
     )
 
 
+@cache
+def _edge(a: int, b: int) -> int:
+    return _EDGES.index((min(a, b), max(a, b)))
+
+
+@cache
+def _on_one_face(e: int, f: int) -> bool:
+    corners = {*_EDGES[e], *_EDGES[f]}
+    return any(corners <= set(face) for face in _FACES)
+
+
+@cache
+def cube_table() -> CubeTable:
+    """The triangles of every case."""
+    counts = np.zeros(256, np.int32)
+    table = np.zeros((256, MAX_TRIANGLES, 3), np.int32)
+    for case in range(256):
+        triangles = [t for loop in _loops(case) for t in _cut(tuple(loop))]
+        counts[case] = len(triangles)
+        table[case, : len(triangles)] = np.array(triangles, np.int32).reshape(-1, 3)
+    return CubeTable(counts, table, np.array(_EDGES, np.int32))
+
+
+def _loops(case: int) -> list[list[int]]:
+    """The outlines of the surface in one cube, as edges in order."""
+    after: dict[int, int] = {}
+    for face in _FACES:
+        inside = [bool(case >> c & 1) for c in face]
+        for k in range(4):
+            if inside[k] or not inside[(k + 1) % 4]:
+                continue
+            # The run of corners inside that starts at k + 1 ends at the next one outside.
+            end = k + 1
+            while inside[(end + 1) % 4]:
+                end += 1
+            entry = _edge(face[k], face[(k + 1) % 4])
+            leave = _edge(face[end % 4], face[(end + 1) % 4])
+            after[entry] = leave
+    loops: list[list[int]] = []
+    while after:
+        edge = min(after)
+        loop: list[int] = []
+        while edge in after:
+            loop.append(edge)
+            edge = after.pop(edge)
+        loops.append(loop)
+    return loops
+
+
+@cache
+def _cut(loop: tuple[int, ...]) -> tuple[tuple[int, int, int], ...]:
+    """Triangles of a loop, with as few inner edges along a face as can be."""
+    return _best_cut(loop)[1]
+
+
+@cache
+def _best_cut(loop: tuple[int, ...]) -> tuple[int, tuple[tuple[int, int, int], ...]]:
+    if len(loop) < 3:
+        return 0, ()
+    first, last = loop[0], loop[-1]
+    best: tuple[int, tuple[tuple[int, int, int], ...]] | None = None
+    for k in range(1, len(loop) - 1):
+        left, right = _best_cut(loop[: k + 1]), _best_cut(loop[k:])
+        cost = left[0] + right[0]
+        for i, j in pairwise((0, k, len(loop) - 1)):
+            cost += int(j - i > 1 and _on_one_face(loop[i], loop[j]))
+        if best is None or cost < best[0]:
+            best = cost, ((first, loop[k], last), *left[1], *right[1])
+    assert best is not None
+    return best
+
+
 @kernel
-def _march(
-    keys: I32, packed: I64, rows: I32, slots: I32, distance_sums: I32, weight_sums: I32,
-    colour_sums: I32, voxel: float, min_weight: int, max_jump: float,
-    counts: I32, triangles_of: I32, corners: I32,
-) -> tuple[I32, I32, I32, F32, I32]:  # fmt: skip
+def _march(keys: I32, tsdf: Tsdf, cube: CubeTable) -> tuple[I32, I32, I32, F32, I32]:
+    max_jump = _MAX_STEPS * tsdf.scale.voxel / tsdf.scale.truncation
     vertex_counts = np.zeros(len(keys), np.int32)
     triangle_counts = np.zeros(len(keys), np.int32)
     edges: Any = np.empty(4096, np.int32)
@@ -82,13 +169,13 @@ def _march(
     ids = np.full(LATTICE * LATTICE * LATTICE * 3, -1, np.int32)
     vertex, face = 0, 0
     for i in range(len(keys)):
-        _neighbours(keys[i], packed, rows, slots, near)
+        _neighbours(keys[i], tsdf.table, near)
         if near[1, 1, 1] < 0:
             continue
-        if not _crossed(near, distance_sums, weight_sums, min_weight):
+        if not _crossed(near, tsdf.sums, tsdf.min_weight):
             continue
-        _gather(near, distance_sums, weight_sums, min_weight, field)
-        faces = _classify(field, max_jump, counts, triangles_of, corners, cases, ids)
+        _gather(near, tsdf.sums, tsdf.min_weight, field)
+        faces = _classify(field, max_jump, cube, cases, ids)
         if faces == 0:
             continue
         while vertex + len(ids) > len(values):
@@ -100,9 +187,9 @@ def _march(
             if ids[e] == 0:
                 ids[e] = vertex - first
                 edges[vertex] = e
-                _vertex(e, keys[i], near, field, colour_sums, voxel, values[vertex])
+                _vertex(e, keys[i], near, field, tsdf, values[vertex])
                 vertex += 1
-        face = _emit(cases, counts, triangles_of, corners, ids, triangles, face)
+        face = _emit(cases, cube, ids, triangles, face)
         vertex_counts[i], triangle_counts[i] = vertex - first, faces
         for k in range(first, vertex):
             ids[edges[k]] = -1
@@ -128,59 +215,56 @@ def _longer(array: I32) -> I32:
 
 
 @kernel
-def _neighbours(key: I32, packed: I64, rows: I32, slots: I32, near: I32) -> None:
-    """Slots of the 27 blocks around a key by (z, y, x), -1 where there is none."""
+def _neighbours(key: I32, table: BlockTable, near: I32) -> None:
+    """Rows of the 27 blocks around a key by (z, y, x), -1 where there is none."""
     for dz in range(3):
         for dy in range(3):
             for dx in range(3):
-                row = row_of(
-                    packed, rows, pack_one(key[0] + dx - 1, key[1] + dy - 1, key[2] + dz - 1)
-                )
-                near[dz, dy, dx] = slots[row] if row >= 0 else -1
+                at = pack_one(key[0] + dx - 1, key[1] + dy - 1, key[2] + dz - 1)
+                near[dz, dy, dx] = row_of(table, at)
 
 
 @kernel
-def _crossed(near: I32, distance_sums: I32, weight_sums: I32, min_weight: int) -> bool:
+def _crossed(near: I32, sums: VoxelSums, min_weight: int) -> bool:
     """Whether the voxels that the cubes of a block read have both signs."""
     inside, outside = False, False
     for z in range(SIDE + 1):
         for y in range(SIDE + 1):
             for part in range(2):
-                slot = near[1 + (z >> 3), 1 + (y >> 3), 1 + part]
-                if slot < 0:
+                row = near[1 + (z >> 3), 1 + (y >> 3), 1 + part]
+                if row < 0:
                     continue
-                sums = distance_sums[slot, z & 7, y & 7]
-                weights = weight_sums[slot, z & 7, y & 7]
+                distances = sums.distances[row, z & 7, y & 7]
+                weights = sums.weights[row, z & 7, y & 7]
                 for x in range(1 if part else SIDE):
                     if weights[x] >= min_weight:
-                        inside |= sums[x] < 0
-                        outside |= sums[x] >= 0
+                        inside |= distances[x] < 0
+                        outside |= distances[x] >= 0
             if inside and outside:
                 return True
     return False
 
 
 @fast_kernel
-def _gather(near: I32, distance_sums: I32, weight_sums: I32, min_weight: int, field: F32) -> None:
+def _gather(near: I32, sums: VoxelSums, min_weight: int, field: F32) -> None:
     """Mean distances in truncations, NaN where the weight is too small."""
     for z in range(_PAD):
         for y in range(_PAD):
             for x in range(_PAD):
-                slot = near[(z + 7) >> 3, (y + 7) >> 3, (x + 7) >> 3]
+                row = near[(z + 7) >> 3, (y + 7) >> 3, (x + 7) >> 3]
                 value = np.float32(np.nan)
-                if slot >= 0:
-                    w = weight_sums[slot, (z + 7) & 7, (y + 7) & 7, (x + 7) & 7]
+                if row >= 0:
+                    w = sums.weights[row, (z + 7) & 7, (y + 7) & 7, (x + 7) & 7]
                     if w >= min_weight:
-                        s = distance_sums[slot, (z + 7) & 7, (y + 7) & 7, (x + 7) & 7]
+                        s = sums.distances[row, (z + 7) & 7, (y + 7) & 7, (x + 7) & 7]
                         value = np.float32(s) / (np.float32(DISTANCE_UNITS) * np.float32(w))
                 field[z, y, x] = value
 
 
 @kernel
-def _classify(
-    field: F32, max_jump: float, counts: I32, triangles_of: I32, corners: I32, cases: U8, ids: I32
-) -> int:
+def _classify(field: F32, max_jump: float, cube: CubeTable, cases: U8, ids: I32) -> int:
     """Set the case of each cube, mark the edges that it uses with 0, and count the triangles."""
+    counts, triangles_of, corners = cube
     faces = 0
     for z in range(SIDE):
         for y in range(SIDE):
@@ -222,10 +306,9 @@ def _edge_id(x: int, y: int, z: int, edge: int, corners: I32) -> int:
 
 
 @kernel
-def _emit(
-    cases: U8, counts: I32, triangles_of: I32, corners: I32, ids: I32, triangles: I32, first: int
-) -> int:
+def _emit(cases: U8, cube: CubeTable, ids: I32, triangles: I32, first: int) -> int:
     """Write the triangles from row ``first`` on; the row after the last."""
+    counts, triangles_of, corners = cube
     face = first
     for z in range(SIDE):
         for y in range(SIDE):
@@ -253,10 +336,9 @@ def _difference(field: F32, z: int, y: int, x: int, dz: int, dy: int, dx: int) -
 
 
 @kernel
-def _vertex(
-    edge: int, key: I32, near: I32, field: F32, colour_sums: I32, voxel: float, out: F32
-) -> None:
+def _vertex(edge: int, key: I32, near: I32, field: F32, tsdf: Tsdf, out: F32) -> None:
     """Position, normal and colour where the distance is zero on an edge of the lattice."""
+    colour_sums, voxel = tsdf.sums.colours, tsdf.scale.voxel
     axis, at = edge % 3, edge // 3
     x, y, z = at % LATTICE, at // LATTICE % LATTICE, at // (LATTICE * LATTICE)
     dx, dy, dz = int(axis == 0), int(axis == 1), int(axis == 2)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32
-from pliant.fusion.open3d_import import require_open3d
+from pliant.export.open3d_import import require_open3d
 
 NEIGHBOURS = 16
 DEPTH = 8
@@ -16,7 +16,7 @@ CUT = 0.05
 def poisson_mesh(points_world: F64, p_world_camera: F64) -> tuple[F32, F32, I32]:
     """Vertices, normals and triangles through points, normals towards the cameras that saw them.
 
-    points_world, p_world_camera: (N, 3).  Raises FusionError without open3d.
+    points_world, p_world_camera: (N, 3).  Raises Open3dError without open3d.
     """
     open3d: Any = require_open3d()
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points_world))

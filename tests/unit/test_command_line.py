@@ -1,0 +1,52 @@
+"""What the command line says of itself, and of the installation."""
+
+import importlib
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import pliant
+from pliant_services.cli import app, doctor
+
+importlib.import_module("pliant_services.cli.commands")  # registers them
+COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+
+
+def shown(*arguments: str) -> str:
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def without_spaces(text: str) -> str:
+    return "".join(text.split())
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_texts_are_shown_whole(name: str) -> None:
+    """With the defaults that stand [in brackets], which Rich would take for markup."""
+    page = without_spaces(shown(name, "--help"))
+    command = COMMANDS[name]
+    texts = [p.help for p in command.params if getattr(p, "help", "") and not p.hidden]
+    for text in (*texts, *command.help.split("\n\n")):
+        assert without_spaces(text) in page
+
+
+def test_the_version_is_said() -> None:
+    assert shown("--version") == f"pliant {pliant.__version__}\n"
+
+
+def test_a_missing_package_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "threadpoolctl", None)
+    (found,) = (f for f in doctor.diagnose() if f.what == "arithmetic")
+    assert found.grade == "error"
+
+
+def test_open3d_is_found_whatever_it_was_installed_as(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", SimpleNamespace(__version__="9.8.7"))
+    (found,) = (f for f in doctor.diagnose() if f.what == "open3d")
+    assert (found.grade, found.detail) == ("ok", "9.8.7")
