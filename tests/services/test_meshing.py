@@ -151,6 +151,20 @@ def test_the_final_mesh_lies_on_the_wall_and_the_box(outputs: dict[Topic, list[H
     assert final(outputs, "fine").voxel_size < final(outputs, "coarse").voxel_size
 
 
+@pytest.mark.parametrize("segment", [0, 1])
+def test_only_the_segment_that_the_last_adjustment_had_is_seen_by_the_corrected_camera(
+    segment: int, outputs: dict[Topic, list[Header]]
+) -> None:
+    """The keyframes are of segment 0."""
+    given = inputs()
+    last = map_update(FRAMES - 1, last=True)
+    given[topics.MAP_FINAL] = [
+        replace(last, segment=segment, calibration_correction=(0.1, 0.0, 0.0, 0.0))
+    ]
+    plain, found = final(outputs, "fine"), final(run(given), "fine")
+    assert (codec.encode(found) == codec.encode(plain)) == (segment == 1)
+
+
 def test_the_same_bytes_again(outputs: dict[Topic, list[Header]]) -> None:
     again = run(inputs())
     for topic in (topics.MESH_BLOCKS, topics.MESH_FINAL):

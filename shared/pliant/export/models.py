@@ -76,8 +76,7 @@ def colmap(recording: Recording, path: Path, folder: Path | None) -> None:
     """``sparse/0`` with the text model, ``images`` with the keyframes as its camera sees them."""
     stream = camera_of(recording)
     run = read_run(recording.path)
-    was_corrected = run.corrected_segment == run.history.longest_segment()
-    view = corrected_view(stream.camera, run.calibration_correction if was_corrected else ())
+    view = corrected_view(stream.camera, run.correction_of(run.history.longest_segment()))
     model = path / "sparse" / "0"
     make_folder(model)
     frames = set(write_colmap_model(recording, view, run.history, model))

@@ -103,7 +103,8 @@ class Mesher:
         self._parameters = parameters
         self._spool = spool
         self._map = CurrentMap()
-        self._view = CorrectedView(camera, ())
+        self._plain = self._corrected = CorrectedView(camera, ())
+        self._corrected_segment = -1
         self._surfaces = KeyframeSurfaces(camera, parameters.surface)
         self._live: LiveMesh | None = None
         self._segment = -1
@@ -121,7 +122,8 @@ class Mesher:
         images: JPEG files of keyframes by their ids, each told once.
         """
         self._map.take(update, frame)
-        self._view = CorrectedView(self._camera, update.calibration_correction)
+        self._corrected = CorrectedView(self._camera, update.calibration_correction)
+        self._corrected_segment = update.segment
         for keyframe, jpeg in images.items():
             self._spool.put_image(keyframe, jpeg)
         bounds = np.concatenate([[0], np.cumsum(keyframes.counts)])
@@ -248,6 +250,11 @@ class Mesher:
     def _surface(self, keyframe: int, timer: StageTimer) -> Surface:
         return self._surfaces.surface(self._pose(keyframe), self._seen(keyframe), timer)
 
+    def _view(self, keyframe: int) -> CorrectedView:
+        """As the calibration has it with which the segment of the keyframe was made."""
+        segment = self._map.keyframes[keyframe].segment
+        return self._corrected if segment == self._corrected_segment else self._plain
+
     def _pose(self, keyframe: int) -> F64:
         return pose_to_matrix(self._map.keyframes[keyframe].pose_world_camera)
 
@@ -257,7 +264,7 @@ class Mesher:
         rows, points = self._map.points_of(ids)
         return SeenPoints(
             ids=points.ids,
-            points_px=self._view.pixels(pixels[rows]),
+            points_px=self._view(keyframe).pixels(pixels[rows]),
             points_world=points.positions,
             sigmas=np.asarray(points.sigmas, np.float32),
             keyframes=np.asarray(points.keyframes, np.int32),
@@ -269,7 +276,7 @@ class Mesher:
         if not jpeg:
             return None
         pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
-        return None if pixels is None else self._view.image(np.asarray(pixels, np.uint8))
+        return None if pixels is None else self._view(keyframe).image(np.asarray(pixels, np.uint8))
 
     def _pass_over(self, keyframe: int, why: str) -> None:
         self.counts["without_surface"] += 1

@@ -50,6 +50,10 @@ class Run:
     arrivals_ns: list[int] = field(default_factory=list[int])
     recorded: Summary = field(default_factory=Summary)
 
+    def correction_of(self, segment: int) -> tuple[float, ...]:
+        """What its last adjustment found wrong with the calibration; () where it had none."""
+        return self.calibration_correction if segment == self.corrected_segment else ()
+
     @property
     def frames_per_second(self) -> float:
         """Rate at which map updates reached the recorder."""
