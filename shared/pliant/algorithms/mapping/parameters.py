@@ -140,10 +140,10 @@ class WindowParameters(Parameters):
         default=1200, ge=50, description="As points_per_keyframe, at the end of the stream"
     )
     final_max_keyframes: int = Field(
-        default=200, ge=3, description="Keyframes above which the final adjustment is left out"
+        default=1000, ge=3, description="Keyframes above which the final adjustment is left out"
     )
     kept_keyframes: int = Field(
-        default=200,
+        default=1000,
         ge=30,
         description="Keyframes to come back to: beyond (and beyond final_max_keyframes) those most "
         "like another leave the active map, which bounds its memory; they stay in the results",
