@@ -5,9 +5,9 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import matrix_to_pose, so3_exp
-from pliant.algorithms.surfels.motion import identity_poses
-from pliant.algorithms.surfels.sampling import A, B, Level, X, make_level
-from pliant.algorithms.surfels.tangent import tangent_jacobian
+from pliant.algorithms.surfels.deformation_models import identity_poses
+from pliant.algorithms.surfels.depth_maps import tangent_jacobian
+from pliant.algorithms.surfels.patch_sampling import A, B, Level, X, make_level
 from pliant.rendering.paths import SampledPath
 from pliant.rendering.render import (
     CameraOptions,

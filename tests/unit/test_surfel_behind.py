@@ -10,7 +10,7 @@ from surfel_scene import board_renderer, film, motion
 from pliant.algorithms.arrays import I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.surfels import SurfelFrame, SurfelParameters, SurfelState, SurfelTracker
-from pliant.algorithms.surfels.sampling import X
+from pliant.algorithms.surfels.patch_sampling import X
 from pliant.rendering.render import RenderedFrame
 
 Mode = Literal["static", "moving"]

@@ -7,12 +7,10 @@ from hypothesis import strategies as st
 from surfel_scene import EVERYWHERE, level_of, slanted_surfels, waves
 
 from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.surfels import motion
-from pliant.algorithms.surfels.align import Templates
-from pliant.algorithms.surfels.birth import make_templates
-from pliant.algorithms.surfels.corners import find_corners, smaller_eigenvalues
-from pliant.algorithms.surfels.damped import factorise, inverse_diagonal, invert, solve
-from pliant.algorithms.surfels.sampling import (
+from pliant.algorithms.surfels import deformation_models as motion
+from pliant.algorithms.surfels.births import find_corners, make_templates, smaller_eigenvalues
+from pliant.algorithms.surfels.depth_maps import fit_inverse_depth, tangent_jacobian
+from pliant.algorithms.surfels.patch_sampling import (
     BIAS,
     GAIN,
     INVALID,
@@ -24,7 +22,7 @@ from pliant.algorithms.surfels.sampling import (
     make_grid,
     sample_patch,
 )
-from pliant.algorithms.surfels.sums import (
+from pliant.algorithms.surfels.photometric import (
     FEATURES,
     correlation,
     feature_matrix,
@@ -32,7 +30,13 @@ from pliant.algorithms.surfels.sums import (
     padded,
     photometric_sums,
 )
-from pliant.algorithms.surfels.tangent import fit_inverse_depth, tangent_jacobian
+from pliant.algorithms.surfels.surfel_alignment import (
+    Templates,
+    factorise,
+    inverse_diagonal,
+    invert,
+    solve,
+)
 
 SIDE = 23
 HIGH = 1e6

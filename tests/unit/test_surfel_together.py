@@ -4,11 +4,17 @@ import numpy as np
 from surfel_scene import slanted_surfels
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.surfels import motion
-from pliant.algorithms.surfels import together_kernels as kernels
-from pliant.algorithms.surfels.neighbours import Edges, find_edges, join_edges, keep_rows
-from pliant.algorithms.surfels.sampling import A, B, F, X
-from pliant.algorithms.surfels.together import torn_off
+from pliant.algorithms.surfels import deformation_models as motion
+from pliant.algorithms.surfels.deformation_graph import (
+    Edges,
+    edge_rows,
+    find_edges,
+    join_edges,
+    keep_rows,
+    torn_off,
+)
+from pliant.algorithms.surfels.graph_alignment import solve_graph
+from pliant.algorithms.surfels.patch_sampling import A, B, F, X
 
 N = 12
 
@@ -23,13 +29,6 @@ def plane(count: int = N, seed: int = 0) -> F64:
 
 def pairs_of(poses: F64, count: int = 3) -> Edges:
     return find_edges(poses, np.ones(len(poses), np.int64), 0, count)
-
-
-def rows_of(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
-    e = len(edges.ends)
-    w, residuals, arms = np.zeros(e), np.zeros((e, 2, 3)), np.zeros((e, 2, 3))
-    kernels.edge_rows(poses, edges, 0.3, w, residuals, arms)
-    return w, residuals, arms
 
 
 def stepped(poses: F64, x: F64) -> F64:
@@ -60,7 +59,7 @@ def test_pairs_follow_their_rows() -> None:
     rows = np.arange(2, N)
     kept = keep_rows(old, rows, N)
     assert 0 < len(kept.ends) < len(old.ends)
-    w, residuals, _ = rows_of(poses[rows], kept)
+    w, residuals, _ = edge_rows(poses[rows], kept)
     np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
     np.testing.assert_allclose(w, 1.0)
     new = find_edges(poses, np.ones(N, np.int64), N - 2, 3)
@@ -75,10 +74,10 @@ def test_a_stretch_that_surfels_know_of_costs_nothing() -> None:
     stretch = np.array([[1.2, 0.05], [0.05, 0.9]])
     pulled[:, X : X + 2] = poses[:, X : X + 2] @ stretch
     pulled[:, F : F + 3] = (1.2, 0.05, 0.9)
-    _, residuals, _ = rows_of(pulled, edges)
+    _, residuals, _ = edge_rows(pulled, edges)
     np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
     pulled[:, F : F + 3] = (1.0, 0.0, 1.0)
-    assert np.abs(rows_of(pulled, edges)[1]).max() > 1e-3
+    assert np.abs(edge_rows(pulled, edges)[1]).max() > 1e-3
 
 
 def test_a_rigid_motion_costs_nothing() -> None:
@@ -91,7 +90,7 @@ def test_a_rigid_motion_costs_nothing() -> None:
     c = np.cross(moved[0, A : A + 3], moved[0, B : B + 3])
     rotation = np.stack([moved[0, A : A + 3], moved[0, B : B + 3], c], axis=1)
     moved[:, X : X + 3] = poses[:, X : X + 3] @ rotation.T + shift
-    _, residuals, _ = rows_of(moved, edges)
+    _, residuals, _ = edge_rows(moved, edges)
     np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
 
 
@@ -101,19 +100,19 @@ def test_solution_against_dense_least_squares() -> None:
     poses = plane()
     edges = pairs_of(poses)
     moved = stepped(poses, 0.003 * rng.standard_normal((N, 6)))
-    w, residuals, arms = rows_of(moved, edges)
+    w, residuals, arms = edge_rows(moved, edges)
     pull, bend = w * 40.0 / edges.lengths**2, w * 3.0 / edges.lengths**2
     roots = np.linalg.cholesky(np.eye(6) + 0.1)
     S = np.broadcast_to(roots @ roots.T, (N, 6, 6)).copy()
     b = rng.standard_normal((N, 6)) * 1e-3
     x = np.zeros((N, 6))
-    kernels.solve_together(S, b, edges, arms, residuals, pull, bend, 500, 1e-24, x)
+    solve_graph(S, b, edges, arms, residuals, pull, bend, 500, 1e-24, x)
     J = np.zeros((residuals.size, 6 * N))
     for k in range(6 * N):
         step = np.zeros(6 * N)
         step[k] = 1e-6
-        ahead = rows_of(stepped(moved, step.reshape(N, 6)), edges)[1]
-        behind = rows_of(stepped(moved, -step.reshape(N, 6)), edges)[1]
+        ahead = edge_rows(stepped(moved, step.reshape(N, 6)), edges)[1]
+        behind = edge_rows(stepped(moved, -step.reshape(N, 6)), edges)[1]
         J[:, k] = (ahead - behind).ravel() / 2e-6
     W = np.repeat(np.stack([pull, bend], axis=1).ravel(), 3)
     H = J.T @ (W[:, None] * J) + np.kron(np.eye(N), roots @ roots.T)
@@ -124,8 +123,8 @@ def test_solution_against_dense_least_squares() -> None:
 def test_who_leaves_all_neighbours_is_torn_off() -> None:
     poses = plane()
     edges = pairs_of(poses, 4)
-    assert not torn_off(edges, rows_of(poses, edges)[0], N).any()
+    assert not torn_off(edges, edge_rows(poses, edges)[0], N).any()
     poses[3, X : X + 3] *= 1.3
-    torn = torn_off(edges, rows_of(poses, edges)[0], N)
+    torn = torn_off(edges, edge_rows(poses, edges)[0], N)
     assert torn[3]
     assert torn.sum() == 1

@@ -11,7 +11,7 @@ from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.mesh_blocks import MeshBlocks
-from pliant.algorithms.surfels.states import SurfelFrame
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame
 from pliant.algorithms.tracks import FrameTracks
 
 CAMERA_FRAME_ID = "camera"

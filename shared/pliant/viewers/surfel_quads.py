@@ -7,7 +7,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
-from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 
 QUAD_PX = 11.0
 """Side of a quad, in pixels of the image at birth: half the default patch, so that they part."""

@@ -1,13 +1,11 @@
 """Starting surfels where something else saw them go (not in the paper)."""
 
-import math
-
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.arrays import F32, F64, I64, U8
 from pliant.algorithms.kernel import fast_kernel
-from pliant.algorithms.surfels.align import Limits, Templates, Workspace, evaluate
-from pliant.algorithms.surfels.sampling import Level, X
+from pliant.algorithms.surfels.patch_sampling import Level, X
+from pliant.algorithms.surfels.surfel_alignment import Limits, Templates, Workspace, evaluate_all
 from pliant.algorithms.tracks import FrameTracks
 
 _NEAREST = 9
@@ -16,37 +14,24 @@ _RADIUS_PX = 30.0
 """About a patch and its margin: what is farther away may move otherwise."""
 
 
-@fast_kernel
 def start_at(
     poses: F64, active: U8, targets_px: F64, level: Level, templates: Templates, limits: Limits,
     work: Workspace,
-) -> int:  # fmt: skip
+) -> None:  # fmt: skip
     """Move each surfel to where it was predicted, at its depth, if it fits better there.
 
     targets_px: (N, 2) pixels of this level, NaN where there is no prediction.  Both starts are
-    rated by Eq. 5 at this level, the coarsest.  Returns how many surfels were moved.
+    rated by Eq. 5 at this level, the coarsest.
     """
-    moved = 0
-    start = np.empty(3)
-    for s in range(len(poses)):
-        u, v = targets_px[s, 0], targets_px[s, 1]
-        if not active[s] or not templates.usable[s]:
-            continue
-        if not (math.isfinite(u) and math.isfinite(v)):
-            continue
-        pose, images, mean = poses[s], templates.images[s], templates.means[s]
-        cost, _ = evaluate(pose, level, images, mean, limits, work, work.sums)
-        start[:] = pose[X : X + 3]
-        z = pose[X + 2]
-        pose[X] = (u - level.cx) / level.fx * z
-        pose[X + 1] = (v - level.cy) / level.fy * z
-        other, _ = evaluate(pose, level, images, mean, limits, work, work.sums)
-        # A negative cost is that of a patch behind the camera.
-        if other >= 0.0 and (cost < 0.0 or other < cost):
-            moved += 1
-        else:
-            pose[X : X + 3] = start
-    return moved
+    led = active * np.isfinite(targets_px).all(axis=1)
+    moved, z = poses.copy(), poses[:, X + 2]
+    moved[:, X] = (targets_px[:, 0] - level.cx) / level.fx * z
+    moved[:, X + 1] = (targets_px[:, 1] - level.cy) / level.fy * z
+    here = evaluate_all(poses, led, level, templates, limits, work).costs
+    there = evaluate_all(moved, led, level, templates, limits, work).costs
+    # A negative cost is that of a patch behind the camera.
+    better = (there >= 0.0) & ((here < 0.0) | (there < here))
+    poses[better] = moved[better]
 
 
 def targets(points_px: F64, displacements_px: F64, scale: float) -> F64:
@@ -66,23 +51,24 @@ def predict(points_px: F32, before: FrameTracks, now: FrameTracks) -> F64:
     start, end = before.points_px[old[order]], now.points_px[new[order]]
     flow = np.ascontiguousarray(now.dominant_flow)
     found = points_px @ flow[:, :2].T + flow[:, 2] - points_px
-    follow_nearest(points_px, start, end - start, found)
+    first = np.searchsorted(start[:, 1], points_px[:, 1] - np.float32(_RADIUS_PX))
+    _follow_nearest(points_px, start, end - start, first, found)
     return found
 
 
 @fast_kernel
-def follow_nearest(points_px: F32, start_px: F32, moves_px: F32, found: F64) -> None:
+def _follow_nearest(points_px: F32, start_px: F32, moves_px: F32, first: I64, found: F64) -> None:
     """Replace a displacement by the median of the nearest moves where enough are near.
 
-    start_px: (M, 2) in ascending order of v.    moves_px: (M, 2).    found: (N, 2), in and out.
+    start_px: (M, 2) in ascending order of v.    moves_px: (M, 2).    first: (N,) where in
+    ``start_px`` to begin.  found: (N, 2), in and out.
     """
     distances = np.empty(_NEAREST)
     nearest = np.empty(_NEAREST, np.int64)
     for s in range(len(points_px)):
         u, v = points_px[s, 0], points_px[s, 1]
         count = 0
-        first = np.searchsorted(start_px[:, 1], np.float32(v - _RADIUS_PX))
-        for i in range(first, len(start_px)):
+        for i in range(first[s], len(start_px)):
             if start_px[i, 1] > v + _RADIUS_PX:
                 break
             distance = (start_px[i, 0] - u) ** 2 + (start_px[i, 1] - v) ** 2
@@ -95,5 +81,18 @@ def follow_nearest(points_px: F32, start_px: F32, moves_px: F32, found: F64) -> 
                 place -= 1
             distances[place], nearest[place] = distance, i
         if count >= _FEWEST:
-            found[s, 0] = np.median(moves_px[nearest[:count], 0])
-            found[s, 1] = np.median(moves_px[nearest[:count], 1])
+            for k in range(2):
+                found[s, k] = _median(moves_px[:, k], nearest[:count], distances)
+
+
+@fast_kernel
+def _median(values: F32, rows: I64, ordered: F64) -> float:
+    """Of the values of some rows.  ordered: scratch."""
+    for n in range(len(rows)):
+        value, place = np.float64(values[rows[n]]), n
+        while place > 0 and ordered[place - 1] > value:
+            ordered[place] = ordered[place - 1]
+            place -= 1
+        ordered[place] = value
+    half = len(rows) // 2
+    return 0.5 * (ordered[half] + ordered[len(rows) - 1 - half])

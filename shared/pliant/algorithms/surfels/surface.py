@@ -4,7 +4,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, I32, I64
 from pliant.algorithms.meshing.delaunay import triangulate
-from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 
 _MAX_LENGTHS = 3.0
 """A longer edge, in medians of all edges, spans a hole."""

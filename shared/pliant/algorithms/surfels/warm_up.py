@@ -7,7 +7,7 @@ import numpy as np
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import predict
-from pliant.algorithms.surfels.tracker import SurfelTracker
+from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 from pliant.algorithms.tracks import FrameTracks
 
 

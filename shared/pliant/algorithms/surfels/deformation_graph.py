@@ -1,18 +1,23 @@
-"""Surfels that were born side by side on one surface.
+"""Surfels that were born side by side on one surface: the edges of a deformation graph.
 
-Not in the paper, whose surfels know nothing of each other; ``together`` says what for.
+Not in the paper, whose surfels know nothing of each other; ``graph_alignment`` says what for.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.arrays import F64, I64, BoolArray
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
-from pliant.algorithms.surfels.sampling import A, B, F, X
+from pliant.algorithms.surfels.patch_sampling import A, B, F, X
 
 _OFF_PLANE = 0.3
 """Neighbours are off each other's plane by at most this share of their distance."""
+
+_TEAR = 0.3
+"""Strain at which neighbours hold on by a quarter only: what tears or slides."""
+_FEW = 3
+_HELD_SHARE = 0.25
 
 
 class Edges(NamedTuple):
@@ -132,3 +137,53 @@ def join_edges(a: Edges, b: Edges) -> Edges:
         np.concatenate([a.second, b.second]),
         np.concatenate([a.lengths, b.lengths]),
     )
+
+
+def edge_rows(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
+    """Robust weights (E,), residuals (E, 2, 3), and arms (E, 2, 3) R_i d and R_j d of all pairs.
+
+    The weights are those of Geman and McClure.  poses: (N, POSE_FLOATS).
+    """
+    e = len(edges.ends)
+    weights, residuals, arms = np.zeros(e), np.zeros((e, 2, 3)), np.zeros((e, 2, 3))
+    _edge_rows(poses, edges, _TEAR, weights, residuals, arms)
+    return weights, residuals, arms
+
+
+@leaf_kernel
+def _edge_rows(
+    poses: F64, edges: Edges, tear: float, weights: F64, residuals: F64, arms: F64
+) -> None:
+    for e in range(len(edges.ends)):
+        i, j = edges.ends[e, 0], edges.ends[e, 1]
+        own_vector(poses[i], edges.first[e], arms[e, 0])
+        own_vector(poses[j], edges.second[e], arms[e, 1])
+        squares = 0.0
+        for k in range(3):
+            p, q = arms[e, 0, k], arms[e, 1, k]
+            r = poses[j, X + k] - poses[i, X + k] - 0.5 * (p + q)
+            residuals[e, 0, k], residuals[e, 1, k] = r, q - p
+            squares += r * r
+        ratio = squares / (tear * edges.lengths[e]) ** 2
+        weights[e] = 1.0 / (1.0 + ratio) ** 2
+
+
+def torn_off(edges: Edges, weights: F64, count: int) -> BoolArray:
+    """(count,) which surfels are held by no more than a few of their neighbours.
+
+    weights: (E,) of ``edge_rows``.  Where two surfaces slide along each other, each surfel still
+    has neighbours of its own; one that has left them all has run away along its ray.
+    """
+    ends = edges.ends.ravel()
+    degree = np.bincount(ends, minlength=count)
+    held = np.bincount(ends, weights=np.repeat(weights, 2), minlength=count)
+    return (degree >= _FEW) & (held < _HELD_SHARE * degree)
+
+
+def pull_of_edges(edges: Edges, count: int, weight: float, strain: float) -> F64:
+    """(count,) DN^2 / m^2 by which its pairs hold each surfel where it is.
+
+    weight: of a pair that is strained by ``strain``, DN^2.
+    """
+    pulls = np.repeat(weight / (strain * edges.lengths) ** 2, 2)
+    return np.bincount(edges.ends.ravel(), weights=pulls, minlength=count)

@@ -4,24 +4,39 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse
+from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.surfels import judge
-from pliant.algorithms.surfels.again import look_again
-from pliant.algorithms.surfels.align import Limits, Workspace, align_all, make_workspace
-from pliant.algorithms.surfels.birth import find_births
-from pliant.algorithms.surfels.joint import Equilibrium, align_rigid, register
-from pliant.algorithms.surfels.motion import MODELS
+from pliant.algorithms.surfels import validation
+from pliant.algorithms.surfels.births import find_births
+from pliant.algorithms.surfels.camera_alignment import align_rigid, fit_camera
+from pliant.algorithms.surfels.deformation_models import MODELS, move_poses
+from pliant.algorithms.surfels.graph_alignment import COARSE_STEPS, STEPS, align_graph, relocate
 from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.patch_sampling import (
+    BIAS,
+    GAIN,
+    A,
+    B,
+    F,
+    Level,
+    X,
+    make_pyramid,
+    usable_levels,
+)
 from pliant.algorithms.surfels.prediction import start_at, targets
-from pliant.algorithms.surfels.pyramid import make_pyramid, usable_levels
-from pliant.algorithms.surfels.rest import OMEGA_E, Rest, no_rest
-from pliant.algorithms.surfels.sampling import BIAS, GAIN, A, B, F, Level, X
-from pliant.algorithms.surfels.states import SurfelFrame, SurfelState
-from pliant.algorithms.surfels.table import SurfelTable, move_poses
-from pliant.algorithms.surfels.together import COARSE_STEPS, STEPS, align_together
+from pliant.algorithms.surfels.surfel_alignment import (
+    OMEGA_E,
+    Equilibrium,
+    Limits,
+    Workspace,
+    align_all,
+    make_workspace,
+    no_equilibrium,
+)
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.surfel_table import SurfelTable
 
-_FOUND_AGAIN_ZNCC = 0.9
+_RELOCATED_ZNCC = 0.9
 """A surfel that was missing must fit better than one that was followed: chance has had tries."""
 _TOGETHER_LEVELS = {False: 2, True: 1}
 """Levels, the finest, at which surfels with neighbours move as one: before a static camera, and
@@ -88,8 +103,8 @@ class SurfelTracker:
         self._frame += 1
         poses = move_poses(self._table.guesses, inverse(self._T_world_camera))
         torn = self._align(pyramid, poses, goals, timer)
-        with timer("judge"):
-            self._judge(pyramid[0], poses, torn)
+        with timer("validation"):
+            self._validate(pyramid[0], poses, torn)
         if depth is not None:
             with timer("births"):
                 self._give_birth(pyramid, _checked_depth(depth, self._camera))
@@ -131,7 +146,7 @@ class SurfelTracker:
             raise ValueError(
                 f"expected a prediction of shape {(len(self._table), 2)}, got {prediction.shape}"
             )
-        points = self._table.verdicts[:, judge.U : judge.V + 1]
+        points = self._table.validations[:, validation.U : validation.V + 1]
         return targets(points, prediction, float(2 ** (levels - 1)))
 
     def _align(
@@ -150,8 +165,8 @@ class SurfelTracker:
         guides = table.tracked.astype(np.uint8)
         if not moving or int(guides.sum()) < self._parameters.min_alive:
             guides = everyone
-        T_camera_world, rest, start = inverse(self._T_world_camera), no_rest(n), poses
-        equilibrium = Equilibrium(table.rest, OMEGA_E * table.information)
+        T_camera_world, equilibrium = inverse(self._T_world_camera), no_equilibrium(n)
+        start, weights = poses, OMEGA_E / table.sigmas**2
         together = _TOGETHER_LEVELS[moving] if len(table.edges.ends) else 0
         for number in range(coarsest, -1, -1):
             level = pyramid[number]
@@ -161,16 +176,16 @@ class SurfelTracker:
                 self._start_at(goals, level, poses, guides)
                 start = poses.copy()
             if moving:
-                rest = equilibrium.seen_from(T_camera_world)
+                equilibrium = Equilibrium(transform(T_camera_world, table.rest), weights)
                 start = move_poses(table.guesses, T_camera_world)
             # Alone each finds its place in the image; close to it depth would go astray.
             if number == coarsest or number >= together:
-                self._align_alone(number, level, poses, everyone, rest, timer)
+                self._align_alone(number, level, poses, everyone, equilibrium, timer)
             if number < together:
-                torn = self._hold_together(number, level, poses, start, everyone, rest, timer)
+                torn = self._align_graph(number, level, poses, start, everyone, equilibrium, timer)
             if moving:
                 with timer("camera"):
-                    T_camera_world = register(poses, guides, T_camera_world, equilibrium)
+                    T_camera_world = fit_camera(poses, guides, T_camera_world, table.rest, weights)
         if moving:
             self._T_world_camera = inverse(T_camera_world)
         return torn
@@ -192,52 +207,54 @@ class SurfelTracker:
             )  # fmt: skip
 
     def _align_alone(
-        self, number: int, level: Level, poses: F64, active: U8, rest: Rest, timer: StageTimer
+        self,
+        number: int,
+        level: Level,
+        poses: F64,
+        active: U8,
+        equilibrium: Equilibrium,
+        timer: StageTimer,
     ) -> None:
         templates, limits = self._table.templates[number], self._limits(fine=number == 0)
         with timer(f"alone, level {number}"):
-            align_all(poses, active, rest, level, templates, limits, self._works[number])
+            align_all(poses, active, equilibrium, level, templates, limits, self._works[number])
 
-    def _hold_together(
+    def _align_graph(
         self,
         number: int,
         level: Level,
         poses: F64,
         start: F64,
         active: U8,
-        rest: Rest,
+        equilibrium: Equilibrium,
         timer: StageTimer,
     ) -> BoolArray:
         with timer(f"together, level {number}"):
-            return align_together(
-                poses, start, active, self._table.edges, rest, level,
+            return align_graph(
+                poses, start, active, self._table.edges, equilibrium, level,
                 self._table.templates[number], self._limits(fine=number == 0), self._works[number],
                 self._parameters, STEPS if number == 0 else COARSE_STEPS,
             )  # fmt: skip
 
-    def _judge(self, level: Level, poses: F64, torn: BoolArray) -> None:
+    def _validate(self, level: Level, poses: F64, torn: BoolArray) -> None:
         """Keep what was found; what was not stays where it was last good."""
         table, p = self._table, self._parameters
-        verdicts, templates, limits = table.verdicts, table.templates[0], self._limits(fine=True)
-        everyone = np.ones(len(poses), np.uint8)
-        judge.judge_all(poses, everyone, level, templates, limits, self._works[0], verdicts)
+        found, templates, limits = table.validations, table.templates[0], self._limits(fine=True)
+        everyone, work = np.ones(len(poses), np.uint8), self._works[0]
+        validation.validate_all(poses, everyone, level, templates, limits, work, found)
         if len(table.edges.ends):
-            unlike = (verdicts[:, judge.CORRELATION] < p.min_zncc) & (
-                verdicts[:, judge.FRONT] > 0.0
-            )
-            again = (unlike | torn) & (verdicts[:, judge.INSIDE] >= p.min_visible)
-            again = again.astype(np.uint8)
-            look_again(
-                poses, again, table.edges, level, templates, limits, self._works[0], p.strain
-            )
-            judge.judge_all(poses, again, level, templates, limits, self._works[0], verdicts)
-            torn = torn & (again == 0)
-        wanted = np.where(table.missing > 0, max(p.min_zncc, _FOUND_AGAIN_ZNCC), p.min_zncc)
+            unlike = (found[:, validation.ZNCC] < p.min_zncc) & (found[:, validation.FRONT] > 0.0)
+            passed = (unlike | torn) & (found[:, validation.INSIDE] >= p.min_visible)
+            rows = passed.astype(np.uint8)
+            relocate(poses, rows, table.edges, level, templates, limits, work, p.strain)
+            validation.validate_all(poses, rows, level, templates, limits, work, found)
+            torn = torn & ~passed
+        wanted = np.where(table.missing > 0, max(p.min_zncc, _RELOCATED_ZNCC), p.min_zncc)
         state = np.full(len(table), SurfelState.TRACKED, np.uint8)
-        state[verdicts[:, judge.CORRELATION] < wanted] = SurfelState.OUTLIER
-        state[verdicts[:, judge.SEEN] < p.min_visible] = SurfelState.OCCLUDED
-        state[verdicts[:, judge.INSIDE] < p.min_visible] = SurfelState.OUTSIDE
-        state[verdicts[:, judge.FRONT] == 0.0] = SurfelState.OUTSIDE
+        state[found[:, validation.ZNCC] < wanted] = SurfelState.OUTLIER
+        state[found[:, validation.VISIBLE] < p.min_visible] = SurfelState.OCCLUDED
+        state[found[:, validation.INSIDE] < p.min_visible] = SurfelState.OUTSIDE
+        state[found[:, validation.FRONT] == 0.0] = SurfelState.OUTSIDE
         state[torn & (state == SurfelState.TRACKED)] = SurfelState.OUTLIER
         good = (state == SurfelState.TRACKED) & np.isfinite(poses).all(axis=1)
         table.missing = np.where(good, 0, table.missing + 1).astype(np.int32)
@@ -261,22 +278,21 @@ class SurfelTracker:
             self._segment += 1
             table.keep(np.zeros(0, np.int64))
         table.keep(np.flatnonzero(table.missing <= p.lost_after + p.forget_after))
-        occupied = table.verdicts[table.tracked][:, judge.U : judge.V + 1]
+        occupied = table.validations[table.tracked][:, validation.U : validation.V + 1]
         births = find_births(
             pyramid, depth, camera, p, occupied, p.max_surfels - int(table.tracked.sum())
         )
         n = len(births.poses)
         # The heuristic covariance of section V: a share of the surfel's depth, all directions.
-        sigma = p.expected_motion * births.poses[:, X + 2]
-        information = np.eye(3) / np.maximum(sigma, 1e-9)[:, None, None] ** 2
-        table.add(births, self._T_world_camera, self._next_id, self._frame, information)
+        sigmas = np.maximum(p.expected_motion * births.poses[:, X + 2], 1e-9)
+        table.add(births, self._T_world_camera, self._next_id, self._frame, sigmas)
         table.connect(len(table) - n, p.neighbours)
         self._next_id += n
         self._lost = int(table.tracked.sum()) < p.min_alive
         rows = (table.born == self._frame).astype(np.uint8)
-        judge.judge_all(
+        validation.validate_all(
             move_poses(table.poses, inverse(self._T_world_camera)), rows, pyramid[0],
-            table.templates[0], self._limits(fine=True), self._works[0], table.verdicts,
+            table.templates[0], self._limits(fine=True), self._works[0], table.validations,
         )  # fmt: skip
 
     def _limits(self, *, fine: bool) -> Limits:
@@ -292,7 +308,7 @@ class SurfelTracker:
 
     def _result(self) -> SurfelFrame:
         table = self._table
-        poses, verdicts = table.poses, table.verdicts
+        poses, validations = table.poses, table.validations
         f11, f12, f22 = (poses[:, F + k, None] for k in range(3))
         a, b = poses[:, A : A + 3], poses[:, B : B + 3]
         means = table.templates[0].means if table.templates else np.zeros(0)
@@ -307,10 +323,10 @@ class SurfelTracker:
             positions=poses[:, X : X + 3].copy(),
             tangents=np.stack([f11 * a + f12 * b, f12 * a + f22 * b], axis=2),
             deformations=poses[:, F : F + 3].copy(),
-            points_px=_f32(verdicts[:, judge.U : judge.V + 1]),
-            zncc=_f32(verdicts[:, judge.CORRELATION]),
-            visible=_f32(verdicts[:, judge.SEEN]),
-            sigma=_f32(verdicts[:, judge.SIGMA]),
+            points_px=_f32(validations[:, validation.U : validation.V + 1]),
+            zncc=_f32(validations[:, validation.ZNCC]),
+            visible=_f32(validations[:, validation.VISIBLE]),
+            sigma=_f32(validations[:, validation.SIGMA]),
             gains=_f32(poses[:, GAIN]),
             biases=_f32(biases),
             state=table.state.copy(),

@@ -6,7 +6,7 @@ is a mixture of eight functions of the grid, and of two for gain and bias,
     Vu, Vv, i Vu, j Vu, i Vv, j Vv, i D, j D, V, 1      with  D = i Vu + j Vv,
 
 Vu and Vv being derivatives of the patch along its own grid.  One 10 x 10 matrix over the samples
-therefore serves every deformation model and both cameras; ``motion`` has the mixing.
+therefore serves every deformation model and both cameras; ``deformation_models`` has the mixing.
 
 The derivatives are those of the frame's patch (forward, as the paper), of the texture, or their
 mean.  The matrix shapes the steps, and not where they end: that is settled by the sums of features
@@ -25,7 +25,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.kernel import inner_kernel, leaf_kernel
-from pliant.algorithms.surfels.sampling import Grid
+from pliant.algorithms.surfels.patch_sampling import Grid
 
 FEATURES = 10
 TEMPLATE_IMAGES = 3

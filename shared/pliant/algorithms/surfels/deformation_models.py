@@ -14,8 +14,8 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.kernel import inner_kernel, leaf_kernel
-from pliant.algorithms.surfels.sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, Level, X
-from pliant.algorithms.surfels.sums import FEATURES
+from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, Level, X
+from pliant.algorithms.surfels.photometric import FEATURES
 
 ISOMETRIC, EQUIAREAL, GENERAL = 0, 2, 3
 MODELS = {"isometric": ISOMETRIC, "equiareal": EQUIAREAL, "general": GENERAL}
@@ -71,9 +71,13 @@ def mixing(pose: F64, level: Level, model: int, out: F64) -> None:
     out[:, :parameters] = 0.0
     for k in range(3):
         out[0, k], out[1, k], out[2, k], out[5, k] = n[0][k], n[1][k], -n[2][k], -n[2][k]
-    _turn(out, 3, n, (0.0, -g2, g1), (0.0, -h2, h1))
-    _turn(out, 4, n, (g2, 0.0, -g0), (h2, 0.0, -h0))
-    _turn(out, 5, n, (-g1, g0, 0.0), (-h1, h0, 0.0))
+    turns = (
+        ((0.0, -g2, g1), (0.0, -h2, h1)),
+        ((g2, 0.0, -g0), (h2, 0.0, -h0)),
+        ((-g1, g0, 0.0), (-h1, h0, 0.0)),
+    )
+    for k in range(3):
+        _turn(out, 3 + k, n, turns[k][0], turns[k][1])
     for k in range(model):
         d11, d12, d22 = deformation_directions(model, pose, k)
         _turn(
@@ -164,8 +168,8 @@ def apply_step(pose: F64, step: F64, model: int, out: F64) -> None:
         out[k] = pose[k]
     for k in range(3):
         out[X + k] += step[k]
-    _rotate(out, A, step[3], step[4], step[5])
-    _rotate(out, B, step[3], step[4], step[5])
+    for tangent in range(A, F, B - A):
+        _rotate(out, tangent, step[3], step[4], step[5])
     if model == EQUIAREAL:
         alpha = min(max(pose[F] + step[RIGID], _MIN_STRETCH), _MAX_STRETCH)
         beta = pose[F + 1] + step[RIGID + 1]
@@ -201,3 +205,13 @@ def identity_poses(count: int) -> F64:
     poses = np.zeros((count, POSE_FLOATS))
     poses[:, F] = poses[:, F + 2] = poses[:, GAIN] = 1.0
     return poses
+
+
+def move_poses(poses: F64, T: F64) -> F64:
+    """Surfels in another frame: (N, POSE_FLOATS) rows moved by a (4, 4) rigid motion."""
+    out = poses.copy()
+    R = T[:3, :3]
+    out[:, X : X + 3] = poses[:, X : X + 3] @ R.T + T[:3, 3]
+    out[:, A : A + 3] = poses[:, A : A + 3] @ R.T
+    out[:, B : B + 3] = poses[:, B : B + 3] @ R.T
+    return out

@@ -6,10 +6,8 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.kernel import leaf_kernel
-from pliant.algorithms.surfels import motion
-from pliant.algorithms.surfels.align import Limits, Templates, Workspace
-from pliant.algorithms.surfels.damped import factorise, inverse_diagonal
-from pliant.algorithms.surfels.sampling import (
+from pliant.algorithms.surfels import deformation_models as models
+from pliant.algorithms.surfels.patch_sampling import (
     BIAS,
     GAIN,
     MARGIN,
@@ -17,11 +15,18 @@ from pliant.algorithms.surfels.sampling import (
     homography,
     sample_patch,
 )
-from pliant.algorithms.surfels.sums import correlation, first_inner
+from pliant.algorithms.surfels.photometric import correlation, first_inner
+from pliant.algorithms.surfels.surfel_alignment import (
+    Limits,
+    Templates,
+    Workspace,
+    factorise,
+    inverse_diagonal,
+)
 
-FRONT, INSIDE, SEEN, CORRELATION, SIGMA, U, V, VERDICTS = 0, 1, 2, 3, 4, 5, 6, 7
-"""Columns of a verdict: in front of the camera (0 or 1), shares of the texture inside of the image
-and seen, ZNCC, standard deviation of the position (metres), pixel of the centre."""
+FRONT, INSIDE, VISIBLE, ZNCC, SIGMA, U, V, COLUMNS = 0, 1, 2, 3, 4, 5, 6, 7
+"""Columns of a validation: in front of the camera (0 or 1), shares of the texture inside of the
+image and seen, ZNCC, standard deviation of the position (metres), pixel of the centre."""
 
 _MIN_NOISE = 0.5  # DN: quantisation alone makes this much of a difference of two images
 _MAX_SIGMA = 1e3
@@ -29,46 +34,46 @@ _FAR = 1e6
 
 
 @leaf_kernel
-def judge_all(
+def validate_all(
     poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
     out: F64,
 ) -> None:  # fmt: skip
-    """Fill a row of ``out`` (N, VERDICTS) for every active surfel.
+    """Fill a row of ``out`` (N, COLUMNS) for every active surfel.
 
     The pixel is left alone where a surfel is not in front.
     """
-    parameters = motion.parameter_count(limits.model)
+    parameters = models.parameter_count(limits.model)
     grid, at = work.grid, first_inner(work.grid)
     for s in range(len(poses)):
         if not active[s]:
             continue
-        pose, verdict = poses[s], out[s]
-        verdict[FRONT] = verdict[INSIDE] = verdict[SEEN] = verdict[CORRELATION] = 0.0
+        pose, row = poses[s], out[s]
+        row[FRONT] = row[INSIDE] = row[VISIBLE] = row[ZNCC] = 0.0
         if not homography(pose, level, work.h):
             continue
         if not sample_patch(work.h, level, grid, limits.highlight):
             continue
-        verdict[FRONT] = 1.0
-        verdict[U], verdict[V] = work.h[2] / work.h[8], work.h[5] / work.h[8]
+        row[FRONT] = 1.0
+        row[U], row[V] = work.h[2] / work.h[8], work.h[5] / work.h[8]
         t, count = templates.images[s, 0], templates.counts[s]
         values = grid.values[at : at + len(t)]
-        verdict[INSIDE] = _inside(t, grid.x[at:], grid.y[at:], level) / count
+        row[INSIDE] = _inside(t, grid.x[at:], grid.y[at:], level) / count
         seen, squares = _agreeing(
             t, values, templates.means[s], pose[GAIN], pose[BIAS], limits.saturation
         )
-        verdict[SEEN] = seen / count
-        verdict[CORRELATION], _ = correlation(t, values)
+        row[VISIBLE] = seen / count
+        row[ZNCC], _ = correlation(t, values)
         if seen < parameters:
             continue
-        motion.mixing(pose, level, limits.model, work.mix)
+        models.mixing(pose, level, limits.model, work.mix)
         # What is covered tells nothing: the information shrinks with the share that is seen.
-        motion.hessian(
-            templates.matrices[s], verdict[SEEN], work.mix, parameters, work.product, work.H
+        models.hessian(
+            templates.matrices[s], row[VISIBLE], work.mix, parameters, work.product, work.H
         )
         noise = max(squares / seen, _MIN_NOISE * _MIN_NOISE)
-        if factorise(work.H, parameters, 0, 0.0, work.L, work.inverse):
+        if factorise(work.H, parameters, parameters, 0.0, work.L, work.inverse):
             trace = inverse_diagonal(work.L, work.inverse, parameters, 3, work.step)
-            verdict[SIGMA] = min(math.sqrt(noise * trace), _MAX_SIGMA)
+            row[SIGMA] = min(math.sqrt(noise * trace), _MAX_SIGMA)
 
 
 @leaf_kernel
@@ -99,6 +104,6 @@ def _agreeing(
     return float(seen), float(squares)
 
 
-def new_verdicts(count: int) -> F64:
-    """Rows of zeros for ``judge_all``."""
-    return np.zeros((count, VERDICTS))
+def new_validations(count: int) -> F64:
+    """Rows of zeros for ``validate_all``."""
+    return np.zeros((count, COLUMNS))

@@ -6,38 +6,26 @@ surfels.  Camera and surfels take turns: surfels by Eq. 21 before a camera that 
 camera that fits them, which needs no image.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8, BoolArray
-from pliant.algorithms.geometry import hat, so3_exp
-from pliant.algorithms.surfels import joint_kernels as kernels
-from pliant.algorithms.surfels.align import Limits, Templates, Workspace
-from pliant.algorithms.surfels.rest import Rest, no_rest, turn_rest
-from pliant.algorithms.surfels.sampling import BIAS, GAIN, Level, X
-from pliant.algorithms.surfels.sums import FEATURES
-from pliant.algorithms.surfels.table import move_poses
+from pliant.algorithms.geometry import hat, so3_exp, transform
+from pliant.algorithms.surfels.deformation_models import ISOMETRIC, move_poses
+from pliant.algorithms.surfels.graph_alignment import eliminate_all
+from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, Level, X
+from pliant.algorithms.surfels.surfel_alignment import (
+    MIN_GAIN,
+    Limits,
+    Templates,
+    Workspace,
+    evaluate_all,
+)
 
 _RIDGE = 1e-9
-_REGISTER_STEPS = 3
-_REGISTERED = 1e-6
+_FIT_STEPS = 3
+_FITTED = 1e-6
 """A step that turns the camera, and moves it relative to the depth, by less than this is the last:
 a thousandth of a pixel."""
-
-
-@dataclass(frozen=True)
-class Equilibrium:
-    """Where N surfels rest and how far they may stray (Eq. 20)."""
-
-    positions: F64  # (N, 3) metres, world
-    weights: F64  # (N, 3, 3) omega_E Sigma^-1, world axes, DN^2 / m^2
-
-    def seen_from(self, T_camera_world: F64) -> Rest:
-        """Positions and weights in the axes of a camera."""
-        seen = no_rest(len(self.positions))
-        turn_rest(T_camera_world, self.positions, self.weights, seen.points, seen.weights)
-        return seen
 
 
 def se3_exp(zeta: F64) -> F64:
@@ -63,42 +51,53 @@ def align_rigid(
     The matrices are the textures' own, which shape the steps and not where they end.
     poses: (N, POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
     """
-    n = len(poses)
-    usable, costs, sums = active.copy(), np.zeros(n), np.zeros((n, FEATURES))
-    kernels.evaluate_all(poses, usable, level, templates, limits, work, costs, sums)
-    light = np.zeros((n, 2, 7))
-    M, v = np.zeros((6, 6)), np.zeros(6)
+    now = evaluate_all(poses, active, level, templates, limits, work)
     damping, accepted = limits.start_lambda, 0
     for _ in range(limits.iterations):
-        rows: BoolArray = usable > 0
-        if not rows.any():
+        usable: BoolArray = now.costs >= 0.0
+        if not usable.any():
             break
-        kernels.rigid_system(poses, usable, level, work, sums, templates.matrices, light, M, v)
+        rows = usable.astype(np.uint8)
+        M, v, light = rigid_system(poses, rows, level, work, now.sums, templates.matrices)
         bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
         zeta = _solve(M, v, bound)
         motion, before = se3_exp(zeta), poses.copy()
         moved = move_poses(poses, motion)
-        moved[:, GAIN] = np.maximum(moved[:, GAIN] + light[:, 0] @ np.r_[1.0, zeta], 0.05)
-        moved[:, BIAS] += light[:, 1] @ np.r_[1.0, zeta]
-        still_usable, new_costs, new_sums = usable.copy(), np.zeros(n), np.zeros((n, FEATURES))
-        kernels.evaluate_all(
-            moved, still_usable, level, templates, limits, work, new_costs, new_sums
-        )
-        both: BoolArray = still_usable > 0
-        if 2 * np.count_nonzero(both) > np.count_nonzero(rows) and (
-            new_costs[both].sum() < costs[both].sum() * (1.0 + limits.slack)
+        light_steps = light @ np.r_[1.0, zeta]
+        moved[:, GAIN] = np.maximum(moved[:, GAIN] + light_steps[:, 0], MIN_GAIN)
+        moved[:, BIAS] += light_steps[:, 1]
+        new = evaluate_all(moved, rows, level, templates, limits, work)
+        both: BoolArray = new.costs >= 0.0
+        if 2 * np.count_nonzero(both) > np.count_nonzero(usable) and (
+            new.costs[both].sum() < now.costs[both].sum() * (1.0 + limits.slack)
         ):
             poses[:] = np.where(active[:, None] > 0, moved, move_poses(poses, motion))
             T_camera_world = motion @ T_camera_world
-            costs, sums, usable = new_costs, new_sums, still_usable
+            now = new
             accepted += 1
             damping = bound / limits.lambda_down
         else:
             damping = bound * limits.lambda_up
-        moved_px = level.fx * float(np.median(_shift(before[rows], moved[rows])))
+        moved_px = level.fx * float(np.median(_shift(before[usable], moved[usable])))
         if moved_px * (1.0 + bound) < limits.min_step_px:
             break
     return T_camera_world
+
+
+def rigid_system(
+    poses: F64, active: U8, level: Level, work: Workspace, sums: F64, matrices: F64
+) -> tuple[F64, F64, F64]:
+    """M (6, 6) and v (6,) of a rigid scene, M zeta = v, and (N, 2, 7) gain and bias from (1, zeta).
+
+    A surfel that stands still in the world steps by its own adjoint times zeta.
+    """
+    own = eliminate_all(poses, active, level, ISOMETRIC, work, sums, matrices)
+    adjoints = np.tile(np.eye(6), (len(poses), 1, 1))
+    adjoints[:, :3, 3:] = -hat(poses[:, X : X + 3])
+    M = np.einsum("nji,njk,nkl->il", adjoints, own.S, adjoints)
+    v = -np.einsum("nji,nj->i", adjoints, own.b)
+    follow = np.einsum("nkj,nji->nki", own.follow[:, :2], adjoints)
+    return M, v, -np.concatenate([own.inner[:, :2, None], follow], axis=2)
 
 
 def _shift(before: F64, after: F64) -> F64:
@@ -107,20 +106,22 @@ def _shift(before: F64, after: F64) -> F64:
     return np.linalg.norm(b[:, :2] / b[:, 2:] - a[:, :2] / a[:, 2:], axis=1)
 
 
-def register(poses: F64, active: U8, T_camera_world: F64, equilibrium: Equilibrium) -> F64:
+def fit_camera(poses: F64, active: U8, T_camera_world: F64, equilibria: F64, weights: F64) -> F64:
     """Minimise Eq. 21 over the camera alone, which only Eq. 20 knows of; no image is needed.
 
     poses: (N, POSE_FLOATS) in the camera's frame: the images have found them, and they stay.
-    Returns T_camera_world.
+    equilibria: (N, 3) metres, world.  weights: (N,) DN^2 / m^2.  Returns T_camera_world.
     """
-    M, v = np.zeros((6, 6)), np.zeros(6)
-    for _ in range(_REGISTER_STEPS):
-        points, weights = equilibrium.seen_from(T_camera_world)
-        kernels.register_system(poses, active, points, weights, M, v)
-        zeta = _solve(M, v, 0.0)
+    w, x = weights * active, poses[:, X : X + 3]
+    for _ in range(_FIT_STEPS):
+        points = transform(T_camera_world, equilibria)
+        # A step turns Sigma's axes, too: it is about where a surfel is, not where it rests.
+        G = np.concatenate([np.tile(np.eye(3), (len(x), 1, 1)), -hat(x)], axis=2)
+        M = np.einsum("n,nki,nkj->ij", w, G, G)
+        zeta = _solve(M, np.einsum("n,nki,nk->i", w, G, x - points), 0.0)
         T_camera_world = se3_exp(zeta) @ T_camera_world
         depth = float(np.abs(points[:, 2]).mean())
-        if np.abs(zeta[:3]).max() < _REGISTERED * depth and np.abs(zeta[3:]).max() < _REGISTERED:
+        if np.abs(zeta[:3]).max() < _FITTED * depth and np.abs(zeta[3:]).max() < _FITTED:
             break
     return T_camera_world
 
