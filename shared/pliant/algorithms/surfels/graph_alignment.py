@@ -256,7 +256,7 @@ def solve_graph(
     n = len(S)
     inverses = np.zeros((n, RIGID, RIGID))
     z, p, y = np.zeros((n, RIGID)), np.zeros((n, RIGID)), np.zeros((n, RIGID))
-    none = np.zeros_like(residuals)
+    none = np.zeros(residuals.shape)
     _inverses(
         edges, arms, w, bend, S.copy(), np.zeros((RIGID, RIGID)), np.zeros((2, RIGID)), inverses
     )
