@@ -186,4 +186,5 @@ def pull_of_edges(edges: Edges, count: int, weight: float, strain: float) -> F64
     weight: of a pair that is strained by ``strain``, DN^2.
     """
     pulls = np.repeat(weight / (strain * edges.lengths) ** 2, 2)
-    return np.bincount(edges.ends.ravel(), weights=pulls, minlength=count)
+    total = np.bincount(edges.ends.ravel(), weights=pulls, minlength=count)
+    return total.astype(np.float64)
