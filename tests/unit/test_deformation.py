@@ -15,6 +15,7 @@ from pliant.algorithms.image.patch_sums import (
     BIRTH_FLOATS,
     BIRTH_MARGIN,
     BIRTH_SIZE,
+    GAUSSIAN,
     TEMPLATE_FLOATS,
 )
 from pliant.algorithms.image.pixels import pixels_of
@@ -130,7 +131,7 @@ def test_a_template_turns_with_the_view() -> None:
     start = (point + origin(track) + [0.6, -0.5]).astype(np.float32)
 
     def aligned(template: F32, energy: float) -> tuple[F64, float]:
-        patch = Template(template, 0, np.float32(energy))
+        patch = Template(template, 0, np.float32(energy), GAUSSIAN)
         found = align_patch(pixels_of(turned), *start, patch, 10, np.float32(4.0))
         return np.array([found.u, found.v]) - origin(track) - point, found.zncc
 
@@ -141,7 +142,7 @@ def test_a_template_turns_with_the_view() -> None:
     left, top = np.rint(point + origin(track)).astype(int)
     image = pixels_of(texture(grid(SIZE, SIZE)))
     # A kernel called from Python returns Python's floats.
-    tensor = PatchTensor(*(np.float32(x) for x in patch_tensor(image, left, top)))
+    tensor = PatchTensor(*(np.float32(x) for x in patch_tensor(image, left, top, GAUSSIAN)))
     old = np.zeros(TEMPLATE_FLOATS, np.float32)
-    make_template(image, left, top, tensor, old, 0)
+    make_template(image, left, top, tensor, GAUSSIAN, old, 0)
     assert aligned(old, tensor.energy)[1] < zncc

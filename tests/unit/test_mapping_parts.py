@@ -18,15 +18,16 @@ from pliant.algorithms.mapping.map_store import (
     CANDIDATE,
     FREE,
     MAPPED,
+    PATCH_SIDE,
     UNLINKED,
     Keyframe,
     PointRows,
     TrackLinks,
+    sample_colours,
 )
 from pliant.algorithms.mapping.observation_table import reprojection_errors, window_errors
 from pliant.algorithms.mapping.parameters import LocalisationParameters, ReacquisitionParameters
-from pliant.algorithms.mapping.patches import cut_patches, sample_colours
-from pliant.algorithms.mapping.reacquisition import MaximaGrid, reacquire
+from pliant.algorithms.mapping.reacquisition import MaximaGrid, cut_patches, reacquire
 from pliant.algorithms.mapping.start import WaitingFrame, find_start
 
 
@@ -111,7 +112,7 @@ def texture(seed=0):
 def looked_for(shift, grey, min_zncc=0.8, kappa=10.0):
     """Re-acquire one point at the image's centre whose maximum is off by ``shift`` px."""
     xyz = np.array([[0.0, 0.0, 4.0]])
-    patches = np.zeros((1, 8, 8), np.uint8)
+    patches = np.zeros((1, PATCH_SIDE, PATCH_SIDE), np.uint8)
     centre = np.array([[CAMERA.cx, CAMERA.cy]], np.float32)
     cut_patches(grey, centre, np.zeros(1, np.int32), patches)
     maxima = np.array([[CAMERA.cx + shift, CAMERA.cy, kappa]], np.float32)
@@ -140,7 +141,7 @@ def test_reacquisition_refuses_far_maxima_other_curvatures_and_other_patches():
 def test_reacquisition_gives_a_maximum_to_one_point_only():
     grey = texture()
     xyz = np.array([[0.0, 0.0, 4.0], [0.001, 0.0, 4.0], [0.0, 0.0, -4.0]])
-    patches = np.zeros((3, 8, 8), np.uint8)
+    patches = np.zeros((3, PATCH_SIDE, PATCH_SIDE), np.uint8)
     px = CAMERA.project(np.abs(xyz)).astype(np.float32)
     cut_patches(grey, px, np.arange(3, dtype=np.int32), patches)
     maxima = np.array([[CAMERA.cx, CAMERA.cy, 10.0]], np.float32)
@@ -153,7 +154,7 @@ def test_reacquisition_gives_a_maximum_to_one_point_only():
 
 
 def test_patches_at_the_border_stay_empty():
-    patches = np.ones((2, 8, 8), np.uint8)
+    patches = np.ones((2, PATCH_SIDE, PATCH_SIDE), np.uint8)
     px = np.array([[2.0, 100.0], [637.5, 100.0]], np.float32)
     cut_patches(texture(), px, np.arange(2, dtype=np.int32), patches)
     assert not patches.any()

@@ -14,10 +14,11 @@ from pliant.algorithms.image.patch_alignment import (
     patch_tensor,
 )
 from pliant.algorithms.image.patch_sums import (
+    GAUSSIAN,
     PATCH_PIXELS,
     PATCH_SIZE,
     TEMPLATE_FLOATS,
-    WINDOW,
+    UNIFORM,
     patch_sums,
 )
 from pliant.algorithms.image.pixels import pixels_of
@@ -27,7 +28,9 @@ SIZE = 48
 
 # Not cached: a cached copy would not notice that the constants of patch_sums have changed.
 @numba.njit
-def call_sums(image: F32, width: int, u: np.float32, v: np.float32, templates: F32) -> F64:
+def call_sums(
+    image: F32, width: int, u: np.float32, v: np.float32, templates: F32, window: F32
+) -> F64:
     column, row = int(u), int(v)
     a, b, c, d, e = patch_sums(
         image,
@@ -37,6 +40,7 @@ def call_sums(image: F32, width: int, u: np.float32, v: np.float32, templates: F
         v - np.float32(row),
         templates,
         np.uint64(0),
+        window,
     )
     return np.array([a, b, c, d, e], np.float64)
 
@@ -58,32 +62,35 @@ def sample(image: F32, u: float, v: float) -> F64:
     return ((1.0 - dv) * rows[:-1] + dv * rows[1:]).ravel()
 
 
-def template_of(image: F32, left: int, top: int) -> tuple[Template, float]:
+def template_of(image: F32, left: int, top: int, window: F32 = GAUSSIAN) -> tuple[Template, float]:
     templates = np.zeros(TEMPLATE_FLOATS, np.float32)
     # A kernel called from Python returns Python's floats.
-    tensor = PatchTensor(*(np.float32(x) for x in patch_tensor(pixels_of(image), left, top)))
+    seen = patch_tensor(pixels_of(image), left, top, window)
+    tensor = PatchTensor(*(np.float32(x) for x in seen))
     strength, _ = patch_strength(tensor)
     if strength > 0.0:
-        make_template(pixels_of(image), left, top, tensor, templates, 0)
-    return Template(templates, 0, tensor.energy), strength
+        make_template(pixels_of(image), left, top, tensor, window, templates, 0)
+    return Template(templates, 0, tensor.energy, window), strength
 
 
-def test_sums_equal_plain_numpy() -> None:
+@pytest.mark.parametrize("window", [GAUSSIAN, UNIFORM])
+def test_sums_equal_plain_numpy(window: F32) -> None:
     image = texture()
     templates = np.random.default_rng(0).normal(size=TEMPLATE_FLOATS).astype(np.float32)
     v = sample(image, 13.3, 20.6)
-    w, t = np.array(WINDOW), templates.reshape(3, PATCH_PIXELS).astype(np.float64)
+    w, t = window.astype(np.float64), templates.reshape(3, PATCH_PIXELS).astype(np.float64)
     expected = [(w * v).sum(), (w * v * v).sum(), *(t @ v)]
-    found = call_sums(image.ravel(), SIZE, np.float32(13.3), np.float32(20.6), templates)
+    found = call_sums(image.ravel(), SIZE, np.float32(13.3), np.float32(20.6), templates, window)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=0.05)
 
 
-def test_templates_equal_plain_numpy() -> None:
+@pytest.mark.parametrize("window", [GAUSSIAN, UNIFORM])
+def test_templates_equal_plain_numpy(window: F32) -> None:
     """Offset and gain projected out of both gradients, then the inverse of the tensor."""
     image = texture()
-    template, strength = template_of(image, 20, 18)
+    template, strength = template_of(image, 20, 18, window)
     block = image[17:27, 19:29].astype(np.float64)
-    w = np.array(WINDOW)
+    w = window.astype(np.float64)
     t = block[1:-1, 1:-1].ravel()
     x = 0.5 * (block[1:-1, 2:] - block[1:-1, :-2]).ravel()
     y = 0.5 * (block[2:, 1:-1] - block[:-2, 1:-1]).ravel()
@@ -95,7 +102,7 @@ def test_templates_equal_plain_numpy() -> None:
     eigenvalues = np.linalg.eigvalsh(tensor)
     assert template.energy == pytest.approx(w @ basis[1] ** 2, rel=1e-4)
     assert strength == pytest.approx(eigenvalues[0] / PATCH_PIXELS, rel=1e-3)
-    isotropy = patch_strength(patch_tensor(pixels_of(image), 20, 18))[1]
+    isotropy = patch_strength(patch_tensor(pixels_of(image), 20, 18, window))[1]
     assert isotropy == pytest.approx(eigenvalues[0] / eigenvalues[1], rel=1e-3)
     found = template.values.reshape(3, PATCH_PIXELS)
     np.testing.assert_allclose(found[0], w * basis[1] / template.energy, atol=1e-6)

@@ -2,7 +2,7 @@
 
 Lucas-Kanade as in Baker and Matthews (2004), translation only.  The patch seen now is modelled as
 gain * template + offset, and both are projected out of the steepest-descent images, so that a
-change of exposure moves nothing.  Pixels count by WINDOW, a Gaussian.
+change of exposure moves nothing.  Pixels count by a window.
 """
 
 from typing import NamedTuple
@@ -48,11 +48,12 @@ class PatchTensor(NamedTuple):
 
 
 class Template(NamedTuple):
-    """One of many templates: values from ``offset`` on, and the energy of its patch."""
+    """One of many templates: values from ``offset`` on, the energy of its patch, its window."""
 
     values: F32
     offset: int
     energy: np.float32
+    window: F32
 
 
 class Alignment(NamedTuple):
@@ -71,16 +72,16 @@ class Alignment(NamedTuple):
 
 
 @leaf_kernel
-def patch_tensor(image: Pixels, left: int, top: int) -> PatchTensor:
+def patch_tensor(image: Pixels, left: int, top: int, window: F32) -> PatchTensor:
     """The tensor of the patch whose first pixel is (left, top).
 
-    The patch and TEMPLATE_MARGIN must lie inside of the image.
+    The patch and TEMPLATE_MARGIN must lie inside of the image.  window: GAUSSIAN or UNIFORM.
     """
     n = np.float32(PATCH_PIXELS)
     first = top * image.width + left
     level = image.values[first + PATCH_SIZE // 2 * image.width + PATCH_SIZE // 2]
     st, sx, sy, stt, stx, sty, sxx, sxy, syy = tensor_sums(
-        image.values, np.uint64(first), np.uint64(image.width), level
+        image.values, np.uint64(first), np.uint64(image.width), level, window
     )
     mean, mean_x, mean_y = st / n, sx / n, sy / n
     energy = stt - st * mean
@@ -112,12 +113,19 @@ def patch_strength(tensor: PatchTensor) -> tuple[np.float32, np.float32]:
 
 @leaf_kernel
 def make_template(
-    image: Pixels, left: int, top: int, tensor: PatchTensor, templates: F32, offset: int
+    image: Pixels,
+    left: int,
+    top: int,
+    tensor: PatchTensor,
+    window: F32,
+    templates: F32,
+    offset: int,
 ) -> None:
     """Make a template from the patch whose first pixel is (left, top).
 
-    tensor: the patch's own, with a strength above 0.  templates: flat; written from ``offset``
-    on: t0 with sum t0 v = gain, and t1, t2 with sum t v = gain * (displacement of the patch).
+    tensor: the patch's own under this window, with a strength above 0.  templates: flat; written
+    from ``offset`` on: t0 with sum t0 v = gain, and t1, t2 with sum t v = gain * (displacement of
+    the patch).
     """
     mean, mean_x, mean_y = tensor.mean + tensor.level, tensor.mean_x, tensor.mean_y
     tx, ty, xx, xy, yy = tensor.tx, tensor.ty, tensor.xx, tensor.xy, tensor.yy
@@ -146,6 +154,7 @@ def make_template(
         ),
         templates,
         offset,
+        window,
     )
 
 
@@ -186,6 +195,7 @@ def align_patch(
             v - np.float32(row),
             template.values,
             np.uint64(template.offset),
+            template.window,
         )
         variance = squares - total * total / n
         if gain <= np.float32(0.05) or gain >= np.float32(20.0) or variance <= np.float32(1e-3):

@@ -37,16 +37,18 @@ WINDOW_SIGMA_PX = 2.0
 """Of the Gaussian weights: a contour at the edge of a patch must not drag its centre along."""
 
 
-def _window() -> tuple[float, ...]:
+def _gaussian() -> F32:
     offsets = np.arange(PATCH_SIZE) - 0.5 * (PATCH_SIZE - 1)
     profile = np.exp(-0.5 * (offsets / WINDOW_SIGMA_PX) ** 2)
     weights = np.outer(profile, profile)
     weights *= PATCH_PIXELS / weights.sum()
-    return tuple(float(np.float32(w)) for w in weights.ravel())
+    return weights.ravel().astype(np.float32)
 
 
-WINDOW = _window()
+GAUSSIAN: F32 = _gaussian()
 """Weights of a patch's pixels, row by row; their sum is PATCH_PIXELS."""
+UNIFORM: F32 = np.ones(PATCH_PIXELS, np.float32)
+"""All pixels count alike: for a single step from near, where noise matters most."""
 
 _FLAGS = ("reassoc", "contract", "nsz", "arcp")
 _ROW = vector_type(PATCH_SIZE)
@@ -55,6 +57,10 @@ _I64 = ir.IntType(64)
 
 def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
     return builder.fadd(builder.fmul(a, b, flags=_FLAGS), c, flags=_FLAGS)
+
+
+def _window_row(builder: Any, window: Any, row: int) -> Any:
+    return load(builder, window, ir.Constant(_I64, row * PATCH_SIZE), PATCH_SIZE)
 
 
 def _sum_lanes(builder: Any, vector: Any) -> Any:
@@ -73,24 +79,28 @@ def patch_sums(
     dv: Any,
     templates: Any,
     offset: Any,
+    window: Any,
 ) -> Any:
     """Sums over a bilinearly interpolated patch v of an image, against a template.
 
     image: flat float32 with rows of ``width`` (uint64).  base: uint64 index of the pixel above
     and left of the patch's first sample; (du, dv) float32 in [0, 1): where between.  templates:
-    flat float32, three images of PATCH_PIXELS from ``offset`` (uint64) on.  Nothing is checked:
+    flat float32, three images of PATCH_PIXELS from ``offset`` (uint64) on.  window: weights of the
+    pixels.  Nothing is checked:
     the patch and one more row and column must lie inside of the image.
 
-    Returns (sum w v, sum w v^2, sum t0 v, sum t1 v, sum t2 v), w being WINDOW.
+    Returns (sum w v, sum w v^2, sum t0 v, sum t1 v, sum t2 v), w being the window.
     """
     signature = types.UniTuple(types.float32, 5)(
-        image, types.uint64, types.uint64, types.float32, types.float32, templates, types.uint64
-    )
+        image, types.uint64, types.uint64, types.float32, types.float32, templates, types.uint64,
+        window,
+    )  # fmt: skip
 
     def codegen(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        image, base, width, du, dv, templates, offset = arguments
+        image, base, width, du, dv, templates, offset, window = arguments
         pixels = context.make_array(sig.args[0])(context, builder, image).data
         weights = context.make_array(sig.args[5])(context, builder, templates).data
+        window_data = context.make_array(sig.args[7])(context, builder, window).data
         across, down = splat(builder, du, PATCH_SIZE), splat(builder, dv, PATCH_SIZE)
 
         def blended_row(row: int) -> Any:
@@ -109,8 +119,7 @@ def patch_sums(
             step = builder.fsub(below, above, flags=_FLAGS)
             v = _multiply_add(builder, down, step, above)
             above = below
-            window = ir.Constant(_ROW, list(WINDOW[row * PATCH_SIZE : (row + 1) * PATCH_SIZE]))
-            weighted = builder.fmul(window, v, flags=_FLAGS)
+            weighted = builder.fmul(_window_row(builder, window_data, row), v, flags=_FLAGS)
             sums[0] = builder.fadd(sums[0], weighted, flags=_FLAGS)
             sums[1] = _multiply_add(builder, weighted, v, sums[1])
             for image_index in range(3):
@@ -125,29 +134,34 @@ def patch_sums(
 
 
 @cast(Any, intrinsic)
-def tensor_sums(typing_context: Any, image: Any, base: Any, width: Any, level: Any) -> Any:
+def tensor_sums(
+    typing_context: Any, image: Any, base: Any, width: Any, level: Any, window: Any
+) -> Any:
     """Weighted sums over a patch and its central differences, for its structure tensor.
 
     image: flat float32 with rows of ``width`` (uint64).  base: uint64 index of the first pixel of
     the patch, which must lie one pixel or more inside.  level: float32 grey level that is taken
     off, near the patch's own, against rounding.
 
-    Returns sums of WINDOW times (t, x, y, t t, t x, t y, x x, x y, y y) with t the grey level and
-    (x, y) the gradient, DN per pixel.
+    Returns sums of the window times (t, x, y, t t, t x, t y, x x, x y, y y) with t the grey level
+    and (x, y) the gradient, DN per pixel.
     """
-    signature = types.UniTuple(types.float32, 9)(image, types.uint64, types.uint64, types.float32)
+    signature = types.UniTuple(types.float32, 9)(
+        image, types.uint64, types.uint64, types.float32, window
+    )
 
     def codegen(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        image, base, width, level = arguments
+        image, base, width, level, window = arguments
         pixels = context.make_array(sig.args[0])(context, builder, image).data
+        window_data = context.make_array(sig.args[4])(context, builder, window).data
         rows = _PatchRows(builder, pixels, base, width)
         offset = splat(builder, level, PATCH_SIZE)
         sums = [ir.Constant(_ROW, [0.0] * PATCH_SIZE)] * 9
         for row in range(PATCH_SIZE):
             value, x, y = rows.value_and_gradient(row)
             t = builder.fsub(value, offset, flags=_FLAGS)
-            window = ir.Constant(_ROW, list(WINDOW[row * PATCH_SIZE : (row + 1) * PATCH_SIZE]))
-            wt, wx, wy = (builder.fmul(window, v, flags=_FLAGS) for v in (t, x, y))
+            weight = _window_row(builder, window_data, row)
+            wt, wx, wy = (builder.fmul(weight, v, flags=_FLAGS) for v in (t, x, y))
             for i, weighted in enumerate((wt, wx, wy)):
                 sums[i] = builder.fadd(sums[i], weighted, flags=_FLAGS)
             for i, (a, b) in enumerate(((wt, t), (wt, x), (wt, y), (wx, x), (wx, y), (wy, y))):
@@ -168,25 +182,29 @@ def write_template(
     weights: Any,
     templates: Any,
     offset: Any,
+    window: Any,
 ) -> Any:
     """Write the three images of a template as combinations of a patch and its gradients.
 
     image, base, width: as in ``tensor_sums``.  weights: 12 float32 numbers, four to each image:
-    its pixels are WINDOW times (constant + a grey level + b x + c y).
+    its pixels are the window times (constant + a grey level + b x + c y).
     """
     if not isinstance(weights, types.UniTuple):
         return None
-    signature = types.void(image, types.uint64, types.uint64, weights, templates, types.int64)
+    signature = types.void(
+        image, types.uint64, types.uint64, weights, templates, types.int64, window
+    )
 
     def codegen(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        image, base, width, weights, templates, offset = arguments
+        image, base, width, weights, templates, offset, window = arguments
         pixels = context.make_array(sig.args[0])(context, builder, image).data
         out = context.make_array(sig.args[4])(context, builder, templates).data
+        window_data = context.make_array(sig.args[6])(context, builder, window).data
         rows = _PatchRows(builder, pixels, base, width)
         factors = [splat(builder, builder.extract_value(weights, i), PATCH_SIZE) for i in range(12)]
         for row in range(PATCH_SIZE):
             terms = rows.value_and_gradient(row)
-            window = ir.Constant(_ROW, list(WINDOW[row * PATCH_SIZE : (row + 1) * PATCH_SIZE]))
+            weight = _window_row(builder, window_data, row)
             for image_index in range(3):
                 total = factors[4 * image_index]
                 for i, term in enumerate(terms):
@@ -194,7 +212,7 @@ def write_template(
                 shift = ir.Constant(_I64, image_index * PATCH_PIXELS + row * PATCH_SIZE)
                 pointer = builder.gep(out, [builder.add(offset, shift)])
                 pointer = builder.bitcast(pointer, ir.PointerType(_ROW))
-                builder.store(builder.fmul(window, total, flags=_FLAGS), pointer, align=4)
+                builder.store(builder.fmul(weight, total, flags=_FLAGS), pointer, align=4)
         return context.get_dummy_value()
 
     return signature, codegen

@@ -1,7 +1,5 @@
 """The map segment that is being built: its points, keyframes, window and linked tracks."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
@@ -24,8 +22,10 @@ from pliant.algorithms.mapping.map_store import (
     MERGED,
     UNLINKED,
     Keyframe,
+    Observations,
     PointRows,
     TrackLinks,
+    sample_colours,
 )
 from pliant.algorithms.mapping.observation_table import (
     columns_in_state,
@@ -34,8 +34,7 @@ from pliant.algorithms.mapping.observation_table import (
     seen_in_state,
 )
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.patches import cut_patches, sample_colours
-from pliant.algorithms.mapping.reacquisition import MaximaGrid, Reacquired
+from pliant.algorithms.mapping.reacquisition import MaximaGrid, Reacquired, cut_patches
 from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.window import Window
@@ -56,14 +55,6 @@ _CLEAR_SHARE = 0.7
 
 _MAX_STRIKES = 3
 """Bad frames in a row after which a track is taken from its point."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Observations:
-    """What a frame sees of the map: rows (n,), each once, and points_px (n, 2)."""
-
-    rows: I32
-    points_px: F32
 
 
 class ActiveMap:
@@ -173,11 +164,9 @@ class ActiveMap:
         What such a track belonged to merges into the point, where both can be the same.  Returns
         the points found where no track is.
         """
-        self.points.misses[reacquired.visible] = np.minimum(
-            self.points.misses[reacquired.visible], MAX_MISSES - 1
-        )
-        self.points.misses[reacquired.visible] += 1
-        self.points.misses[reacquired.rows] = 0
+        misses, visible = self.points.misses, reacquired.visible
+        misses[visible] = np.minimum(misses[visible], MAX_MISSES - 1) + 1
+        misses[reacquired.rows] = 0
         camera = self.camera
         places = np.column_stack([tracks.points_px, tracks.kappas])
         nearby = MaximaGrid.build(places, camera.width, camera.height)

@@ -5,8 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
+from pliant.algorithms.image.patch_alignment import TEMPLATE_MARGIN
+from pliant.algorithms.image.patch_sums import PATCH_SIZE
 from pliant.algorithms.kernel import kernel
-from pliant.algorithms.mapping.patches import PATCH
+
+PATCH_SIDE = PATCH_SIZE + 2 * TEMPLATE_MARGIN
+"""Of the grey levels kept around a point, whose samples lie at -4.5, ..., 4.5 px from it."""
+
+UNLINKED = -1
+"""Row of a track that belongs to no point."""
 
 FREE, CANDIDATE, MAPPED, MERGED = 0, 1, 2, 3
 """State of a row: nothing, a track that still lacks parallax, a point of the map, the alias of
@@ -47,7 +54,7 @@ class PointRows:
         self.kappas: F32 = np.zeros(1024, np.float32)
         self.strikes: U8 = np.zeros(1024, np.uint8)
         self.misses: U8 = np.zeros(1024, np.uint8)
-        self.patches: U8 = np.zeros((1024, PATCH, PATCH), np.uint8)
+        self.patches: U8 = np.zeros((1024, PATCH_SIDE, PATCH_SIDE), np.uint8)
         self.culled = 0
         """Points of the map that were published and are not kept any more."""
         self._free: I32 = np.zeros(0, np.int32)
@@ -144,7 +151,12 @@ def _has_aliases(rows: I32, alias: I32) -> bool:
     return found > 0
 
 
-UNLINKED = -1
+@dataclass(frozen=True, kw_only=True)
+class Observations:
+    """What a frame sees of the map: rows (n,), each once, and points_px (n, 2)."""
+
+    rows: I32
+    points_px: F32
 
 
 class TrackLinks:
@@ -172,3 +184,17 @@ def _carry_over(ids: I64, rows: I32, new_ids: I64, new_rows: I32) -> None:
             i += 1
         if i < ids.size and ids[i] == new_ids[j]:
             new_rows[j] = rows[i]
+
+
+@kernel
+def sample_colours(image: U8, points_px: F32) -> U8:
+    """(N, 3) RGB of the pixel nearest to each point; image (H, W, 3) or (H, W)."""
+    colours = np.empty((points_px.shape[0], 3), np.uint8)
+    flat = image.reshape(image.shape[0], image.shape[1], -1)
+    channels = flat.shape[2]
+    for i in range(points_px.shape[0]):
+        column = min(max(int(points_px[i, 0] + 0.5), 0), flat.shape[1] - 1)
+        line = min(max(int(points_px[i, 1] + 0.5), 0), flat.shape[0] - 1)
+        for k in range(3):
+            colours[i, k] = flat[line, column, min(k, channels - 1)]
+    return colours

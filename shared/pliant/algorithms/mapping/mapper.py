@@ -13,9 +13,9 @@ from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
-from pliant.algorithms.mapping.active_map import ActiveMap, Observations
+from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.localisation import locate, refine
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, Observations, PointRows
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
@@ -260,9 +260,7 @@ class Mapper:
             self._parameters.reacquisition,
         )
         found = active.take_over(reacquired, tracks)
-        linked = active.linked(MAPPED)
-        rows = np.concatenate([active.links.rows[linked], found.rows])
-        points_px = np.concatenate([tracks.points_px[linked], found.points_px])
+        rows, points_px = active.observed(tracks.points_px, found)
         located = refine(
             T_world_camera,
             points.xyz[rows],
@@ -271,6 +269,7 @@ class Mapper:
             self._parameters.localisation,
             near=True,
         )
+        linked = active.linked(MAPPED)
         points.kappas[active.links.rows[linked]] = tracks.kappas[linked]
         return located.T_world_camera, found
 

@@ -2,25 +2,42 @@
 
 A point is projected with the pose of the frame; the maximum near it whose curvature and patch fit
 best takes it.  Its patch then refines the position, since an extremum alone is known to half a
-pixel only.  Not in the paper; docs/results.md says what it is worth."""
+pixel only.  Not in the paper; docs/results.md says what it is worth.
+"""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.algorithms.image.patch_alignment import (
+    Template,
+    align_patch,
+    make_template,
+    patch_strength,
+    patch_tensor,
+)
+from pliant.algorithms.image.patch_sums import PATCH_PIXELS, PATCH_SIZE, TEMPLATE_FLOATS, UNIFORM
+from pliant.algorithms.image.pixels import Pixels, pixels_of
+from pliant.algorithms.kernel import fast_kernel, kernel, leaf_kernel
+from pliant.algorithms.mapping.map_store import PATCH_SIDE
 from pliant.algorithms.mapping.parameters import ReacquisitionParameters
-from pliant.algorithms.mapping.patches import PATCH, align_patch, normalise_patch
 
 CELL_PX = 8
 """Side of a cell: larger than any search radius, so that nine cells suffice."""
 
+_MARGIN_PX = 8.0
+_ALIGN_REACH_PX = np.float32(1.5)
+_ITERATIONS = 4
 
-@dataclass(frozen=True, kw_only=True)
-class MaximaGrid:
+_FLAT = np.float32(1.0)
+"""Standard deviation, in grey levels, under which a patch says nothing."""
+
+
+class MaximaGrid(NamedTuple):
     """Maxima (M, 3) as (u, v, kappa); those of cell c are ``order[starts[c] : starts[c + 1]]``."""
 
     maxima: F32
@@ -36,15 +53,12 @@ class MaximaGrid:
         starts = np.zeros(columns * lines + 1, np.int32)
         order = np.empty(len(maxima), np.int32)
         _sort_into_cells(maxima, columns, lines, starts, order)
-        return MaximaGrid(maxima=maxima, starts=starts, order=order, columns=columns, lines=lines)
+        return MaximaGrid(maxima, starts, order, columns, lines)
 
     def nearest(self, points_px: F32, radius_px: float) -> I32:
         """(N,) index of the maximum nearest to each point (N, 2) within the radius, else -1."""
         found = np.full(len(points_px), -1, np.int32)
-        _nearest(
-            points_px, self.maxima, self.starts, self.order, self.columns, self.lines, radius_px,
-            found,
-        )  # fmt: skip
+        _nearest(points_px, self, radius_px, found)
         return found
 
 
@@ -65,32 +79,20 @@ def _sort_into_cells(maxima: F32, columns: int, lines: int, starts: I32, order: 
 
 
 @kernel
-def _nearest(
-    points_px: F32,
-    maxima: F32,
-    starts: I32,
-    order: I32,
-    columns: int,
-    lines: int,
-    radius_px: float,
-    found: I32,
-) -> None:
+def _nearest(points_px: F32, grid: MaximaGrid, radius_px: float, found: I32) -> None:
+    maxima, columns = grid.maxima, grid.columns
     for i in range(points_px.shape[0]):
         u, v = points_px[i, 0], points_px[i, 1]
         column, line = int(u) // CELL_PX, int(v) // CELL_PX
         best = radius_px * radius_px
-        for y in range(max(line - 1, 0), min(line + 2, lines)):
+        for y in range(max(line - 1, 0), min(line + 2, grid.lines)):
             for x in range(max(column - 1, 0), min(column + 2, columns)):
                 cell = y * columns + x
-                for k in range(starts[cell], starts[cell + 1]):
-                    m = order[k]
+                for k in range(grid.starts[cell], grid.starts[cell + 1]):
+                    m = grid.order[k]
                     distance2 = (maxima[m, 0] - u) ** 2 + (maxima[m, 1] - v) ** 2
                     if distance2 < best:
                         best, found[i] = distance2, m
-
-
-_MARGIN_PX = 8.0
-_ALIGN_REACH_PX = 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +107,26 @@ class Reacquired:
     points_px: F32
     maxima: I32
     visible: I32
+
+
+class _Wanted(NamedTuple):
+    """Points looked for.
+
+    projected: (W, 2) where they should be, px.  kappas: (W,) curvature when last seen.
+    patches: (W, PATCH_SIDE, PATCH_SIDE) grey levels around them then.
+    """
+
+    projected: F32
+    kappas: F32
+    patches: U8
+
+
+class _Limits(NamedTuple):
+    """See the fields of ReacquisitionParameters."""
+
+    radius_px: float
+    kappa_ratio: float
+    min_zncc: float
 
 
 def reacquire(
@@ -127,19 +149,44 @@ def reacquire(
     K = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
     projected = np.empty((len(rows), 2), np.float32)
     visible = _project(T_camera_world, rows, xyz, K, projected)
-    wanted = rows[visible]
-    choice = np.full(len(wanted), -1, np.int32)
-    points_px = np.zeros((len(wanted), 2), np.float32)
-    image = grey if grey is not None else np.zeros((0, 0), np.uint8)
-    _match(
-        wanted, projected[visible], kappas, patches, grid.maxima, grid.starts, grid.order,
-        grid.columns, grid.lines, image, parameters.radius_px, parameters.kappa_ratio,
-        parameters.min_zncc, choice, points_px,
-    )  # fmt: skip
+    visible_rows = rows[visible]
+    wanted = _Wanted(projected[visible], kappas[visible_rows], patches[visible_rows])
+    choice = np.full(len(visible_rows), -1, np.int32)
+    points_px = np.zeros((len(visible_rows), 2), np.float32)
+    image = np.zeros((0, 0), np.float32) if grey is None else grey.astype(np.float32)
+    limits = _Limits(parameters.radius_px, parameters.kappa_ratio, parameters.min_zncc)
+    _match(wanted, grid, pixels_of(image), limits, choice, points_px)
     found = choice >= 0
     return Reacquired(
-        rows=wanted[found], points_px=points_px[found], maxima=choice[found], visible=wanted
+        rows=visible_rows[found],
+        points_px=points_px[found],
+        maxima=choice[found],
+        visible=visible_rows,
     )
+
+
+@fast_kernel
+def cut_patches(grey: U8, points_px: F32, rows: I32, patches: U8) -> None:
+    """Store the patch around each point (N, 2), and the margin that its gradients need, in
+    ``patches[rows[n]]``; zeros at the border of the image."""
+    height, width = grey.shape
+    for i in range(rows.size):
+        patch = patches[rows[i]]
+        left = points_px[i, 0] - np.float32(0.5 * (PATCH_SIDE - 1))
+        top = points_px[i, 1] - np.float32(0.5 * (PATCH_SIDE - 1))
+        x, y = int(np.floor(left)), int(np.floor(top))
+        if x < 0 or y < 0 or x + PATCH_SIDE >= width or y + PATCH_SIDE >= height:
+            patch[:] = 0
+            continue
+        a, b = left - np.float32(x), top - np.float32(y)
+        one = np.float32(1.0)
+        w00, w01, w10, w11 = (one - a) * (one - b), a * (one - b), (one - a) * b, a * b
+        for r in range(PATCH_SIDE):
+            upper, lower = grey[y + r, x:], grey[y + r + 1, x:]
+            for c in range(PATCH_SIDE):
+                above = w00 * upper[c] + w01 * upper[c + 1]
+                below = w10 * lower[c] + w11 * lower[c + 1]
+                patch[r, c] = np.uint8(above + below + np.float32(0.5))
 
 
 @kernel
@@ -158,83 +205,95 @@ def _project(T: F64, rows: I32, xyz: F64, K: F64, projected: F32) -> BoolArray:
 
 @fast_kernel
 def _match(
-    rows: I32,
-    projected: F32,
-    kappas: F32,
-    patches: U8,
-    maxima: F32,
-    starts: I32,
-    order: I32,
-    columns: int,
-    lines: int,
-    grey: U8,
-    radius_px: float,
-    kappa_ratio: float,
-    min_zncc: float,
+    wanted: _Wanted,
+    grid: MaximaGrid,
+    image: Pixels,
+    limits: _Limits,
     choice: I32,
     points_px: F32,
 ) -> None:
+    """Give each maximum to the point that fits it best; writes its choice, -1, and its place."""
+    maxima = grid.maxima
     owner = np.full(maxima.shape[0], -1, np.int32)
     scores = np.zeros(maxima.shape[0])
-    template = np.empty((PATCH, PATCH), np.float32)
-    work = np.empty((PATCH, PATCH), np.float32)
-    position, best_position = np.empty(2), np.empty(2)
-    near, nearest = np.empty(2, np.int64), np.empty(2)
-    reach2 = radius_px * radius_px
-    with_patch = grey.size > 0
-    for i in range(rows.size):
-        row = rows[i]
-        u, v = projected[i, 0], projected[i, 1]
-        known = kappas[row]
-        column, line = int(u) // CELL_PX, int(v) // CELL_PX
-        near[0], near[1], nearest[0], nearest[1] = -1, -1, reach2, reach2
-        for y in range(max(line - 1, 0), min(line + 2, lines)):
-            # The cells of a line lie one after the other.
-            first = y * columns + max(column - 1, 0)
-            last = y * columns + min(column + 1, columns - 1)
-            for k in range(starts[first], starts[last + 1]):
-                m = order[k]
-                mu, mv, kappa = maxima[m, 0], maxima[m, 1], maxima[m, 2]
-                distance2 = (mu - u) ** 2 + (mv - v) ** 2
-                # Signed: a dark feature (kappa > 0) is never taken for a bright one.
-                if (
-                    distance2 >= nearest[1]
-                    or kappa * known <= 0.0
-                    or abs(kappa) > kappa_ratio * abs(known)
-                    or abs(known) > kappa_ratio * abs(kappa)
-                ):
-                    continue
-                if distance2 < nearest[0]:
-                    near[1], nearest[1] = near[0], nearest[0]
-                    near[0], nearest[0] = m, distance2
-                else:
-                    near[1], nearest[1] = m, distance2
-        if near[0] < 0:
+    window = Pixels(np.empty(PATCH_SIDE * PATCH_SIDE, np.float32), PATCH_SIDE, PATCH_SIDE)
+    values = np.empty(TEMPLATE_FLOATS, np.float32)
+    to_origin = np.float32(0.5 * (PATCH_SIZE - 1))
+    for i in range(len(wanted.kappas)):
+        first, second, distance2 = _two_nearest(wanted, i, grid, limits)
+        if first < 0:
             continue
         best, best_score = -1, -1.0
-        if not with_patch:
-            best, best_score = near[0], 1.0 / (1.0 + nearest[0])
-            best_position[0], best_position[1] = maxima[best, 0], maxima[best, 1]
+        best_u, best_v = np.float32(0.0), np.float32(0.0)
+        if image.width == 0:
+            best, best_score = first, 1.0 / (1.0 + distance2)
+            best_u, best_v = maxima[best, 0], maxima[best, 1]
         else:
-            for r in range(PATCH):
-                for c in range(PATCH):
-                    template[r, c] = patches[row, r, c]
-            if not normalise_patch(template):
+            energy = _template_of(wanted.patches[i], window, values)
+            if energy < np.float32(PATCH_PIXELS) * _FLAT * _FLAT:
                 continue
+            template = Template(values, 0, energy, UNIFORM)
             for k in range(2):
-                m = near[k]
+                m = first if k == 0 else second
                 if m < 0:
                     break
-                score = align_patch(
-                    grey, template, maxima[m, 0], maxima[m, 1], work, _ALIGN_REACH_PX, position
-                )
-                if score >= min_zncc and score > best_score:
-                    best, best_score = m, score
-                    best_position[0], best_position[1] = position[0], position[1]
+                u, v = maxima[m, 0] - to_origin, maxima[m, 1] - to_origin
+                found = align_patch(image, u, v, template, _ITERATIONS, _ALIGN_REACH_PX)
+                if found.zncc >= limits.min_zncc and found.zncc > best_score:
+                    best, best_score = m, float(found.zncc)
+                    best_u, best_v = found.u + to_origin, found.v + to_origin
         if best < 0 or (owner[best] >= 0 and scores[best] >= best_score):
             continue
         if owner[best] >= 0:
             choice[owner[best]] = -1
         owner[best], scores[best] = i, best_score
         choice[i] = best
-        points_px[i, 0], points_px[i, 1] = best_position[0], best_position[1]
+        points_px[i, 0], points_px[i, 1] = best_u, best_v
+
+
+@leaf_kernel
+def _two_nearest(
+    wanted: _Wanted, i: int, grid: MaximaGrid, limits: _Limits
+) -> tuple[int, int, float]:
+    """The nearest two maxima of a curvature like the point's, -1 where there is none, and the
+    squared distance of the first."""
+    u, v, known = wanted.projected[i, 0], wanted.projected[i, 1], wanted.kappas[i]
+    column, line = int(u) // CELL_PX, int(v) // CELL_PX
+    ratio = limits.kappa_ratio
+    first, second = -1, -1
+    nearest = next_nearest = limits.radius_px * limits.radius_px
+    for y in range(max(line - 1, 0), min(line + 2, grid.lines)):
+        # The cells of a line lie one after the other.
+        begin = y * grid.columns + max(column - 1, 0)
+        end = y * grid.columns + min(column + 1, grid.columns - 1)
+        for k in range(grid.starts[begin], grid.starts[end + 1]):
+            m = int(grid.order[k])
+            kappa = grid.maxima[m, 2]
+            distance2 = (grid.maxima[m, 0] - u) ** 2 + (grid.maxima[m, 1] - v) ** 2
+            # Signed: a dark feature (kappa > 0) is never taken for a bright one.
+            if (
+                distance2 >= next_nearest
+                or kappa * known <= 0.0
+                or abs(kappa) > ratio * abs(known)
+                or abs(known) > ratio * abs(kappa)
+            ):
+                continue
+            if distance2 < nearest:
+                second, next_nearest = first, nearest
+                first, nearest = m, distance2
+            else:
+                second, next_nearest = m, distance2
+    return first, second, nearest
+
+
+@leaf_kernel
+def _template_of(patch: U8, window: Pixels, values: F32) -> np.float32:
+    """Make the template of a kept patch; returns its energy, 0 where it cannot be placed by."""
+    for r in range(PATCH_SIDE):
+        for c in range(PATCH_SIDE):
+            window.values[r * PATCH_SIDE + c] = np.float32(patch[r, c])
+    tensor = patch_tensor(window, 1, 1, UNIFORM)
+    if patch_strength(tensor)[0] <= np.float32(0.0):
+        return np.float32(0.0)
+    make_template(window, 1, 1, tensor, UNIFORM, values, 0)
+    return tensor.energy

@@ -16,7 +16,12 @@ from pliant.algorithms.image.patch_alignment import (
     patch_strength,
     patch_tensor,
 )
-from pliant.algorithms.image.patch_sums import PATCH_SIZE, TEMPLATE_FLOATS, prefetch_template
+from pliant.algorithms.image.patch_sums import (
+    GAUSSIAN,
+    PATCH_SIZE,
+    TEMPLATE_FLOATS,
+    prefetch_template,
+)
 from pliant.algorithms.image.pixels import Pixels
 from pliant.algorithms.image.vector_code import prefetch
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
@@ -334,14 +339,14 @@ def _align_track(
         image,
         to_octave(start_u, octave) + track.left,
         to_octave(start_v, octave) + track.top,
-        Template(templates, track.slot * TEMPLATE_FLOATS, track.energy),
+        Template(templates, track.slot * TEMPLATE_FLOATS, track.energy, GAUSSIAN),
         limits.patch_iterations,
         reach * scale,
     )
     u, v = _from_octave(found.u - track.left, octave), _from_octave(found.v - track.top, octave)
     accepted = found.zncc >= _COAST_ZNCC and found.step <= np.float32(0.5)
     fits = found.zncc > limits.min_zncc or found.residual < limits.min_residual
-    return _Place(u, v, accepted and fits)
+    return _Place(u, v, bool(accepted and fits))
 
 
 @leaf_kernel
@@ -360,11 +365,11 @@ def _leads_back(
     left, top = patch_origin(at_u, at_v)
     if not patch_inside(image, left, top):
         return False
-    tensor = patch_tensor(image, left, top)
+    tensor = patch_tensor(image, left, top, GAUSSIAN)
     strength, _ = patch_strength(tensor)
     if strength <= np.float32(0.0):
         return False
-    make_template(image, left, top, tensor, scratch, 0)
+    make_template(image, left, top, tensor, GAUSSIAN, scratch, 0)
     from_u = to_octave(track.u, octave) + (np.float32(left) - at_u)
     from_v = to_octave(track.v, octave) + (np.float32(top) - at_v)
     # As the noise of a patch: what is sharp has to come back exactly.
@@ -376,7 +381,7 @@ def _leads_back(
         image_before,
         from_u,
         from_v,
-        Template(scratch, np.int64(0), tensor.energy),
+        Template(scratch, 0, tensor.energy, GAUSSIAN),
         limits.patch_iterations,
         np.float32(2.0) * gate,
     )

@@ -13,6 +13,7 @@ from pliant.algorithms.image.patch_sums import (
     BIRTH_FLOATS,
     BIRTH_MARGIN,
     BIRTH_SIZE,
+    GAUSSIAN,
     PATCH_SIZE,
     TEMPLATE_FLOATS,
 )
@@ -97,10 +98,10 @@ def turn_templates(
         track = tracks[lagging[rank]]
         m = patches.deformations[track.slot]
         sample_birth(births, track.slot * BIRTH_FLOATS, track, m, window.values)
-        tensor = patch_tensor(window, 1, 1)
+        tensor = patch_tensor(window, 1, 1, GAUSSIAN)
         if patch_strength(tensor)[0] <= np.float32(0.0):
             continue
-        make_template(window, 1, 1, tensor, templates, track.slot * TEMPLATE_FLOATS)
+        make_template(window, 1, 1, tensor, GAUSSIAN, templates, track.slot * TEMPLATE_FLOATS)
         track.energy = tensor.energy
         m[4], m[5], m[6], m[7] = m[0], m[1], m[2], m[3]
 

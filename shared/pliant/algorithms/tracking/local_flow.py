@@ -17,7 +17,7 @@ from pliant.algorithms.image.patch_alignment import (
     patch_strength,
     patch_tensor,
 )
-from pliant.algorithms.image.patch_sums import PATCH_SIZE, TEMPLATE_FLOATS
+from pliant.algorithms.image.patch_sums import GAUSSIAN, PATCH_SIZE, TEMPLATE_FLOATS
 from pliant.algorithms.image.pixels import Pixels, pixels_of
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 
@@ -141,10 +141,10 @@ def _align_cells(
                 continue
             if top > previous.height - PATCH_SIZE - 1:
                 continue
-            tensor = patch_tensor(previous, left, top)
+            tensor = patch_tensor(previous, left, top, GAUSSIAN)
             if patch_strength(tensor)[0] < MIN_STRENGTH:
                 continue
-            make_template(previous, left, top, tensor, template, 0)
+            make_template(previous, left, top, tensor, GAUSSIAN, template, 0)
             base_u = affine[0] * u + affine[1] * v + affine[2] - u
             base_v = affine[3] * u + affine[4] * v + affine[5] - v
             best = MIN_ZNCC
@@ -167,7 +167,7 @@ def _align_cells(
                     current,
                     np.float32(left) + (base_u + guess_u) * scale,
                     np.float32(top) + (base_v + guess_v) * scale,
-                    Template(template, np.int64(0), tensor.energy),
+                    Template(template, 0, tensor.energy, GAUSSIAN),
                     8,
                     np.float32(4.0),
                 )

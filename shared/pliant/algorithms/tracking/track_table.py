@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F32, I32
 from pliant.algorithms.image.patch_sums import BIRTH_FLOATS, TEMPLATE_FLOATS
@@ -44,7 +43,7 @@ TRACK = np.dtype(
 
 Track: TypeAlias = Any
 """A record of type TRACK."""
-Tracks: TypeAlias = NDArray[Any]
+Tracks: TypeAlias = Any
 """(N,) records of type TRACK."""
 
 

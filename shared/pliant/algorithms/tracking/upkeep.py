@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F32, I32
 from pliant.algorithms.image.patch_alignment import make_template, patch_strength, patch_tensor
-from pliant.algorithms.image.patch_sums import BIRTH_FLOATS, TEMPLATE_FLOATS
+from pliant.algorithms.image.patch_sums import BIRTH_FLOATS, GAUSSIAN, TEMPLATE_FLOATS
 from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.tracking.advance import (
     FrameImages,
@@ -107,7 +107,7 @@ def start_tracks(
             if limits.subpixel:
                 u, v = maxima[i, 0], maxima[i, 1]
             slot = free_slots[free_count - 1]
-            birth = _Birth(np.int64(0), np.int64(0), np.int64(0), np.float32(0.0))
+            birth = _Birth(0, 0, 0, np.float32(0.0))
             if limits.patch_refinement:
                 set_bit(occupied, at)
                 birth = _take_patch(now, u, v, limits, slot, patches)
@@ -143,13 +143,13 @@ def _take_patch(
     patches: Patches,
 ) -> _Birth:
     """Keep the patch around a point, at half size where there is little to see so near."""
-    nothing = _Birth(np.int64(0), np.int64(0), np.int64(0), np.float32(-1.0))
+    nothing = _Birth(0, 0, 0, np.float32(-1.0))
     octave = 0
     image = now.full
     left, top = patch_origin(u, v)
     if not patch_inside(image, left, top):
         return nothing
-    tensor = patch_tensor(image, left, top)
+    tensor = patch_tensor(image, left, top, GAUSSIAN)
     strength, isotropy = patch_strength(tensor)
     if strength < limits.fine_strength:
         octave = 1
@@ -157,18 +157,18 @@ def _take_patch(
         left, top = patch_origin(to_octave(u, 1), to_octave(v, 1))
         if not patch_inside(image, left, top):
             return nothing
-        tensor = patch_tensor(image, left, top)
+        tensor = patch_tensor(image, left, top, GAUSSIAN)
         strength, isotropy = patch_strength(tensor)
         if strength < limits.min_strength:
             return nothing
     if strength <= np.float32(0.0) or isotropy < limits.min_isotropy:
         return nothing
-    make_template(image, left, top, tensor, patches.templates, slot * TEMPLATE_FLOATS)
+    make_template(image, left, top, tensor, GAUSSIAN, patches.templates, slot * TEMPLATE_FLOATS)
     keep_birth(image, left, top, patches.births, slot * BIRTH_FLOATS)
     m = patches.deformations[slot]
     m[:] = 0.0
     m[0] = m[3] = m[4] = m[7] = 1.0
-    return _Birth(np.int64(octave), left, top, tensor.energy)
+    return _Birth(octave, left, top, tensor.energy)
 
 
 @fast_kernel
