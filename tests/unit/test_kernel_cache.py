@@ -8,6 +8,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+import pytest
+
 import pliant
 from pliant import cache, errors
 from pliant.algorithms import kernel, kernel_cache, kernel_linking
@@ -121,6 +124,15 @@ def test_one_line_says_that_kernels_can_be_kept_nowhere(tmp_path: Path) -> None:
         line = _call(tmp_path, code, nowhere)
         assert "set PLIANT_CACHE_DIR to a folder that can be written" in line
         assert "\n" not in line
+
+
+def test_a_slice_of_another_shape_is_an_error_without_strings() -> None:
+    @kernel.kernel
+    def copy(source: np.ndarray, target: np.ndarray) -> None:
+        target[:] = source
+
+    with pytest.raises(ValueError, match="an array of another shape"):
+        copy(np.zeros(3), np.zeros(4))
 
 
 def _object(file: Path) -> bytes:

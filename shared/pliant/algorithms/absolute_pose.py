@@ -11,12 +11,12 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64, BoolArray
-from pliant.algorithms.kernel import inline_kernel, kernel
+from pliant.algorithms.kernel import fast_kernel, kernel
 
 _SMALL = 1e-12
 
 
-@inline_kernel
+@fast_kernel
 def _largest_root_of_cubic(a: float, b: float, c: float) -> float:
     """The largest real root of x^3 + a x^2 + b x + c."""
     q = (a * a - 3.0 * b) / 9.0
@@ -31,7 +31,7 @@ def _largest_root_of_cubic(a: float, b: float, c: float) -> float:
     return first + second - a / 3.0
 
 
-@inline_kernel
+@fast_kernel
 def _quartic_roots(A4: float, A3: float, A2: float, A1: float, A0: float, roots: F64) -> int:
     """Real roots of A4 x^4 + ... + A0 into ``roots`` (4,); returns how many."""
     if abs(A4) < _SMALL:
@@ -72,7 +72,7 @@ def _quartic_roots(A4: float, A3: float, A2: float, A1: float, A0: float, roots:
     return count
 
 
-@inline_kernel
+@fast_kernel
 def _frame_of_triangle(x: F64, frame: F64) -> bool:
     """Orthonormal axes (columns of ``frame``) of the triangle with corners ``x`` (3, 3) rows."""
     ax, ay, az = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+import numba.np.arrayobj
+from numba.extending import overload
 
 from pliant.algorithms.kernel_cache import SourcesCache
 from pliant.algorithms.kernel_linking import keep_copies_apart
@@ -21,19 +23,33 @@ _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 _FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
 
 
+def _shapes_differ(source: Any, target: Any) -> None:
+    raise NotImplementedError
+
+
+@overload(_shapes_differ)
+def _raise_that_shapes_differ(source: Any, target: Any) -> Any:
+    def shapes_differ(source: Any, target: Any) -> None:
+        raise ValueError("cannot assign an array of another shape")
+
+    return shapes_differ
+
+
+# Numba's own names both shapes, and every process compiles its strings for three to five seconds.
+numba.np.arrayobj.raise_with_shape_context = _shapes_differ
+
+
 def kernel(function: _Function) -> _Function:
     """Compile with strict floating point.  Cached on disk, keyed by CPU."""
     return _compile(function)
 
 
 def fast_kernel(function: _Function) -> _Function:
-    """Compile with reassociation and fused multiply-add allowed, so that reductions vectorise."""
+    """Compile with reassociation and fused multiply-add allowed, so that reductions vectorise.
+
+    LLVM puts small ones into the kernels that call them.
+    """
     return _compile(function, fastmath=_FAST)
-
-
-def inline_kernel(function: _Function) -> _Function:
-    """Compile a small helper that LLVM may inline into the kernels that call it."""
-    return _compile(function, inline="never", fastmath=_FAST)
 
 
 def leaf_kernel(function: _Function) -> _Function:

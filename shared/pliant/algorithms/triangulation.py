@@ -11,7 +11,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.kernel import inline_kernel, kernel
+from pliant.algorithms.kernel import fast_kernel, kernel
 
 _ITERATIONS = 4
 _MIN_DEPTH = 1e-6
@@ -58,7 +58,7 @@ def spread_of_rays(
     return parallax, sigmas
 
 
-@inline_kernel
+@fast_kernel
 def _solve3(H: F64, g: F64, x: F64) -> bool:
     """Solve the symmetric ``H x = g`` by cofactors; H as xx, xy, xz, yy, yz, zz."""
     a = H[3] * H[5] - H[4] * H[4]
@@ -77,7 +77,7 @@ def _solve3(H: F64, g: F64, x: F64) -> bool:
     return True
 
 
-@inline_kernel
+@fast_kernel
 def _intersect(
     T: F64, centres: F64, u: F32, v: F32, seen: BoolArray, n: int, K: F64, H: F64, g: F64, X: F64
 ) -> bool:
@@ -106,7 +106,7 @@ def _intersect(
     return _solve3(H, g, X)
 
 
-@inline_kernel
+@fast_kernel
 def _step(T: F64, u: F32, v: F32, seen: BoolArray, n: int, K: F64, H: F64, g: F64, X: F64) -> float:
     """Normal equations of the reprojection error at X; returns the largest error, px squared."""
     H[:] = 0.0
@@ -207,7 +207,7 @@ def _spread(
         sigmas[i] = 1.0 / (focal_px * math.sqrt(information)) if information > 0.0 else np.inf
 
 
-@inline_kernel
+@fast_kernel
 def _apart(directions: F64, a: int, b: int) -> float:
     """Squared distance of two unit vectors: ``4 sin^2`` of half the angle between them."""
     x = directions[a, 0] - directions[b, 0]

@@ -10,13 +10,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I32
-from pliant.algorithms.kernel import inline_kernel
+from pliant.algorithms.kernel import fast_kernel
 from pliant.rendering.view import NEAR_M, TILE_PX, TILE_RAYS, Reals
 
 Scalar: TypeAlias = Any  # a number of any width inside a kernel
 
 
-@inline_kernel
+@fast_kernel
 def _box(
     lx: Scalar,
     ly: Scalar,
@@ -44,7 +44,7 @@ def _box(
     return near if near <= far else np.inf
 
 
-@inline_kernel
+@fast_kernel
 def _sphere(
     ox: Scalar,
     oy: Scalar,
@@ -61,7 +61,7 @@ def _sphere(
     return (-b - math.sqrt(root)) / a if root >= 0.0 else np.inf
 
 
-@inline_kernel
+@fast_kernel
 def _cylinder(
     ox: Scalar,
     oy: Scalar,
@@ -86,7 +86,7 @@ def _cylinder(
     return cap if x * x + y * y <= radius * radius else np.inf
 
 
-@inline_kernel
+@fast_kernel
 def hit_solid(
     kind: Scalar,
     ox: Scalar,
@@ -107,7 +107,7 @@ def hit_solid(
     return _cylinder(ox, oy, oz, dx, dy, dz, hx, hz)
 
 
-@inline_kernel
+@fast_kernel
 def _offer_box(
     s: Scalar,
     inside: bool,
@@ -144,7 +144,7 @@ def _offer_box(
         solid[i] = s if taken else solid[i]
 
 
-@inline_kernel
+@fast_kernel
 def _offer_round(
     s: Scalar,
     kind: Scalar,
@@ -174,7 +174,7 @@ def _offer_round(
             best[i], solid[i] = t, s
 
 
-@inline_kernel
+@fast_kernel
 def meet_tile(
     kind: I32,
     half: Reals,
@@ -207,7 +207,7 @@ def meet_tile(
         farthest = best.max()
 
 
-@inline_kernel
+@fast_kernel
 def load_tile(rays: Reals, tile: Scalar, x: Reals, y: Reals) -> tuple[int, int, int, int]:
     """Copy the rays of a tile, row by row; beyond the image's edge the edge is repeated."""
     height, width = rays.shape[:2]
@@ -219,7 +219,7 @@ def load_tile(rays: Reals, tile: Scalar, x: Reals, y: Reals) -> tuple[int, int, 
     return top, left, min(TILE_PX, height - top), min(TILE_PX, width - left)
 
 
-@inline_kernel
+@fast_kernel
 def face_point(
     kind: Scalar, x: Scalar, y: Scalar, z: Scalar, hx: Scalar, hy: Scalar, hz: Scalar
 ) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8
-from pliant.algorithms.kernel import fast_kernel, inline_kernel, kernel
+from pliant.algorithms.kernel import fast_kernel, kernel
 from pliant.rendering.intersect import Scalar, face_point, load_tile, meet_tile
 from pliant.rendering.scene import SolidArrays
 from pliant.rendering.view import TILE_PX, TILE_RAYS, Tiles, View
@@ -22,7 +22,7 @@ class Atlas(NamedTuple):
     density: F64  # (F,) texels per metre
 
 
-@inline_kernel
+@fast_kernel
 def bilinear(
     texels: U8, offset: Scalar, width: Scalar, height: Scalar, x: Scalar, y: Scalar
 ) -> Scalar:

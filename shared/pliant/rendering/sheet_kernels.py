@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32
-from pliant.algorithms.kernel import fast_kernel, inline_kernel, kernel
+from pliant.algorithms.kernel import fast_kernel, kernel
 from pliant.rendering.intersect import Scalar
 from pliant.rendering.raycast import Atlas, bilinear
 
@@ -15,7 +15,7 @@ _NO_AREA = 1e-12  # px^2
 _SHININESS = 300.0
 
 
-@inline_kernel
+@fast_kernel
 def _meet(
     a: F64, b: F64, c: F64, inverse: Scalar, x: Scalar, y: Scalar
 ) -> tuple[Scalar, Scalar, Scalar]:
@@ -34,7 +34,7 @@ def _meet(
     return w, q * b[2] / w, r * c[2] / w
 
 
-@inline_kernel
+@fast_kernel
 def _area(a: F64, b: F64, c: F64) -> Scalar:
     """Twice the area in the image; 0 where a corner is behind the camera."""
     if a[2] <= 0.0 or b[2] <= 0.0 or c[2] <= 0.0:

@@ -45,7 +45,7 @@ from pliant.algorithms.bundle.projection import (
     point_rows,
 )
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.kernel import fast_kernel, inline_kernel
+from pliant.algorithms.kernel import fast_kernel
 
 LOWER = np.tril_indices(SHARED)
 _NEWTON_STEPS = 8
@@ -141,7 +141,7 @@ def _add_shared(
         _add_points(cameras, m, slots.point[b], local, A, blocks.points)
 
 
-@inline_kernel
+@fast_kernel
 def _shares(n2: Any, k1: Any, k2: Any) -> Any:
     """rho of s, k1 and k2 at the squared radius n2."""
     inverse = 1.0 / (1.0 + n2 * (3.0 * k1 + 5.0 * k2 * n2))

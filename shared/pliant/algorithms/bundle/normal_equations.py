@@ -39,7 +39,7 @@ from pliant.algorithms.bundle.projection import (
     point_rows,
     residual,
 )
-from pliant.algorithms.kernel import fast_kernel, inline_kernel, leaf_kernel
+from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 
 RECORD, FACTOR = 8, 9
 """Numbers kept of an observation, and of a point."""
@@ -310,7 +310,7 @@ def eliminate_points(
             subtract_product3(S, np.uintp(block[last, np.uintp(rows[c])]), U, a, c)
 
 
-@inline_kernel
+@fast_kernel
 def factor_point(
     one: Any, d00: Any, v10: Any, d11: Any, v20: Any, v21: Any, d22: Any, smallest: Any
 ) -> Any:

@@ -24,7 +24,7 @@ from numpy.typing import DTypeLike
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.bundle.problem import BundleParameters
-from pliant.algorithms.kernel import inline_kernel, kernel
+from pliant.algorithms.kernel import fast_kernel, kernel
 
 _Number: TypeAlias = Any
 _Camera: TypeAlias = Any
@@ -82,32 +82,32 @@ def limits_of(parameters: BundleParameters, dtype: DTypeLike = np.float64) -> Li
     )
 
 
-@inline_kernel
+@fast_kernel
 def motion_of(cameras: Cameras, m: int) -> Any:
     """The 12 numbers of camera m, to stand in registers during a loop."""
     return row_of(cameras.motion[m])
 
 
-@inline_kernel
+@fast_kernel
 def row_of(c: Any) -> Any:
     """The 12 numbers of a motion (12,)."""
     return (c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9], c[10], c[11])
 
 
-@inline_kernel
+@fast_kernel
 def pinhole_of(cameras: Cameras, m: int) -> Any:
     """fx, fy, cx, cy of camera m."""
     k = cameras.pinhole[m]
     return (k[0], k[1], k[2], k[3])
 
 
-@inline_kernel
+@fast_kernel
 def lens_of(cameras: Cameras, m: int) -> Any:
     """(k1, k2) of camera m; () where there is no distortion."""
     return _lens_of(cameras.lens, m)
 
 
-@inline_kernel
+@fast_kernel
 def _lens_of(lens: Any, m: int) -> Any:
     # Of an argument numba knows the dimensions before it types the branches.
     if lens.ndim == 1:
@@ -115,7 +115,7 @@ def _lens_of(lens: Any, m: int) -> Any:
     return (lens[m, 0], lens[m, 1])
 
 
-@inline_kernel
+@fast_kernel
 def residual(
     one: _Number, T: _Camera, K: _Camera, lens: Any, X: Any, Y: Any, Z: Any, u: Any, v: Any,
     limits: Limits,
@@ -133,14 +133,14 @@ def residual(
     return x, y, iz, front, u - (K[0] * d * x + K[2]), v - (K[1] * d * y + K[3])
 
 
-@inline_kernel
+@fast_kernel
 def robust_cost(one: _Number, du: Any, dv: Any, w: Any, front: Any, limits: Limits) -> Any:
     """w rho(r^2), Geman-McClure."""
     s = du * du + dv * dv
     return w * (s / (one + s * limits.inverse_sigma2) if front else limits.behind)
 
 
-@inline_kernel
+@fast_kernel
 def observe(
     one: _Number, T: _Camera, K: _Camera, lens: Any, X: Any, Y: Any, Z: Any, u: Any, v: Any, w: Any,
     limits: Limits,
@@ -165,7 +165,7 @@ def observe(
     return x, y, iz, m00, (m01,), m11, g00 * du + g10 * dv, g01 * du + g11 * dv, cost
 
 
-@inline_kernel
+@fast_kernel
 def apply_metric(m00: Any, m01: Any, m11: Any, a: Any, b: Any) -> Any:
     """M (a, b) for the symmetric M."""
     if len(m01) == 0:
@@ -173,7 +173,7 @@ def apply_metric(m00: Any, m01: Any, m11: Any, a: Any, b: Any) -> Any:
     return m00 * a + m01[0] * b, m01[0] * a + m11 * b
 
 
-@inline_kernel
+@fast_kernel
 def corner(m01: Any, factor: Any, zero: _Number) -> Any:
     """The off-diagonal of M times a factor."""
     if len(m01) == 0:
@@ -181,7 +181,7 @@ def corner(m01: Any, factor: Any, zero: _Number) -> Any:
     return m01[0] * factor
 
 
-@inline_kernel
+@fast_kernel
 def point_rows(T: _Camera, x: Any, y: Any, iz: Any) -> Any:
     """The six numbers of P, row by row."""
     return (
@@ -190,14 +190,14 @@ def point_rows(T: _Camera, x: Any, y: Any, iz: Any) -> Any:
     )  # fmt: skip
 
 
-@inline_kernel
+@fast_kernel
 def couple(x: Any, y: Any, iz: Any, a: Any, c: Any) -> Any:
     """``B^T (a, c)``: the six numbers of a column of H_cp."""
     e = x * a + y * c
     return iz * a, iz * c, -iz * e, -c - y * e, a + x * e, x * c - y * a
 
 
-@inline_kernel
+@fast_kernel
 def solve_point(
     one: _Number, v00: Any, v10: Any, v11: Any, v20: Any, v21: Any, v22: Any, g0: Any, g1: Any,
     g2: Any, smallest: _Number,

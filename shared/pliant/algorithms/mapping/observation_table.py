@@ -7,7 +7,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.kernel import inline_kernel, kernel
+from pliant.algorithms.kernel import fast_kernel, kernel
 
 
 def weigh(points_px: F32, camera: PinholeCamera, lens_radius: float) -> F32:
@@ -231,7 +231,7 @@ def _intrinsics(camera: PinholeCamera) -> F64:
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
-@inline_kernel
+@fast_kernel
 def _error(T: F64, X: F64, u: float, v: float, K: F64) -> float:
     z = T[2, 0] * X[0] + T[2, 1] * X[1] + T[2, 2] * X[2] + T[2, 3]
     if z < _MIN_DEPTH:
