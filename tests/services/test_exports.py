@@ -15,16 +15,21 @@ from mcap.reader import make_reader
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.map_delta import TRACKING
+from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.algorithms.tracks import FrameTracks
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config
 from pliant.datasets import open_source
 from pliant.errors import ResultError
 from pliant.export.export import export_result
+from pliant.export.open3d_import import Open3dError, require_open3d
+from pliant.export.textured import keyframe_images, textured_mesh
 from pliant.formats.ply import read_ply
 from pliant.formats.tum import read_tum
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Extrema, MapUpdate, SourceImage
+from pliant.recording.reader import Recording
+from pliant.results.run import read_run
 from pliant.viewers.point_blocks import BLOCK_POINTS, PointBlocks
 from pliant_services.nodes import recorder
 
@@ -333,3 +338,50 @@ def test_every_is_for_surfaces(result: Path, tmp_path: Path) -> None:
         export_result(result, "tum", tmp_path / "poses.txt", every=2)
     with pytest.raises(ResultError, match="has no surfels"):
         export_result(result, "surface", tmp_path / "surface")
+
+
+def test_a_textured_mesh_has_the_colours_that_its_keyframes_show(
+    result: Path, tmp_path: Path
+) -> None:
+    try:
+        require_open3d()
+    except Open3dError as error:
+        pytest.skip(str(error))
+    path = export_result(result, "glb", tmp_path / "mesh.glb", triangles=8000)
+    assert path.read_bytes()[:4] == b"glTF"
+    again = export_result(result, "glb", tmp_path / "again.glb", triangles=8000)
+    assert path.read_bytes() == again.read_bytes()
+    obj = export_result(result, "obj", tmp_path / "obj", triangles=800)
+    assert {each.name for each in obj.iterdir()} == {"mesh.obj", "mesh.mtl", "mesh.png"}
+    recording = Recording(result / "recording.mcap")
+    mesh = textured_mesh(recording, 8000)
+    assert 4000 < len(mesh.triangles) <= 8000
+    assert mesh.uvs.min() >= 0.0
+    assert mesh.uvs.max() <= 1.0
+    assert (np.linalg.norm(mesh.normals, axis=1) > 0.99).mean() > 0.99
+    run = read_run(recording.path)
+    assert run.stream is not None
+    images = list(keyframe_images(recording, run, run.history.longest_segment()))
+    assert len(images) > 4
+    for T_world_camera, image in images[:: len(images) // 3]:
+        seen = view_mesh(mesh.positions, mesh.triangles, run.stream.camera, T_world_camera)
+        at = seen.interpolate(mesh.triangles, mesh.uvs) * np.float32(len(mesh.texture)) - 0.5
+        drawn = cv2.remap(mesh.texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        inside = seen.triangles >= 0
+        assert inside.mean() > 0.5
+        off = np.abs(drawn.astype(float) - image)[inside]
+        contrast = np.abs(image - np.median(image)).mean()
+        assert np.median(off) < 0.3 * contrast
+
+
+def test_a_textured_mesh_needs_open3d_and_a_mesh(
+    result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ResultError, match="--triangles: tum has no such option, only glb and obj"):
+        export_result(result, "tum", tmp_path / "poses.txt", triangles=500)
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    require_open3d.cache_clear()
+    with pytest.raises(Open3dError, match=r"pip install 'pliant\[open3d\]'"):
+        export_result(result, "glb", tmp_path / "mesh.glb")
+    assert not (tmp_path / "mesh.glb").exists()
+    require_open3d.cache_clear()

@@ -12,8 +12,8 @@ def export(
         str,
         typer.Option(
             "--to",
-            help="foxglove, rerun, tum, kitti, euroc, ply, colmap, images, surface, overlay, "
-            "picture or overview.",
+            help="foxglove, rerun, tum, kitti, euroc, ply, colmap, images, glb, obj, surface, "
+            "overlay, picture or overview.",
         ),
     ],
     output: Annotated[
@@ -22,6 +22,9 @@ def export(
     ] = None,
     every: Annotated[
         int | None, typer.Option(min=1, help="surface: a mesh of every so-manyth frame [1].")
+    ] = None,
+    triangles: Annotated[
+        int | None, typer.Option(min=100, help="glb, obj: most triangles of the mesh [40000].")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
 ) -> None:
@@ -33,10 +36,14 @@ def export(
 
     pliant export results/room --to colmap --output models/room
 
+    pliant export results/room --to glb
+
     pliant export results/cloth --to surface --every 10
 
     pliant export recording.mcap --to kitti --output poses.txt
     """
     from pliant.export.export import export_result
 
-    typer.echo(str(export_result(result, to, output, force=force, every=every)))
+    typer.echo(
+        str(export_result(result, to, output, force=force, every=every, triangles=triangles))
+    )

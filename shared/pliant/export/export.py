@@ -14,6 +14,7 @@ from pliant.errors import ResultError
 from pliant.export import models as export_models
 from pliant.export.models import camera_of, rectified_images
 from pliant.export.surface import overlay_pictures, surfaces
+from pliant.export.textured import glb, obj
 from pliant.formats.euroc import write_euroc
 from pliant.formats.kitti import write_kitti
 from pliant.formats.tum import write_tum
@@ -36,8 +37,9 @@ _OVERVIEW_WIDTH = 960
 _OVERVIEW_FPS = 10.0
 
 
-Export = Callable[[Recording, Path, Path | None], None]
-"""Writes to a path what a recording holds; the folder is that of the result, if it is one."""
+Export = Callable[..., None]
+"""Writes to a path what a recording holds: the recording, the path, the folder if it is that of a
+result, and options of its own."""
 
 
 @dataclass(frozen=True)
@@ -50,18 +52,23 @@ class RecordedFrame:
 
 
 def export_result(
-    result: Path, to: str, output: Path | None, *, force: bool = False, every: int | None = None
-) -> Path:
+    result: Path, to: str, output: Path | None, *, force: bool = False,
+    every: int | None = None, triangles: int | None = None,
+) -> Path:  # fmt: skip
     """Write one export of a result folder or a recording and return where.
 
-    every: of surfaces, which frames.
+    every: of surfaces, which frames.    triangles: most of a textured mesh.
 
     Raises ResultError for an unknown kind, and for what is there already unless ``force``.
     """
     if to not in EXPORTS:
         raise ResultError(f"--to {to}: choose {', '.join(EXPORTS)}")
-    if every is not None and EXPORTS[to][1] is not surfaces:
-        raise ResultError(f"--every: {to} has no such option, surface has")
+    options = {"every": every, "triangles": triangles}
+    given = {name: value for name, value in options.items() if value is not None}
+    for option in given:
+        if to not in _OPTIONS[option]:
+            has = " and ".join(_OPTIONS[option])
+            raise ResultError(f"--{option}: {to} has no such option, only {has}")
     if not result.exists():
         raise ResultError(f"{result}: no such result folder or recording")
     folder = result if result.is_dir() and not parts_in(result) else None
@@ -73,10 +80,7 @@ def export_result(
         raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
     fresh = not path.exists()
     try:
-        if every is not None:
-            surfaces(recording, path, folder, every)
-        else:
-            write(recording, path, folder)
+        write(recording, path, folder, **given)
     except BaseException:  # Ctrl-C, too: half an export is none
         if fresh:
             _remove(path)
@@ -206,9 +210,13 @@ EXPORTS: dict[str, tuple[str, Export]] = {
     "ply": ("points_longest.ply", export_models.ply),
     "colmap": ("colmap", export_models.colmap),
     "images": ("images", export_models.images),
+    "glb": ("mesh.glb", glb),
+    "obj": ("obj", obj),
     "surface": ("surface", surfaces),
     "overlay": ("overlay.mp4", _overlay),
     "picture": ("picture.png", _picture),
     "overview": ("overview.webp", _overview),
 }
 """Kind of export: its default name, and who writes it."""
+_OPTIONS = {"every": ("surface",), "triangles": ("glb", "obj")}
+"""Which kinds have an option."""

@@ -1,0 +1,128 @@
+"""The mesh of a run with a texture of what its keyframes show, as glTF or OBJ."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.meshing.corrected_view import corrected_view
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.algorithms.meshing.texturing import (
+    TexelColours,
+    cut_apart,
+    find_texels,
+    make_atlas,
+    patches,
+)
+from pliant.errors import ResultError
+from pliant.export.models import make_folder
+from pliant.export.open3d_import import require_open3d
+from pliant.formats.textured import TexturedMesh, write_glb, write_obj
+from pliant.messages import topics
+from pliant.messages.mesh_pieces import joined
+from pliant.messages.types import Keyframe, MeshPiece
+from pliant.recording.reader import Recording
+from pliant.results.mesh import meshes_of
+from pliant.results.run import Run, read_run
+
+TRIANGLES = 40_000
+"""What a mesh is decimated to, unless told otherwise."""
+_TEXELS = 2048
+
+
+def glb(
+    recording: Recording, path: Path, folder: Path | None, triangles: int | None = None
+) -> None:
+    """Binary glTF with the texture inside."""
+    write_glb(path, textured_mesh(recording, triangles or TRIANGLES))
+
+
+def obj(
+    recording: Recording, path: Path, folder: Path | None, triangles: int | None = None
+) -> None:
+    """A folder with ``mesh.obj``, ``mesh.mtl`` and ``mesh.png``."""
+    mesh = textured_mesh(recording, triangles or TRIANGLES)
+    make_folder(path)
+    write_obj(path, mesh)
+
+
+def textured_mesh(recording: Recording, triangles: int) -> TexturedMesh:
+    """The fine mesh of the longest segment, of at most so many triangles.
+
+    Raises Open3dError where there is no open3d, ResultError where there is no mesh.
+    """
+    open3d = require_open3d()
+    run = read_run(recording.path)
+    segment = run.history.longest_segment()
+    pieces = [p for p in recording.decoded(topics.MESH_FINAL) if isinstance(p, MeshPiece)]
+    fine = meshes_of(pieces).get((segment, "fine"))
+    if run.stream is None or fine is None or not sum(len(piece.triangles) for piece in fine):
+        raise ResultError(f"{recording.path}: there is no mesh in it: run its source again")
+    points, faces, colours = _decimated(open3d, joined(fine), triangles)
+    cut, _ = cut_apart(faces, patches(points[faces]))
+    uvs = make_atlas(points[faces], cut, _TEXELS)
+    texels = find_texels(uvs, _TEXELS)
+    shown = TexelColours(texels, points, faces)
+    was_corrected = run.corrected_segment == segment
+    view = corrected_view(run.stream.camera, run.calibration_correction if was_corrected else ())
+    for T_world_camera, image in keyframe_images(recording, run, segment):
+        shown.add(view.image(image), view.camera, T_world_camera)
+    unseen = np.rint(texels.interpolate(colours[faces])).astype(np.uint8)
+    return _with_texture(points, faces, uvs, shown.texture(unseen))
+
+
+def _decimated(open3d: Any, mesh: TriangleMesh, triangles: int) -> tuple[F32, I32, F32]:
+    """Vertices, triangles and colours (0 to 255) of a mesh of no more triangles."""
+    utility = open3d.utility
+    made = open3d.geometry.TriangleMesh(
+        utility.Vector3dVector(mesh.positions.astype(np.float64)),
+        utility.Vector3iVector(mesh.triangles),
+    )
+    made.vertex_colors = utility.Vector3dVector(mesh.colours / 255.0)
+    if len(mesh.triangles) > triangles:
+        made = made.simplify_quadric_decimation(triangles)
+    made.remove_degenerate_triangles()
+    made.remove_unreferenced_vertices()
+    return (
+        np.asarray(made.vertices, np.float32),
+        np.asarray(made.triangles, np.int32),
+        np.asarray(made.vertex_colors, np.float32) * np.float32(255.0),
+    )
+
+
+def keyframe_images(recording: Recording, run: Run, segment: int) -> Iterator[tuple[F64, U8]]:
+    """Final pose and (H, W, 3) image of each keyframe of a segment that has one."""
+    for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
+        for message in recording.decoded(topic):
+            assert isinstance(message, Keyframe)
+            for number, jpeg in message.images().items():
+                known = run.history.keyframes.get(number)
+                if known is None or known.segment != segment or not jpeg:
+                    continue
+                image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
+                if image is not None:
+                    yield pose_to_matrix(known.pose_world_camera), np.asarray(image, np.uint8)
+
+
+def _with_texture(points: F32, faces: I32, uvs: F32, texture: U8) -> TexturedMesh:
+    """One vertex for each pair of a point and a place in the texture."""
+    rows = np.concatenate([faces.reshape(-1, 1).astype(np.float32), uvs.reshape(-1, 2)], axis=1)
+    _, first, where = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    corners = points[faces].astype(np.float64)
+    turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros((len(points), 3))
+    for k in range(3):
+        np.add.at(normals, faces[:, k], turned)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    source = faces.ravel()[first]
+    return TexturedMesh(
+        positions=points[source],
+        normals=normals[source].astype(np.float32),
+        uvs=uvs.reshape(-1, 2)[first],
+        triangles=where.reshape(-1, 3).astype(np.int32),
+        texture=texture,
+    )
