@@ -44,14 +44,14 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "tracking",
         "pliant_services.nodes.tracking",
-        kernels=("pliant.algorithms.tracking",),
+        kernels=("pliant.algorithms.tracking.tracker",),
         inputs=(topics.STREAM, topics.IMAGE),
         outputs=(topics.EXTREMA,),
     ),
     Process(
         "bundle_adjustment",
         "pliant_services.nodes.bundle_adjustment",
-        kernels=("pliant.algorithms.mapping",),
+        kernels=("pliant.algorithms.mapping.warm_up",),
         finishing="adjusting the whole map",
         inputs=(topics.STREAM, topics.IMAGE, topics.EXTREMA),
         outputs=(topics.MAP_UPDATE, topics.MAP_FINAL, topics.KEYFRAME, topics.KEYFRAME_FINAL),
@@ -75,7 +75,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "surfels",
         "pliant_services.nodes.surfels",
-        kernels=("pliant.algorithms.surfels",),
+        kernels=("pliant.algorithms.surfels.warm_up",),
         inputs=(topics.STREAM, topics.IMAGE, topics.DEPTH),
         optional=(topics.EXTREMA, topics.MAP_UPDATE, topics.KEYFRAME),
         outputs=(topics.SURFELS,),

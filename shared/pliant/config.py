@@ -12,11 +12,11 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, Field, ValidationError
 
-from pliant.algorithms.mapping import MappingParameters
+from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.meshing.parameters import MeshingParameters
 from pliant.algorithms.parameters import Parameters
-from pliant.algorithms.surfels import SurfelParameters
-from pliant.algorithms.tracking import TrackingParameters
+from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.errors import ConfigError, RecordingError
 
 

@@ -14,7 +14,7 @@ from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import TRACKING, KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
 from pliant.algorithms.meshing.parameters import SurfaceParameters
-from pliant.algorithms.surfels import SurfelParameters
+from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.map_history import CurrentMap
 
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pliant.algorithms.map_delta import MapDelta
-from pliant.algorithms.mapping import Mapper
+from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.tracking import ExtremaTracker
+from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.algorithms.tracks import FrameTracks
 from pliant.config import Config
 from pliant.datasets.base import Dataset

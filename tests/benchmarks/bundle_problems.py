@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.bundle import BundleParameters, BundleProblem, shared_intrinsics
+from pliant.algorithms.bundle.problem import BundleParameters, BundleProblem, shared_intrinsics
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_exp
 from pliant.datasets.bal import load_bal, load_libmv

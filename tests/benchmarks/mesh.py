@@ -11,7 +11,8 @@ from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.warm_up import warm_up
 from pliant.config import recorded_config
-from pliant.datasets.builtin import builtin_folder, is_builtin
+from pliant.datasets.base import is_builtin
+from pliant.datasets.builtin import builtin_folder
 from pliant.errors import ResultError
 from pliant.evaluation.mesh_truth import Mesh
 from pliant.evaluation.recorded_mesh import compare_mesh

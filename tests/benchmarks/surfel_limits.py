@@ -6,7 +6,9 @@ import numpy as np
 
 from benchmarks.surfel_sequences import Sequence, load
 from benchmarks.table import markdown
-from pliant.algorithms.surfels import SurfelParameters, SurfelState, SurfelTracker
+from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.surfel_frame import SurfelState
+from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 
 _PAIRS = 8
 _RIGHT = 0.01

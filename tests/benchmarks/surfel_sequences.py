@@ -8,12 +8,14 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.tracking import ExtremaTracker, TrackingParameters
+from pliant.algorithms.tracking.parameters import TrackingParameters
+from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.algorithms.tracks import FrameTracks
-from pliant.datasets import Rectifier, open_source
-from pliant.datasets.base import BrokenFrame
-from pliant.datasets.builtin import builtin_folder, is_builtin, is_deforming
+from pliant.datasets import open_source
+from pliant.datasets.base import BrokenFrame, is_builtin
+from pliant.datasets.builtin import builtin_folder, is_deforming
 from pliant.datasets.depth import DepthRectifier
+from pliant.datasets.rectifier import Rectifier
 from pliant.errors import DatasetError
 from pliant.evaluation.surface_truth import SurfaceTruth
 

@@ -13,9 +13,12 @@ from benchmarks.table import markdown
 from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import matrix_to_pose, so3_exp
-from pliant.algorithms.surfels import SurfelParameters, SurfelState, SurfelTracker
-from pliant.datasets import Rectifier, open_source
+from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.surfel_frame import SurfelState
+from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
+from pliant.datasets import open_source
 from pliant.datasets.depth import DepthRectifier
+from pliant.datasets.rectifier import Rectifier
 from pliant.errors import DatasetError
 from pliant.rendering.paths import SampledPath
 from pliant.rendering.render import CameraOptions, Renderer, SceneGeometry, paint_faces

@@ -11,8 +11,10 @@ import numpy as np
 from benchmarks.surfel_limits import measure_limits
 from benchmarks.surfel_sequences import Sequence, load
 from benchmarks.table import markdown
-from pliant.algorithms.surfels import SurfelParameters, SurfelTracker, predict
-from pliant.algorithms.surfels import warm_up as compile_kernels
+from pliant.algorithms.surfels.parameters import SurfelParameters
+from pliant.algorithms.surfels.prediction import predict
+from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
+from pliant.algorithms.surfels.warm_up import warm_up as compile_kernels
 from pliant.datasets.builtin import is_deforming
 from pliant.errors import DatasetError
 from pliant.evaluation.exact_surfels import ExactSurfels

@@ -8,10 +8,10 @@ import numpy as np
 
 from benchmarks.stopwatch import Stopwatch
 from benchmarks.table import markdown
-from pliant.algorithms.tracking import ExtremaTracker
+from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.config import Config
-from pliant.datasets import Rectifier, open_source
-from pliant.datasets.rectifier import rectified
+from pliant.datasets import open_source
+from pliant.datasets.rectifier import Rectifier, rectified
 
 _WARM_FRAMES = 15
 _LK = {"winSize": (21, 21), "maxLevel": 3}

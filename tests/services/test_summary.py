@@ -9,7 +9,8 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from pliant.algorithms.mapping import Mapper, MappingParameters
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameTracks
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic

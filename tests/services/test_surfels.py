@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from restarting import Restarted, Stopping
 
-from pliant.algorithms.surfels import SurfelState
+from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, load_config
 from pliant.datasets import open_source

@@ -9,7 +9,7 @@ from restarting import Restarted, Stopping
 
 from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.geometry import pose_to_matrix
-from pliant.algorithms.surfels import SurfelState
+from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, load_config
 from pliant.datasets import open_source

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from running import pliant
 
-from pliant.algorithms.surfels import SurfelState
+from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.datasets.builtin import builtin_folder
 
 pytestmark = pytest.mark.system

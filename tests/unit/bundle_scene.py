@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pliant.algorithms.bundle import BundleParameters, BundleProblem
+from pliant.algorithms.bundle.problem import BundleParameters, BundleProblem
 from pliant.algorithms.geometry import inverse, so3_exp
 
 F64 = NDArray[np.float64]

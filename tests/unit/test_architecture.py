@@ -3,6 +3,7 @@
 import ast
 import re
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -115,3 +116,20 @@ def test_no_file_names_a_machine() -> None:
         if path.suffix in {".py", ".md", ".toml", ".yaml", ".txt", ".cfg", ""} and path.is_file():
             text = path.read_text(encoding="utf-8", errors="replace")
             assert not machine_path.search(text), f"{name} names a path of one machine"
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "pliant.config",
+        "pliant_services.cli.commands",
+        "pliant_services.cli.router",
+        "pliant_services.nodes.recorder",
+        "pliant_services.runtime.host",
+        "pliant_services.runtime.status",
+        "pliant_services.run.command",
+    ],
+)
+def test_what_calls_no_kernel_loads_none(module: str) -> None:
+    code = f"import sys, {module}; sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pliant.algorithms.bundle import BundleParameters
+from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.schur import solve_schur
 from pliant.datasets.bal import load_bal, load_libmv
 from pliant.errors import DatasetError

@@ -9,13 +9,8 @@ import yaml
 
 from pliant.cache import cache_folder
 from pliant.datasets import builtin
-from pliant.datasets.builtin import (
-    SequenceOptions,
-    builtin_folder,
-    is_builtin,
-    parse_builtin,
-    render_sequence,
-)
+from pliant.datasets.base import is_builtin
+from pliant.datasets.builtin import SequenceOptions, builtin_folder, parse_builtin, render_sequence
 from pliant.errors import DatasetError
 
 SMALL = "built-in:tiny?frames=3&width=64"

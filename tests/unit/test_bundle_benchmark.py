@@ -12,7 +12,7 @@ from benchmarks.solvers import (
     solve_with_scipy,
 )
 
-from pliant.algorithms.bundle import BundleProblem
+from pliant.algorithms.bundle.problem import BundleProblem
 
 
 def small_window(points: int) -> BundleProblem:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from bundle_scene import make_scene, numeric_jacobian, project
 
-from pliant.algorithms.bundle import BundleParameters, CalibrationUncertainty
 from pliant.algorithms.bundle.calibration import SharedCalibration, ideal_pixels
 from pliant.algorithms.bundle.normal_equations import SHARED
 from pliant.algorithms.bundle.packed_layout import build_packed_layout
+from pliant.algorithms.bundle.problem import BundleParameters, CalibrationUncertainty
 from pliant.algorithms.bundle.schur import SchurSystem, solve_schur
 from pliant.algorithms.camera import PinholeCamera
 

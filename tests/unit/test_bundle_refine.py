@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from bundle_scene import make_scene, move, project
 
-from pliant.algorithms.bundle import BundleParameters, subspace
+from pliant.algorithms.bundle import subspace
+from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.subspace import refine_points, refine_pose
 from pliant.algorithms.camera import PinholeCamera
 

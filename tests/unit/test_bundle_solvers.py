@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from bundle_scene import cost, make_scene, residuals
 
-from pliant.algorithms.bundle import (
-    BundleParameters,
-    BundleProblem,
-    BundleWindow,
-)
+from pliant.algorithms.bundle.problem import BundleParameters, BundleProblem, BundleWindow
 from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.bundle.subspace import solve_subspace
 from pliant.algorithms.geometry import so3_exp

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pliant.algorithms.arrays import array_fields
-from pliant.algorithms.surfels import SurfelFrame
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame
 from pliant.algorithms.tracks import FrameTracks
 from pliant.errors import MessageError
 from pliant.messages import codec

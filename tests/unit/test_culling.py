@@ -5,10 +5,10 @@ from mapping_scene import CAMERA, Scene, sideways
 from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING
-from pliant.algorithms.mapping import Mapper, MappingParameters
 from pliant.algorithms.mapping.covisibility import most_redundant, seen_by_none
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
-from pliant.algorithms.mapping.parameters import WindowParameters
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters, WindowParameters
 from pliant.state import load_state, save_state
 
 

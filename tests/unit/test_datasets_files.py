@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from pliant.datasets import FORMATS, Dataset, Rectifier, decode, open_source
+from pliant.datasets import FORMATS, open_source
+from pliant.datasets.base import Dataset
 from pliant.datasets.images import image_files, parse_stamp
+from pliant.datasets.rectifier import Rectifier, decode
 from pliant.errors import CalibrationError, DatasetError, PliantError
 
 WIDTH, HEIGHT = 64, 48

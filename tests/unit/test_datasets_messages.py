@@ -10,7 +10,8 @@ import pytest
 import recorded_messages as bags
 from recorded_messages import COUNT, HEIGHT, START_NS, STEP_NS, WIDTH, Ros
 
-from pliant.datasets import decode, open_source
+from pliant.datasets import open_source
+from pliant.datasets.rectifier import decode
 from pliant.errors import CalibrationError, DatasetError
 
 Write = Callable[[Path], None]

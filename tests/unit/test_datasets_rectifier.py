@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pliant.datasets import BrokenFrame, Rectifier, SourceFrame, decode
-from pliant.datasets.base import encoding_of
+from pliant.datasets.base import BrokenFrame, SourceFrame, encoding_of
 from pliant.datasets.calibration import Calibration, calibration_from_yaml, calibration_yaml
+from pliant.datasets.rectifier import Rectifier, decode
 
 WIDTH, HEIGHT = 64, 48
 PLAIN = Calibration(model="pinhole", width=WIDTH, height=HEIGHT, fx=60, fy=60, cx=31.5, cy=23.5)

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
-from pliant.datasets import CameraDevice, Rectifier, SourceOptions, open_source
+from pliant.datasets import open_source
 from pliant.datasets.base import BrokenFrame
-from pliant.datasets.camera_device import camera_index
+from pliant.datasets.camera_device import CameraDevice, camera_index
+from pliant.datasets.images import SourceOptions
+from pliant.datasets.rectifier import Rectifier
 from pliant.datasets.video import quiet_opencv
 from pliant.errors import CalibrationError, DatasetError
 

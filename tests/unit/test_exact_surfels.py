@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.geometry import inverse, so3_exp, transform
-from pliant.algorithms.surfels import SurfelFrame, SurfelState
-from pliant.datasets import Rectifier, open_source
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
+from pliant.datasets import open_source
 from pliant.datasets.builtin import builtin_folder
+from pliant.datasets.rectifier import Rectifier
 from pliant.errors import DatasetError
 from pliant.evaluation.exact_surfels import ExactSurfels, format_exact
 from pliant.evaluation.later_surfels import LaterSurfels, format_later, scaled, true_scale

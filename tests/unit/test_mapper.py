@@ -7,7 +7,8 @@ from mapping_scene import CAMERA, Scene, looking, sideways
 from pliant.algorithms.arrays import check_arrays
 from pliant.algorithms.geometry import align_umeyama, pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
-from pliant.algorithms.mapping import Mapper, MappingParameters
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameTracks
 
 PARAMETERS = MappingParameters()

@@ -11,7 +11,6 @@ from mapping_scene import CAMERA, Scene, looking
 
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.mapping import MappingParameters
 from pliant.algorithms.mapping.covisibility import missing_rows, near_keyframes, rows_of
 from pliant.algorithms.mapping.localisation import locate, refine
 from pliant.algorithms.mapping.map_store import (
@@ -26,7 +25,11 @@ from pliant.algorithms.mapping.map_store import (
     sample_colours,
 )
 from pliant.algorithms.mapping.observation_table import reprojection_errors, window_errors
-from pliant.algorithms.mapping.parameters import LocalisationParameters, ReacquisitionParameters
+from pliant.algorithms.mapping.parameters import (
+    LocalisationParameters,
+    MappingParameters,
+    ReacquisitionParameters,
+)
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, cut_patches, reacquire
 from pliant.algorithms.mapping.start import WaitingFrame, find_start
 

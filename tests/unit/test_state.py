@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 
 from pliant import __version__
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.mapping import Mapper, MappingParameters
-from pliant.algorithms.tracking import ExtremaTracker, TrackingParameters
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.tracking.parameters import TrackingParameters
+from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.datasets import open_source
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.errors import StateError

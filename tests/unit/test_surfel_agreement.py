@@ -8,8 +8,9 @@ import pytest
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import transform
-from pliant.algorithms.surfels import SurfelFrame, SurfelState, agree
 from pliant.algorithms.surfels.camera_alignment import se3_exp
+from pliant.algorithms.surfels.depth_maps import agree
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 
 CAMERA = PinholeCamera(width=160, height=120, fx=200.0, fy=200.0, cx=79.5, cy=59.5)
 PATCH_PX = 23

@@ -9,8 +9,10 @@ from surfel_scene import board_renderer, film, motion
 
 from pliant.algorithms.arrays import I64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.surfels import SurfelFrame, SurfelParameters, SurfelState, SurfelTracker
+from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import X
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 from pliant.rendering.render import RenderedFrame
 
 Mode = Literal["static", "moving"]

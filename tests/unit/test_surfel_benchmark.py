@@ -7,7 +7,7 @@ import pytest
 from benchmarks import surfels
 from benchmarks.surfels import LIMITS, TABLES, measure
 
-from pliant.algorithms.surfels import SurfelParameters
+from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.datasets.builtin import parse_builtin
 from pliant.errors import DatasetError
 

@@ -8,11 +8,11 @@ from surfel_scene import motion as rigid_motion
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
-from pliant.algorithms.surfels import SurfelParameters, SurfelState, SurfelTracker
 from pliant.algorithms.surfels import deformation_models as motion
 from pliant.algorithms.surfels.births import make_templates
 from pliant.algorithms.surfels.camera_alignment import fit_camera, rigid_system, se3_exp
 from pliant.algorithms.surfels.deformation_models import move_poses
+from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import X
 from pliant.algorithms.surfels.surfel_alignment import (
     Equilibrium,
@@ -20,6 +20,8 @@ from pliant.algorithms.surfels.surfel_alignment import (
     evaluate_all,
     make_workspace,
 )
+from pliant.algorithms.surfels.surfel_frame import SurfelState
+from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 from pliant.rendering.render import RenderedFrame
 
 SMALL = SurfelParameters(max_surfels=80, levels=2, camera="moving")

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pliant.algorithms.surfels import predict
+from pliant.algorithms.surfels.prediction import predict
 from pliant.algorithms.tracks import FrameTracks
 
 

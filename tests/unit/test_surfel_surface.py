@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pliant.algorithms.surfels import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surface import surface_of
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 
 FOCAL = 500.0
 

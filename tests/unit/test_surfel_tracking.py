@@ -7,9 +7,9 @@ from surfel_scene import HEIGHT, WIDTH, board_renderer, film, motion
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.surfels import SurfelFrame, SurfelParameters, SurfelState, SurfelTracker
 from pliant.algorithms.surfels.deformation_graph import pull_of_edges
 from pliant.algorithms.surfels.graph_alignment import relocate
+from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import X
 from pliant.algorithms.surfels.surfel_alignment import (
     Templates,
@@ -17,6 +17,8 @@ from pliant.algorithms.surfels.surfel_alignment import (
     make_workspace,
     no_equilibrium,
 )
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 from pliant.rendering.render import RenderedFrame
 
 SMALL = SurfelParameters(max_surfels=60, levels=2)

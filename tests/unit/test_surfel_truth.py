@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.surfels import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.evaluation.surfel_truth import (
     SurfelTruth,
     distances,

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F64, U8, check_arrays
-from pliant.algorithms.tracking import ExtremaTracker, TrackingParameters
+from pliant.algorithms.tracking.parameters import TrackingParameters
+from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.algorithms.tracks import FrameTracks
 
 HEIGHT, WIDTH = 240, 320

@@ -8,12 +8,12 @@ import typer
 
 from pliant.errors import PliantError
 from pliant_services.cli.options import Connect, TlsFolder, identity_in
+from pliant_services.processes import BY_NAME, PROFILES
 
 if TYPE_CHECKING:
     from pliant.config import Config
 
-_NAMES = "ingest, tracking, bundle_adjustment, meshing, surfels, recorder"
-_PROFILES = "rigid, points, deformable, deformable-tracks, deformable-map"
+_NAMES, _PROFILES = ", ".join(BY_NAME), ", ".join(PROFILES)
 
 
 def service(
@@ -68,7 +68,7 @@ def service(
     pliant service tracking --connect tcp/host:7447
     """
     from pliant.config import load_config
-    from pliant_services.processes import BY_NAME, PROFILES, reads_depth
+    from pliant_services.processes import reads_depth
     from pliant_services.runtime.host import ServiceOptions, end_with_launcher, run_service
     from pliant_services.runtime.session_end import run_alone
 

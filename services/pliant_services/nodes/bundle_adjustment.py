@@ -14,7 +14,7 @@ out  map/update       one per frame: pose, points, keyframes, corrections of ear
 import cv2
 
 from pliant.algorithms.map_delta import WAITING, MapDelta
-from pliant.algorithms.mapping import Mapper
+from pliant.algorithms.mapping.mapper import Mapper
 from pliant.bus.base import Bus, join, receive, receive_one, resume
 from pliant.config import Config
 from pliant.messages import topics

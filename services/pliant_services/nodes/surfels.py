@@ -15,7 +15,10 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
-from pliant.algorithms.surfels import SurfelFrame, SurfelState, SurfelTracker, agree, predict
+from pliant.algorithms.surfels.depth_maps import agree
+from pliant.algorithms.surfels.prediction import predict
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 from pliant.algorithms.tracks import FrameTracks
 from pliant.bus.base import Bus, join, receive, receive_one, resume
 from pliant.config import Config

@@ -5,7 +5,7 @@ in   camera/stream    once
 out  tracks/extrema   one per frame: tracks and all maxima; empty where the frame has no pixels
 """
 
-from pliant.algorithms.tracking import ExtremaTracker
+from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.algorithms.tracks import FrameTracks
 from pliant.bus.base import Bus, receive_one, resume
 from pliant.config import Config

@@ -11,7 +11,6 @@ from pathlib import Path
 from pliant.errors import ResultError
 from pliant.results.folder import SESSION_NAME
 from pliant_services.runtime.launcher import Fleet
-from pliant_services.view.command import place
 
 _START_S = 30.0  # a viewer imports Rerun, and may wait for a busy machine
 _WAIT_S = 120.0  # services compile before they are up
@@ -36,6 +35,8 @@ def check_viewer(output: Path, *, web: bool, save: Path | None, force: bool) -> 
 
     output: the result folder, which need not be there yet.
     """
+    from pliant_services.view.command import place  # it loads what draws
+
     place(web=web, save=save, force=force)
     folder = save.resolve().parent if save is not None else output.resolve()
     if not folder.is_dir() and folder != output.resolve():

@@ -20,9 +20,9 @@ from pliant.bus.session import Identity, open_session
 from pliant.bus.zenoh_bus import ZenohBus
 from pliant.config import Config
 from pliant.errors import SourceLostError
+from pliant.messages import topics
 from pliant_services import processes
 from pliant_services.runtime.kernels import load_kernels
-from pliant_services.runtime.link_images import packed_topics
 from pliant_services.runtime.monitor import StatusMonitor
 
 ENDED_EARLY = 3  # exit code of a source that failed after its first frame
@@ -98,7 +98,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
             **(checkpoint_windows(config, options.fleet) if restartable else {}),
         },
         lags=lags(config, options.fleet),
-        packed=packed_topics(config.bus),
+        packed=topics.WITH_PIXELS if config.bus.link_images != "raw" else (),
         disturb=random_delays(options.delays_ms),
         identity=options.identity,
         on_fault=lambda line: print(line, file=sys.stderr, flush=True),

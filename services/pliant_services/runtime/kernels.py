@@ -2,10 +2,12 @@
 
 import hashlib
 import importlib
+import os
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 
 import pliant
@@ -78,12 +80,10 @@ def load_kernels(service: str) -> None:
 
 
 def _fingerprint() -> str:
-    import numba
-
     digest = hashlib.sha256()
     root = Path(pliant.__file__).parent
     for path in sorted(root.rglob("*.py")):
         digest.update(f"{path.relative_to(root)} {path.stat().st_mtime_ns}".encode())
-    where = f"{root} {numba.config.CACHE_DIR}"  # type: ignore[attr-defined]
-    digest.update(f"{where} {sys.version} {numba.__version__} {arithmetic.target()}".encode())
+    where = f"{root} {os.environ.get('NUMBA_CACHE_DIR', '')}"
+    digest.update(f"{where} {sys.version} {version('numba')} {arithmetic.target()}".encode())
     return digest.hexdigest()[:24]

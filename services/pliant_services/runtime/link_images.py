@@ -23,17 +23,9 @@ from pliant.datasets.jpeg import jpeg_size
 from pliant.datasets.rectifier import Rectifier, decode
 from pliant.errors import MessageError, PliantError
 from pliant.messages import topics
-from pliant.messages.topics import Topic
 from pliant.messages.types import Image
 
-PACKED: tuple[Topic, ...] = (topics.IMAGE, topics.SOURCE)
-"""Topics with pixels."""
 _NO_PIXELS = np.zeros((0, 0), np.uint8)
-
-
-def packed_topics(bus: BusParameters) -> tuple[Topic, ...]:
-    """The topics whose messages are made smaller."""
-    return PACKED if bus.link_images != "raw" else ()
 
 
 class Sender:

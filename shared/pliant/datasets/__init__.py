@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pliant.datasets.base import BrokenFrame, Dataset, SourceFrame
+from pliant.datasets.base import BrokenFrame, Dataset, SourceFrame, is_builtin
 from pliant.datasets.calibration import Calibration, calibration_from_yaml, calibration_yaml
 from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.camera_device import CameraDevice, camera_index
@@ -47,8 +47,6 @@ __all__ = [
     "open_source",
     "read_calibration",
 ]
-
-_BUILTIN_PREFIX = "built-in:"
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ def _open_video(source: str, options: SourceOptions) -> Dataset:
 FORMATS: dict[str, SourceFormat] = {
     "built-in": SourceFormat(
         "built-in:NAME",
-        lambda source: source.startswith(_BUILTIN_PREFIX),
+        is_builtin,
         _open_builtin,
         has_depth=True,
     ),

@@ -94,3 +94,11 @@ def encoding_of(data: bytes) -> str:
         if data.startswith(magic):
             return encoding
     return "webp" if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else "unknown"
+
+
+BUILTIN_PREFIX = "built-in:"
+
+
+def is_builtin(source: str) -> bool:
+    """Whether a source names a built-in sequence."""
+    return source.startswith(BUILTIN_PREFIX)

@@ -30,6 +30,8 @@ from pydantic import ValidationError
 
 from pliant.algorithms.parameters import Parameters
 from pliant.cache import cache_folder
+from pliant.datasets.base import BUILTIN_PREFIX as PREFIX
+from pliant.datasets.base import is_builtin
 from pliant.datasets.builtin_deforming import deforming_plan
 from pliant.datasets.builtin_rigid import SequenceOptions, rigid_plan
 from pliant.datasets.sequence_files import Progress
@@ -38,16 +40,12 @@ from pliant.rendering.deforming_scenes import DEFORMING, DeformingOptions
 from pliant.rendering.scenes import SCENES
 
 __all__ = [
-    "PREFIX",
     "SequenceOptions",
     "builtin_folder",
-    "is_builtin",
     "is_deforming",
     "parse_builtin",
     "render_sequence",
 ]
-
-PREFIX = "built-in:"
 
 Options = SequenceOptions | DeformingOptions
 
@@ -62,11 +60,6 @@ class _Plan(Protocol):
     def render(self, folder: Path, progress: Progress) -> None:
         """Fill an empty folder, but for ``scene.json``."""
         ...
-
-
-def is_builtin(source: str) -> bool:
-    """Whether a source names a built-in sequence."""
-    return source.startswith(PREFIX)
 
 
 def is_deforming(source: str) -> bool:

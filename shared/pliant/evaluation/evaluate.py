@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pliant.datasets.builtin import builtin_folder, is_builtin
+from pliant.datasets.base import is_builtin
+from pliant.datasets.builtin import builtin_folder
 from pliant.errors import ResultError
 from pliant.evaluation.report import (
     evaluation_to_json,

@@ -10,7 +10,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.surfels import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.evaluation.surface_truth import MaterialPoints, SurfaceTruth
 from pliant.evaluation.surfel_truth import rmse
 

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from pliant.datasets import Rectifier, open_source
-from pliant.datasets.base import BrokenFrame
-from pliant.datasets.builtin import builtin_folder, is_builtin
+from pliant.datasets import open_source
+from pliant.datasets.base import BrokenFrame, is_builtin
+from pliant.datasets.builtin import builtin_folder
 from pliant.datasets.builtin_deforming import SURFACES_NAME
 from pliant.datasets.depth import DepthRectifier
+from pliant.datasets.rectifier import Rectifier
 from pliant.errors import ResultError
 from pliant.evaluation.exact_surfels import ExactSurfels, format_exact
 from pliant.evaluation.later_surfels import LaterSurfels, format_later, scaled, true_scale

@@ -22,7 +22,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.surfels import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.evaluation.report import table
 
 MAX_RETURN_PX = 0.5

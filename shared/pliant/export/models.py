@@ -9,10 +9,10 @@ import numpy as np
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.meshing.corrected_view import corrected_view
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
-from pliant.datasets import Rectifier, calibration_from_yaml
 from pliant.datasets.base import BrokenFrame
-from pliant.datasets.calibration import Calibration, calibration_yaml
+from pliant.datasets.calibration import Calibration, calibration_from_yaml, calibration_yaml
 from pliant.datasets.own_recording import recorded_frame
+from pliant.datasets.rectifier import Rectifier
 from pliant.errors import ResultError
 from pliant.export.colmap import image_name, write_colmap_model
 from pliant.formats.ply import read_ply, write_ply

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from pliant.algorithms.arrays import U8
-from pliant.algorithms.surfels import SurfelState
 from pliant.algorithms.surfels.surface import surface_of
+from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.errors import ResultError
 from pliant.export.models import camera_of, make_folder, rectified_images
 from pliant.formats.ply import write_ply

@@ -8,9 +8,8 @@ of SIDE voxels through the band of the truncation.
 import math
 
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing.mesh_blocks import SIDE
+from pliant.algorithms.meshing.mesh_blocks import BLOCK_BYTES, SIDE
 from pliant.algorithms.meshing.parameters import TsdfParameters
-from pliant.algorithms.meshing.tsdf_blocks import BLOCK_BYTES
 from pliant.errors import PliantError
 
 _GROWTH = 0.6

@@ -18,10 +18,9 @@ from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.corrected_view import CorrectedView
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints, Surface
-from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, TriangleMesh, sorted_keys
+from pliant.algorithms.meshing.mesh_blocks import BLOCK_BYTES, MeshBlocks, TriangleMesh, sorted_keys
 from pliant.algorithms.meshing.parameters import MeshingParameters, TsdfParameters
 from pliant.algorithms.meshing.rendering import DepthMap
-from pliant.algorithms.meshing.tsdf_blocks import BLOCK_BYTES
 from pliant.algorithms.meshing.tsdf_integrate import blocks_in_band, pixel_planes
 from pliant.algorithms.meshing.tsdf_volume import TsdfVolume, VolumeFullError
 from pliant.algorithms.stages import StageTimer, no_stages

@@ -73,6 +73,8 @@ TOPICS = (
     STREAM, SOURCE, IMAGE, DEPTH, EXTREMA, MAP_UPDATE, MAP_FINAL, KEYFRAME, KEYFRAME_FINAL,
     MESH_BLOCKS, MESH_FINAL, SURFELS, STREAM_END,
 )  # fmt: skip
+WITH_PIXELS = (IMAGE, SOURCE)
+"""Those that are made smaller for a link between machines."""
 _BY_KEY = {topic.key: topic for topic in TOPICS}
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.surfels import SurfelState
+from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.config import recorded_config
 from pliant.errors import ResultError
 from pliant.files import move_all

@@ -2,21 +2,3 @@
 
 ``schur`` adjusts cameras, points and a calibration together, ``subspace`` by halves.
 """
-
-from pliant.algorithms.bundle.problem import (
-    BundleParameters,
-    BundleProblem,
-    BundleResult,
-    BundleWindow,
-    CalibrationUncertainty,
-    shared_intrinsics,
-)
-
-__all__ = [
-    "BundleParameters",
-    "BundleProblem",
-    "BundleResult",
-    "BundleWindow",
-    "CalibrationUncertainty",
-    "shared_intrinsics",
-]

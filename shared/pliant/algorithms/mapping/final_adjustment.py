@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
-from pliant.algorithms.bundle import BundleProblem, BundleResult, shared_intrinsics
 from pliant.algorithms.bundle.calibration import ideal_pixels
+from pliant.algorithms.bundle.problem import BundleProblem, BundleResult, shared_intrinsics
 from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.bundle.subspace import refine_points
 from pliant.algorithms.camera import PinholeCamera

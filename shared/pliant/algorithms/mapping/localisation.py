@@ -6,7 +6,7 @@ import numpy as np
 
 from pliant.algorithms.absolute_pose import pose_by_ransac, truncated_cost
 from pliant.algorithms.arrays import F32, F64, BoolArray
-from pliant.algorithms.bundle import BundleParameters
+from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.subspace import refine_pose
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse

@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from pliant.algorithms.bundle import BundleParameters, CalibrationUncertainty
+from pliant.algorithms.bundle.problem import BundleParameters, CalibrationUncertainty
 from pliant.algorithms.parameters import Parameters
 
 

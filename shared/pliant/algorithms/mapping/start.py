@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64
-from pliant.algorithms.bundle import BundleProblem, shared_intrinsics
+from pliant.algorithms.bundle.problem import BundleProblem, shared_intrinsics
 from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.epipolar import (

@@ -3,7 +3,7 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, BoolArray
-from pliant.algorithms.bundle import BundleResult, BundleWindow, shared_intrinsics
+from pliant.algorithms.bundle.problem import BundleResult, BundleWindow, shared_intrinsics
 from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.bundle.subspace import refine_points, solve_subspace
 from pliant.algorithms.camera import PinholeCamera

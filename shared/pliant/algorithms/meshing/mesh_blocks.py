@@ -12,6 +12,8 @@ from pliant.algorithms.arrays import F32, I32, I64, U8, BoolArray, Shape
 
 SIDE = 8
 """Voxels along the side of a block."""
+BLOCK_BYTES = SIDE**3 * 4 * 6
+"""Six int32 a voxel: see ``VoxelSums``."""
 KEY_LIMIT = 1 << 20
 """Keys beyond this have no number: such blocks are passed over."""
 KEY_BITS = 21

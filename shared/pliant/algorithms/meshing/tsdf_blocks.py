@@ -18,8 +18,6 @@ from pliant.algorithms.meshing.mesh_blocks import (
     unpack,
 )
 
-BLOCK_BYTES = SIDE**3 * 4 * 6
-"""Six int32 a voxel: see ``VoxelSums``."""
 _FIRST_BLOCKS = 512
 EMPTY = -1
 """In a table of packed keys: a free place."""

@@ -9,10 +9,15 @@ from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.meshing.marching_cubes import Tsdf, extract_blocks
-from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, TriangleMesh, sorted_keys, weld
+from pliant.algorithms.meshing.mesh_blocks import (
+    BLOCK_BYTES,
+    MeshBlocks,
+    TriangleMesh,
+    sorted_keys,
+    weld,
+)
 from pliant.algorithms.meshing.parameters import TsdfParameters
 from pliant.algorithms.meshing.tsdf_blocks import (
-    BLOCK_BYTES,
     BlockPool,
     Scale,
     find_rows,
