@@ -9,7 +9,7 @@ import pytest
 from pliant.errors import PliantError
 from pliant.export import open3d_import
 from pliant.export.open3d_import import require_open3d
-from pliant_services.cli.diagnosis import diagnose
+from pliant_services.cli.doctor import diagnose
 
 
 @pytest.fixture(autouse=True)
