@@ -1,3 +1,5 @@
 """Pliant's processes, what hosts them, and the command line."""
 
-import pliant  # noqa: F401  (fixes the arithmetic before any module loads numpy)
+from pliant import arithmetic
+
+arithmetic.fix()  # before any module of these loads numpy
