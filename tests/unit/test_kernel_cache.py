@@ -135,6 +135,17 @@ def test_a_slice_of_another_shape_is_an_error_without_strings() -> None:
         copy(np.zeros(3), np.zeros(4))
 
 
+def test_fast_kernels_are_without_estimates_that_differ_between_processors() -> None:
+    @kernel.fast_kernel
+    def normalised(x: np.float32, y: np.float32) -> np.float32:
+        return x / np.sqrt(y)
+
+    assert normalised(np.float32(3.0), np.float32(4.0)) == 1.5
+    (code,) = normalised.inspect_asm().values()  # type: ignore[attr-defined]
+    assert "sqrt" in code
+    assert "rsqrt" not in code
+
+
 def _object(file: Path) -> bytes:
     """The object file that Numba keeps there among other things."""
     data = file.read_bytes()
