@@ -25,6 +25,7 @@ _OFF = {
     "coasting": ["tracking.coast_frames=0"],
     "minima beside maxima": ["tracking.both_signs=false"],
     "re-acquisition": ["bundle_adjustment.reacquisition.enabled=false"],
+    "sweeps on every frame": ["bundle_adjustment.window.sweeps=0"],
     "final adjustment": ["bundle_adjustment.window.final_adjustment=false"],
     "readout of a rolling shutter": ["bundle_adjustment.calibration.readout=0"],
 }
