@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.stopwatch import Stopwatch
 from benchmarks.table import markdown
 from pliant.config import load_config
 from pliant.datasets import open_source
@@ -13,7 +12,7 @@ from pliant.evaluation.report import metres
 from pliant.evaluation.result import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
-from pliant.offline import Timers, process
+from pliant.offline import process
 
 _OFF = {
     "mutual check": ["tracking.mutual_check=false"],
@@ -47,20 +46,16 @@ def measure(sources: Sequence[str]) -> Iterator[str]:
     rows = []
     for name, overrides in VARIANTS.items():
         rows.append([name, *(_cell(source, overrides) for source in sources)])
-    yield "ATE of the final trajectory / median mapped inliers / ms of tracking and mapping a frame"
+    yield "ATE of the final trajectory / median mapped inliers"
     yield markdown(header, rows)
 
 
 def _cell(source: str, overrides: Sequence[str]) -> str:
     dataset = open_source(source)
     history = MapHistory()
-    watches = Stopwatch(), Stopwatch()
     inliers: list[int] = []
-    for frame in process(dataset, load_config(None, overrides), history, timers=Timers(*watches)):
+    for frame in process(dataset, load_config(None, overrides), history):
         inliers.append(frame.delta.inliers)
-        for watch in watches:
-            watch.lap()
-    milliseconds = sum(watch.mean_ms() for watch in watches)
     poses = history.final()
     assert dataset.ground_truth_path is not None
     truth = read_trajectory(dataset.ground_truth_path)
@@ -70,4 +65,4 @@ def _cell(source: str, overrides: Sequence[str]) -> str:
     rate = 100.0 * (evaluation.success_rate or 0.0)
     shown = metres(evaluation.ate_m.rmse) if evaluation.ate_m else "fails"
     at = f" at {rate:.0f} %" if rate < 99.0 else ""
-    return f"{shown}{at} / {np.median(inliers):.0f} / {milliseconds:.0f}"
+    return f"{shown}{at} / {np.median(inliers):.0f}"
