@@ -1,1 +1,1 @@
-"""The TSDF volume on Open3D's blocks: the only room that imports open3d."""
+"""From keyframes to meshes: a live one that follows the map, and a final one from its last word."""
