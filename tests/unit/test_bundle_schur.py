@@ -14,7 +14,7 @@ from pliant.algorithms.bundle.packed_layout import build_packed_layout
 from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.reduced import find_pattern, solve_reduced
 from pliant.algorithms.bundle.schur import SchurSystem, solve_schur
-from pliant.algorithms.kernel import leaf_kernel
+from pliant.compiler.kernel import leaf_kernel
 
 LENSES = [(0.0, 0.0), (-0.2, 0.05)]
 TIGHT = BundleParameters(kernel_sigma_px=4.0, min_relative_decrease=1e-12, max_iterations=60)

@@ -13,10 +13,10 @@ import pytest
 
 import pliant
 from pliant import cache, errors
-from pliant.algorithms import kernel, kernel_cache, kernel_linking
+from pliant.compiler import kernel, kernel_cache, kernel_linking
 
 _KERNEL = """
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 from pliant.algorithms.constants import (
     FACTOR,
 )
@@ -31,7 +31,7 @@ _CALL = (
 )
 # A helper that calls itself is never wholly part of its caller.
 _HELPED = """
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 
 @kernel
 def helper(x):
@@ -44,15 +44,16 @@ def helped(x):
 
 
 def _package(root: Path) -> Path:
-    package = root / "pliant" / "algorithms"
-    package.mkdir(parents=True)
+    package, compiler = (root / "pliant" / name for name in ("algorithms", "compiler"))
+    for folder in (package, compiler):
+        folder.mkdir(parents=True)
     for module in (kernel, kernel_cache, kernel_linking):
         source = Path(module.__file__)
-        (package / source.name).write_bytes(source.read_bytes())
+        (compiler / source.name).write_bytes(source.read_bytes())
     for module in (cache, errors):
         source = Path(module.__file__)
         (package.parent / source.name).write_bytes(source.read_bytes())
-    for folder in (package, package.parent):
+    for folder in (package, compiler, package.parent):
         (folder / "__init__.py").touch()
     return package
 
@@ -78,12 +79,12 @@ def test_a_constant_of_another_module_changes_the_kernel(tmp_path: Path) -> None
 
 
 def test_sources_are_followed_through_imports() -> None:
-    algorithms = Path(pliant.__file__).parent / "algorithms"
-    paths = kernel_cache.sources(algorithms / "tracking" / "advance.py")
-    found = {str(path.relative_to(algorithms)) for path in paths}
-    assert {"tracking/advance.py", "kernel.py", "kernel_cache.py"} <= found
-    assert "image/patch_alignment.py" in found
-    assert not any(name.startswith("bundle/") for name in found)
+    library = Path(pliant.__file__).parent
+    paths = kernel_cache.sources(library / "algorithms" / "tracking" / "advance.py")
+    found = {str(path.relative_to(library)) for path in paths}
+    assert {"algorithms/tracking/advance.py", "compiler/kernel.py"} <= found
+    assert {"compiler/kernel_cache.py", "algorithms/image/patch_alignment.py"} <= found
+    assert not any(name.startswith("algorithms/bundle/") for name in found)
 
 
 def test_a_kernel_calls_the_helpers_in_its_own_object_file(tmp_path: Path) -> None:

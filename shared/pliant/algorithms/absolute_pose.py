@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64, BoolArray
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
 _SMALL = 1e-12
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 
 MIN_KEYFRAMES = 3
 MIN_PARALLAX_RAD = float(np.radians(1.0))

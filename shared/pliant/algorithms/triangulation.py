@@ -11,7 +11,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
 _ITERATIONS = 4
 _MIN_DEPTH = 1e-6

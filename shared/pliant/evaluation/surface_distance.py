@@ -3,7 +3,7 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 
 _MAX_CELL = 1 << 20
 """Cells along an axis: 21 bits of a key for each."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 from pliant.rendering.light import light_at
 from pliant.rendering.raycast import Atlas
 from pliant.rendering.scene import Scene, SolidArrays, face_sizes

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 from pliant.rendering.intersect import hit_solid
 from pliant.rendering.scene import SolidArrays
 

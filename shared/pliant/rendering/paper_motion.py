@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 from pliant.rendering.sheets import Shape
 
 KEY_EVERY_S = 8.0 / 30.0

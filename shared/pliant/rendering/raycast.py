@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 from pliant.rendering.intersect import Scalar, face_point, load_tile, meet_tile
 from pliant.rendering.scene import SolidArrays
 from pliant.rendering.view import TILE_PX, TILE_RAYS, Tiles, View

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 from pliant.rendering.intersect import Scalar
 from pliant.rendering.raycast import Atlas, bilinear
 

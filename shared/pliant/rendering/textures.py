@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 from pliant.rendering.scene import Material
 
 # Smallest radius of a mark, texels: smaller ones would vanish at the texture's own resolution.

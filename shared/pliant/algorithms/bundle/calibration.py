@@ -45,7 +45,7 @@ from pliant.algorithms.bundle.projection import (
     point_rows,
 )
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.kernel import fast_kernel
+from pliant.compiler.kernel import fast_kernel
 
 LOWER = np.tril_indices(SHARED)
 _NEWTON_STEPS = 8

@@ -13,7 +13,7 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.bundle.problem import AnyProblem, BundleProblem
 from pliant.algorithms.bundle.projection import Cameras
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 
 BLOCK = 128
 """Points in a block: W of ten cameras and one block (184 kB) stays in the L2 cache."""

@@ -39,7 +39,7 @@ from pliant.algorithms.bundle.projection import (
     point_rows,
     residual,
 )
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel, leaf_kernel
 
 RECORD, FACTOR = 8, 9
 """Numbers kept of an observation, and of a point."""

@@ -20,7 +20,7 @@ from pliant.algorithms.bundle.layout import (
     weights_of,
 )
 from pliant.algorithms.bundle.problem import AnyProblem, BundleProblem
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 
 _NOWHERE = -1
 

@@ -24,7 +24,7 @@ from numpy.typing import DTypeLike
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.bundle.problem import BundleParameters
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
 _Number: TypeAlias = Any
 _Camera: TypeAlias = Any

@@ -17,7 +17,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.block_product import subtract_product6
-from pliant.algorithms.kernel import kernel, leaf_kernel
+from pliant.compiler.kernel import kernel, leaf_kernel
 
 LOWER = np.tril_indices(6)
 DIAGONAL = 7 * np.arange(6)

@@ -40,7 +40,7 @@ from pliant.algorithms.bundle.problem import (
 from pliant.algorithms.bundle.projection import limits_of, move_cameras
 from pliant.algorithms.bundle.reduced import LOWER as LOWER6
 from pliant.algorithms.bundle.reduced import find_pattern, solve_reduced
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e8
 

@@ -40,7 +40,7 @@ from pliant.algorithms.bundle.projection import (
 )
 from pliant.algorithms.bundle.subspace_kernels import iterate_pose, sweep_cameras, sweep_points
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
 _LOWER = np.tril_indices(6)
 

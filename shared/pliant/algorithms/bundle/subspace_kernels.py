@@ -23,7 +23,7 @@ from pliant.algorithms.bundle.projection import (
     solve_camera,
     solve_point,
 )
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 SINGULAR = np.float32(1e-6)

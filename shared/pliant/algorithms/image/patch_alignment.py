@@ -18,7 +18,7 @@ from pliant.algorithms.image.patch_sums import (
     write_template,
 )
 from pliant.algorithms.image.pixels import Pixels
-from pliant.algorithms.kernel import leaf_kernel
+from pliant.compiler.kernel import leaf_kernel
 
 TEMPLATE_MARGIN = 1
 """Pixels around a patch that its gradients need when the template is made."""

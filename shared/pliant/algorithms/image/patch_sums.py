@@ -20,7 +20,7 @@ from pliant.algorithms.image.vector_code import (
     splat,
     vector_type,
 )
-from pliant.algorithms.kernel import leaf_kernel
+from pliant.compiler.kernel import leaf_kernel
 
 PATCH_SIZE = 8
 """Side of a patch in pixels: one row is one vector."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F32
-from pliant.algorithms.kernel import fast_kernel
+from pliant.compiler.kernel import fast_kernel
 
 
 class Pixels(NamedTuple):

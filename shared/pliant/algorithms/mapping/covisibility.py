@@ -11,7 +11,6 @@ back to.  Where a place is visited many times that is one view of it, not one of
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64, U8, BoolArray
-from pliant.algorithms.kernel import kernel
 from pliant.algorithms.mapping.map_store import (
     CANDIDATE,
     MAPPED,
@@ -19,6 +18,7 @@ from pliant.algorithms.mapping.map_store import (
     Keyframe,
     PointRows,
 )
+from pliant.compiler.kernel import kernel
 
 MAX_MISSES = 8
 """Frames in which a point may be looked for in vain before it waits."""

@@ -7,7 +7,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.image.patch_alignment import TEMPLATE_MARGIN
 from pliant.algorithms.image.patch_sums import PATCH_SIZE
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 
 PATCH_SIDE = PATCH_SIZE + 2 * TEMPLATE_MARGIN
 """Of the grey levels kept around a point, whose samples lie at -4.5, ..., 4.5 px from it."""

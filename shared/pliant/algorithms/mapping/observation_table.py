@@ -7,7 +7,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
 
 def weigh(points_px: F32, camera: PinholeCamera, lens_radius: float) -> F32:

@@ -6,9 +6,9 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64, U8
 from pliant.algorithms.geometry import inverse, matrix_to_pose
-from pliant.algorithms.kernel import kernel
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.compiler.kernel import kernel
 
 _MOVED_SHARE = 2e-3
 """Points are published again when they moved by this share of their distance to the camera."""

@@ -22,9 +22,9 @@ from pliant.algorithms.image.patch_alignment import (
 )
 from pliant.algorithms.image.patch_sums import PATCH_PIXELS, PATCH_SIZE, TEMPLATE_FLOATS, UNIFORM
 from pliant.algorithms.image.pixels import Pixels, pixels_of
-from pliant.algorithms.kernel import fast_kernel, kernel, leaf_kernel
 from pliant.algorithms.mapping.map_store import PATCH_SIDE
 from pliant.algorithms.mapping.parameters import ReacquisitionParameters
+from pliant.compiler.kernel import fast_kernel, kernel, leaf_kernel
 
 CELL_PX = 8
 """Side of a cell: larger than any search radius, so that nine cells suffice."""

@@ -11,8 +11,8 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log
-from pliant.algorithms.kernel import kernel
 from pliant.algorithms.mapping.map_store import Keyframe
+from pliant.compiler.kernel import kernel
 
 _SPAN = 2
 """Frames before and after a keyframe over which its motion is measured: poses have noise."""

@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, Shape
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 
 EXTENT_BITS = 20
 """Twice a triangle's area is at most 2**40 and a lift 2**41: exact in float64."""

@@ -9,12 +9,12 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.kernel import kernel
 from pliant.algorithms.meshing.delaunay import Triangulation, triangulate
 from pliant.algorithms.meshing.nltgv import NltgvResult, NltgvStart, carry_duals, smooth
 from pliant.algorithms.meshing.parameters import SurfaceParameters, TriangleFilterParameters
 from pliant.algorithms.meshing.rendering import DepthMap, render_depth
 from pliant.algorithms.stages import StageTimer, no_stages
+from pliant.compiler.kernel import kernel
 
 _MIN_POINTS = 3
 _MIN_SHARED = 0.3

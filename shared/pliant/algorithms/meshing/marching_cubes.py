@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32, U8
-from pliant.algorithms.kernel import fast_kernel, kernel
 from pliant.algorithms.meshing.mesh_blocks import LATTICE, SIDE, MeshBlocks
 from pliant.algorithms.meshing.tsdf_blocks import BlockTable, Scale, VoxelSums, pack_one, row_of
 from pliant.algorithms.meshing.tsdf_integrate import DISTANCE_UNITS
+from pliant.compiler.kernel import fast_kernel, kernel
 
 MAX_TRIANGLES = 5
 _FACES = (  # Corners in the order of their outline, anticlockwise from outside.

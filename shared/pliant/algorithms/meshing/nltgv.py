@@ -37,7 +37,6 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32, I64, BoolArray, Shape
-from pliant.algorithms.kernel import fast_kernel, kernel
 from pliant.algorithms.meshing.nltgv_start import (
     Graph,
     change_sides,
@@ -48,6 +47,7 @@ from pliant.algorithms.meshing.nltgv_start import (
     usual_rise,
 )
 from pliant.algorithms.meshing.parameters import NltgvParameters
+from pliant.compiler.kernel import fast_kernel, kernel
 
 _MIN_SHIFT_SIGMAS = 3.0
 _HALF_U, _HALF_V, _FIRST, _SECOND, _FIRST_STEP, _SECOND_STEP = range(6)

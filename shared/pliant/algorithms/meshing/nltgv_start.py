@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32, I64, BoolArray, Shape
-from pliant.algorithms.kernel import fast_kernel, kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
 _RIDGE = 0.02
 """Mean edges squared that hold a slope at zero: few noisy neighbours in a row give none."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, Shape
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.kernel import kernel
+from pliant.compiler.kernel import kernel
 
 _NEAREST_SHARE = 1e-3
 """Triangles nearer than this share of the median depth are left out: there is no clipping."""

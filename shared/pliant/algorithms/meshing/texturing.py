@@ -11,8 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray, Shape
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.kernel import kernel
 from pliant.algorithms.meshing.rendering import view_mesh
+from pliant.compiler.kernel import kernel
 
 _PATCHES_ACROSS = 8
 """Cells of patches along the longest side of a scene."""

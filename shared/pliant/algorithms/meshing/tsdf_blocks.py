@@ -9,7 +9,6 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import I32, I64, Shape
-from pliant.algorithms.kernel import kernel
 from pliant.algorithms.meshing.mesh_blocks import (
     KEY_BITS,
     KEY_LIMIT,
@@ -17,6 +16,7 @@ from pliant.algorithms.meshing.mesh_blocks import (
     pack,
     unpack,
 )
+from pliant.compiler.kernel import kernel
 
 _FIRST_BLOCKS = 512
 EMPTY = -1

@@ -19,7 +19,6 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray, Shape
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.kernel import fast_kernel, kernel
 from pliant.algorithms.meshing.mesh_blocks import KEY_LIMIT, SIDE, unpack
 from pliant.algorithms.meshing.tsdf_blocks import (
     EMPTY,
@@ -30,6 +29,7 @@ from pliant.algorithms.meshing.tsdf_blocks import (
     slot_of,
     used_keys,
 )
+from pliant.compiler.kernel import fast_kernel, kernel
 
 WEIGHT_UNITS = 128
 """A weight of 1."""

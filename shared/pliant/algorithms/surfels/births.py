@@ -11,7 +11,6 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I64, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.kernel import fast_kernel
 from pliant.algorithms.surfels.deformation_models import identity_poses
 from pliant.algorithms.surfels.depth_maps import fit_inverse_depth, tangent_jacobian
 from pliant.algorithms.surfels.parameters import SurfelParameters
@@ -35,6 +34,7 @@ from pliant.algorithms.surfels.photometric import (
     padded,
 )
 from pliant.algorithms.surfels.surfel_alignment import Templates
+from pliant.compiler.kernel import fast_kernel
 
 _FAR = 0.5 * INVALID
 _MIN_VARIANCE = 4.0  # DN^2: a patch with less contrast is noise

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64, BoolArray
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.surfels.patch_sampling import A, B, F, X
+from pliant.compiler.kernel import fast_kernel, leaf_kernel
 
 _OFF_PLANE = 0.3
 """Neighbours are off each other's plane by at most this share of their distance."""

@@ -13,9 +13,9 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.kernel import inner_kernel, leaf_kernel
 from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, Level, X
 from pliant.algorithms.surfels.photometric import FEATURES
+from pliant.compiler.kernel import inner_kernel, leaf_kernel
 
 ISOMETRIC, EQUIAREAL, GENERAL = 0, 2, 3
 MODELS = {"isometric": ISOMETRIC, "equiareal": EQUIAREAL, "general": GENERAL}

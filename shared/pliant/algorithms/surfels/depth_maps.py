@@ -14,8 +14,8 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
+from pliant.compiler.kernel import fast_kernel, leaf_kernel
 
 _REWEIGHTINGS = 4
 _TUKEY = 4.685  # 95 % efficiency for Gaussian noise

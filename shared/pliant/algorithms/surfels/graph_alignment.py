@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8, BoolArray
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.surfels import deformation_models as models
 from pliant.algorithms.surfels.deformation_graph import Edges, edge_rows, pull_of_edges, torn_off
 from pliant.algorithms.surfels.deformation_models import RIGID
@@ -39,6 +38,7 @@ from pliant.algorithms.surfels.surfel_alignment import (
     patch_steps_px,
     solve,
 )
+from pliant.compiler.kernel import fast_kernel, leaf_kernel
 
 STEPS, COARSE_STEPS = 3, 2
 """Steps of all surfels, at full size and at half the size."""

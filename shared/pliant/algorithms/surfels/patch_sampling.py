@@ -16,7 +16,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, U8, U32, U64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.pixels import halve
-from pliant.algorithms.kernel import fast_kernel, inner_kernel, kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel, inner_kernel, kernel, leaf_kernel
 
 X, A, B, F, GAIN, BIAS, POSE_FLOATS = 0, 3, 6, 9, 12, 13, 14
 """Where the parts of a surfel's row begin, and its length."""

@@ -24,8 +24,8 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.kernel import inner_kernel, leaf_kernel
 from pliant.algorithms.surfels.patch_sampling import Grid
+from pliant.compiler.kernel import inner_kernel, leaf_kernel
 
 FEATURES = 10
 TEMPLATE_IMAGES = 3

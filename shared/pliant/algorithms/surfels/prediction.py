@@ -3,10 +3,10 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I64, U8
-from pliant.algorithms.kernel import fast_kernel
 from pliant.algorithms.surfels.patch_sampling import Level, X
 from pliant.algorithms.surfels.surfel_alignment import Limits, Templates, Workspace, evaluate_all
 from pliant.algorithms.tracks import FrameTracks
+from pliant.compiler.kernel import fast_kernel
 
 _NEAREST = 9
 _FEWEST = 3

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
-from pliant.algorithms.kernel import inner_kernel, leaf_kernel
 from pliant.algorithms.surfels import deformation_models as models
 from pliant.algorithms.surfels.patch_sampling import (
     BIAS,
@@ -33,6 +32,7 @@ from pliant.algorithms.surfels.photometric import (
     make_features,
     photometric_sums,
 )
+from pliant.compiler.kernel import inner_kernel, leaf_kernel
 
 MIN_GAIN = 0.05
 _N = models.MOST_PARAMETERS

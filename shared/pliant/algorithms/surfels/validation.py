@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
-from pliant.algorithms.kernel import leaf_kernel
 from pliant.algorithms.surfels import deformation_models as models
 from pliant.algorithms.surfels.patch_sampling import (
     BIAS,
@@ -23,6 +22,7 @@ from pliant.algorithms.surfels.surfel_alignment import (
     factorise,
     inverse_diagonal,
 )
+from pliant.compiler.kernel import leaf_kernel
 
 FRONT, INSIDE, VISIBLE, ZNCC, SIGMA, U, V, COLUMNS = 0, 1, 2, 3, 4, 5, 6, 7
 """Columns of a validation: in front of the camera (0 or 1), shares of the texture inside of the

@@ -24,13 +24,13 @@ from pliant.algorithms.image.patch_sums import (
 )
 from pliant.algorithms.image.pixels import Pixels
 from pliant.algorithms.image.vector_code import prefetch
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.tracking.climbing import climb
 from pliant.algorithms.tracking.curvature import CURVATURE_BORDER
 from pliant.algorithms.tracking.local_flow import Flow, flow_at
 from pliant.algorithms.tracking.maxima import subpixel_offset
 from pliant.algorithms.tracking.track_table import Track, Tracks
 from pliant.algorithms.tracks import COASTING, EXTREMUM
+from pliant.compiler.kernel import fast_kernel, leaf_kernel
 
 AHEAD = 3
 """Tracks by which memory is asked for before it is read."""

@@ -9,8 +9,8 @@ from numba.extending import intrinsic
 
 from pliant.algorithms.image.pixels import Pixels
 from pliant.algorithms.image.vector_code import call_llvm, load, splat, vector_type
-from pliant.algorithms.kernel import leaf_kernel
 from pliant.algorithms.tracking.curvature import CURVATURE_BORDER
+from pliant.compiler.kernel import leaf_kernel
 
 NEIGHBOURS = 8
 STEPS_X = (-1, 0, 1, -1, 1, -1, 0, 1)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F32
-from pliant.algorithms.kernel import leaf_kernel
+from pliant.compiler.kernel import leaf_kernel
 
 BLUR_RADIUS = 3
 """Half-width of the Gaussian in pixels: enough for a sigma up to about 1.3 px."""

@@ -19,9 +19,9 @@ from pliant.algorithms.image.patch_sums import (
 )
 from pliant.algorithms.image.pixels import Pixels
 from pliant.algorithms.image.vector_code import CACHE_LINE_FLOATS, prefetch
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.tracking.local_flow import CELL_PX, fit_planes, grid_shape
 from pliant.algorithms.tracking.track_table import Patches, Track, Tracks
+from pliant.compiler.kernel import fast_kernel, leaf_kernel
 
 WINDOW_SIDE = PATCH_SIZE + 2
 """Of the samples of a patch with the margin of its gradients."""

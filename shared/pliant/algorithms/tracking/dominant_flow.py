@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pliant.algorithms.arrays import F32, F64, Shape
 from pliant.algorithms.image.pixels import shrink
 from pliant.algorithms.image.vector_code import count_bits
-from pliant.algorithms.kernel import fast_kernel
 from pliant.algorithms.tracking.maxima import curvature_and_maxima
+from pliant.compiler.kernel import fast_kernel
 
 SHRINK = 6
 """The paper's subsampling."""

@@ -19,7 +19,7 @@ from pliant.algorithms.image.patch_alignment import (
 )
 from pliant.algorithms.image.patch_sums import GAUSSIAN, PATCH_SIZE, TEMPLATE_FLOATS
 from pliant.algorithms.image.pixels import Pixels, pixels_of
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel, leaf_kernel
 
 CELL_PX = 20
 """Side of a cell of the grid in full-size pixels: 32 x 24 cells at 640x480."""

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F32, I32
 from pliant.algorithms.image.vector_code import count_bits, first_bit, load, splat, vector_type
-from pliant.algorithms.kernel import leaf_kernel
 from pliant.algorithms.tracking.curvature import (
     CURVATURE_BORDER,
     GaussianTaps,
@@ -20,6 +19,7 @@ from pliant.algorithms.tracking.curvature import (
     gaussian_taps,
     row_scratch,
 )
+from pliant.compiler.kernel import leaf_kernel
 
 RUN = 32
 """Pixels that one word speaks of."""

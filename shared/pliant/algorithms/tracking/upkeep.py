@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from pliant.algorithms.arrays import F32, I32
 from pliant.algorithms.image.patch_alignment import make_template, patch_strength, patch_tensor
 from pliant.algorithms.image.patch_sums import BIRTH_FLOATS, GAUSSIAN, TEMPLATE_FLOATS
-from pliant.algorithms.kernel import fast_kernel, leaf_kernel
 from pliant.algorithms.tracking.advance import (
     FrameImages,
     patch_inside,
@@ -18,6 +17,7 @@ from pliant.algorithms.tracking.advance import (
 from pliant.algorithms.tracking.deformation import keep_birth
 from pliant.algorithms.tracking.track_table import Patches, Track, Tracks
 from pliant.algorithms.tracks import EXTREMUM
+from pliant.compiler.kernel import fast_kernel, leaf_kernel
 
 BINS = 2048
 """Bins of |kappa|, eight to the octave: the upper bits of its float32."""

@@ -14,8 +14,8 @@ import numba
 import numba.np.arrayobj
 from numba.extending import overload
 
-from pliant.algorithms.kernel_cache import SourcesCache
-from pliant.algorithms.kernel_linking import keep_copies_apart
+from pliant.compiler.kernel_cache import SourcesCache
+from pliant.compiler.kernel_linking import keep_copies_apart
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
