@@ -1,5 +1,6 @@
 """kill -9 of the recorder at random moments: what recovery keeps."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -55,7 +56,7 @@ def measure(kills: int) -> Iterator[str]:
     worst_s, kept = 0.0, 0
     with tempfile.TemporaryDirectory(prefix="pliant-kills-") as folder:
         for number in range(kills):
-            path = Path(folder) / "recording.mcap"
+            path = Path(folder) / f"{number}.mcap"
             lost_s, safe, found = _one(path, float(random.uniform(*_SECONDS)))
             if found < safe or lost_s > 1.0:
                 raise PliantError(
@@ -70,7 +71,13 @@ def _one(path: Path, after_s: float) -> tuple[float, int, int]:
     """Seconds lost, frames that were acknowledged, frames that were recovered."""
     code = _RECORDER.replace("RATE", str(_RATE_HZ))
     process = subprocess.Popen(
-        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code, str(path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(sys.path),
+        },  # this package is not installed
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "up\n"

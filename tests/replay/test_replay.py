@@ -140,7 +140,7 @@ def test_a_recording_cut_off_is_recovered_and_then_replays(
 
 def test_what_cannot_be_replayed_is_one_line(result: Path, tmp_path: Path) -> None:
     assert_one_line(pliant("replay", tmp_path / "none.mcap"), "no such recording")
-    assert_one_line(pliant("replay", result, "--output", result), "exists")
+    assert_one_line(pliant("replay", result, "--output", result), "is read from there")
     assert_one_line(pliant("replay", result, "--check", "--loop"), "--loop is for playing", 2)
 
 

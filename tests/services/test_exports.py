@@ -264,8 +264,8 @@ def test_evo_reads_the_trajectory(result: Path, tmp_path: Path) -> None:
 
 
 def test_wrong_requests_are_one_line(result: Path, tmp_path: Path) -> None:
-    with pytest.raises(ResultError, match=r"--to obj: choose foxglove, rerun"):
-        export_result(result, "obj", None)
+    with pytest.raises(ResultError, match=r"--to stl: choose foxglove, rerun"):
+        export_result(result, "stl", None)
     with pytest.raises(ResultError, match="no such result folder or recording"):
         export_result(tmp_path / "nothing", "tum", None)
     there = tmp_path / "there.txt"

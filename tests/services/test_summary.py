@@ -129,7 +129,7 @@ def test_broken_images_are_a_fault_and_dropped_ones_are_not(
     record(tmp_path, [""] * 3)
     report = json.loads((tmp_path / "report.json").read_text())
     report |= {"segments": [{"id": 0}], "frames_without_pixels": missing}
-    monkeypatch.setattr(pipeline, "write_results", lambda _: report)
+    monkeypatch.setattr("pliant.results.write.write_results", lambda _: report)
     assert pipeline._finish(tmp_path, interrupted=False, failure=None) == code
 
 

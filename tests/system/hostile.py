@@ -3,9 +3,11 @@
 import struct
 import threading
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import zenoh
 
 from pliant.bus.health import health_key
 from pliant.bus.links import ENVELOPE
@@ -97,7 +99,8 @@ def attack(
     keys = keys_of(fleet)
     senders = {t.key: name for name in fleet for t in readers_of(name, fleet)}
     taken = threading.Event()
-    with open_session([endpoint]) as connection:
+    connection = open_session([endpoint])
+    try:
         tokens = connection.liveliness().get(f"pliant/{session}/ready/**")
         told = (str(reply.ok.key_expr).split("/") for reply in tokens if reply.ok is not None)
         starts = {parts[3]: int(parts[4]) for parts in told}
@@ -117,4 +120,7 @@ def attack(
             connection.put(mark, b"")
             assert taken.wait(_PATIENCE_S), "the session went away, or hands nothing on"
         held.undeclare()
+    finally:
+        with suppress(zenoh.ZError):  # the session that it attacked may be over
+            connection.close()  # type: ignore[no-untyped-call]
     return each * len(keys)

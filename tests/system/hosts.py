@@ -152,7 +152,10 @@ class Spread:
         listen = ["--listen", self.endpoint, "--listen", side]
         self.router = self._start(self.where["recorder"], "router", *listen)
         assert self.router.stdout is not None
-        assert "router on" in self.router.stdout.readline()
+        said = self.router.stdout.readline()
+        while said.startswith("WARNING"):  # it is open to the other hosts
+            said = self.router.stdout.readline()
+        assert "router on" in said
         self._looking = open_session([side])
         prefix = f"pliant/{SESSION}"
         self._held = [

@@ -161,7 +161,7 @@ def test_a_recording_is_replayed_to_a_viewer_elsewhere(endpoint: str, tmp_path: 
 
 def test_an_interrupted_command_does_not_wait_for_what_zenoh_left_behind() -> None:
     code = (
-        "import threading; from pliant_services import cli; cli._run = lambda: 130; "
+        "import threading; from pliant_services import cli; cli._run = lambda _: 130; "
         "threading.Thread(target=threading.Event().wait).start(); cli.main()"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 130

@@ -97,7 +97,7 @@ def broken_frames() -> list[tuple[SourceFrame, str]]:
     png, jpeg = encode(picture()), encode(picture(), ".jpg")
     bgr = raw(picture(), "bgr8")
     return [
-        (SourceFrame(index=7, stamp_ns=1, encoding="png", data=b""), "the image file is empty"),
+        (SourceFrame(index=7, stamp_ns=1, encoding="png", data=b""), "empty: its file is gone"),
         (source(b"no image at all"), "the image does not decode"),
         (source(png[: len(png) // 2]), "the png image is cut off"),
         (source(jpeg[: len(jpeg) // 2]), "the jpeg image is cut off"),

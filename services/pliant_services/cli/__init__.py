@@ -53,14 +53,14 @@ _UsageError: type[typer.BadParameter] = next(
 )
 
 
-def main(application: typer.Typer = app) -> None:
+def main(application: typer.Typer | None = None) -> None:
     """The command ``pliant``, or another that ends as it does."""
     # A container stops by SIGTERM and a terminal that closes sends SIGHUP: both are a Ctrl-C.
     for kind in _INTERRUPTIONS:
         if signal.getsignal(kind) == signal.SIG_DFL:  # not under nohup
             signal.signal(kind, signal.default_int_handler)
     try:
-        run_and_exit(application)
+        run_and_exit(application or app)
     except KeyboardInterrupt:  # one more, just before it was ignored
         os._exit(_INTERRUPTED)
     finally:
@@ -74,7 +74,7 @@ def run_and_exit(application: typer.Typer) -> None:
         sys.stdout.flush()
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more to flush
-        if error.errno != errno.EPIPE:  # `| head` has seen enough
+        if error.errno != errno.EPIPE and not code:  # `| head` has seen enough
             code = _say(f"cannot write the output: {error.strerror}; free some space")
     if code >= _INTERRUPTED:
         # All is closed, but a Zenoh session that was just being opened or closed leaves threads
