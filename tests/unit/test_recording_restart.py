@@ -104,6 +104,21 @@ def test_a_chunk_that_never_reached_the_disk_is_asked_for_again(path: Path) -> N
     assert summarise(path).complete
 
 
+def test_an_end_counts_though_its_chunk_lies_before_that_of_the_last_messages(path: Path) -> None:
+    """Chunks hold messages of one compression: what came last of all may lie in an earlier one."""
+    with RollingWriter(path, {}, append=True) as writer:
+        data = codec.encode(end_of(KEY, 2))
+        writer.write(topics.STREAM_END, data, sequence=2, log_time_ns=2, publish_time_ns=0)
+        writer.sync()
+        for n in range(2):
+            writer.write(topics.SOURCE, image(n), sequence=n, log_time_ns=n, publish_time_ns=n)
+        writer.sync()
+    part = parts_of(path)[0]
+    part.write_bytes(part.read_bytes()[:-8])  # a kill before it was closed
+    assert mend(path) == ({KEY: 3}, {KEY})
+    assert on_disk(path) == [0, 1]
+
+
 def test_a_zeroed_end_is_none(path: Path) -> None:
     end, noise = codec.encode(end_of(topics.STREAM.key, 0)), image(0)
     with RollingWriter(path, {}, append=True) as writer:

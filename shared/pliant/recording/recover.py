@@ -133,7 +133,7 @@ def mend(path: Path) -> tuple[dict[str, int], set[str]]:
         try:
             summary = summarise(last)
             if not summary.has_index or summary.damage:
-                recover(last, last, keep=books.take)
+                books.mend(last)
             else:
                 books.take_up(last)
         except NothingReadableError:
@@ -152,14 +152,41 @@ class _Books:
     ended: set[str] = field(default_factory=set[str])
     from_the_beginning: bool = True
 
-    def take(self, message: Recorded) -> bool:
-        """Count a message, if it is the next of its topic and a checksum vouches for it."""
-        key = self._key(message)
-        following = self.counts.get(key, 0 if self.from_the_beginning else message.sequence)
-        if not message.checked or message.sequence != following:
+    def mend(self, file: Path) -> None:
+        """Leave of a part what follows without a gap, under a checksum, and count it.
+
+        Ends lie in chunks of their own, perhaps before the last messages of their topics: so
+        messages are counted first, without writing anything.
+        """
+        reached = _Books(dict(self.counts), set(), self.from_the_beginning)
+        for item in Recording(file).everything():
+            if isinstance(item, Recorded) and item.topic is not topics.STREAM_END:
+                reached._take(item)
+        ends: dict[str, Recorded] = {}
+
+        def keep(message: Recorded) -> bool:
+            if message.topic is not topics.STREAM_END:
+                return self._take(message)
+            if reached._follows(message):
+                ends[self._key(message)] = message
+                return True
             return False
-        self._count(key, message)
-        return True
+
+        recover(file, file, keep=keep)
+        for key, end in ends.items():
+            self._count(key, end)
+
+    def _take(self, message: Recorded) -> bool:
+        """Count a message, if it is the next of its topic and a checksum vouches for it."""
+        follows = self._follows(message)
+        if follows:
+            self._count(self._key(message), message)
+        return follows
+
+    def _follows(self, message: Recorded) -> bool:
+        none_yet = 0 if self.from_the_beginning else message.sequence
+        following = self.counts.get(self._key(message), none_yet)
+        return message.checked and message.sequence == following
 
     def take_up(self, file: Path) -> None:
         """Count what the last chunks of a closed part say; one that is damaged is mended first."""
