@@ -143,7 +143,8 @@ def test_messages_that_no_service_sends_are_counted_told_and_change_nothing(
         said = (tmp_path / "logs" / f"{name}.log").read_text()
         assert "messages passed over" in said, name
         assert "refused" in said, name
-    assert "credit of camera/image" in (tmp_path / "logs" / "ingest.log").read_text()
+    # Its last frame may pass before the last of them, in whichever order they come.
+    assert "credit of camera/" in (tmp_path / "logs" / "ingest.log").read_text()
 
 
 def run_attacked(
@@ -164,6 +165,7 @@ def run_attacked(
     def hold_and_attack(status: Status, fleet: Fleet) -> Sequence[str]:
         if not attackers and status.service == "bundle_adjustment" and status.frame >= 10:
             source = fleet.pids["ingest"]
+            os.kill(source, signal.SIGSTOP)  # before it is done
 
             def work() -> None:
                 try:
@@ -172,12 +174,14 @@ def run_attacked(
                     failures.append(error)
 
             def hold() -> None:
-                while attackers[0].is_alive():
-                    os.kill(source, signal.SIGSTOP)
+                while True:
                     attackers[0].join(_HELD_S)
                     watch(fleet)
                     os.kill(source, signal.SIGCONT)
                     attackers[0].join(_LET_GO_S)
+                    if not attackers[0].is_alive():
+                        return
+                    os.kill(source, signal.SIGSTOP)
 
             attackers.append(threading.Thread(target=work))
             attackers[0].start()  # no Zenoh call in a callback

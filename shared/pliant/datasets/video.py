@@ -7,7 +7,6 @@ Frames are published as they leave the decoder, as raw BGR pixels.
 """
 
 import contextlib
-import os
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -93,7 +92,6 @@ def quiet_opencv() -> Generator[None, None, None]:
     """Keep OpenCV and FFmpeg from writing to the terminal: our own line says what is wrong."""
     logging: Any = cv2.utils.logging
     before = logging.getLogLevel()
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read by OpenCV at its first video
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)
     try:
         yield
