@@ -70,14 +70,15 @@ _unexpected: list[str] = []
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     """Keep the skips that nobody has allowed."""
-    if report.skipped and isinstance(report.longrepr, tuple):
-        _, _, reason = report.longrepr
-        if not any(allowed in reason for allowed in ALLOWED_SKIPS):
-            _unexpected.append(f"{report.nodeid}: {reason}")
+    _note_skip(report)
 
 
 def pytest_collectreport(report: pytest.CollectReport) -> None:
     """The same for a file that is skipped as a whole."""
+    _note_skip(report)
+
+
+def _note_skip(report: pytest.TestReport | pytest.CollectReport) -> None:
     if report.skipped and isinstance(report.longrepr, tuple):
         _, _, reason = report.longrepr
         if not any(allowed in reason for allowed in ALLOWED_SKIPS):
