@@ -9,11 +9,21 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 import pliant  # noqa: F401  (fixes the arithmetic before any test loads numpy)
 
 ROOT = Path(__file__).parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
+
+# A busy machine is no fault of the tests, and what fails once fails always.
+settings.register_profile(
+    "any machine",
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("any machine")
 
 PATIENCE_S = 600.0  # the longest test takes a minute and a half
 
@@ -43,6 +53,16 @@ def kill_descendants() -> None:
     for pid in family - {os.getpid()}:
         with suppress(ProcessLookupError, PermissionError):
             os.kill(pid, signal.SIGKILL)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with long tests first: begun last, the longest would go on when all others are done."""
+
+    def takes_long(item: pytest.Item) -> bool:
+        return any(item.get_closest_marker(mark) for mark in ("slow", "system"))
+
+    long = {item.path for item in items if takes_long(item)}
+    items.sort(key=lambda item: item.path not in long)
 
 
 ALLOWED_SKIPS = (

@@ -18,7 +18,6 @@ class Process:
     optional: topics that it reads besides where a service of the fleet publishes them.
     observer: it reads every logged topic of the others, and nobody reads it.
     niceness: how much it gives way where processors are few; others do not wait for what it makes.
-    kernels: modules whose ``warm_up()`` compiles, or loads, what it calls.
     finishing: what it does when the last frame is done, for people; "" where that is nothing.
     may_lag: it may be further behind than others with frames that bundle adjustment passes over.
     """
@@ -30,7 +29,6 @@ class Process:
     optional: tuple[Topic, ...] = ()
     observer: bool = False
     niceness: int = 0
-    kernels: tuple[str, ...] = ()
     finishing: str = ""
     may_lag: bool = False
 
@@ -44,14 +42,12 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "tracking",
         "pliant_services.nodes.tracking",
-        kernels=("pliant.algorithms.tracking.tracker",),
         inputs=(topics.STREAM, topics.IMAGE),
         outputs=(topics.EXTREMA,),
     ),
     Process(
         "bundle_adjustment",
         "pliant_services.nodes.bundle_adjustment",
-        kernels=("pliant.algorithms.mapping.warm_up",),
         finishing="adjusting the whole map",
         inputs=(topics.STREAM, topics.IMAGE, topics.EXTREMA),
         outputs=(topics.MAP_UPDATE, topics.MAP_FINAL, topics.KEYFRAME, topics.KEYFRAME_FINAL),
@@ -60,7 +56,6 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "meshing",
         "pliant_services.nodes.meshing",
-        kernels=("pliant.algorithms.meshing.warm_up",),
         finishing="fusing the final mesh",
         inputs=(
             topics.STREAM,
@@ -75,7 +70,6 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "surfels",
         "pliant_services.nodes.surfels",
-        kernels=("pliant.algorithms.surfels.warm_up",),
         inputs=(topics.STREAM, topics.IMAGE, topics.DEPTH),
         optional=(topics.EXTREMA, topics.MAP_UPDATE, topics.KEYFRAME),
         outputs=(topics.SURFELS,),

@@ -33,6 +33,12 @@ class IngestParameters(Parameters):
         description="Depth maps for surfels: the first one alone, or those of all frames, from "
         "which new surfels are born, too.",
     )
+    longest_side_px: int = Field(
+        default=0,
+        ge=0,
+        description="Images are worked on, and recorded, with no more pixels along their longer "
+        "side; 0: as many as their details need, at most 1280.",
+    )
     mapping_lag_s: float = Field(
         default=0.4,
         ge=0.0,

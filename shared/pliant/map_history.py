@@ -1,13 +1,13 @@
 """Folds map updates into what a run leaves: trajectories, keyframes and points."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
-from pliant.algorithms.geometry import matrix_to_pose, pose_to_matrix
-from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.geometry import matrix_to_pose, move_by_similarity, pose_to_matrix
+from pliant.algorithms.map_delta import MapDelta, MapMoves
 from pliant.trajectory import Trajectory
 
 MIN_INLIERS = 30
@@ -64,6 +64,14 @@ class _PointTable:
     def remove(self, ids: np.ndarray[Any, Any]) -> None:
         self._alive[ids[ids < len(self._alive)]] = False
 
+    def move(self, moves: MapMoves) -> None:
+        """Points move with the keyframes on which they hang."""
+        if not self._columns:
+            return
+        ids = self.alive()
+        xyz = self._columns["positions"]
+        xyz[ids] = moves.points(xyz[ids], self._columns["hosts"][ids])
+
     def alive(self) -> I64:
         """Ids of the points that exist."""
         return np.flatnonzero(self._alive)
@@ -73,7 +81,7 @@ class _PointTable:
         if not self._columns:
             none = np.zeros(0, np.int64)
             xyz, rgb = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-            return none, Points(none, none, xyz, rgb, none, np.zeros(0), np.zeros(0), none)
+            return none, Points(none, none, xyz, rgb, none, np.zeros(0), np.zeros(0), none, none)
         known = (ids >= 0) & (ids < len(self._alive))
         known[known] = self._alive[ids[known]]
         ids = ids[known]
@@ -92,6 +100,7 @@ def _grown(array: np.ndarray[Any, Any], size: int) -> np.ndarray[Any, Any]:
 class Points:
     """The map's points.  Arrays as in MapDelta, one row for each point that exists.
 
+    hosts: the keyframe on which each hangs.
     frames: the frame whose update first had the point, which observed it.
     """
 
@@ -102,6 +111,7 @@ class Points:
     keyframes: Any
     parallax_rad: Any
     sigmas: Any
+    hosts: Any
     frames: Any
 
     def select(self, rows: Any) -> "Points":
@@ -121,6 +131,8 @@ class CurrentMap:
 
     def take(self, delta: MapDelta, frame: int) -> None:
         """Take in the keyframes and points of one update."""
+        if len(delta.moved_keyframes):
+            self._move(delta.map_moves())
         for row in range(len(delta.keyframe_ids)):
             self.keyframes[int(delta.keyframe_ids[row])] = Keyframe(
                 int(delta.keyframe_frames[row]),
@@ -137,9 +149,19 @@ class CurrentMap:
                 "keyframes": delta.point_keyframes,
                 "parallax_rad": delta.point_parallax_rad,
                 "sigmas": delta.point_sigmas,
+                "hosts": delta.hosts(),
             },
         )
         self._points.remove(delta.removed_point_ids)
+
+    def _move(self, moves: MapMoves) -> None:
+        """The whole map moves."""
+        ids = np.array(list(self.keyframes), np.int64)
+        poses = np.array([k.pose_world_camera for k in self.keyframes.values()])
+        moved = move_by_similarity(moves.matrices(ids), pose_to_matrix(poses))
+        for keyframe, pose in zip(ids.tolist(), matrix_to_pose(moved), strict=True):
+            self.keyframes[keyframe] = replace(self.keyframes[keyframe], pose_world_camera=pose)
+        self._points.move(moves)
 
     def points_of(self, ids: I64) -> tuple[I64, Points]:
         """Those of the points (N,) that exist: their places in ``ids``, and the points."""
@@ -164,6 +186,8 @@ class MapHistory(CurrentMap):
     def apply(self, delta: MapDelta, *, frame: int, stamp_ns: int, final: bool = False) -> None:
         """Take in one update.  ``final``: the one after the last frame."""
         self.take(delta, frame)
+        if len(delta.moved_keyframes):
+            self._scale(delta.map_moves())
         for row in range(len(delta.pose_frames)):
             self.frames[int(delta.pose_frames[row])] = FramePose(
                 int(delta.pose_segments[row]),
@@ -178,6 +202,14 @@ class MapHistory(CurrentMap):
         known = self.frames.get(frame)
         if known is not None and known.inliers >= MIN_INLIERS:
             self.causal[frame] = (known.segment, matrix_to_pose(self._world(known)))
+
+    def _scale(self, moves: MapMoves) -> None:
+        """Distances of frames to their keyframes scale as the whole map moves."""
+        hanging = np.array([pose.keyframe for pose in self.frames.values()], np.int64)
+        scales = np.cbrt(np.linalg.det(moves.matrices(hanging)[:, :3, :3]))
+        for (frame, pose), scale in zip(list(self.frames.items()), scales, strict=True):
+            scaled = pose.pose_keyframe_camera * np.repeat([scale, 1.0], [3, 4])
+            self.frames[frame] = replace(pose, pose_keyframe_camera=scaled)
 
     def final(self) -> dict[int, tuple[int, F64]]:
         """Segment and T_world_camera of every supported frame, after all corrections."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pliant.algorithms.map_delta import MapDelta
-from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.trial import mapper_for
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.algorithms.tracks import FrameTracks
@@ -46,7 +46,8 @@ def process(
     rectifier = Rectifier(dataset.calibration)
     camera = rectifier.camera
     tracker = ExtremaTracker(camera.width, camera.height, config.tracking, config.seed)
-    mapper = Mapper(camera, config.bundle_adjustment, config.seed)
+    focal_sigma = dataset.calibration.focal_sigma
+    mapper = mapper_for(camera, config.bundle_adjustment, config.seed, focal_sigma)
     last = 0
     for source in dataset:
         image = rectified(source, rectifier)
@@ -57,7 +58,7 @@ def process(
             tracks = tracker.track(image.grey, timers.tracking)
             colour = image.colour if image.colour.size else None
             delta = mapper.process(
-                image.frame, tracks, image.grey, colour, timers.bundle_adjustment
+                image.frame, image.stamp_ns, tracks, image.grey, colour, timers.bundle_adjustment
             )
         history.apply(delta, frame=image.frame, stamp_ns=image.stamp_ns)
         yield Frame(image, tracks, delta)

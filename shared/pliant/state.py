@@ -31,7 +31,7 @@ _ROOMS = (
 )
 _CLASSES = {
     *("ExtremaTracker", "BriefExtractor"),
-    *("Mapper", "ActiveMap", "PointRows", "Window", "Path", "TrackLinks"),
+    *("Mapper", "ActiveMap", "PointRows", "Window", "Path", "TrackLinks", "TrialMapper"),
     *("MapChanges", "KeyframeChanges"),
     *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
 }

@@ -53,6 +53,24 @@ def surfel_speed(
     _print(measure(source, frames, surfels))
 
 
+@app.command("drone-flights")
+def drone_flights(
+    motions: Annotated[Path, typer.Argument(help="Folder of TUM files: EuRoC's true motions.")],
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Names of flights; may be repeated.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=2, help="First frames of each only.")] = None,
+    overrides: Overrides = None,
+) -> None:
+    """EuRoC's motions through a rendered hall and room.  All eleven take two hours.
+
+    scripts/bench drone-flights euroc_gt_leftcam --only V102
+    """
+    from benchmarks.drone_flights import measure
+
+    _print(measure(motions, only=only or [], frames=frames, overrides=overrides or []))
+
+
 @app.command()
 def codec() -> None:
     """Packing and unpacking an image.

@@ -9,7 +9,6 @@ from benchmarks.poisson import poisson_mesh
 from benchmarks.table import markdown
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
-from pliant.algorithms.meshing.warm_up import warm_up
 from pliant.config import recorded_config
 from pliant.datasets.base import is_builtin
 from pliant.datasets.builtin import builtin_folder
@@ -24,6 +23,7 @@ from pliant.results.folder import RECORDING_NAME
 from pliant.results.mesh import meshes_of
 from pliant.results.run import read_run
 from pliant_services.mesh.command import Meshing, mesh_recording
+from pliant_services.runtime.warm_ups import WARM_UPS
 
 _SMOOTHING = {
     "NLTGV": "nltgv",
@@ -59,7 +59,7 @@ def measure(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterato
 def measure_live(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterator[str]:
     """A table of both ways in which the live mesh can follow the map, and of the final one."""
     compared = _Compared(result, groundtruth)
-    warm_up()
+    WARM_UPS["meshing"]()
     rows: list[list[str]] = []
     for name, kind in _CORRECTIONS.items():
         found = compared.make([*overrides, f"meshing.corrections={kind}"])

@@ -20,8 +20,9 @@ from pliant.datasets import open_source
 from pliant.datasets.depth import DepthRectifier
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import DatasetError
+from pliant.rendering.film import CameraOptions
 from pliant.rendering.paths import SampledPath
-from pliant.rendering.render import CameraOptions, Renderer, SceneGeometry, paint_faces
+from pliant.rendering.render import Renderer, SceneGeometry, paint_faces
 from pliant.rendering.scene import Material, Scene, Solid
 
 KINDS: dict[str, dict[str, Any]] = {

@@ -14,11 +14,11 @@ from benchmarks.table import markdown
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import predict
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
-from pliant.algorithms.surfels.warm_up import warm_up as compile_kernels
 from pliant.datasets.builtin import is_deforming
 from pliant.errors import DatasetError
 from pliant.evaluation.exact_surfels import ExactSurfels
 from pliant.evaluation.surfel_truth import SurfelTruth, mean_rows
+from pliant_services.runtime.warm_ups import WARM_UPS
 
 _STATIC = ("sliding", "objects", "stretching", "stretching?poisson=1", "stretching?held=1")
 _BREATHING = tuple(f"breathing?amplitude={share}" for share in ("0", "0.01", "0.03", "0.08"))
@@ -81,7 +81,7 @@ def measure(
     unknown = [name for name in tables if name not in TABLES]
     if unknown:
         raise DatasetError(f"no table {unknown[0]!r}; there are {', '.join(TABLES)}")
-    compile_kernels()
+    WARM_UPS["surfels"]()
     if tracks is None and not sources:
         yield "(built-in:kinect-paper is left out: say --tracks PATH)"
     loaded: dict[str, Sequence] = {}

@@ -162,6 +162,7 @@ def corrected_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         point_colours=np.zeros((400, 3), np.uint8), point_keyframes=np.full(400, 3, np.int32),
         point_parallax_rad=np.ones(400, np.float32), point_sigmas=np.ones(400, np.float32),
         removed_point_ids=np.zeros(0, np.int64), calibration_correction=CORRECTION,
+        point_hosts=np.zeros(400, np.int64),
     )  # fmt: skip
     tracks, images = list[Extrema](), list[SourceImage]()
     v, u = np.mgrid[:120, :160]
@@ -319,11 +320,11 @@ def test_points_that_were_missed_are_right_after_the_next_snapshot() -> None:
         told = np.array(sorted(window if snapshot else window & set(new.tolist())), np.int64)
         xyz = np.array([alive[i] for i in told.tolist()], np.float32).reshape(-1, 3)
         rgb = np.zeros((len(told), 3), np.uint8)
-        full.tell(told, xyz, rgb, np.sort(removed), snapshot=snapshot)
+        full.tell(told, xyz, rgb, 0 * told, np.sort(removed), snapshot=snapshot)
         if step % 60 in (7, 8, 9):
             holey.miss()
         else:
-            holey.tell(told, xyz, rgb, np.sort(removed), snapshot=snapshot)
+            holey.tell(told, xyz, rgb, 0 * told, np.sort(removed), snapshot=snapshot)
         if snapshot:
             theirs = {tuple(row) for row in holey.everything()[0].tolist()}
             true = {tuple(row) for row in full.everything()[0].tolist()}

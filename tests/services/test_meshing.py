@@ -76,6 +76,7 @@ def map_update(frame: int, *, last: bool = False) -> MapUpdate:
         point_keyframes=np.full(len(ids), 5, np.int32),
         point_parallax_rad=np.full(len(ids), 0.1, np.float32),
         point_sigmas=np.full(len(ids), 0.01, np.float32), removed_point_ids=none,
+        point_hosts=np.zeros(len(ids), np.int64),
     )  # fmt: skip
 
 

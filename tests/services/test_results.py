@@ -48,6 +48,7 @@ def delta(frame: int) -> MapDelta:
         point_keyframes=np.full(1, 3, np.int32),
         point_parallax_rad=np.full(1, 0.1, np.float32),
         point_sigmas=np.full(1, 0.01, np.float32),
+        point_hosts=number,
         removed_point_ids=np.zeros(0, np.int64),
     )
 

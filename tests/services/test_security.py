@@ -16,6 +16,7 @@ pytest.importorskip("cryptography")
 from cryptography.x509 import ExtendedKeyUsage, SubjectAlternativeName, load_pem_x509_certificate
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
+from pliant.bus import session
 from pliant.bus.session import (
     Identity,
     free_endpoint,
@@ -49,6 +50,12 @@ def endpoint(folder: Path) -> Iterator[str]:
     router.close()
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who is refused tries again until the time is over, which says no more after seven seconds."""
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 1.0)
+
+
 def test_made_once_and_keys_are_secret(folder: Path) -> None:
     before = (folder / "tracking.key").read_bytes()
     assert make_certificates(folder, NAMES, []) == []
@@ -77,6 +84,7 @@ def test_an_authority_that_is_elsewhere_is_asked_for(folder: Path, tmp_path: Pat
         make_certificates(copy, NAMES, [], authority=authority)
 
 
+@pytest.mark.usefixtures("impatient")
 def test_no_other_certificate_plays_the_router(folder: Path) -> None:
     found = free_endpoint().replace("tcp/", "tls/")
     with (
@@ -120,11 +128,13 @@ def test_which_endpoints_other_machines_reach() -> None:
     )
 
 
+@pytest.mark.usefixtures("impatient")
 def test_without_a_certificate_nobody_gets_in(endpoint: str) -> None:
     with pytest.raises(BusError, match="cannot reach"):
         open_session([endpoint])
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_certificate_of_another_authority_is_refused(endpoint: str, tmp_path: Path) -> None:
     make_certificates(tmp_path / "theirs", ["tracking"], [])
     with pytest.raises(BusError, match="cannot reach"):

@@ -97,6 +97,12 @@ def test_dropped_and_broken_images_are_told_apart(tmp_path: Path) -> None:
     assert "1 image dropped to keep up (live mode)" in record(tmp_path, ["", "dropped"])
 
 
+def test_the_last_line_says_what_the_run_is_worth(tmp_path: Path) -> None:
+    assert record(tmp_path, ["", ""])[-1] == "bad: there is no map"
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["verdict"], report["doubtful_frames"]) == ("bad", [])
+
+
 def test_one_is_not_many(tmp_path: Path) -> None:
     assert record(tmp_path, [""])[0].startswith("1 frame at 0.0 frames/s, ")
     assert record(tmp_path, ["", ""])[0].startswith("2 frames at ")

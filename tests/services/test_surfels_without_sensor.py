@@ -144,6 +144,7 @@ def with_map(made: Messages, after: int, change: Callable[[F64, F64], F64]) -> M
                 point_keyframes=points.keyframes,
                 point_parallax_rad=points.parallax_rad,
                 point_sigmas=points.sigmas,
+                point_hosts=np.full(len(points.ids), min(known.keyframes)),
             )
         )
     return {**made, topics.MAP_UPDATE: updates}

@@ -56,8 +56,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_sequence(tmp_path / "backwards", IMAGES, stamps=[0.0, 0.2, 0.1])
     write_sequence(tmp_path / "not_images", [b"no", IMAGE])
     (tmp_path / "not_images" / "images" / "0001.png").write_bytes(b"no")
-    shutil.copytree(tmp_path / "nan", tmp_path / "no_calibration")
-    (tmp_path / "no_calibration" / "calib.yaml").unlink()
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -68,7 +66,6 @@ MISTAKES: list[tuple[Sequence[str], int, Sequence[str]]] = [
     (["run", "negative"], 1, ["negative/calib.yaml", "fy is -50", "positive"]),
     (["run", "wrong_size"], 1, ["wrong_size/calib.yaml", "640x480", "64x48"]),
     (["run", "no_focal"], 1, ["no_focal/calib.yaml", "fx", "add"]),
-    (["run", "no_calibration"], 1, ["no_calibration", "--calibration", "--fov"]),
     (["run", "repeats"], 1, ["repeats/rgb.txt", "line 3", "repeats that of line 2"]),
     (["run", "backwards"], 1, ["backwards/rgb.txt", "line 3", "runs backwards"]),
     (["run", "not_images"], 1, ["not_images/images/0000.png", "decode"]),

@@ -187,7 +187,10 @@ def test_every_compose_reads_the_files_of_the_machines(machine: str) -> None:
         content = yaml.safe_load(done.stdout)
         for name, service in content["services"].items():
             assert service["read_only"], name
-            assert name == "mesher" or any(part.startswith("--tls") for part in service["command"])
+            own = set() if name == "mesher" else {"ca.pem", f"{name}.key", f"{name}.pem"}
+            assert {secret["source"] for secret in service.get("secrets", [])} == own
+            assert "certs" not in str(service["volumes"])
+            assert not own or any(part.startswith("--tls") for part in service["command"])
 
 
 @contextmanager

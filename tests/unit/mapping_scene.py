@@ -10,6 +10,9 @@ from pliant.algorithms.tracks import FrameTracks
 
 CAMERA = PinholeCamera(width=640, height=480, fx=520.0, fy=520.0, cx=319.5, cy=239.5)
 
+INTERVAL_NS = 33_333_333
+"""Between two frames: 30 a second."""
+
 
 def looking(position, rotation_vector=(0.0, 0.0, 0.0)):
     T = np.eye(4)

@@ -8,14 +8,9 @@ from pliant.algorithms.geometry import matrix_to_pose, so3_exp
 from pliant.algorithms.surfels.deformation_models import identity_poses
 from pliant.algorithms.surfels.depth_maps import tangent_jacobian
 from pliant.algorithms.surfels.patch_sampling import A, B, Level, X, make_level
+from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.paths import SampledPath
-from pliant.rendering.render import (
-    CameraOptions,
-    RenderedFrame,
-    Renderer,
-    SceneGeometry,
-    paint_faces,
-)
+from pliant.rendering.render import Renderer, SceneGeometry, paint_faces
 from pliant.rendering.scene import Material, Scene, Solid
 
 WIDTH, HEIGHT = 320, 240

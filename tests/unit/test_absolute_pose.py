@@ -14,7 +14,7 @@ def solutions(points, rays):
     return [(R[i], t[i]) for i in range(count)]
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.integers(0, 2**32 - 1))
 def test_p3p_finds_the_true_pose(seed):
     generator = np.random.default_rng(seed)

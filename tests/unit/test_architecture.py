@@ -37,7 +37,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "results": {
         *{"results", "formats", "pictures", "recording", "messages", "algorithms", "errors"},
-        *{"config", "files", "map_history", "trajectory"},
+        *{"config", "files", "map_history", "trajectory", "datasets"},
     },
     "offline": {"datasets", "messages", "algorithms", "config", "map_history"},
     "fusion": {"fusion", "algorithms", "errors", "map_history"},
@@ -117,11 +117,14 @@ def test_no_file_names_a_machine() -> None:
     "module",
     [
         "pliant.config",
+        "pliant.datasets.builtin",
         "pliant_services.cli.commands",
         "pliant_services.cli.router",
+        "pliant_services.nodes.ingest",
         "pliant_services.nodes.recorder",
         "pliant_services.runtime.host",
         "pliant_services.runtime.status",
+        "pliant_services.runtime.warm_ups",
         "pliant_services.run.command",
     ],
 )

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from bundle_scene import make_scene, move, project
 
-from pliant.algorithms.bundle import subspace
 from pliant.algorithms.bundle.problem import BundleParameters
-from pliant.algorithms.bundle.subspace import refine_points, refine_pose
+from pliant.algorithms.bundle.subspace import refine_pose, solve_subspace
 from pliant.algorithms.camera import PinholeCamera
 
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
@@ -74,24 +73,14 @@ def test_pose_without_observations_stays():
 @pytest.mark.parametrize("distortion", [(0.0, 0.0), (-0.2, 0.05)])
 def test_points_are_found_with_known_cameras(distortion):
     scene = make_scene(points=300, distortion=distortion)
-    problem = dataclasses.replace(scene.problem, T_world_camera=scene.T_world_camera)
-    result = refine_points(problem, PARAMETERS, iterations=50)
+    problem = dataclasses.replace(
+        scene.problem,
+        T_world_camera=scene.T_world_camera,
+        fixed_cameras=np.ones(len(scene.T_world_camera), np.bool_),
+    )
+    result = solve_subspace(problem, PARAMETERS.model_copy(update={"max_sweeps": 50}))
     assert np.array_equal(result.T_world_camera, scene.T_world_camera)
     error = np.linalg.norm(result.points_world - scene.points_world, axis=1)
     assert np.median(error) < 1e-3
     assert (error < 0.02).mean() > 0.98
     assert result.final_cost < 1e-3 * result.initial_cost
-
-
-def test_a_list_refined_in_parts_ends_as_it_does_at_once(monkeypatch):
-    problem = make_scene(points=300, visible=0.5, noise_px=0.5, disturbance=0.5).problem
-    parameters = BundleParameters(min_relative_decrease=0.0)
-    together = refine_points(problem, parameters, iterations=5)
-    monkeypatch.setattr(subspace, "_CHUNK", 64)
-    parts = refine_points(problem, parameters, iterations=5)
-    # Each part has an origin of its own, and so rounds in its own way.
-    np.testing.assert_allclose(parts.points_world, together.points_world, atol=5e-3)
-    a, b = parts.squared_residuals, together.squared_residuals
-    np.testing.assert_allclose(a, b, rtol=1e-2, atol=2e-2)
-    assert parts.initial_cost == pytest.approx(together.initial_cost)
-    assert parts.final_cost == pytest.approx(together.final_cost, rel=1e-5)

@@ -14,20 +14,20 @@ from pliant.algorithms.bundle.packed_layout import build_packed_layout
 from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.reduced import find_pattern, solve_reduced
 from pliant.algorithms.bundle.schur import SchurSystem, solve_schur
-from pliant.compiler.kernel import leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 LENSES = [(0.0, 0.0), (-0.2, 0.05)]
 TIGHT = BundleParameters(kernel_sigma_px=4.0, min_relative_decrease=1e-12, max_iterations=60)
 
 
-@leaf_kernel
+@fast_kernel
 def subtract_all3(S, U):
     for a in range(U.shape[0]):
         for c in range(U.shape[0]):
             subtract_product3(S, np.uintp(a * U.shape[0] + c), U, np.uintp(a), np.uintp(c))
 
 
-@leaf_kernel
+@fast_kernel
 def subtract_all6(S, U):
     for a in range(U.shape[0]):
         for c in range(U.shape[0]):
@@ -99,7 +99,7 @@ def test_a_repeated_observation_replaces_the_earlier_one():
     assert (twice.squared_residuals[5:] == once.squared_residuals).all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), count=st.integers(0, 400), cameras=st.integers(2, 7))
 def test_every_observation_has_a_slot_and_a_place(seed, count, cameras):
     scene = make_scene(cameras=cameras, points=30, seed=seed % 1000).problem
@@ -142,7 +142,7 @@ def random_meetings(rng, cameras, share):
     return met | met.T
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), cameras=st.integers(1, 30), share=st.floats(0.0, 0.3))
 @pytest.mark.parametrize("bordered", [False, True])
 def test_reduced_system_is_solved_as_numpy_solves_it(bordered, seed, cameras, share):

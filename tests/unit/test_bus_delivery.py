@@ -24,7 +24,7 @@ def deliver(inbox: Inbox, message: Numbered) -> None:
         inbox.put(Received(topics.IMAGE, 0, message.sequence, False, message.payload))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 2**32), loss=st.floats(0.0, 0.6))
 def test_every_message_is_taken_once_and_in_order(seed: int, loss: float) -> None:
     chance = random.Random(seed)

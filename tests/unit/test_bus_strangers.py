@@ -111,4 +111,3 @@ def test_whoever_writes_as_a_start_of_the_sender_that_was_not_announced_is_not_b
         assert next(bus.receive(topics.IMAGE)).frame == 0
         sender.end_all()
         assert list(bus.receive(topics.IMAGE)) == []
-        bus.see_off()

@@ -291,7 +291,7 @@ def test_field_of_view() -> None:
 finite = st.floats(-1e-2, 1e-2, allow_subnormal=False)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.floats(40.0, 90.0), st.floats(10.0, 50.0), finite, finite, finite, st.booleans())
 def test_yaml_gives_back_the_same_numbers(
     focal: float, centre: float, k1: float, k2: float, p1: float, fisheye: bool
@@ -306,7 +306,7 @@ def test_yaml_gives_back_the_same_numbers(
     assert calibration_from_yaml(calibration_yaml(calibration)) == calibration
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.dictionaries(
         st.sampled_from(

@@ -5,7 +5,7 @@ from typing import get_args, get_origin
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -47,7 +47,6 @@ def messages(draw: st.DrawFn, message: type[Header]) -> Header:
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.__name__)
-@settings(suppress_health_check=[HealthCheck.too_slow])  # a busy machine is no fault of theirs
 @given(data=st.data())
 def test_round_trip_of_every_message(message: type[Header], data: st.DataObject) -> None:
     sent = data.draw(messages(message))

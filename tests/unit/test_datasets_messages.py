@@ -11,6 +11,7 @@ import recorded_messages as bags
 from recorded_messages import COUNT, HEIGHT, START_NS, STEP_NS, WIDTH, Ros
 
 from pliant.datasets import open_source
+from pliant.datasets.calibration import UNSAID_SIGMA
 from pliant.datasets.rectifier import decode
 from pliant.errors import CalibrationError, DatasetError
 
@@ -209,7 +210,8 @@ def test_the_choice_of_a_topic(tmp_path: Path) -> None:
         tmp_path / "two", "/nowhere"
     )
     assert "/chatter carries std_msgs/String, no images" in refused(tmp_path / "two", "/chatter")
-    assert "no calibration comes with it; give --calibration" in refused(tmp_path / "two", "/other")
+    other = open_source(str(tmp_path / "two"), topic="/other").calibration
+    assert other.focal_sigma == UNSAID_SIGMA
     bags.write_ros2_bag(tmp_path / "none", ros, {"/chatter": [ros.text()]})
     assert "no topic with images; it carries std_msgs/String" in refused(tmp_path / "none")
     folder = tmp_path / "folder"

@@ -137,7 +137,7 @@ def test_dropped_frames_keep_their_number_and_time() -> None:
     assert not frame.dropped
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=200), st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"BM", b"P5", b"RIFF"]))
 def test_any_bytes_are_an_image_or_a_broken_frame(data: bytes, magic: bytes) -> None:
     try:

@@ -11,6 +11,7 @@ import yaml
 
 from pliant.datasets import open_source
 from pliant.datasets.base import BrokenFrame
+from pliant.datasets.calibration import UNSAID_SIGMA, calibration_from_yaml, calibration_yaml
 from pliant.datasets.camera_device import CameraDevice, camera_index
 from pliant.datasets.images import SourceOptions
 from pliant.datasets.rectifier import Rectifier
@@ -73,10 +74,12 @@ def test_a_damaged_frame_is_named_and_ends_nothing(tmp_path: Path) -> None:
 
 def test_calibration_of_a_video(tmp_path: Path) -> None:
     file = video(tmp_path)
-    with pytest.raises(CalibrationError, match=r"clip.avi: no clip.yaml; give --calibration"):
-        open_source(str(file))
+    guess = open_source(str(file)).calibration
+    assert guess.focal_sigma == UNSAID_SIGMA
+    assert calibration_from_yaml(calibration_yaml(guess)) == guess
     (tmp_path / "clip.yaml").write_text(yaml.safe_dump(CALIBRATION))
     assert open_source(str(file)).calibration.fx == 60.0
+    assert open_source(str(file)).calibration.focal_sigma == 0.0
     other = tmp_path / "other.yaml"
     other.write_text(yaml.safe_dump({**CALIBRATION, "width": 128}))
     with pytest.raises(CalibrationError, match="128x48"):

@@ -18,8 +18,8 @@ from pliant.rendering.deforming_scenes import (
     deforming_scene,
     frame_numbers,
 )
+from pliant.rendering.film import CameraOptions
 from pliant.rendering.paper_motion import KEY_EVERY_S, plate_weights, points_at
-from pliant.rendering.render import CameraOptions
 from pliant.rendering.sheet_render import SheetRenderer, look, look_at_pixels, paint_sheet
 from pliant.rendering.sheets import DeformingScene, material_positions
 

@@ -26,7 +26,7 @@ def test_weights_are_the_derivative_of_the_kernel() -> None:
     np.testing.assert_allclose(numeric * sigma**2, geman_mcclure_weights(squares, sigma), rtol=1e-6)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.floats(-0.1, 0.1),
     st.floats(0.9, 1.1),

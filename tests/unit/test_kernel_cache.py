@@ -13,7 +13,7 @@ import pytest
 
 import pliant
 from pliant import cache, errors
-from pliant.compiler import kernel, kernel_cache, kernel_linking
+from pliant.compiler import kernel, kernel_cache, kernel_linking, reference_counts
 
 _KERNEL = """
 from pliant.compiler.kernel import kernel
@@ -47,7 +47,7 @@ def _package(root: Path) -> Path:
     package, compiler = (root / "pliant" / name for name in ("algorithms", "compiler"))
     for folder in (package, compiler):
         folder.mkdir(parents=True)
-    for module in (kernel, kernel_cache, kernel_linking):
+    for module in (kernel, kernel_cache, kernel_linking, reference_counts):
         source = Path(module.__file__)
         (compiler / source.name).write_bytes(source.read_bytes())
     for module in (cache, errors):
@@ -145,6 +145,65 @@ def test_fast_kernels_are_without_estimates_that_differ_between_processors() -> 
     (code,) = normalised.inspect_asm().values()  # type: ignore[attr-defined]
     assert "sqrt" in code
     assert "rsqrt" not in code
+
+
+def test_a_kernel_is_strict_whoever_calls_it_first() -> None:
+    @kernel.kernel
+    def strict(a: float, b: float, c: float) -> float:
+        return a * b + c
+
+    @kernel.fast_kernel
+    def fast(a: float, b: float, c: float) -> float:
+        return strict(a, b, c)
+
+    nearly = 2.0**-30
+    assert fast(1.0 + nearly, 1.0 - nearly, -1.0) == 0.0  # in one operation it would be -2^-60
+    assert strict(1.0 + nearly, 1.0 - nearly, -1.0) == 0.0
+
+
+def test_kernels_load_no_blas() -> None:
+    code = (
+        "import sys, pliant.compiler.kernel, numba.np.arraymath; "
+        "sys.exit('scipy.linalg' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_what_makes_no_array_counts_no_references() -> None:
+    @kernel.kernel
+    def deep(values: np.ndarray, place: int) -> float:
+        return values[place] if place < 2 else deep(values, place - 1) + deep(values, place - 2)
+
+    @kernel.kernel
+    def sums(values: np.ndarray, out: np.ndarray) -> None:
+        for row in range(len(values)):
+            out[row] = deep(values[row], 2)
+
+    out = np.zeros(2)
+    sums(np.arange(4.0).reshape(2, 2), out)
+    assert list(out) == [1.0, 5.0]
+    (code,) = sums.inspect_llvm().values()  # type: ignore[attr-defined]
+    assert "NRT_" not in code
+
+
+def test_an_array_that_a_kernel_hands_out_or_makes_is_counted() -> None:
+    @kernel.kernel
+    def last(rows: np.ndarray) -> np.ndarray:
+        return rows[-1]
+
+    @kernel.kernel
+    def sum_of_doubled(rows: np.ndarray) -> float:
+        doubled = 2.0 * last(rows)
+        return doubled.sum()
+
+    rows = np.arange(1000.0).reshape(2, 500)
+    handed_out = last(rows)
+    before = sys.getrefcount(rows)
+    assert sum_of_doubled(rows) == 2.0 * rows[1].sum()
+    assert sys.getrefcount(rows) == before
+    del rows
+    np.full((2, 500), -1.0)
+    assert handed_out[-1] == 999.0
 
 
 def _object(file: Path) -> bytes:

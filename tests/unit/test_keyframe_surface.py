@@ -5,8 +5,8 @@ import pytest
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import so3_exp
-from pliant.algorithms.meshing.corrected_view import CorrectedView
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
 from pliant.algorithms.meshing.parameters import SurfaceParameters
 

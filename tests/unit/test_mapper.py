@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from mapping_scene import CAMERA, Scene, looking, sideways
+from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 
 from pliant.algorithms.arrays import check_arrays
-from pliant.algorithms.geometry import align_umeyama, pose_to_matrix
+from pliant.algorithms.geometry import align_umeyama, move_by_similarity, pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -22,6 +22,12 @@ class Published:
 
     def apply(self, delta):
         check_arrays(delta)
+        moves = delta.map_moves()
+        for i, T in self.keyframes.items():
+            self.keyframes[i] = move_by_similarity(moves.matrices(np.array(i)), T)
+        for point, (xyz, seen, host) in self.points.items():
+            moved = moves.points(xyz[None], np.array([host]))[0]
+            self.points[point] = (moved, seen, host)
         for i, pose in zip(delta.keyframe_ids.tolist(), delta.keyframe_poses, strict=True):
             self.keyframes[i] = pose_to_matrix(pose)
         for k, frame in enumerate(delta.pose_frames.tolist()):
@@ -31,7 +37,8 @@ class Published:
         for point in delta.removed_point_ids.tolist():
             del self.points[point]
         for k, point in enumerate(delta.point_ids.tolist()):
-            self.points[point] = (delta.points_world[k], int(delta.point_keyframes[k]))
+            told = (delta.points_world[k], int(delta.point_keyframes[k]), delta.point_hosts[k])
+            self.points[point] = told
         self.states.append(delta.state)
         self.reasons.append(delta.reason)
         return self
@@ -44,7 +51,7 @@ class Published:
 def run(frames, parameters=PARAMETERS, seed=0):
     mapper, published, deltas = Mapper(CAMERA, parameters, seed), Published(), []
     for frame, tracks in enumerate(frames):
-        deltas.append(mapper.process(frame, tracks, None, None))
+        deltas.append(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
         published.apply(deltas[-1])
     deltas.append(mapper.finish())
     published.apply(deltas[-1])
@@ -121,7 +128,7 @@ def test_a_late_reader_catches_up_by_the_snapshots():
     mapper, late = Mapper(CAMERA, parameters, 0), Published()
     poses = sideways(42)
     for frame, tracks in enumerate(Scene.box().frames(poses)):
-        delta = mapper.process(frame, tracks, None, None)
+        delta = mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
         if frame >= 39:
             for name in ("pose_frames", "removed_point_ids"):
                 assert getattr(delta, name).ndim == 1
@@ -222,7 +229,7 @@ def test_frames_that_are_passed_over_get_no_pose_and_the_next_one_goes_on():
     mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
     for frame, tracks in enumerate(Scene.box().frames(poses)):
         if frame % 3 == 0:
-            published.apply(mapper.process(frame, tracks, None, None))
+            published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
             continue
         delta = mapper.skip(frame, "no time")
         assert (delta.reason, delta.inliers, len(delta.pose_frames)) == ("no time", 0, 0)
@@ -238,8 +245,8 @@ def test_a_frame_without_pixels_leaves_the_state_as_it_was():
     mapper = Mapper(CAMERA, PARAMETERS, 0)
     assert mapper.skip(0).state == WAITING
     for k, tracks in enumerate(Scene.box().frames(sideways(20))):
-        state = mapper.process(k, tracks, None, None).state
+        state = mapper.process(k, k * INTERVAL_NS, tracks, None, None).state
     assert state == TRACKING
     assert mapper.skip(20).state == TRACKING
-    assert mapper.process(21, FrameTracks.empty(), None, None).state == LOST
+    assert mapper.process(21, 21 * INTERVAL_NS, FrameTracks.empty(), None, None).state == LOST
     assert mapper.skip(22).state == LOST

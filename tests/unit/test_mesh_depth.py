@@ -11,7 +11,6 @@ from pliant.algorithms.meshing.delaunay import triangulate
 from pliant.algorithms.meshing.keyframe_surface import filter_triangles
 from pliant.algorithms.meshing.parameters import TriangleFilterParameters
 from pliant.algorithms.meshing.rendering import render_depth
-from pliant.algorithms.meshing.warm_up import warm_up
 
 CAMERA = PinholeCamera(width=80, height=60, fx=70.0, fy=75.0, cx=38.5, cy=31.0)
 LOOSE = TriangleFilterParameters(
@@ -161,7 +160,3 @@ def test_slant_is_the_angle_between_normal_and_ray(slant_deg: float) -> None:
     if slant_deg:
         below = LOOSE.model_copy(update={"max_slant_deg": slant_deg - 1.0})
         assert not kept(depths, below, points=points)
-
-
-def test_warm_up_runs() -> None:
-    warm_up()

@@ -218,7 +218,7 @@ def test_impossible_distortion_is_refused() -> None:
         rectified_camera(lens)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     k1=st.floats(-0.35, 0.3),
     k2=st.floats(-0.05, 0.1),

@@ -119,7 +119,7 @@ def test_tiles_list_every_solid_that_can_be_seen(name: str):
             assert depth[row, col] == pytest.approx(best, rel=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     kind=st.sampled_from(range(len(KINDS))),
     face=st.integers(0, 5),

@@ -7,16 +7,11 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import matrix_to_pose, so3_exp
 from pliant.evaluation.visible_depth import DepthView
 from pliant.rendering.atlas import FaceTexture
+from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.lens import lens, pixel_rays
 from pliant.rendering.paths import CameraPath, SampledPath
 from pliant.rendering.photometry import exposure_gain, sensor_image
-from pliant.rendering.render import (
-    CameraOptions,
-    RenderedFrame,
-    Renderer,
-    SceneGeometry,
-    paint_faces,
-)
+from pliant.rendering.render import Renderer, SceneGeometry, paint_faces
 from pliant.rendering.scenes import SCENES
 from pliant.rendering.textures import make_texture, shrink
 

@@ -13,7 +13,7 @@ from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import X
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
-from pliant.rendering.render import RenderedFrame
+from pliant.rendering.film import RenderedFrame
 
 Mode = Literal["static", "moving"]
 KINDS = [("static", 8), ("static", 0), ("moving", 8), ("moving", 0)]

@@ -22,7 +22,7 @@ from pliant.algorithms.surfels.surfel_alignment import (
 )
 from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
-from pliant.rendering.render import RenderedFrame
+from pliant.rendering.film import RenderedFrame
 
 SMALL = SurfelParameters(max_surfels=80, levels=2, camera="moving")
 

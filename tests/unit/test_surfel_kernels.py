@@ -260,7 +260,7 @@ def test_isometry_resolves_the_depth() -> None:
 
 
 @given(st.floats(0.5, 2.0), st.floats(-0.5, 0.5))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_equiareal_steps_keep_the_area(alpha: float, beta: float) -> None:
     """Table I prints (1 + beta) / alpha, whose determinant is not one."""
     pose, out = slanted_surfels()[0], np.zeros(14)

@@ -32,7 +32,7 @@ def slow(points: np.ndarray, start: np.ndarray, moves: np.ndarray, flow: np.ndar
     return found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 200))
 def test_the_kernel_does_what_plain_numpy_does(seed: int, count: int) -> None:
     random = np.random.default_rng(seed)

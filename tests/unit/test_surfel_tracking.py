@@ -19,7 +19,7 @@ from pliant.algorithms.surfels.surfel_alignment import (
 )
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
-from pliant.rendering.render import RenderedFrame
+from pliant.rendering.film import RenderedFrame
 
 SMALL = SurfelParameters(max_surfels=60, levels=2)
 

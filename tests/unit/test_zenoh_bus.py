@@ -68,7 +68,6 @@ def test_a_reader_of_images_tells_at_once_when_it_has_taken_all(endpoint: str) -
             assert sender.untaken(topics.IMAGE, "tracking") == 0
         sender.end_all()
         assert list(taken) == []
-        bus.see_off()
 
 
 def test_who_was_waited_for_is_known_and_for_how_long(endpoint: str) -> None:

@@ -96,6 +96,7 @@ def service(
             fov_deg=fov,
             topic=topic,
             depth=config.ingest.depth if reads_depth(names, config) else "none",
+            longest_side_px=config.ingest.longest_side_px,
         )
     elif name == "recorder":
         if output is None:

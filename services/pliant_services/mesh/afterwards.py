@@ -18,7 +18,7 @@ from pliant.recording.summary import Summary, summarise
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import RECORDING_NAME
 from pliant_services.processes import BY_NAME
-from pliant_services.replay.services import run_on
+from pliant_services.replay.services import record
 from pliant_services.runtime.child import Child
 from pliant_services.runtime.host import end_with_launcher
 from pliant_services.runtime.launcher import MOST_DEATHS, ServiceDiedError
@@ -68,7 +68,7 @@ def mesh_into_recording(output: Path) -> None:
     with RecordingWriter(
         folder / _PARTIAL, {**summary.metadata, PART_RECORD: {"number": str(number)}}
     ) as writer:
-        run_on(_MESHING, inputs, config, writer)
+        record(_MESHING, inputs, config, writer)
     put_in_place(folder / _PARTIAL, folder / PART.format(number))
 
 

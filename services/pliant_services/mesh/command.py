@@ -9,7 +9,6 @@ import numpy as np
 
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.meshing.mesh_blocks import BlockMesh
-from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, recorded_config
 from pliant.errors import RecordingError
 from pliant.files import write_whole
@@ -24,11 +23,11 @@ from pliant.recording.summary import summarise
 from pliant.results.folder import keep_apart, written
 from pliant.results.mesh import mesh_report, meshes_of, write_meshes
 from pliant.results.run import folded_map
-from pliant_services.nodes import meshing
 from pliant_services.processes import BY_NAME
-from pliant_services.runtime.monitor import StatusMonitor
+from pliant_services.replay.services import run_on
 
 REPORT_NAME = "mesh.json"
+_MESHING = BY_NAME["meshing"]
 
 
 @dataclass
@@ -70,7 +69,7 @@ def mesh_recording(recording: Path, config: Config) -> Meshing:
     Raises RecordingError where it has no keyframes; VoxelSizeError before the work starts.
     """
     reader = Recording(recording)
-    inputs = BY_NAME["meshing"].inputs
+    inputs = {topic: reader.decoded(topic) for topic in _MESHING.inputs}
     known = summarise(recording).topics
     missing = [topic.key for topic in inputs if topic.key not in known]
     if missing:
@@ -79,11 +78,7 @@ def mesh_recording(recording: Path, config: Config) -> Meshing:
         assert isinstance(stream, CameraStream)
         check_voxel_sizes(stream.camera, config.meshing.tsdf)
     found = Meshing()
-    bus = ReplayBus(
-        {topic: reader.decoded(topic) for topic in inputs}, through_codec=False,
-        on_publish=found.take,
-    )  # fmt: skip
-    meshing.run(bus, config, StatusMonitor(bus, "meshing"))
+    run_on(_MESHING, inputs, config, found.take)
     return found
 
 

@@ -9,12 +9,18 @@ out  map/update       one per frame: pose, points, keyframes, corrections of ear
      map/keyframe     one per frame: a new keyframe with its image, observations of those that leave
                       (as a map starts: the images of all keyframes that it starts from)
      map/keyframe_final   one, after the last frame: observations of those still in the window
+
+The whole map is adjusted in a thread beside the frames, see ``whole_map.py``.
 """
+
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import cv2
 
-from pliant.algorithms.map_delta import WAITING, MapDelta
+from pliant.algorithms.map_delta import KeyframeDelta, MapDelta, MapMoves
 from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
+from pliant.algorithms.mapping.whole_map import Question, WholeMap, find_moves
 from pliant.bus.base import Bus, join, receive, receive_one, resume
 from pliant.config import Config
 from pliant.messages import topics
@@ -38,27 +44,35 @@ _JPEG_QUALITY = 95
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     """Map until the tracks end."""
 
-    def start() -> tuple[Header, Mapper, dict[int, bytes]]:
+    def start() -> tuple[Header, Mapper | TrialMapper, dict[int, bytes]]:
         stream = receive_one(bus, topics.STREAM, CameraStream)
-        return stream, Mapper(stream.camera, config.bundle_adjustment, config.seed), {}
+        parameters, sigma = config.bundle_adjustment, stream.focal_sigma
+        return stream, mapper_for(stream.camera, parameters, config.seed, sigma), {}
 
     # waiting: images of the frames from which a map may yet start, by frame number.
     last, mapper, waiting = resume(bus, start)
     extrema = receive(bus, topics.EXTREMA, Extrema)
+    beside = Beside()
     for image, tracks in join(receive_images(bus, mapped_only=True), extrema):
+        beside.answer(mapper.whole_map, tracks.frame)
         if tracks.missing:
             delta = mapper.skip(tracks.frame)
         elif image.unmapped:
             delta = mapper.skip(tracks.frame, PASSED_OVER)
         else:
             colour = image.colour if image.colour.size else None
-            delta = mapper.process(tracks.frame, tracks, image.grey, colour, monitor.stage)
+            delta = mapper.process(
+                tracks.frame, tracks.stamp_ns, tracks, image.grey, colour, monitor.stage
+            )
         bus.publish(topics.MAP_UPDATE, _update(tracks, delta))
-        bus.publish(topics.KEYFRAME, _keyframe(image, mapper, delta, waiting))
-        if delta.state == WAITING and not (tracks.missing or image.unmapped):
+        keyframes = mapper.publish_keyframes()
+        if tracks.frame in delta.keyframe_frames:
             waiting[tracks.frame] = _jpeg(image)
-            if len(waiting) > config.bundle_adjustment.start.max_frames:
-                del waiting[min(waiting)]
+        bus.publish(topics.KEYFRAME, _keyframe(image, keyframes, delta, waiting))
+        needed = mapper.waiting_frames
+        if tracks.frame in needed:
+            waiting[tracks.frame] = _jpeg(image)
+        waiting = {frame: waiting[frame] for frame in needed}
         monitor.report(
             tracks,
             note=delta.reason,
@@ -67,30 +81,57 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
             points=mapper.point_count,
         )
         last = Header(frame=tracks.frame, stamp_ns=tracks.stamp_ns, frame_id=tracks.frame_id)
+        beside.ask(mapper.whole_map)
         bus.checkpoint(tracks.frame, (last, mapper, waiting))
     with monitor.stage("finish"):
         final = mapper.finish()
     bus.publish(topics.MAP_FINAL, _update(last, final))
-    bus.publish(topics.KEYFRAME_FINAL, Keyframe.of(last, mapper.publish_keyframes()))
+    keyframes = _keyframe(last, mapper.publish_keyframes(), final, waiting)
+    bus.publish(topics.KEYFRAME_FINAL, keyframes)
     monitor.report(last, points=mapper.point_count)
 
 
+class Beside:
+    """Adjusts the whole map in a thread beside the frames; kernels run outside Python's lock.
+
+    It is no state: after a restart the mapper's question is asked again.
+    """
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, "whole map")
+        self._asked: Question | None = None
+        self._found: Future[MapMoves] | None = None
+
+    def ask(self, whole_map: WholeMap) -> None:
+        """Begin with what the mapper has asked."""
+        question = whole_map.question
+        if question is not None and question is not self._asked:
+            self._found = self._thread.submit(find_moves, question)
+        self._asked = question
+
+    def answer(self, whole_map: WholeMap, frame: int) -> None:
+        """Hand over what was found, where the mapper needs it now."""
+        if self._found is None or whole_map.question is not self._asked:
+            return
+        if whole_map.is_due(frame):
+            whole_map.answer, self._found = self._found.result(), None
+
+
 def _keyframe(
-    image: Image, mapper: Mapper, update: MapDelta, waiting: dict[int, bytes]
+    header: Header, delta: KeyframeDelta, update: MapDelta, waiting: dict[int, bytes]
 ) -> Keyframe:
-    """What the frame changed in keyframes.  Images that wait are done with once a map starts."""
-    delta = mapper.publish_keyframes()
+    """What changed in keyframes.  Images that wait are done with once a map starts."""
     if delta.new < 0:
-        return Keyframe.of(image, delta)
+        return Keyframe.of(header, delta)
     moved = zip(update.keyframe_ids.tolist(), update.keyframe_frames.tolist(), strict=True)
-    earlier = [(keyframe, waiting[frame]) for keyframe, frame in moved if frame in waiting]
+    images = {keyframe: waiting[frame] for keyframe, frame in moved if frame in waiting}
     waiting.clear()
     return Keyframe.of(
-        image,
+        header,
         delta,
-        jpeg=_jpeg(image),
-        earlier_ids=tuple(keyframe for keyframe, _ in earlier),
-        earlier_jpegs=tuple(jpeg for _, jpeg in earlier),
+        jpeg=images.pop(delta.new, b""),
+        earlier_ids=tuple(images),
+        earlier_jpegs=tuple(images.values()),
     )
 
 

@@ -21,6 +21,7 @@ from pliant.config import Config
 from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.calibration import calibration_yaml
 from pliant.datasets.rectifier import Rectifier, rectified
+from pliant.datasets.working_size import SmallerImages
 from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import topics
 from pliant.messages.types import CAMERA_FRAME_ID, CameraStream, Depth, Image, SourceImage
@@ -62,13 +63,13 @@ def run(
                 continue
             drops.take(dropped=source.dropped, waited_s=bus.waited_s)
             with monitor.stage("rectify"):
-                source, made_from = link.source(source)
+                source = link.source(source)
                 image = rectified(source, rectifier)
             if live and pace.passes_over(image, images_that_wait(bus), config.ingest.mapping_lag_s):
                 image = replace(image, unmapped=True)
             dropped += source.dropped
             broken += bool(image.missing) and not source.dropped
-            bus.publish(topics.SOURCE, _source_message(source, made_from, image.unmapped))
+            bus.publish(topics.SOURCE, _source_message(source, image.unmapped))
             may_lag = readers_that_may_lag(image)
             bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)
             bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
@@ -160,6 +161,7 @@ def newest(
 
 def _stream(dataset: Dataset, rectifier: Rectifier, *, live: bool) -> CameraStream:
     camera = rectifier.camera
+    size = dataset.source_size if isinstance(dataset, SmallerImages) else (0, 0)
     return CameraStream(
         frame=0,
         stamp_ns=0,
@@ -174,10 +176,13 @@ def _stream(dataset: Dataset, rectifier: Rectifier, *, live: bool) -> CameraStre
         fy=camera.fy,
         cx=camera.cx,
         cy=camera.cy,
+        focal_sigma=dataset.calibration.focal_sigma,
+        source_width=size[0],
+        source_height=size[1],
     )
 
 
-def _source_message(source: SourceFrame, made_from: str, unmapped: bool) -> SourceImage:
+def _source_message(source: SourceFrame, unmapped: bool) -> SourceImage:
     return SourceImage(
         frame=source.index,
         stamp_ns=source.stamp_ns,
@@ -186,7 +191,7 @@ def _source_message(source: SourceFrame, made_from: str, unmapped: bool) -> Sour
         width=source.width,
         height=source.height,
         data=source.data,
-        made_from=made_from,
+        made_from=source.made_from,
         unmapped=unmapped,
     )
 

@@ -120,7 +120,7 @@ class Replay:
                 }
                 first = process == self._services[0]  # it reads nothing of what is copied
                 beside = partial(self._copy, writer) if first else None
-                run_on(process, inputs, self._config, writer, beside)
+                record(process, inputs, self._config, writer, beside)
 
     def messages(self, topic: Topic, recording: Recording | None = None) -> Iterator[Header]:
         """A topic as a service reads it; of a recording that was cut off, what all topics have."""
@@ -177,6 +177,17 @@ def run_on(
     process: Process,
     inputs: Mapping[Topic, Iterable[Header]],
     config: Config,
+    on_publish: Callable[[Topic, Header], None],
+) -> None:
+    """Run a service on messages; ``on_publish`` is given what it makes."""
+    bus = ReplayBus(inputs, through_codec=False, on_publish=on_publish)
+    importlib.import_module(process.module).run(bus, config, StatusMonitor(bus, process.name))
+
+
+def record(
+    process: Process,
+    inputs: Mapping[Topic, Iterable[Header]],
+    config: Config,
     writer: RecordingWriter,
     beside: Callable[[Event], None] | None = None,
 ) -> None:
@@ -189,11 +200,9 @@ def run_on(
         if beside is not None:
             do(partial(beside, failed))
         sink = _Sink(writer, outputs_of(process.name), do)
-        bus = ReplayBus(inputs, through_codec=False, on_publish=sink.publish)
-        module = importlib.import_module(process.module)
         complete = False
         try:
-            module.run(bus, config, StatusMonitor(bus, process.name))
+            run_on(process, inputs, config, sink.publish)
             complete = True
         finally:
             if not complete:

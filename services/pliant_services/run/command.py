@@ -1,5 +1,6 @@
 """One run from the command line: check, compile, launch, wait, write the results."""
 
+import math
 import os
 import re
 import shutil
@@ -13,8 +14,11 @@ from typing import Literal
 from pliant.config import Config, config_yaml, load_config
 from pliant.datasets import open_source
 from pliant.datasets.base import is_builtin
+from pliant.datasets.calibration import Calibration
+from pliant.datasets.calibration_files import UNDERSTOOD
 from pliant.datasets.rectifier import Rectifier
-from pliant.errors import PliantError, ResultError
+from pliant.datasets.working_size import SmallerImages
+from pliant.errors import CalibrationError, PliantError, ResultError
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.recording import parts
 from pliant.recording.recover import mend
@@ -28,7 +32,6 @@ from pliant.results.folder import (
     prepare,
     written,
 )
-from pliant_services.mesh.afterwards import add_mesh
 from pliant_services.nodes.ingest import plays_live
 from pliant_services.processes import PROFILES, deformable_fleet, inputs_of, reads_depth
 from pliant_services.run.progress import Progress
@@ -91,7 +94,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
     if request.view or request.save:
         check_viewer(output, web=request.view == "web", save=request.save, force=request.force)
     if is_builtin(request.source):
-        from pliant.datasets.builtin import builtin_folder  # its renderer has kernels
+        from pliant.datasets.builtin import builtin_folder  # other sources need none
 
         builtin_folder(request.source, progress=_say_rendering)
     dataset = open_source(
@@ -100,8 +103,13 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
         fov_deg=request.fov_deg,
         topic=request.topic,
         depth=config.ingest.depth if reads_depth(PROFILES[profile], config) else "none",
+        longest_side_px=config.ingest.longest_side_px,
     )
     progress = Progress(dataset.frame_count)
+    if isinstance(dataset, SmallerImages):
+        progress.say(dataset.note)
+    if request.calibration is None and request.fov_deg is None:
+        _say_guess(dataset.calibration, profile, progress)
     if profile == _DEFORMABLE:
         profile = deformable_fleet(config)
     else:
@@ -129,6 +137,8 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
         interrupted, failure = _go_through(request, config, output, fleet, progress, viewer)
     if failure is None and mesh_afterwards and parts.exists(output / RECORDING_NAME):
         progress.say("meshing what was recorded ...")
+        from pliant_services.mesh.afterwards import add_mesh  # it loads what else replays
+
         try:
             add_mesh(output)
         except KeyboardInterrupt:
@@ -236,10 +246,10 @@ def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> 
             raise failure from None
         raise
     with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
-        for line in summary(report):
-            print(line)
         files = ", ".join(files_of(output, report))
         print(f"results in {output}/: {files}, {_recording_in(output)}")
+        for line in summary(report):
+            print(line)
     if failure is not None:
         raise failure
     return INTERRUPTED if interrupted else grade(report)
@@ -252,6 +262,22 @@ def _recording_in(output: Path) -> str:
         return path.name
     count = len(parts.parts_of(path))
     return f"{parts.folder_of_parts(path).name}/ ({count} {'part' if count == 1 else 'parts'})"
+
+
+def _say_guess(calibration: Calibration, profile: str, progress: Progress) -> None:
+    """What is taken of a camera of which nothing is known.  Raises CalibrationError."""
+    if calibration.focal_sigma == 0.0:
+        return
+    if profile == _DEFORMABLE:
+        raise CalibrationError(
+            "no calibration comes with the source, and --profile deformable finds none: "
+            f"give --calibration FILE ({UNDERSTOOD}), or --fov DEGREES"
+        )
+    fov = math.degrees(2.0 * math.atan(0.5 * calibration.width / calibration.fx))
+    progress.say(
+        f"no calibration: the camera is taken to see {fov:.0f} degrees across, and its focal "
+        "length is found from the images (--calibration FILE, or --fov DEGREES, says it)"
+    )
 
 
 def _say_rendering(what: str, done: int, total: int) -> None:

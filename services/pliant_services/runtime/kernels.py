@@ -1,7 +1,6 @@
 """Compiles every kernel once, before services start together and would each compile them all."""
 
 import hashlib
-import importlib
 import os
 import subprocess
 import sys
@@ -14,10 +13,7 @@ import pliant
 from pliant import arithmetic
 from pliant.cache import cache_folder
 from pliant.errors import PliantError
-from pliant_services.processes import BY_NAME, PROCESSES
-
-COMPILED = tuple(process.name for process in PROCESSES if process.kernels)
-"""The services that have kernels."""
+from pliant_services.runtime import warm_ups
 
 
 def compile_kernels(say: Callable[[str], None]) -> None:
@@ -27,7 +23,7 @@ def compile_kernels(say: Callable[[str], None]) -> None:
         return
     say("compiling kernels (once, about a minute) ...")
     # In processes of their own: the launcher stays small, a crash of the compiler is one line.
-    compilers = {service: start_compiler(service) for service in COMPILED}
+    compilers = {service: start_compiler(service) for service in warm_ups.WARM_UPS}
     try:
         for number, (service, compiler) in enumerate(compilers.items(), start=1):
             assert compiler.stderr is not None
@@ -48,7 +44,7 @@ def start_compiler(service: str) -> subprocess.Popen[str]:
     """Compile the kernels of a service in a process that ends with this one, whatever kills it."""
     code = (
         "from pliant_services.runtime.host import end_with_launcher; end_with_launcher(); "
-        f"from pliant_services.runtime.kernels import load_kernels; load_kernels({service!r})"
+        f"from pliant_services.runtime.warm_ups import WARM_UPS; WARM_UPS[{service!r}]()"
     )
     return subprocess.Popen(
         [sys.executable, "-c", code],
@@ -69,21 +65,11 @@ def end_compiler(compiler: subprocess.Popen[str]) -> None:
             pipe.close()
 
 
-def load_kernels(service: str) -> None:
-    """Call every kernel of a service on a small input with the types that it meets.
-
-    Compiles what is not in the cache; otherwise loads it, so that the first frame is as quick as
-    all others.  Services without kernels have nothing to load.
-    """
-    for name in BY_NAME[service].kernels:
-        importlib.import_module(name).warm_up()
-
-
 def _fingerprint() -> str:
     digest = hashlib.sha256()
     root = Path(pliant.__file__).parent
-    for path in sorted(root.rglob("*.py")):
-        digest.update(f"{path.relative_to(root)} {path.stat().st_mtime_ns}".encode())
+    for path in (*sorted(root.rglob("*.py")), Path(warm_ups.__file__)):
+        digest.update(f"{path} {path.stat().st_mtime_ns}".encode())
     where = f"{root} {os.environ.get('NUMBA_CACHE_DIR', '')}"
     digest.update(f"{where} {sys.version} {version('numba')} {arithmetic.target()}".encode())
     return digest.hexdigest()[:24]

@@ -36,18 +36,18 @@ class Sender:
         self._quality = bus.jpeg_quality
         self._calibration = calibration_yaml(calibration)
 
-    def source(self, frame: SourceFrame) -> tuple[SourceFrame, str]:
-        """The frame that everybody is to work on, and what it was made from; "" as it came."""
+    def source(self, frame: SourceFrame) -> SourceFrame:
+        """The frame that everybody is to work on."""
         if self._how != "jpeg" or frame.dropped or frame.encoding == "jpeg":
-            return frame, ""
+            return frame
         try:
             pixels = decode(frame)
         except BrokenFrame:
-            return frame, ""  # told when it is rectified
+            return frame  # told when it is rectified
         bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
         data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])[1].tobytes()
-        made_from = f"{frame.encoding}, quality {self._quality}"
-        return replace(frame, encoding="jpeg", data=data, width=0, height=0), made_from
+        made_from = f"{frame.made_from or frame.encoding}, quality {self._quality}"
+        return replace(frame, encoding="jpeg", data=data, width=0, height=0, made_from=made_from)
 
     def image(self, image: Image, frame: SourceFrame) -> Image:
         """The message that crosses."""

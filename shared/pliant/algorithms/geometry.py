@@ -119,6 +119,20 @@ def transform(T: F64, points: F64) -> F64:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
+def similarity_to_matrix(similarity: F64) -> F64:
+    """(..., 8) poses with a scale to (..., 4, 4) matrices of ``X -> scale R X + t``."""
+    S = pose_to_matrix(similarity[..., :7])
+    S[..., :3, :3] *= similarity[..., 7, None, None]
+    return S
+
+
+def move_by_similarity(S: F64, T_world_camera: F64) -> F64:
+    """Poses (..., 4, 4) after the world has moved by similarities (..., 4, 4)."""
+    moved = S @ T_world_camera
+    moved[..., :3, :3] /= np.cbrt(np.linalg.det(S[..., :3, :3]))[..., None, None]
+    return moved
+
+
 def align_umeyama(source: F64, target: F64, *, with_scale: bool) -> tuple[float, F64, F64]:
     """Least squares similarity (Umeyama 1991): ``target ~ scale * R @ source + t``.
 

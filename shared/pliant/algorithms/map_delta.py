@@ -2,13 +2,43 @@
 
 One atomic update a frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
+import numpy as np
+
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray, Shape
+from pliant.algorithms.geometry import similarity_to_matrix
 
 WAITING, TRACKING, LOST = 0, 1, 2
 """State of the map after a frame: not started, localised, or lost (a new segment must start)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapMoves:
+    """How an adjustment of the whole map moves it: what hangs on a keyframe moves with it.
+
+    keyframe_ids: ascending.  A keyframe that is not listed moves with the last one listed before
+    it, so newer ones move rigidly; those older than the first stay.
+    moves: similarities of the world, a pose and a scale each: ``X -> scale R X + t``.
+    """
+
+    keyframe_ids: Annotated[I64, Shape("C")]
+    moves: Annotated[F64, Shape("C", 8)]
+
+    def matrices(self, keyframes: I64) -> F64:
+        """(N, 4, 4) the similarity of each of the keyframes (N,), by id."""
+        table = np.concatenate([np.eye(4)[None], similarity_to_matrix(self.moves)])
+        return table[np.searchsorted(self.keyframe_ids, keyframes, side="right")]
+
+    def points(self, xyz: F64, hosts: I64) -> F64:
+        """Points (N, 3) that hang on keyframes (N,), moved."""
+        S = self.matrices(hosts)
+        return (S[:, :3, :3] @ xyz[:, :, None])[:, :, 0] + S[:, :3, 3]
+
+
+def _no_ids() -> I64:
+    return np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +51,7 @@ class MapDelta:
     moves them for free.
 
     state: WAITING, TRACKING or LOST.
-    reason: why the map cannot start or was lost; "" when TRACKING.
+    reason: why the map cannot start or was lost; when TRACKING why the pose is doubtful, mostly "".
     segment: id of the map segment; segments are never joined.   -1 before the first.
     inliers: points that support this frame's pose (reprojection error < 1.5 px).
     pose_frames: frames whose pose is new or changed; includes this frame when it is localised.
@@ -35,11 +65,15 @@ class MapDelta:
     point_keyframes: keyframes that observe the point.
     point_parallax_rad: largest angle between two of the rays that observe it.
     point_sigmas: standard deviation along the ray, as a share of the depth.
+    point_hosts: keyframe on which each of them hangs.
     removed_point_ids: points that no longer exist (wrong, or merged into another).
+    moved_keyframes, moves: how the whole map moved before all else of this update: ``MapMoves``.
+        Keyframes and points move; of poses that hang on a keyframe, the distance to it scales.
     calibration_correction: (s, k1, k2, readout), what the last adjustment found wrong with the
         calibration: a point of the map at (x, y) on the plane z = 1 is seen in the rectified image
         at ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx``, likewise v, and a rolling shutter takes the
         rows of a frame in this share of the frame interval.   () where nothing was estimated.
+    calibration_sigmas: standard deviation of each of these, at residuals of 1 px.
     snapshot: every keyframe and point of the active window is in it, changed or not.
     """
 
@@ -65,7 +99,20 @@ class MapDelta:
     point_sigmas: Annotated[F32, Shape("P")]
     removed_point_ids: Annotated[I64, Shape("R")]
     calibration_correction: tuple[float, ...] = ()
+    calibration_sigmas: tuple[float, ...] = ()
     snapshot: bool = False
+    point_hosts: Annotated[I64, Shape("P")] = field(default_factory=_no_ids)
+    moved_keyframes: Annotated[I64, Shape("C")] = field(default_factory=_no_ids)
+    moves: Annotated[F64, Shape("C", 8)] = field(default_factory=lambda: np.zeros((0, 8)))
+
+    def hosts(self) -> I64:
+        """(P,) ``point_hosts``; -1 in recordings from before maps moved."""
+        known = len(self.point_hosts) == len(self.point_ids)
+        return self.point_hosts if known else np.full(len(self.point_ids), -1, np.int64)
+
+    def map_moves(self) -> MapMoves:
+        """How the whole map moved; empty where it did not."""
+        return MapMoves(keyframe_ids=self.moved_keyframes, moves=self.moves)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -51,6 +51,9 @@ def _config(mode: str, identity: Identity | None) -> zenoh.Config:
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("scouting/gossip/enabled", "false")
+    config.insert_json5(
+        "scouting/delay", "0"
+    )  # a router waits so long for others, of half a second
     config.insert_json5("transport/link/rx/max_message_size", str(_MAX_BYTES))
     config.insert_json5("transport/link/tx/lease", str(_PATIENCE_MS))
     config.insert_json5(

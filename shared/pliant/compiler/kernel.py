@@ -8,18 +8,25 @@ meaning.  A kernel is kept on disk until one of the modules that it is built fro
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from functools import partial
+from typing import Any, TypeVar, cast, overload
 
 import numba
 import numba.np.arrayobj
-from numba.extending import overload
+from numba import extending
 
 from pliant.compiler.kernel_cache import SourcesCache
 from pliant.compiler.kernel_linking import keep_copies_apart
+from pliant.compiler.reference_counts import BorrowingCompiler
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+_OPTIONS: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "no_cfunc_wrapper": True,
+    "pipeline_class": BorrowingCompiler,
+}
 # Without "arcp": by it 1 / sqrt(x) becomes an estimate, which Intel and AMD make unlike.
 _FAST = {"reassoc", "contract", "nsz", "afn"}
 
@@ -28,7 +35,7 @@ def _shapes_differ(source: Any, target: Any) -> None:
     raise NotImplementedError
 
 
-@overload(_shapes_differ)
+@extending.overload(_shapes_differ)
 def _raise_that_shapes_differ(source: Any, target: Any) -> Any:
     def shapes_differ(source: Any, target: Any) -> None:
         raise ValueError("cannot assign an array of another shape")
@@ -42,38 +49,34 @@ numba.np.arrayobj.raise_with_shape_context = _shapes_differ
 
 def kernel(function: _Function) -> _Function:
     """Compile with strict floating point.  Cached on disk, keyed by CPU."""
-    return _compile(function)
+    return _compile(function, fastmath=False)
 
 
-def fast_kernel(function: _Function) -> _Function:
+@overload
+def fast_kernel(function: _Function) -> _Function: ...
+
+
+@overload
+def fast_kernel(*, inline: bool) -> Callable[[_Function], _Function]: ...
+
+
+def fast_kernel(function: Any = None, *, inline: bool = False) -> Any:
     """Compile with reassociation and fused multiply-add allowed, so that reductions vectorise.
 
-    LLVM puts small ones into the kernels that call them.
+    inline: put the code into every kernel that calls it, however long it is.  A call passes five
+    to seven words for every array: with the two dozen arrays of a level and its scratch that
+    takes as long as a small patch.  Loops that are to be vectorised stay calls: among many arrays
+    LLVM no longer proves that they are apart.
     """
-    return _compile(function, fastmath=_FAST)
+    if function is None:
+        return partial(fast_kernel, inline=inline)
+    return _compile(function, fastmath=_FAST, forceinline=inline)
 
 
-def leaf_kernel(function: _Function) -> _Function:
-    """Compile as ``fast_kernel`` does, without reference counts.  It must not make an array.
-
-    Numba counts a reference, atomically, for every array passed to every function.  In a loop over
-    tracks, whose helpers take a dozen arrays each, that costs several times more than the work.
-    """
-    return _compile(function, fastmath=_FAST, _nrt=False)
-
-
-def inner_kernel(function: _Function) -> _Function:
-    """Compile as ``leaf_kernel`` does, and put the code into every kernel that calls it.
-
-    A call passes five to seven words for every array: with the two dozen arrays of a level and its
-    scratch that takes as long as a small patch.  Loops that are to be vectorised stay calls: among
-    many arrays LLVM no longer proves that they are apart.
-    """
-    return _compile(function, fastmath=_FAST, _nrt=False, forceinline=True)
-
-
-def _compile(function: _Function, **options: Any) -> _Function:
+def _compile(function: _Function, *, fastmath: Any, forceinline: bool = False) -> _Function:
     keep_copies_apart()
+    # What is left out here, numba takes from the kernel that happens to call this one first.
+    options: dict[str, Any] = {"fastmath": fastmath, "forceinline": forceinline, "_nrt": True}
     dispatcher: Any = numba.njit(**_OPTIONS, **options)(function)
     dispatcher._cache = SourcesCache(dispatcher.py_func)
     return cast(_Function, dispatcher)

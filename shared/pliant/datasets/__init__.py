@@ -28,6 +28,7 @@ from pliant.datasets.rectifier import Rectifier, decode
 from pliant.datasets.ros_bag import is_ros_bag, open_ros_bag
 from pliant.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from pliant.datasets.video import VideoFile
+from pliant.datasets.working_size import at_working_size
 from pliant.errors import DatasetError
 
 __all__ = [
@@ -55,6 +56,7 @@ class SourceFormat:
 
     layout: what it looks like, for people.     recognises: whether a source is of this kind.
     open: opens it; raises DatasetError and CalibrationError.
+    sized: its images have their working size already.
     """
 
     layout: str
@@ -62,6 +64,7 @@ class SourceFormat:
     open: Callable[[str, SourceOptions], Dataset]
     has_topics: bool = False
     has_depth: bool = False
+    sized: bool = False
 
 
 def _open_builtin(source: str, options: SourceOptions) -> Dataset:
@@ -94,7 +97,7 @@ FORMATS: dict[str, SourceFormat] = {
     ),
     "camera": SourceFormat("camera:0", _is_camera, _open_camera),
     "recording": SourceFormat(
-        "a recording of Pliant's", is_own_recording, open_own_recording, has_depth=True
+        "a recording of Pliant's", is_own_recording, open_own_recording, has_depth=True, sized=True
     ),
     "mcap": SourceFormat("an MCAP file", is_mcap, open_mcap, has_topics=True),
     "ros-bag": SourceFormat(
@@ -122,6 +125,7 @@ def open_source(
     fov_deg: float | None = None,
     topic: str = "",
     depth: Literal["none", "first", "all"] = "none",
+    longest_side_px: int = 0,
 ) -> Dataset:
     """Open a source of frames of any of the ``FORMATS``, and check it as far as can be seen.
 
@@ -129,6 +133,7 @@ def open_source(
     fov_deg: horizontal field of view, for a guess without any calibration.
     topic: which images of a file that holds several; "" where there is one.
     depth: which depth maps the frames bring along; a source without any is refused then.
+    longest_side_px: to which larger images are made smaller; 0: as large as their details need.
 
     Raises DatasetError or CalibrationError: one line with what is wrong, where, and what to do.
     """
@@ -146,7 +151,10 @@ def open_source(
                         f"{source}: brings no depth along, and surfels need it to start: use "
                         "a folder with rgb.txt and depth.txt"
                     )
-                return kind.open(source, options)
+                opened = kind.open(source, options)
+                if kind.sized and not longest_side_px:
+                    return opened
+                return at_working_size(opened, longest_side_px)
         if not path.exists():
             raise DatasetError(f"{source}: no such file or folder; understood are {understood()}")
     except OSError as error:  # a name too long, a folder that may not be entered, a broken disk

@@ -23,6 +23,7 @@ class SourceFrame:
     the others of ``rectifier.RAW_BYTES``).
     data: bytes as they are in the file, or the raw pixels.
     width, height: of raw pixels; 0 for file formats, which say it themselves.
+    made_from: "" as it came; else what it was before, for people.
     depth: the file of the depth map that belongs to it, as it is; b"" where there is none.
     """
 
@@ -33,6 +34,7 @@ class SourceFrame:
     width: int = 0
     height: int = 0
     depth: bytes = b""
+    made_from: str = ""
 
     @property
     def dropped(self) -> bool:

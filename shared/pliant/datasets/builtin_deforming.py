@@ -27,8 +27,7 @@ from pliant.rendering.deforming_scenes import (
     deforming_scene,
     frame_numbers,
 )
-from pliant.rendering.render import CameraOptions
-from pliant.rendering.sheet_render import SheetRenderer, paint_sheet
+from pliant.rendering.film import CameraOptions
 from pliant.rendering.sheets import DeformingScene
 
 SURFACES_NAME = "surfaces.npz"
@@ -69,6 +68,8 @@ class DeformingPlan:
 
     def render(self, folder: Path, progress: Progress) -> None:
         """Fill an empty folder, but for ``scene.json``."""
+        from pliant.rendering.sheet_render import SheetRenderer, paint_sheet  # it has kernels
+
         scene = self.scene
         numbers = self.numbers
         with render_threads() as executor:

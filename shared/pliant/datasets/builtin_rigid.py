@@ -3,7 +3,7 @@
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -15,11 +15,14 @@ from pliant.datasets.sequence_files import (
     write_sequence,
 )
 from pliant.errors import DatasetError, ResultError
-from pliant.rendering.atlas import FaceTexture, make_face
+from pliant.rendering.film import CameraOptions, FilmOptions
 from pliant.rendering.lens import NO_DISTORTION, Distortion, pixel_rays
-from pliant.rendering.paths import CameraPath, SampledPath
-from pliant.rendering.render import CameraOptions, FilmOptions, Renderer, SceneGeometry
+from pliant.rendering.paths import CameraPath, SampledPath, TurnedPath
 from pliant.rendering.scenes import SCENES, BuiltinScene
+
+if TYPE_CHECKING:  # they have kernels, and a folder that is there needs none
+    from pliant.rendering.atlas import FaceTexture
+    from pliant.rendering.render import SceneGeometry
 
 # Raise it with every change that alters a single pixel: old caches are then passed over.
 RENDERER_VERSION = 2
@@ -30,6 +33,10 @@ _SURFACE_EVERY = 10  # frames
 _SURFACE_STRIDE = 4  # pixels
 _SURFACE_GRID_M = 0.01
 
+_AXES = {"yaw": (0.0, 1.0, 0.0), "pitch": (1.0, 0.0, 0.0), "roll": (0.0, 0.0, 1.0)}
+_TURN_AT = 0.25  # share of the path, so that a map has started
+_TURN_S = 12.0  # a degree in each frame
+
 
 class SequenceOptions(FilmOptions):
     """What may be said after the name of a rigid built-in sequence."""
@@ -38,6 +45,9 @@ class SequenceOptions(FilmOptions):
     colour: bool = Field(default=False, description="Colour images.")
     path: str | None = Field(
         default=None, description="TUM file with the camera path, at its own times."
+    )
+    turn: Literal["yaw", "pitch", "roll"] | None = Field(
+        default=None, description="Halt after a quarter of the path for a full turn on the spot."
     )
 
 
@@ -68,11 +78,14 @@ class RigidPlan:
 
     def render(self, folder: Path, progress: Progress) -> None:
         """Fill an empty folder, but for ``scene.json``."""
+        from pliant.rendering.atlas import make_face
+        from pliant.rendering.render import Renderer, SceneGeometry
+
         geometry = SceneGeometry(self.builtin.scene)
         with render_threads() as executor:
             seen = _seen_faces(self, geometry)
 
-            def paint(number: int) -> FaceTexture:
+            def paint(number: int) -> "FaceTexture":
                 detail = 1.0 if number in seen else _UNSEEN_DETAIL
                 return make_face(geometry.scene, geometry.solids, number, detail=detail)
 
@@ -105,8 +118,11 @@ def rigid_plan(name: str, options: SequenceOptions) -> RigidPlan:
     except ValueError as error:
         raise DatasetError(f"built-in:{name}: {error}; choose smaller coefficients") from None
     if options.path is None:
-        path: CameraPath = builtin.path
-        stamps = [i * 1_000_000_000 // 30 for i in range(builtin.frames)]
+        path, frames = builtin.path, builtin.frames
+        if options.turn is not None:
+            path = TurnedPath(path, _AXES[options.turn], _TURN_AT * path.duration_s, _TURN_S)
+            frames += round(30 * _TURN_S)
+        stamps = [i * 1_000_000_000 // 30 for i in range(frames)]
     else:
         path, stamps = _given_path(Path(options.path))
     if options.frames is not None and options.frames > len(stamps):
@@ -130,7 +146,7 @@ def _given_path(file: Path) -> tuple[CameraPath, list[int]]:
     return SampledPath(times, np.asarray(trajectory.poses, np.float64)), stamps
 
 
-def _seen_faces(plan: RigidPlan, geometry: SceneGeometry) -> frozenset[int]:
+def _seen_faces(plan: RigidPlan, geometry: "SceneGeometry") -> frozenset[int]:
     """Faces that a coarse look along the path sees.  The others need no fine texture."""
     rays = pixel_rays(plan.camera.pinhole(), plan.camera.distortion)
     rays = np.ascontiguousarray(rays[::_LOOK_STRIDE, ::_LOOK_STRIDE])
@@ -141,7 +157,7 @@ def _seen_faces(plan: RigidPlan, geometry: SceneGeometry) -> frozenset[int]:
     return frozenset(seen)
 
 
-def _write_surface(folder: Path, plan: RigidPlan, geometry: SceneGeometry) -> None:
+def _write_surface(folder: Path, plan: RigidPlan, geometry: "SceneGeometry") -> None:
     """Points that some frame sees, one in each cell of a grid, with their exact normals."""
     rays = pixel_rays(plan.camera.pinhole(), NO_DISTORTION)
     rays = np.ascontiguousarray(rays[::_SURFACE_STRIDE, ::_SURFACE_STRIDE])

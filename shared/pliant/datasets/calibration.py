@@ -19,6 +19,7 @@ The YAML is flat, as the ``calib.yaml`` beside an image folder:
     depth_fx: 460.0            #   depth_fy, depth_cx, depth_cy (default: the camera's own)
     depth_invalid: [0]         #   and the values that mean "no depth"
     stereo_baseline: 0.0053    # optional: metres to the right camera of a rectified pair
+    focal_sigma: 0.3           # optional: fx is a guess; standard deviation of its logarithm
 """
 
 import math
@@ -40,6 +41,11 @@ COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
 """Names of the distortion coefficients, in the order of OpenCV."""
 _OPTIONAL = {("pinhole-radtan", "k3")}
 _MODELS: tuple[str, ...] = get_args(LensModel)
+SAID_SIGMA = 0.3
+"""How far a field of view that somebody says may be wrong: standard deviation of log focal."""
+UNSAID_FOV_DEG, UNSAID_SIGMA = 60.0, 0.4
+"""What is taken where nobody says anything: +-2 standard deviations are 29 to 104 degrees."""
+_MAX_SIGMA = 1.0
 _MAX_UNITS = 65535  # of a 16-bit depth map
 _MAX_SIDE_PX = 32767  # what the fixed-point maps can address
 
@@ -63,6 +69,7 @@ class Calibration:
     """A camera: size and intrinsics in pixels, and distortion in the order of ``COEFFICIENTS``.
 
     fps: frames a second of a source without time stamps.
+    focal_sigma: standard deviation of the log focal length where it is a guess; 0: calibrated.
 
     Raises CalibrationError, in one line without the name of the file, on impossible values.
     """
@@ -77,6 +84,7 @@ class Calibration:
     distortion: tuple[float, ...] = ()
     fps: float | None = None
     depth: DepthImages | None = None
+    focal_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         _check_intrinsics(self)
@@ -105,8 +113,12 @@ class Calibration:
         )
 
 
-def calibration_from_fov(width: int, height: int, fov_deg: float) -> Calibration:
+def calibration_from_fov(
+    width: int, height: int, fov_deg: float, focal_sigma: float = SAID_SIGMA
+) -> Calibration:
     """A first guess: a pinhole camera with this horizontal field of view, looking straight ahead.
+
+    focal_sigma: as in ``Calibration``.
 
     Raises CalibrationError for a field of view that a pinhole camera cannot have.
     """
@@ -124,6 +136,7 @@ def calibration_from_fov(width: int, height: int, fov_deg: float) -> Calibration
         fy=focal,
         cx=0.5 * (width - 1),
         cy=0.5 * (height - 1),
+        focal_sigma=focal_sigma,
     )
 
 
@@ -139,6 +152,8 @@ def calibration_yaml(calibration: Calibration) -> str:
     content.update(zip(COEFFICIENTS[calibration.model], calibration.distortion, strict=True))
     if calibration.fps is not None:
         content["fps"] = calibration.fps
+    if calibration.focal_sigma > 0.0:
+        content["focal_sigma"] = calibration.focal_sigma
     if calibration.depth is not None:
         depth = calibration.depth
         if depth.baseline_m > 0.0:
@@ -192,6 +207,7 @@ def calibration_from_keys(
         # Files describe their rate in words, too; those say nothing here.
         fps=float(fps) if isinstance(fps, int | float) and 0.0 < fps < 1e6 else None,
         depth=_depth(content, width, height, intrinsics),
+        focal_sigma=_sigma(content),
         **intrinsics,
     )
 
@@ -206,6 +222,15 @@ def number(content: dict[str, Any], key: str) -> float:
     if not math.isfinite(result):
         raise CalibrationError(f"{key} is {value}: expected a finite number")
     return result
+
+
+def _sigma(content: dict[str, Any]) -> float:
+    if content.get("focal_sigma") is None:
+        return 0.0
+    sigma = number(content, "focal_sigma")
+    if not 0.0 <= sigma <= _MAX_SIGMA:
+        raise CalibrationError(f"focal_sigma is {sigma:g}: expected 0 to {_MAX_SIGMA:g}")
+    return sigma
 
 
 def _whole(content: dict[str, Any], key: str) -> int:

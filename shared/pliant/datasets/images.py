@@ -9,8 +9,13 @@ from pathlib import Path
 from typing import Literal
 
 from pliant.datasets.base import BrokenFrame, SourceFrame, encoding_of
-from pliant.datasets.calibration import Calibration, calibration_from_fov
-from pliant.datasets.calibration_files import UNDERSTOOD, check_size, read_calibration
+from pliant.datasets.calibration import (
+    UNSAID_FOV_DEG,
+    UNSAID_SIGMA,
+    Calibration,
+    calibration_from_fov,
+)
+from pliant.datasets.calibration_files import check_size, read_calibration
 from pliant.datasets.rectifier import decode
 from pliant.datasets.stereo import StereoPair
 from pliant.errors import CalibrationError, DatasetError
@@ -126,7 +131,7 @@ def choose_calibration(
 ) -> Calibration:
     """The user's calibration or field of view, else what was found with the source.
 
-    Raises CalibrationError where there is none, it is broken, or it is for other images.
+    Where there is none, a guess.  Raises CalibrationError where it is broken, or for other images.
     """
     if options.fov_deg is not None:
         return calibration_from_fov(*size, options.fov_deg)
@@ -137,10 +142,7 @@ def choose_calibration(
         return found
     if found is not None and found.is_file():
         return read_calibration(found, size, kitti_camera=kitti_camera)
-    missing = f"no {found.name}" if found is not None else "no calibration comes with it"
-    raise CalibrationError(
-        f"{where}: {missing}; give --calibration FILE ({UNDERSTOOD}), or --fov DEGREES for a guess"
-    )
+    return calibration_from_fov(*size, UNSAID_FOV_DEG, UNSAID_SIGMA)
 
 
 def existing(*candidates: Path) -> Path | None:

@@ -13,8 +13,8 @@ import yaml
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import matrix_to_pose
+from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.lens import NO_DISTORTION
-from pliant.rendering.render import CameraOptions, RenderedFrame
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, steps done, and steps in all."""

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import inverse, pose_to_matrix
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
-from pliant.algorithms.meshing.corrected_view import CorrectedView
 from pliant.errors import ResultError
 from pliant.formats.colmap import ColmapImage, write_colmap
 from pliant.map_history import MapHistory
@@ -92,7 +92,7 @@ def _meet(tracks: Extrema, T_world_camera: F64, positions: F64, view: CorrectedV
     front, pixels = front[inside], pixels[inside]
     places = np.zeros((len(tracks.ids), 3), np.float32)
     places[:, :2] = tracks_px
-    grid = MaximaGrid.build(places, camera.width, camera.height)
+    grid = MaximaGrid.build(places, camera.width, camera.height, _NEAR_PX)
     nearest = grid.nearest(pixels.astype(np.float32), _NEAR_PX)
     met = nearest >= 0
     rows = nearest[met]

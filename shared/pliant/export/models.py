@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import U8
-from pliant.algorithms.meshing.corrected_view import corrected_view
+from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import Calibration, calibration_from_yaml, calibration_yaml

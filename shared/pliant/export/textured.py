@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import pose_to_matrix
-from pliant.algorithms.meshing.corrected_view import corrected_view
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.texturing import (
     TexelColours,
@@ -67,8 +67,7 @@ def textured_mesh(recording: Recording, triangles: int) -> TexturedMesh:
     uvs = make_atlas(points[faces], cut, _TEXELS)
     texels = find_texels(uvs, _TEXELS)
     shown = TexelColours(texels, points, faces)
-    was_corrected = run.corrected_segment == segment
-    view = corrected_view(run.stream.camera, run.calibration_correction if was_corrected else ())
+    view = corrected_view(run.stream.camera, run.correction_of(segment))
     for T_world_camera, image in keyframe_images(recording, run, segment):
         shown.add(view.image(image), view.camera, T_world_camera)
     unseen = np.rint(texels.interpolate(colours[faces])).astype(np.uint8)

@@ -14,9 +14,9 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
-from pliant.algorithms.meshing.corrected_view import CorrectedView
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints, Surface
 from pliant.algorithms.meshing.mesh_blocks import BLOCK_BYTES, MeshBlocks, TriangleMesh, sorted_keys
 from pliant.algorithms.meshing.parameters import MeshingParameters, TsdfParameters
@@ -91,6 +91,7 @@ class _FinalVolume:
 class Mesher:
     """A function of what it is given; it holds no image but those of keyframes in the window.
 
+    focal: logarithm of the camera's focal length over that of the camera which was given.
     counts: what has been done so far, for the report.    note: the last problem, or all of those
     of the final meshes; "" without.
     """
@@ -102,10 +103,10 @@ class Mesher:
         self._parameters = parameters
         self._spool = spool
         self._map = CurrentMap()
-        self._plain = self._corrected = CorrectedView(camera, ())
-        self._corrected_segment = -1
+        self._views: dict[int, CorrectedView] = {}
         self._surfaces = KeyframeSurfaces(camera, parameters.surface)
         self._live: LiveMesh | None = None
+        self._focal = 0.0
         self._segment = -1
         self._pending: list[tuple[int, bool]] = []
         self.note = ""
@@ -121,8 +122,8 @@ class Mesher:
         images: JPEG files of keyframes by their ids, each told once.
         """
         self._map.take(update, frame)
-        self._corrected = CorrectedView(self._camera, update.calibration_correction)
-        self._corrected_segment = update.segment
+        if update.calibration_correction:
+            self._see(update.segment, update.calibration_correction)
         for keyframe, jpeg in images.items():
             self._spool.put_image(keyframe, jpeg)
         bounds = np.concatenate([[0], np.cumsum(keyframes.counts)])
@@ -132,6 +133,16 @@ class Mesher:
                 keyframe, keyframes.point_ids[told], keyframes.points_px[told]
             )
             self._pending.append((keyframe, bool(keyframes.settled[row])))
+
+    def _see(self, segment: int, correction: tuple[float, ...]) -> None:
+        """A segment is made with a corrected calibration."""
+        if not self._views and not self._spool.keyframes():
+            # Nothing was fused yet: where the focal length was a guess, all of the view is wanted.
+            self._focal = correction[0]
+            self._camera = corrected_view(self._camera, correction).camera
+            self._surfaces = KeyframeSurfaces(self._camera, self._parameters.surface)
+        rest = (correction[0] - self._focal, *correction[1:3])
+        self._views[segment] = CorrectedView(self._camera, rest)
 
     def fuse(self, *, newest_only: bool = False, timer: StageTimer = no_stages) -> list[LiveChange]:
         """Fuse what waits; returns what changed.
@@ -251,8 +262,8 @@ class Mesher:
 
     def _view(self, keyframe: int) -> CorrectedView:
         """As the calibration has it with which the segment of the keyframe was made."""
-        segment = self._map.keyframes[keyframe].segment
-        return self._corrected if segment == self._corrected_segment else self._plain
+        none = CorrectedView(self._camera, (-self._focal, 0.0, 0.0) if self._focal else ())
+        return self._views.get(self._map.keyframes[keyframe].segment, none)
 
     def _pose(self, keyframe: int) -> F64:
         return pose_to_matrix(self._map.keyframes[keyframe].pose_world_camera)

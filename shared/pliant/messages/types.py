@@ -58,6 +58,8 @@ class CameraStream(Header):
     calibration: the source's, as YAML, from which the rectified image can be made again.
     width, height, fx, fy, cx, cy: the rectified pinhole camera, in pixels.
     scale_is_metric: whether lengths are metres; never so for one camera alone.
+    focal_sigma: standard deviation of the log focal length where it is a guess; 0: calibrated.
+    source_width, source_height: of the images before they were made smaller; 0: as they are.
     """
 
     source: str
@@ -71,6 +73,9 @@ class CameraStream(Header):
     cx: float
     cy: float
     scale_is_metric: bool = False
+    focal_sigma: float = 0.0
+    source_width: int = 0
+    source_height: int = 0
 
     @property
     def camera(self) -> PinholeCamera:
@@ -91,7 +96,7 @@ class Rows:
 class SourceImage(Header):
     """A frame as it came: ``encoding`` says how ``data`` is read.  Empty where it was dropped.
 
-    made_from: "" as it came; else what it was before it became a JPEG for a link, and the quality.
+    made_from: "" as it came; else what it was before it was made smaller, or a JPEG for a link.
     unmapped: as in ``Image``, so that a replay does what the run did.
     """
 

@@ -9,9 +9,8 @@ from pydantic import Field
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import so3_exp
-from pliant.rendering.paper_motion import paper_shape
+from pliant.rendering.film import FilmOptions
 from pliant.rendering.paths import CameraPath, SplinePath
-from pliant.rendering.render import FilmOptions
 from pliant.rendering.scene import Material
 from pliant.rendering.sheets import DeformingScene, Lamp, Sheet
 
@@ -172,6 +171,8 @@ def _paper(_options: DeformingOptions, tracks_m: F64 | None) -> DeformingScene:
     """The real motion of a sheet of paper (Kinect paper), with a texture of ours."""
     if tracks_m is None:
         raise ValueError("the Kinect paper needs its tracks")
+    from pliant.rendering.paper_motion import paper_shape  # it has kernels
+
     width, height, shape = paper_shape(tracks_m)
     sheets = (Sheet("paper", _PRINT, width, height, shape), _wall())
     return DeformingScene("kinect-paper", sheets, _STILL, frames=8 * (len(tracks_m) - 1) + 1)

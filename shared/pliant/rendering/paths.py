@@ -98,6 +98,34 @@ class SampledPath:
         return len(self.times_s) - 1
 
 
+@dataclass(frozen=True)
+class TurnedPath:
+    """A path that is halted for a full turn on the spot, and then goes on.
+
+    axis: (3,) unit vector in the camera, about which it turns.   at_s: time of the halt.
+    The turn starts and ends slowly.
+    """
+
+    path: CameraPath
+    axis: tuple[float, float, float]
+    at_s: float
+    turn_s: float
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the path, seconds."""
+        return self.path.duration_s + self.turn_s
+
+    def T_world_camera(self, time_s: float) -> F64:
+        """(4, 4) pose at a time; times outside are clamped to the ends."""
+        turning_s = min(max(time_s - self.at_s, 0.0), self.turn_s)
+        part = turning_s / self.turn_s
+        angle = 2.0 * np.pi * part * part * (3.0 - 2.0 * part)
+        T = self.path.T_world_camera(time_s - turning_s).copy()
+        T[:3, :3] = T[:3, :3] @ so3_exp(angle * np.array(self.axis))
+        return T
+
+
 def _bspline(points: F64, part: float) -> F64:
     """Uniform cubic B-spline through (N, 3) control points, ends held; part from 0 to 1."""
     padded = np.concatenate([points[:1], points[:1], points, points[-1:], points[-1:]])

@@ -3,98 +3,22 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 
-from pliant.algorithms.arrays import F32, F64, I32, U8
-from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.geometry import so3_exp
-from pliant.algorithms.parameters import Parameters
 from pliant.rendering.atlas import FaceTexture, make_face, pack_atlas
-from pliant.rendering.lens import NO_DISTORTION, Distortion, pixel_rays
-from pliant.rendering.paths import CameraPath, SplinePath
+from pliant.rendering.film import CameraOptions, RenderedFrame
+from pliant.rendering.lens import NO_DISTORTION, pixel_rays
+from pliant.rendering.paths import CameraPath
 from pliant.rendering.photometry import exposure_gain, sensor_image
 from pliant.rendering.raycast import Atlas, accumulate, cast, cast_depth
-from pliant.rendering.scene import Kind, Scene, Solid, SolidArrays, face_sizes, solid_arrays
+from pliant.rendering.scene import Scene, SolidArrays, face_sizes, solid_arrays
 from pliant.rendering.view import Tiles, View, tile_bounds, view_of, visible_tiles
 
 # Offsets of the sub-exposures within a pixel, in sixths: no two share a row or a column.
 SUB_PIXELS = ((-2.5, 0.5), (1.5, 2.5), (-0.5, -1.5), (2.5, -0.5), (-1.5, 1.5), (0.5, -2.5))
 # A little sharper than the footprint says: the sub-pixel offsets take care of the rest.
 FOOTPRINT = 0.7
-
-
-class CameraOptions(Parameters):
-    """The camera that films a sequence."""
-
-    width: int = Field(default=640, ge=32, le=4096, description="Columns of the image.")
-    height: int = Field(default=480, ge=32, le=4096, description="Rows of the image.")
-    focal: float = Field(default=525.0, gt=0.0, description="Focal length at 640 columns, pixels.")
-    fps: float = Field(default=30.0, gt=0.0, description="Frames per second.")
-    noise: float = Field(
-        default=2.0, ge=0.0, description="Deviation of the image noise, grey values."
-    )
-    exposure: float = Field(
-        default=0.2, ge=0.0, lt=1.0, description="Swing of the exposure: 0.2 is 20 %."
-    )
-    blur: float = Field(
-        default=0.3, ge=0.0, le=1.0, description="Open shutter, share of the frame time."
-    )
-    distortion: Distortion = Field(default=NO_DISTORTION, description="k1, k2, p1, p2 of the lens.")
-    colour: bool = Field(default=False, description="Colour images instead of grey ones.")
-    seed: int = Field(default=0, ge=0, description="Seed of the noise.")
-
-    def pinhole(self) -> PinholeCamera:
-        """The camera of the rectified image."""
-        focal = self.focal * self.width / 640.0
-        return PinholeCamera(
-            width=self.width,
-            height=self.height,
-            fx=focal,
-            fy=focal,
-            cx=0.5 * (self.width - 1),
-            cy=0.5 * (self.height - 1),
-        )
-
-
-class FilmOptions(Parameters):
-    """What may be said after the name of every built-in sequence."""
-
-    frames: int | None = Field(
-        default=None, ge=2, description="First frames only; all where not given."
-    )
-    width: int | None = Field(
-        default=None, ge=64, le=2048, description="Columns; 3/4 as many rows."
-    )
-    noise: float = Field(default=2.0, ge=0.0, le=50.0, description="Image noise, grey values.")
-    exposure: float = Field(
-        default=0.2, ge=0.0, lt=1.0, description="Swing of the exposure; 0.2: 20 %."
-    )
-    blur: float = Field(
-        default=0.3, ge=0.0, le=1.0, description="Open shutter, share of the frame time."
-    )
-    seed: int = Field(default=0, ge=0, description="Seed of the noise.")
-
-    def camera(self, width: int = 640) -> CameraOptions:
-        """The camera that films so; width: where none was given."""
-        width = self.width or width
-        return CameraOptions(
-            width=width,
-            height=3 * width // 4,
-            noise=self.noise,
-            exposure=self.exposure,
-            blur=self.blur,
-            seed=self.seed,
-        )
-
-
-@dataclass(frozen=True)
-class RenderedFrame:
-    """One frame and the truth about it."""
-
-    time_s: float
-    T_world_camera: F64  # (4, 4), at the middle of the exposure
-    image: U8  # (H, W) grey or (H, W, 3) red, green, blue
-    depth_m: F64  # (H, W) z of the surface at the pixel centre of the rectified image, 0: none
 
 
 @dataclass(frozen=True)
@@ -214,22 +138,6 @@ class Renderer:
 def paint_faces(geometry: SceneGeometry) -> list[FaceTexture]:
     """The textures of all faces, one after the other."""
     return [make_face(geometry.scene, geometry.solids, i) for i in range(geometry.n_faces)]
-
-
-def warm_up() -> None:
-    """Compile every kernel of the renderer, or load it from numba's cache."""
-    kinds: tuple[Kind, ...] = ("sphere", "cylinder")
-    solids = [Solid(name="room", kind="room", centre=(0, 0, 0), size=(2, 2, 2), texels_per_metre=9)]
-    solids += [
-        Solid(name=kind, kind=kind, centre=(0, 0.4, 0.8), size=(0.2, 0.2, 0.2), texels_per_metre=9)
-        for kind in kinds
-    ]
-    scene = Scene(name="warm up", solids=tuple(solids), lights=((0.0, 0.0, 0.5),))
-    geometry = SceneGeometry(scene)
-    path = SplinePath(positions=[(0, 0, 0)] * 2, targets=[(0, 1, 0)] * 2, duration_s=1.0)
-    camera = CameraOptions(width=32, height=32)
-    Renderer(geometry, paint_faces(geometry), path, camera).frame(0, 0.0)
-    geometry.surface(np.eye(4), pixel_rays(camera.pinhole(), NO_DISTORTION))
 
 
 def _tints(scene: Scene, *, colour: bool) -> F32:

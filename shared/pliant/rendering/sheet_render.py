@@ -8,11 +8,12 @@ from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.rendering.atlas import FaceTexture, mip_pyramid, pack_atlas
+from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.lens import NO_DISTORTION, pixel_rays
 from pliant.rendering.photometry import exposure_gain, sensor_image
-from pliant.rendering.render import FOOTPRINT, SUB_PIXELS, CameraOptions, RenderedFrame
+from pliant.rendering.render import FOOTPRINT, SUB_PIXELS
 from pliant.rendering.sheet_kernels import NEAR_M, empty_buffers, pick, rasterise, shade
-from pliant.rendering.sheets import DeformingScene, Sheet, vertex_normals
+from pliant.rendering.sheets import DeformingScene, vertex_normals
 from pliant.rendering.textures import make_texture
 
 _LAMP_REACH_M = 2.2  # as in the rigid scenes
@@ -157,17 +158,3 @@ def _diffuse(
     cosine = side * (normals * way).sum(axis=2) / np.sqrt(square)
     direct = np.maximum(cosine, 0.0) / (1.0 + square / _LAMP_REACH_M**2)
     return ambient + 1.6 * (1.0 - ambient) * strength * direct
-
-
-def warm_up() -> None:
-    """Compile the kernels, or load them from numba's cache."""
-    from pliant.rendering.paths import SplinePath
-    from pliant.rendering.scene import Material
-
-    v, u = np.mgrid[0:3, 0:3] - 1.0
-    flat = np.stack([u, v, np.ones((3, 3))], axis=2)
-    sheet = Sheet("warm up", Material(), 0.1, 0.1, lambda _time: flat, texels_per_metre=100.0)
-    path = SplinePath([(0, 0, 0)] * 2, [(0, 0, 1)] * 2, 1.0, up=np.array([0.0, -1.0, 0.0]))
-    scene = DeformingScene("warm up", (sheet,), path, 1)
-    camera = CameraOptions(width=32, height=32)
-    SheetRenderer(scene, [paint_sheet(scene, 0)], camera).frame(0, 0.0)

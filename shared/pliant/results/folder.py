@@ -26,6 +26,7 @@ STATE_FOLDER = "state"
 """Checkpoints of the services, while a run goes on that may be started again."""
 SESSION_NAME = "session.json"
 """While a run goes on: how to reach it."""
+CALIBRATION_NAME = "calibration.yaml"
 TRAJECTORY_NAME = "trajectory.txt"
 SURFELS_NAME = "surfels.npz"
 _RIGID_FILES = (
@@ -33,6 +34,7 @@ _RIGID_FILES = (
     "trajectory_causal.txt",
     "keyframes.txt",
     "points.ply",
+    CALIBRATION_NAME,
     REPORT_NAME,
 )
 SURFEL_FILES = (TRAJECTORY_NAME, SURFELS_NAME, REPORT_NAME)

@@ -7,6 +7,8 @@ import numpy as np
 
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_density import count_distinct, well_observed
+from pliant.results.calibration import calibration_verdict
+from pliant.results.judgement import doubtful_frames, judge
 from pliant.results.mesh import mesh_report
 from pliant.results.run import Run
 
@@ -29,7 +31,16 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
     silent = {*run.missing, *run.passed_over}
     telling = [reason for frame, reason in reasons.items() if frame not in silent]
     telling = telling or list(reasons.values())
+    doubtful = doubtful_frames(history)
+    word, why = judge(
+        frames=frames - len(run.missing) - len(run.passed_over),
+        in_segments=[len(members) for members in by_segment.values()],
+        doubtful=len(doubtful),
+    )
     return {
+        "verdict": word,
+        "verdict_reason": why,
+        "doubtful_frames": doubtful,
         "source": run.stream.source if run.stream else "",
         "mode": run.stream.mode if run.stream else "",
         "complete": run.complete,
@@ -46,7 +57,8 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "keyframes": len(history.keyframes),
         "points": len(history.points()),
         "points_well_observed": _well_observed(run, final),
-        "calibration_correction": _correction(run.calibration_correction),
+        "calibration_correction": _correction(run),
+        "calibration_verdict": calibration_verdict(run, final),
         "median_tracks_per_frame": _median(run.tracks.values()),
         "median_inliers_per_frame": _median(run.inliers[f] for f in final if f in run.inliers),
         "mesh": mesh_report(run.mesh),
@@ -105,12 +117,15 @@ def _well_observed(run: Run, final: dict[int, Any]) -> int:
     )
 
 
-def _correction(correction: tuple[float, ...]) -> dict[str, float] | None:
-    """What the final adjustment found wrong with the calibration; None if it was not asked."""
+def _correction(run: Run) -> dict[str, float] | None:
+    """What the last adjustment found wrong with the calibration; None if it was not asked."""
+    correction, sigmas = run.calibration_correction, run.calibration_sigmas
     if len(correction) < 3:
         return None
     s, k1, k2, readout = (*correction, 0.0)[:4]  # recordings from before the readout have three
     found = {"focal_factor": float(np.exp(s)), "k1": k1, "k2": k2, "readout": readout}
+    if sigmas:
+        found["focal_sigma"] = sigmas[0]
     return {name: round(value, 6) for name, value in found.items()}
 
 

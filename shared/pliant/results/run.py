@@ -43,8 +43,8 @@ class Run:
     counters: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
     cpu_seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     source_failure: str = ""
-    calibration_correction: tuple[float, ...] = ()
-    corrected_segment: int = -1
+    corrections: dict[int, tuple[float, ...]] = field(default_factory=dict[int, tuple[float, ...]])
+    calibration_sigmas: tuple[float, ...] = ()
     mesh: list[MeshPiece] = field(default_factory=list[MeshPiece])
     ends: dict[str, StreamEnd] = field(default_factory=dict[str, StreamEnd])
     arrivals_ns: list[int] = field(default_factory=list[int])
@@ -52,7 +52,12 @@ class Run:
 
     def correction_of(self, segment: int) -> tuple[float, ...]:
         """What its last adjustment found wrong with the calibration; () where it had none."""
-        return self.calibration_correction if segment == self.corrected_segment else ()
+        return self.corrections.get(segment, ())
+
+    @property
+    def calibration_correction(self) -> tuple[float, ...]:
+        """That of the last segment which has one, and so saw what was known before."""
+        return self.corrections[max(self.corrections)] if self.corrections else ()
 
     @property
     def frames_per_second(self) -> float:
@@ -89,10 +94,10 @@ def read_run(path: Path) -> Run:
         elif isinstance(message, MapUpdate):
             final = recorded.topic.key == topics.MAP_FINAL.key
             run.history.apply(message, frame=message.frame, stamp_ns=message.stamp_ns, final=final)
-            if final:
-                run.calibration_correction = message.calibration_correction
-                run.corrected_segment = message.segment
-            else:
+            if message.calibration_correction:
+                run.corrections[message.segment] = message.calibration_correction
+                run.calibration_sigmas = message.calibration_sigmas
+            if not final:
                 run.inliers[message.frame] = message.inliers
                 if message.reason == PASSED_OVER:
                     run.passed_over.append(message.frame)

@@ -38,12 +38,13 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         for mesh in report["mesh"]
         if mesh["level"] == "fine"
     ]
+    lines += [report["calibration_verdict"]] if report.get("calibration_verdict") else []
     lines += _faults(report)
     if not report["segments"]:
         lines.append(f"no map could start: {report['last_reason'] or 'no frames'}")
     elif len(report["segments"]) > 1:
         lines.append(f"the map was lost and restarted: {len(report['segments'])} segments")
-    return lines
+    return [*lines, f"{report['verdict']}: {report['verdict_reason']}"]
 
 
 def _broken(report: dict[str, Any]) -> dict[str, str]:

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from pliant.datasets.calibration import calibration_yaml
 from pliant.errors import ResultError
 from pliant.files import move_all
 from pliant.formats.ply import write_ply
 from pliant.formats.tum import write_tum
-from pliant.results.folder import RECORDING_NAME, REPORT_NAME
+from pliant.results.calibration import found_calibration
+from pliant.results.folder import CALIBRATION_NAME, RECORDING_NAME, REPORT_NAME
 from pliant.results.mesh import write_meshes
 from pliant.results.report import rigid_report
 from pliant.results.run import Run, read_run
@@ -67,5 +69,9 @@ def _write_files(folder: Path, run: Run, final: dict[int, Any], report: dict[str
             np.asarray(here.positions, np.float32),
             np.asarray(here.colours, np.uint8).reshape(-1, 3),
         )
+    calibration = found_calibration(run)
+    if calibration is not None:
+        text = calibration_yaml(calibration)
+        (folder / CALIBRATION_NAME).write_text(text, encoding="utf-8")
     text = json.dumps(report, indent=1) + "\n"
     (folder / REPORT_NAME).write_text(text, encoding="utf-8")

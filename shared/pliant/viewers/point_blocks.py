@@ -3,12 +3,13 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I64, U8
+from pliant.algorithms.map_delta import MapMoves
 
 BLOCK_POINTS = 4096
 
 
 class PointBlocks:
-    """Positions and colours of points, 17 bytes each; a viewer that missed updates stays right.
+    """Positions and colours of points, 25 bytes each; a viewer that missed updates stays right.
 
     Points that live in the mapper's window are told again in each snapshot.  So after a gap, what
     was told since the snapshot before the gap is in doubt: it may have been removed meanwhile.
@@ -18,6 +19,7 @@ class PointBlocks:
     def __init__(self) -> None:
         self._xyz: F32 = np.zeros((0, 3), np.float32)
         self._rgb: U8 = np.zeros((0, 3), np.uint8)
+        self._hosts: I64 = np.zeros(0, np.int64)
         self._alive = np.zeros(0, np.bool_)
         self._recent = np.zeros(0, np.bool_)  # told since the last snapshot, or in it
         self._doubtful = np.zeros(0, np.bool_)
@@ -26,12 +28,17 @@ class PointBlocks:
     def __len__(self) -> int:
         return int(np.count_nonzero(self._alive))
 
-    def tell(self, ids: I64, xyz: F32, rgb: U8, removed: I64, *, snapshot: bool) -> None:
-        """Take in new, changed and removed points.  snapshot: ``ids`` are all active ones."""
+    def tell(
+        self, ids: I64, xyz: F32, rgb: U8, hosts: I64, removed: I64, *, snapshot: bool
+    ) -> None:
+        """Take in new, changed and removed points.  snapshot: ``ids`` are all active ones.
+
+        hosts: the keyframe on which each hangs.
+        """
         self._reserve(int(max(ids.max(initial=-1), removed.max(initial=-1))) + 1)
         if snapshot:
             self._recent[:] = False
-        self._xyz[ids], self._rgb[ids] = xyz, rgb
+        self._xyz[ids], self._rgb[ids], self._hosts[ids] = xyz, rgb, hosts
         self._alive[ids], self._recent[ids], self._doubtful[ids] = True, True, False
         self._alive[removed] = self._doubtful[removed] = False
         self._touch(ids)
@@ -40,6 +47,13 @@ class PointBlocks:
             self._touch(np.flatnonzero(self._doubtful))
             self._alive[self._doubtful] = False
             self._doubtful[:] = False
+
+    def move(self, moves: MapMoves) -> None:
+        """The whole map moves, points with the keyframes on which they hang."""
+        ids = np.flatnonzero(self._alive)
+        moved = moves.points(self._xyz[ids].astype(np.float64), self._hosts[ids])
+        self._xyz[ids] = moved.astype(np.float32)
+        self._touch(ids)
 
     def miss(self) -> None:
         """Updates were missed here."""
@@ -78,6 +92,7 @@ class PointBlocks:
         more = max(size, 2 * len(self._alive), BLOCK_POINTS) - len(self._alive)
         self._xyz = np.concatenate([self._xyz, np.zeros((more, 3), np.float32)])
         self._rgb = np.concatenate([self._rgb, np.zeros((more, 3), np.uint8)])
+        self._hosts = np.concatenate([self._hosts, np.zeros(more, np.int64)])
         self._alive = np.concatenate([self._alive, np.zeros(more, np.bool_)])
         self._recent = np.concatenate([self._recent, np.zeros(more, np.bool_)])
         self._doubtful = np.concatenate([self._doubtful, np.zeros(more, np.bool_)])

@@ -11,8 +11,9 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import matrix_to_pose, pose_to_matrix
-from pliant.algorithms.meshing.corrected_view import corrected_view
+from pliant.algorithms.corrected_view import corrected_view
+from pliant.algorithms.geometry import matrix_to_pose, move_by_similarity, pose_to_matrix
+from pliant.algorithms.map_delta import MapMoves
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.own_recording import recorded_frame
@@ -141,6 +142,8 @@ class Scene:
                 self._canvas.forget(at, world.segment)
             world = self._world = _World(segment=update.segment)
             self._drawn = at.frame - REDRAW_FRAMES
+        if len(update.moved_keyframes):
+            self._move_map(update.map_moves())
         mine = update.keyframe_segments == world.segment
         for row in np.flatnonzero(mine):
             frame, pose = int(update.keyframe_frames[row]), update.keyframe_poses[row]
@@ -151,6 +154,7 @@ class Scene:
             update.point_ids[here],
             update.points_world[here].astype(np.float32),
             update.point_colours[here],
+            update.hosts()[here],
             update.removed_point_ids,
             snapshot=update.snapshot,
         )
@@ -160,6 +164,17 @@ class Scene:
             self._canvas.camera(at, view.camera, view.lens)
         if final or at.frame - self._drawn >= REDRAW_FRAMES:
             self._draw_map(at)
+
+    def _move_map(self, moves: MapMoves) -> None:
+        """The whole map moves: keyframes, and points with those on which they hang."""
+        world = self._world
+        ids = np.array(list(world.keyframes), np.int64)
+        poses = np.array([pose for _, pose in world.keyframes.values()]).reshape(-1, 7)
+        moved = matrix_to_pose(move_by_similarity(moves.matrices(ids), pose_to_matrix(poses)))
+        for keyframe, pose in zip(ids.tolist(), moved, strict=True):
+            world.keyframes[keyframe] = (world.keyframes[keyframe][0], pose)
+        world.points.move(moves)
+        world.moved = True
 
     def _notice_gap(self, at: Moment, sequence: int) -> None:
         missed, self._expected = sequence - self._expected, sequence + 1

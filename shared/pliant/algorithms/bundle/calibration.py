@@ -50,6 +50,8 @@ from pliant.compiler.kernel import fast_kernel
 LOWER = np.tril_indices(SHARED)
 _NEWTON_STEPS = 8
 _LEAST_SLOPE = 0.1
+_FARTHEST = 4.0
+"""Times as far from the axis as it is seen: no lens within the model moves a point farther."""
 
 
 class SharedBlocks(NamedTuple):
@@ -73,16 +75,27 @@ def no_shared_blocks() -> SharedBlocks:
 class SharedCalibration:
     """The calibration of one problem: where it starts, its prior, what it does to the layout.
 
+    given: (SHARED,) the middle of the prior.     start: (SHARED,) where the solver begins.
     unknown: (SHARED,) which of the unknowns there are; the others keep their values.
     """
 
-    def __init__(self, layout: PackedLayout, lens: F64, uncertainty: CalibrationUncertainty):
-        """lens: (M, 2) k1, k2 as given.  Raises ValueError where cameras differ in it."""
+    def __init__(
+        self,
+        layout: PackedLayout,
+        lens: F64,
+        uncertainty: CalibrationUncertainty,
+        start: F64 | None = None,
+    ):
+        """lens: (M, 2) k1, k2 as given.  start: (SHARED,), None: at the given calibration.
+
+        Raises ValueError where cameras differ in their lenses.
+        """
         if len(lens) == 0 or (lens != lens[0]).any():
             raise ValueError("an unknown calibration must be that of all cameras")
         sigmas = uncertainty.sigmas
         self.layout = layout
         self.given: F64 = np.array([0.0, lens[0, 0], lens[0, 1], 0.0])
+        self.start: F64 = self.given if start is None else start.copy()
         self.unknown = sigmas > 0.0
         self.unknown[3] &= layout.flow.size > 0
         self.precision: F64 = np.zeros(SHARED)
@@ -237,6 +250,7 @@ def ideal_pixels(u: F32, v: F32, camera: PinholeCamera, correction: F64) -> tupl
         r2 = r * r
         slope = np.maximum(1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2), _LEAST_SLOPE)
         r -= (r * (1.0 + r2 * (k1 + k2 * r2)) - wanted) / slope
+        r = np.clip(r, 0.0, _FARTHEST * wanted)
     share = np.exp(-s) * np.divide(r, wanted, out=np.ones_like(r), where=wanted > 0.0)
     return (
         (camera.cx + camera.fx * x * share).astype(np.float32),

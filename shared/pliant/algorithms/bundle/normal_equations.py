@@ -39,7 +39,7 @@ from pliant.algorithms.bundle.projection import (
     point_rows,
     residual,
 )
-from pliant.compiler.kernel import fast_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 RECORD, FACTOR = 8, 9
 """Numbers kept of an observation, and of a point."""
@@ -200,7 +200,7 @@ def camera_block(local: F64, normal: F64) -> None:
         normal[r] += sums[r]
 
 
-@leaf_kernel
+@fast_kernel
 def eliminate_points(
     records: F64,
     shared: F64,
@@ -331,7 +331,7 @@ def factor_point(
     return i00, l10, i11, l20, l21, i22
 
 
-@leaf_kernel
+@fast_kernel
 def substitute(
     records: F64,
     shared: F64,

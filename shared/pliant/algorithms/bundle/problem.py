@@ -166,6 +166,7 @@ class BundleResult:
         One for each observation of a ``BundleProblem`` (O,); (M, N) for a ``BundleWindow``, inf
         where nothing is observed.  Observations left out as not finite: inf.
     correction: (4,) of the calibration, where it was unknown: see ``solve_schur``.
+    covariance: (4, 4) of the correction, where residuals have a standard deviation of 1 px.
     """
 
     T_world_camera: F64
@@ -177,6 +178,7 @@ class BundleResult:
     squared_residuals: F32
     costs: F64 = field(default_factory=lambda: np.zeros(0))
     correction: F64 = field(default_factory=lambda: np.zeros(4))
+    covariance: F64 = field(default_factory=lambda: np.zeros((4, 4)))
 
 
 def shared_intrinsics(camera: PinholeCamera, count: int) -> F64:

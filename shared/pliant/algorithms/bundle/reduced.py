@@ -17,7 +17,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.block_product import subtract_product6
-from pliant.compiler.kernel import kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
 LOWER = np.tril_indices(6)
 DIAGONAL = 7 * np.arange(6)
@@ -122,7 +122,7 @@ def solve_reduced(pattern: Pattern, S: F64, b: F64, damping: F64) -> F64 | None:
     return x if np.isfinite(x).all() else None
 
 
-@leaf_kernel
+@fast_kernel
 def _factor(start: I64, row: I32, block: I32, S: F64) -> bool:
     """Overwrite S with L: its blocks below the diagonal by columns; False where it has none."""
     for j in range(start.size - 1):
@@ -149,7 +149,7 @@ def _factor(start: I64, row: I32, block: I32, S: F64) -> bool:
     return True
 
 
-@leaf_kernel
+@fast_kernel
 def _divide(A: F64, D: F64) -> None:
     """``A D^-T`` of a block by rows, written by columns.  D has its reciprocal diagonal."""
     for r in range(6):
@@ -163,7 +163,7 @@ def _divide(A: F64, D: F64) -> None:
             A[6 * r + c], A[6 * c + r] = A[6 * c + r], A[6 * r + c]
 
 
-@leaf_kernel
+@fast_kernel
 def _substitute(start: I64, row: I32, L: F64, x: F64) -> None:
     """Solve ``L L^T x = b`` in place."""
     N = start.size - 1

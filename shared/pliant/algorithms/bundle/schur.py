@@ -44,6 +44,9 @@ from pliant.compiler.kernel import kernel
 
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e8
 
+_GAUGE_DAMPING = 1e-9
+"""Keeps the scale of a map, which nothing holds, from making its system singular."""
+
 OnIteration: TypeAlias = Callable[[float], None]
 """Called with the cost after each iteration, so that a benchmark can note the time."""
 
@@ -54,6 +57,7 @@ def solve_schur(
     on_iteration: OnIteration | None = None,
     *,
     uncertainty: CalibrationUncertainty | None = None,
+    start: F64 | None = None,
 ) -> BundleResult:
     """Minimise Eq. 6 over all movable cameras and points by damped Gauss-Newton steps.
 
@@ -63,15 +67,16 @@ def solve_schur(
     uncertainty: of the calibration, which is then a further unknown that all cameras share; None:
     it is right.  Of the result, ``correction`` (s, k1, k2, readout) says that the observations
     follow ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx + readout flow``, likewise for v, and the
-    costs include the prior, at k1 and k2 of the problem's intrinsics.  Several views tell the focal
+    costs include the prior, at k1 and k2 of the problem's intrinsics.  start: (4,) the correction
+    to begin from, None: the middle of the prior.  Several views tell the focal
     length from rotation, and from parallax that differs across the image.  Where they cannot (no
-    rotation, one plane, forward motion) the prior holds it.  Raises ValueError where cameras differ
-    in their lenses.
+    rotation, one plane, forward motion) the prior holds it, as ``covariance`` then says.  Raises
+    ValueError where cameras differ in their lenses.
     """
     layout = build_packed_layout(problem)
     calibration = None
     if uncertainty is not None:
-        calibration = SharedCalibration(layout, problem.intrinsics[:, 4:], uncertainty)
+        calibration = SharedCalibration(layout, problem.intrinsics[:, 4:], uncertainty, start)
     system = SchurSystem(layout, parameters, calibration)
     state, costs, converged = _iterate(system, parameters, on_iteration)
     squared = system.squared_residuals(state)
@@ -88,6 +93,7 @@ def solve_schur(
         squared_residuals=squared,
         costs=np.array(costs),
         correction=state.calibration,
+        covariance=system.calibration_covariance(state),
     )
 
 
@@ -159,8 +165,8 @@ class SchurSystem:
 
     def start(self) -> State:
         """The state that the problem starts from."""
-        given = np.zeros(SHARED) if self.calibration is None else self.calibration.given
-        return self.linearise(self.layout.cameras.motion, self.layout.points, given)
+        start = np.zeros(SHARED) if self.calibration is None else self.calibration.start
+        return self.linearise(self.layout.cameras.motion, self.layout.points, start)
 
     def linearise(self, motion: F64, points: F64, q: F64, other: F64 | None = None) -> State:
         """The state of given cameras, points and calibration; ``other``: records that must stay."""
@@ -195,6 +201,22 @@ class SchurSystem:
         )  # fmt: skip
         motion, q = move_cameras(state.motion, steps), state.calibration + change
         return self.linearise(motion, moved, q, state.records)
+
+    def calibration_covariance(self, state: State) -> F64:
+        """(SHARED, SHARED) of the calibration with all else unknown, at residuals of 1 px.
+
+        Its block of the inverse of S: the calibration is eliminated last.  0 where it is held.
+        """
+        covariance = np.zeros((SHARED, SHARED))
+        if self.calibration is None:
+            return covariance
+        S, b, diagonal = self._reduced_system(state, _GAUGE_DAMPING)
+        for k in np.flatnonzero(self.calibration.unknown):
+            b[:] = 0.0
+            b[-1, k] = 1.0
+            solution = solve_reduced(self.pattern, S.copy(), b, _GAUGE_DAMPING * diagonal)
+            covariance[:, k] = np.inf if solution is None else solution[-1, :SHARED]
+        return covariance
 
     def _reduced_system(self, state: State, damping: float) -> tuple[F64, F64, F64]:
         """Of Eq. 9: S without damping, the right side (N, 6) and diag(H) (N, 6)."""

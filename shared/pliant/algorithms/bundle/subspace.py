@@ -6,18 +6,16 @@ solves every point for fixed cameras and then every camera for fixed points: blo
 Gauss-Seidel pass, linearised afresh for each of its halves.
 """
 
-import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I64, BoolArray
+from pliant.algorithms.arrays import F32, F64, BoolArray
 from pliant.algorithms.bundle.layout import (
     BLOCK,
     Layout,
     Table,
     build_layout,
-    columns_of,
     points_of,
     poses_of,
     residuals_of,
@@ -25,7 +23,6 @@ from pliant.algorithms.bundle.layout import (
 from pliant.algorithms.bundle.problem import (
     AnyProblem,
     BundleParameters,
-    BundleProblem,
     BundleResult,
 )
 from pliant.algorithms.bundle.projection import (
@@ -43,9 +40,6 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.compiler.kernel import fast_kernel, kernel
 
 _LOWER = np.tril_indices(6)
-
-_CHUNK = 4096
-"""Points of a list that are brought into the dense layout at a time."""
 
 
 def solve_subspace(
@@ -171,75 +165,6 @@ def _motion(camera: F64, origin: F64) -> F64:
     T_world_camera[:3, :3] = rotation.T
     T_world_camera[:3, 3] = origin - rotation.T @ camera[9:]
     return T_world_camera
-
-
-def refine_points(
-    problem: AnyProblem, parameters: BundleParameters, *, iterations: int = 10
-) -> BundleResult:
-    """Gauss-Newton on every point by itself, all cameras fixed (Eq. 12 alone).
-
-    A list of observations is worked through some points at a time, each part until it converges.
-    """
-    problem = dataclasses.replace(
-        problem, fixed_cameras=np.ones(len(problem.T_world_camera), np.bool_)
-    )
-    if not isinstance(problem, BundleProblem) or len(problem.points_world) <= _CHUNK:
-        return _refine_together(problem, parameters, iterations)
-    points, squared = problem.points_world.copy(), np.empty(len(problem.camera_index), np.float32)
-    costs, steps, converged = np.zeros(2), 0, True
-    column = columns_of(problem)
-    order = np.argsort(column[problem.point_index], kind="stable")
-    ends = np.searchsorted(column[problem.point_index][order], np.arange(len(column) + 1))
-    of_column = np.argsort(column)
-    for lo in range(0, len(column), _CHUNK):
-        hi = min(lo + _CHUNK, len(column))
-        chosen, some = of_column[lo:hi], order[ends[lo] : ends[hi]]
-        found = _refine_together(_part(problem, chosen, some), parameters, iterations)
-        points[chosen], squared[some] = found.points_world, found.squared_residuals
-        costs += found.initial_cost, found.final_cost
-        steps, converged = max(steps, found.iterations), converged and found.converged
-    return BundleResult(
-        T_world_camera=problem.T_world_camera, points_world=points, initial_cost=float(costs[0]),
-        final_cost=float(costs[1]), iterations=steps, converged=converged,
-        squared_residuals=squared, costs=costs,
-    )  # fmt: skip
-
-
-def _part(problem: BundleProblem, points: I64, observations: I64) -> BundleProblem:
-    """Some points with all their observations, and the cameras that see them."""
-    cameras, camera_index = np.unique(problem.camera_index[observations], return_inverse=True)
-    number = np.empty(len(problem.points_world), np.int32)
-    number[points] = np.arange(len(points), dtype=np.int32)
-    return BundleProblem(
-        T_world_camera=problem.T_world_camera[cameras],
-        points_world=problem.points_world[points],
-        camera_index=camera_index.astype(np.int32),
-        point_index=number[problem.point_index[observations]],
-        points_px=problem.points_px[observations],
-        intrinsics=problem.intrinsics[cameras],
-        fixed_cameras=problem.fixed_cameras[cameras],
-        weights=None if problem.weights is None else problem.weights[observations],
-    )
-
-
-def _refine_together(
-    problem: AnyProblem, parameters: BundleParameters, iterations: int
-) -> BundleResult:
-    layout = build_layout(problem)
-    cameras = layout.cameras.single()
-    points, points32 = layout.points.copy(), layout.points.astype(np.float32)
-    limits, damping = limits_of(parameters, np.float32), np.float32(parameters.sweep_damping)
-    costs = [total_cost(layout, layout.cameras.motion, points, parameters)]
-    converged = False
-    for _ in range(iterations):
-        before, after = sweep_points(cameras, points32, points, layout.table, limits, damping)
-        costs.append(after)
-        converged = before - after <= parameters.min_relative_decrease * after
-        if converged:
-            break
-    costs[-1] = total_cost(layout, layout.cameras.motion, points, parameters)
-    motion = layout.cameras.motion
-    return make_result(problem, layout, motion, points, costs, converged, parameters)
 
 
 def make_result(

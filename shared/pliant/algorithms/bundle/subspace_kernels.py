@@ -307,10 +307,11 @@ def iterate_pose(
     step = np.zeros(6)
     fresh = np.empty(28)
     lowest = np.inf
+    m = len(cameras.motion) - 1  # for a literal 0 numba compiles what is called once more
     for iteration in range(iterations + 1):
         for k in range(12):
-            cameras.motion[0, k] = np.float32(trial[k])
-        linearise_camera(0, cameras, points, table, limits, fresh)
+            cameras.motion[m, k] = np.float32(trial[k])
+        linearise_camera(m, cameras, points, table, limits, fresh)
         if fresh[27] <= lowest:
             small = lowest - fresh[27] <= min_relative_decrease * fresh[27]
             lowest = fresh[27]

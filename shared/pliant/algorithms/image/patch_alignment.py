@@ -18,7 +18,7 @@ from pliant.algorithms.image.patch_sums import (
     write_template,
 )
 from pliant.algorithms.image.pixels import Pixels
-from pliant.compiler.kernel import leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 TEMPLATE_MARGIN = 1
 """Pixels around a patch that its gradients need when the template is made."""
@@ -71,7 +71,7 @@ class Alignment(NamedTuple):
     step: np.float32
 
 
-@leaf_kernel
+@fast_kernel
 def patch_tensor(image: Pixels, left: int, top: int, window: F32) -> PatchTensor:
     """The tensor of the patch whose first pixel is (left, top).
 
@@ -94,7 +94,7 @@ def patch_tensor(image: Pixels, left: int, top: int, window: F32) -> PatchTensor
     return PatchTensor(level, mean, mean_x, mean_y, energy, tx, ty, xx, xy, yy)
 
 
-@leaf_kernel
+@fast_kernel
 def patch_strength(tensor: PatchTensor) -> tuple[np.float32, np.float32]:
     """Smaller eigenvalue of a ``patch_tensor`` per pixel, DN^2, and that over the larger one.
 
@@ -111,7 +111,7 @@ def patch_strength(tensor: PatchTensor) -> tuple[np.float32, np.float32]:
     return strength, smaller / larger
 
 
-@leaf_kernel
+@fast_kernel
 def make_template(
     image: Pixels,
     left: int,
@@ -158,7 +158,7 @@ def make_template(
     )
 
 
-@leaf_kernel
+@fast_kernel
 def align_patch(
     image: Pixels,
     u: np.float32,

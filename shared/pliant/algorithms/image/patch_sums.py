@@ -20,7 +20,7 @@ from pliant.algorithms.image.vector_code import (
     splat,
     vector_type,
 )
-from pliant.compiler.kernel import leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 PATCH_SIZE = 8
 """Side of a patch in pixels: one row is one vector."""
@@ -243,7 +243,7 @@ class _PatchRows:
         )
 
 
-@leaf_kernel
+@fast_kernel
 def prefetch_template(templates: F32, offset: int) -> None:
     """Ask for the template at ``offset`` of flat templates; waits for nothing."""
     for start in range(0, TEMPLATE_FLOATS, CACHE_LINE_FLOATS):

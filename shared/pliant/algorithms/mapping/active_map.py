@@ -36,6 +36,7 @@ from pliant.algorithms.mapping.observation_table import (
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, Reacquired, cut_patches
 from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.window import Window
 from pliant.algorithms.tracks import FrameTracks
@@ -84,6 +85,7 @@ class ActiveMap:
         self.window = self._window([], fixed=0, outside=0)
         self._next_keyframe_id = first_keyframe_id
         self._removed: list[I64] = []
+        self._inverse_distance = 1.0
         self._nearby: I32 = np.zeros(0, np.int32)
         self._marks: I64 = np.zeros(0, np.int64)
 
@@ -136,6 +138,10 @@ class ActiveMap:
         rows = self.links.rows
         return np.flatnonzero((rows != UNLINKED) & (self.points.state[rows] == state))
 
+    def nearby(self) -> I32:
+        """Rows of the mapped points of the window and of the keyframes near it."""
+        return self._nearby[self.points.state[self._nearby] == MAPPED]
+
     def missing(self, frame: int) -> I32:
         """Rows of mapped points without a track that are worth looking for in this frame.
 
@@ -169,7 +175,7 @@ class ActiveMap:
         misses[reacquired.rows] = 0
         camera = self.camera
         places = np.column_stack([tracks.points_px, tracks.kappas])
-        nearby = MaximaGrid.build(places, camera.width, camera.height)
+        nearby = MaximaGrid.build(places, camera.width, camera.height, _TRACK_AT_MAXIMUM_PX)
         track = nearby.nearest(tracks.maxima[reacquired.maxima, :2], _TRACK_AT_MAXIMUM_PX)
         alone = track < 0
         new = reacquired.rows[~alone]
@@ -192,9 +198,9 @@ class ActiveMap:
         distance_b = np.linalg.norm(self.points.xyz[b] - centre, axis=1)
         return np.abs(distance_a - distance_b) < _SAME_DEPTH_SHARE * distance_b
 
-    def observed(self, points_px: F32, found: Observations) -> tuple[I32, F32]:
-        """Rows and pixels of the mapped points that the current frame sees."""
-        linked = self.linked(MAPPED)
+    def observed(self, points_px: F32, found: Observations, directions: I64) -> tuple[I32, F32]:
+        """Rows and pixels of the points that place the current frame."""
+        linked = np.concatenate([self.linked(MAPPED), directions])
         rows = np.concatenate([self.links.rows[linked], found.rows])
         return rows, np.concatenate([points_px[linked], found.points_px])
 
@@ -214,6 +220,7 @@ class ActiveMap:
         points.state[old] = MERGED
         points.alias[old] = new
         points.first_keyframe[new] = min(points.first_keyframe[old], points.first_keyframe[new])
+        points.published_keyframes[new] = -1  # others are told on what it hangs
 
     def _note_removed(self, rows: I32) -> None:
         """Points go that have been published; nobody knows of the others."""
@@ -261,10 +268,12 @@ class ActiveMap:
         found: Observations,
         grey: U8 | None,
         colour: U8 | None,
+        turned: bool,
     ) -> Keyframe:
         """Make the frame a keyframe and adjust the window.
 
         points_px: of all living tracks.    found: points that it sees without a track.
+        turned: whether it stands where the last one does.
         """
         new = self._link_new_tracks(points_px)
         image = colour if colour is not None else grey
@@ -275,6 +284,7 @@ class ActiveMap:
             np.concatenate([self.links.rows, found.rows]),
             np.concatenate([points_px, found.points_px]),
         )
+        keyframe.turned = turned
         self._settle(keyframe, grey)
         return keyframe
 
@@ -283,15 +293,10 @@ class ActiveMap:
         self.collect_garbage()
         self.rebuild_window()
         self.triangulate()
-        sizes = self.parameters.window
-        self.window.adjust(
-            self.camera,
-            self.parameters,
-            iterations=sizes.keyframe_iterations,
-            points_per_keyframe=sizes.points_per_keyframe,
-        )
+        self.window.adjust(self.camera, self.parameters)
         self.remove_outliers()
         self.window.update_statistics(self.camera)
+        self._inverse_distance = self.window.place_directions(self.camera, self._inverse_distance)
         if grey is not None:
             mapped = self.points.state[newest.rows] == MAPPED
             rows, points_px = newest.rows[mapped], newest.points_px[mapped]
@@ -351,14 +356,14 @@ class ActiveMap:
         self.window = self._window(chosen, fixed=prior, outside=len(fixed))
         self._nearby = rows_of(older, self.window.rows, len(self.points.state))
 
-    def adjust_all(self, path: Path) -> F64:
-        """Adjust all but the first keyframe; returns ``adjust_keyframes``' correction."""
+    def adjust_all(self, path: Path, known: SelfCalibration) -> SelfCalibration:
+        """Adjust all but the first keyframe and the calibration, from what is known of it."""
         motions = path.motions(self.keyframes)
-        correction, gone = adjust_keyframes(
-            self.keyframes, self.points, self.camera, self.parameters, motions
-        )
+        known, gone = adjust_keyframes(self.keyframes, self.points, known, self.parameters, motions)
         self._remove(gone)
-        return correction
+        self.camera = known.view.camera
+        self.rebuild_window()
+        return known
 
     def mapped_rows(self) -> I32:
         """Rows of all points of the segment, oldest first."""

@@ -8,26 +8,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
-from pliant.algorithms.bundle.calibration import ideal_pixels
 from pliant.algorithms.bundle.problem import BundleProblem, BundleResult, shared_intrinsics
 from pliant.algorithms.bundle.schur import solve_schur
-from pliant.algorithms.bundle.subspace import refine_points
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
-from pliant.algorithms.mapping.observation_table import choose, list_errors, weigh
+from pliant.algorithms.mapping.observation_table import list_errors, weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import readout_flow
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.triangulation import spread_of_rays
-
-_POINT_STEPS = 3
-"""Gauss-Newton steps of the points that Schur LM leaves out: they start near their optimum."""
 
 _CHUNK = 4096
 """Points whose rays are compared at a time: bounds a dense table of keyframes x points."""
 
 
 @dataclass(kw_only=True)
-class _Seen:
+class ListedMap:
     """What the keyframes see of the map, keyframe by keyframe, and the state of both.
 
     rows: (N,) of the points.     xyz: (N, 3).     T_world_camera: (M, 4, 4).
@@ -41,53 +37,75 @@ class _Seen:
     point: I32
     px: F32
     weights: F32
+    fixed: BoolArray
     flow: F32 | None = None
 
 
 def adjust_keyframes(
     keyframes: list[Keyframe],
     points: PointRows,
-    camera: PinholeCamera,
+    known: SelfCalibration,
     parameters: MappingParameters,
     motions: F64,
-) -> tuple[F64, I32]:
-    """Schur LM over all but the first keyframe, the best observed points and the calibration.
+) -> tuple[SelfCalibration, I32]:
+    """Schur LM over all but the first keyframe, their points and the calibration.
 
-    The other points follow alone.  Observations that then miss their point are forgotten.
-    motions: (M, 6) of the keyframes, see ``Path``.
-    Returns the correction (4,), see ``solve_schur``, and the rows of points that too few keyframes
-    see; what is said of the others is brought up to date.
+    Observations that then miss their point are forgotten, and what is said of the points is
+    brought up to date.  The keyframes' pixels become those of the camera that is found.
+    known: of the camera, whose pixels the keyframes have.    motions: (M, 6) of the keyframes, see
+    ``Path``.    Returns what is known now, and the rows of points that too few keyframes see.
     """
-    seen = _list(keyframes, points, camera, parameters.window.lens_radius)
-    count = np.bincount(seen.point, minlength=len(seen.rows))
-    best = _best_observed(seen, count, parameters.window.final_points_per_keyframe)
-    bundle = parameters.bundle.model_copy(
-        update={"max_iterations": parameters.window.final_iterations}
-    )
-    calibrating = bool(parameters.calibration.sigmas.any())
-    if calibrating:
+    camera, before = known.given, known.view
+    seen = list_map(keyframes, points, before.camera, parameters.window.lens_radius)
+    seen.px = before.seen(seen.px)
+    if parameters.calibration.sigmas.any():
         seen.flow = readout_flow(
-            seen.T_world_camera, motions, seen.xyz, seen.camera, seen.point, seen.px, camera
+            seen.T_world_camera, motions, seen.xyz, seen.camera, seen.point, seen.px, before.camera
         )
-    uncertainty = parameters.calibration if calibrating else None
-    found = solve_schur(_problem(seen, best, camera), bundle, uncertainty=uncertainty)
-    _take(seen, best, found)
-    _correct(seen, camera, found.correction)
-    others = (count >= 2) & ~best
-    problem = _problem(seen, others, camera)
-    _take(seen, others, refine_points(problem, bundle, iterations=_POINT_STEPS))
+    iterations = parameters.window.final_iterations
+    found = adjust_listed(seen, camera, parameters, iterations=iterations, start=known.correction)
+    known = known.corrected(found.correction, found.covariance, len(keyframes))
+    view = known.view
+    if seen.flow is not None:
+        seen.px = seen.px - (found.correction[3] * seen.flow).astype(np.float32)
+    seen.px = view.pixels(seen.px)
     points.xyz[seen.rows] = seen.xyz
     for slot, keyframe in enumerate(keyframes):
         keyframe.T_world_camera = seen.T_world_camera[slot]
-    good = _forget_outliers(seen, keyframes, points, camera, parameters.window.outlier_px)
+    good = _forget_outliers(seen, keyframes, points, view.camera, parameters.window.outlier_px)
     count = np.bincount(seen.point[good], minlength=len(seen.rows))
-    _update_statistics(seen, good, count, points, camera)
-    return found.correction, seen.rows[count < 2]
+    _update_statistics(seen, good, count, points, view.camera)
+    for keyframe in keyframes:
+        keyframe.points_px = view.pixels(before.seen(keyframe.points_px))
+    return known, seen.rows[count < 2]
 
 
-def _list(
+def adjust_listed(
+    seen: ListedMap,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    *,
+    iterations: int,
+    start: F64 | None = None,
+) -> BundleResult:
+    """Schur LM over all but the first keyframe, all points that two see, and the calibration.
+
+    ``seen`` is changed, but for its observations.  start: (4,) correction of the calibration to
+    begin from.
+    """
+    chosen = np.bincount(seen.point, minlength=len(seen.rows)) >= 2
+    bundle = parameters.bundle.model_copy(update={"max_iterations": iterations})
+    uncertainty = parameters.calibration if parameters.calibration.sigmas.any() else None
+    problem = _problem(seen, chosen, camera)
+    found = solve_schur(problem, bundle, uncertainty=uncertainty, start=start)
+    seen.xyz[chosen] = found.points_world
+    seen.T_world_camera = found.T_world_camera
+    return found
+
+
+def list_map(
     keyframes: list[Keyframe], points: PointRows, camera: PinholeCamera, lens_radius: float
-) -> _Seen:
+) -> ListedMap:
     mapped = [points.state[keyframe.rows] == MAPPED for keyframe in keyframes]
     listed = [k.rows[each] for k, each in zip(keyframes, mapped, strict=True)]
     px = np.concatenate([k.points_px[each] for k, each in zip(keyframes, mapped, strict=True)])
@@ -98,7 +116,7 @@ def _list(
     rank = np.empty(len(rows), np.int32)
     rank[order] = np.arange(len(rows), dtype=np.int32)
     rows = rows[order]
-    return _Seen(
+    return ListedMap(
         rows=rows,
         xyz=points.xyz[rows],
         T_world_camera=np.array([keyframe.T_world_camera for keyframe in keyframes]),
@@ -106,23 +124,11 @@ def _list(
         point=rank[point],
         px=px,
         weights=weigh(px, camera, lens_radius),
+        fixed=np.array([k.turned for k in keyframes]) | (np.arange(len(keyframes)) == 0),
     )
 
 
-def _best_observed(seen: _Seen, count: I64, wanted: int) -> BoolArray:
-    """(N,) mask that gives every keyframe its ``wanted`` most observed points, of two or more."""
-    order = np.argsort(-count, kind="stable")
-    order = order[count[order] >= 2]
-    chosen, columns = np.zeros(len(count), np.bool_), np.arange(len(count), dtype=np.int32)
-    ends = np.cumsum(np.bincount(seen.camera, minlength=len(seen.T_world_camera)))
-    for slot in range(len(ends) - 1, -1, -1):
-        sees = np.zeros(len(count), np.bool_)
-        sees[seen.point[ends[slot - 1] if slot else 0 : ends[slot]]] = True
-        choose(order, columns, sees, wanted, chosen)
-    return chosen
-
-
-def _problem(seen: _Seen, chosen: BoolArray, camera: PinholeCamera) -> BundleProblem:
+def _problem(seen: ListedMap, chosen: BoolArray, camera: PinholeCamera) -> BundleProblem:
     """Of the chosen points; the first keyframe does not move."""
     kept = chosen[seen.point]
     number = np.cumsum(chosen, dtype=np.int32) - 1
@@ -134,29 +140,14 @@ def _problem(seen: _Seen, chosen: BoolArray, camera: PinholeCamera) -> BundlePro
         point_index=number[seen.point[kept]].astype(np.int32),
         points_px=seen.px[kept],
         intrinsics=shared_intrinsics(camera, M),
-        fixed_cameras=np.arange(M) == 0,
+        fixed_cameras=seen.fixed,
         weights=seen.weights[kept],
         readout_flow=None if seen.flow is None else seen.flow[kept],
     )
 
 
-def _take(seen: _Seen, chosen: BoolArray, result: BundleResult) -> None:
-    seen.xyz[chosen] = result.points_world
-    seen.T_world_camera = result.T_world_camera
-
-
-def _correct(seen: _Seen, camera: PinholeCamera, correction: F64) -> None:
-    """Let the observations be those of ``camera``: what follows goes on with a pinhole camera."""
-    if not correction.any():
-        return
-    if seen.flow is not None:
-        seen.px = seen.px - (correction[3] * seen.flow).astype(np.float32)
-    u, v = (np.ascontiguousarray(each) for each in seen.px.T)
-    seen.px = np.stack(ideal_pixels(u, v, camera, correction), axis=1)
-
-
 def _forget_outliers(
-    seen: _Seen,
+    seen: ListedMap,
     keyframes: list[Keyframe],
     points: PointRows,
     camera: PinholeCamera,
@@ -175,7 +166,7 @@ def _forget_outliers(
 
 
 def _update_statistics(
-    seen: _Seen, good: BoolArray, count: I64, points: PointRows, camera: PinholeCamera
+    seen: ListedMap, good: BoolArray, count: I64, points: PointRows, camera: PinholeCamera
 ) -> None:
     """Keyframes, parallax and uncertainty of the points, as ``MapDelta`` defines them."""
     rows, N = seen.rows, len(seen.rows)

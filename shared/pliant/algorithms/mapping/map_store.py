@@ -25,7 +25,9 @@ class PointRows:
 
     state: FREE, CANDIDATE, MAPPED or MERGED.    ids: of mapped points, never reused; else -1.
     alias: the row that a MERGED one stands for; itself otherwise.
-    xyz: world position of mapped points.    published_xyz: as last published, NaN before.
+    xyz: world position of mapped points, and of candidates the provisional one.
+    spread: (3,) how uncertain that is, see ``directions``; 0 for mapped points, NaN for candidates
+    that have no place yet.    published_xyz: as last published, NaN before.
     published_keyframes: ``keyframes`` when last published.    segment: of the map.
     first_keyframe: keyframe id of the first observation.
     keyframes, parallax_rad, sigmas: as MapDelta defines them.
@@ -42,6 +44,7 @@ class PointRows:
         self.alias: I32 = np.zeros(1024, np.int32)
         self.segment: I32 = np.zeros(1024, np.int32)
         self.xyz: F64 = np.zeros((1024, 3))
+        self.spread: F64 = np.zeros((1024, 3))
         self.published_xyz: F64 = np.zeros((1024, 3))
         self.published_keyframes: I32 = np.zeros(1024, np.int32)
         self.colours: U8 = np.zeros((1024, 3), np.uint8)
@@ -78,6 +81,7 @@ class PointRows:
         self.state[rows] = CANDIDATE
         self.ids[rows] = -1
         self.alias[rows] = rows
+        self.spread[rows] = np.nan
         self.published_xyz[rows] = np.nan
         return rows
 
@@ -100,6 +104,7 @@ class PointRows:
     def promote(self, rows: I32) -> None:
         """Make candidates points of the map: they get their ids, in the order given."""
         self.state[rows] = MAPPED
+        self.spread[rows] = 0.0
         self.ids[rows] = np.arange(self._next_id, self._next_id + len(rows))
         self._next_id += len(rows)
 
@@ -116,6 +121,8 @@ class Keyframe:
 
     rows: (n,) rows of points or candidates, each at most once.    points_px: (n, 2).
     published_pose: T_world_camera when last published.
+    turned: it stands where the last one does: what turns on the spot tells nothing of depths, and
+    its pose rests on all that it saw when it was made.
     focus: (3,) where it looks: on its axis, at the median depth of its points.  Set when it leaves
     the window; NaN where it sees no point of the map.
     """
@@ -126,6 +133,7 @@ class Keyframe:
     T_world_camera: F64
     rows: I32
     points_px: F32
+    turned: bool = False
     published_pose: F64 | None = None
     focus: F64 | None = None
 

@@ -9,21 +9,35 @@ import dataclasses
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.arrays import F64, I32, I64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.directions import (
+    Spread,
+    helping_candidates,
+    placed_candidates,
+    spread_of,
+)
 from pliant.algorithms.mapping.localisation import locate, refine
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, Observations, PointRows
+from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe, Observations, PointRows
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
-from pliant.algorithms.mapping.reacquisition import MaximaGrid, reacquire
+from pliant.algorithms.mapping.reacquisition import reacquire
+from pliant.algorithms.mapping.recovery import Motion, recover
 from pliant.algorithms.mapping.rolling_shutter import Path
-from pliant.algorithms.mapping.start import Start, WaitingFrame, find_start
+from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, is_guess
+from pliant.algorithms.mapping.start import Start
+from pliant.algorithms.mapping.support import Support, doubt, support_of
+from pliant.algorithms.mapping.waiting import Waiting, earlier_poses
+from pliant.algorithms.mapping.whole_map import WholeMap, move_map
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracks import FrameTracks
+
+_LEAST_LOST = 3
+"""Frames without a pose before a map is given up, however long that takes: of a time lapse."""
 
 
 class Mapper:
@@ -37,60 +51,78 @@ class Mapper:
         camera: PinholeCamera,
         parameters: MappingParameters,
         seed: int,
+        calibration: SelfCalibration | None = None,
     ) -> None:
-        self._camera = camera
+        """calibration: what is known of the camera already; None: what the parameters say."""
         self._parameters = parameters
+        self.calibration = calibration or SelfCalibration.of(camera, parameters.calibration)
         self._generator = np.random.default_rng(seed)
         self._timer: StageTimer = no_stages
         self._points = PointRows()
         self._changes = MapChanges()
         self._path = Path()
+        self.whole_map = WholeMap()
         self._keyframe_changes = KeyframeChanges(self._points)
-        self._waiting: list[WaitingFrame] = []
+        self._waiting = Waiting()
         self._map: ActiveMap | None = None
         self._segments = 0
         self._keyframes = 0
-        self._recent_poses: list[F64] = []
+        self._motion: Motion | None = None
         self._lost_frames = 0
-        self._since_keyframe = 0
+        self._keyframe_ns = 0
+        self._keyframe_is_new = False
         self._published_frames = 0
+        self._whole = False
 
     def process(
         self,
         frame: int,
+        stamp_ns: int,
         tracks: FrameTracks,
         grey: U8 | None,
         colour: U8 | None,
         timer: StageTimer = no_stages,
     ) -> MapDelta:
-        """Localise a frame and let the map grow.  grey: (H, W).  colour: (H, W, 3) RGB."""
+        """Localise a frame and let the map grow.
+
+        stamp_ns: when it was taken, increasing.    grey: (H, W).    colour: (H, W, 3) RGB.
+        """
         self._timer = timer
-        if self._map is None:
-            return self._wait(frame, tracks, grey, colour)
+        tracks, grey, colour = self.calibration.ideal(tracks, grey, colour)
+        if self._map is None or self._motion is None:
+            return self._wait(frame, stamp_ns, tracks, grey, colour)
+        with self._timer("whole map"):
+            if (moves := self.whole_map.take(frame)) is not None:
+                self._motion = self._motion.moved(move_map(self._map, moves, self._path))
+                self._changes.move(moves)
         self._map.links.follow(tracks.ids)
         with self._timer("localisation"):
-            located = self._localise(self._map, tracks)
+            located = self._localise(self._map, self._motion, stamp_ns, tracks, grey)
         if located is None:
-            return self._lost(self._map, frame, tracks)
+            return self._lost(self._map, frame, stamp_ns, tracks)
         with self._timer("reacquisition"):
             T_world_camera, found = self._reacquire(self._map, frame, located, tracks, grey)
         with self._timer("subspace adjustment"):
-            T_world_camera, inliers = self._adjust(self._map, T_world_camera, found, tracks)
+            T_world_camera, support = self._adjust(self._map, T_world_camera, found, tracks)
         with self._timer("triangulation"):
             self._map.triangulate()
         hanging = self._map.keyframes[-1]
-        if self._keyframe_is_due(self._map):
+        self._keyframe_is_new = self._keyframe_is_due(self._map, stamp_ns)
+        if self._keyframe_is_new:
             with self._timer("keyframe"):
+                T_world_camera, turned = self._stand(self._map, T_world_camera, found, tracks)
                 hanging = self._map.insert_keyframe(
-                    frame, T_world_camera, tracks.points_px, found, grey, colour
+                    frame, T_world_camera, tracks.points_px, found, grey, colour, turned
                 )
+            self._motion = self._motion.moved(self._calibrate(self._map))
             T_world_camera = hanging.T_world_camera
-            self._since_keyframe = 0
-        self._since_keyframe += 1
-        self._lost_frames = 0
-        self._recent_poses = [*self._recent_poses[-1:], T_world_camera]
-        self._add_pose(self._map, frame, hanging, T_world_camera, inliers)
-        return self._publish(TRACKING, "", inliers)
+            self._keyframe_ns = stamp_ns
+        self._lost_frames, self._waiting = 0, Waiting()
+        self._motion = self._motion.then(stamp_ns, T_world_camera)
+        self._add_pose(self._map, frame, hanging, T_world_camera, support.inliers)
+        if hanging.frame == frame and self._finishes(self._map):
+            self.whole_map.ask(frame, self._map)
+        return self._publish(TRACKING, doubt(support, self._parameters.support), support.inliers)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
         """Pass over a frame, without pixels (dropped or broken) or without time: it gets no pose.
@@ -98,11 +130,25 @@ class Mapper:
         Whether the camera is lost is for frames with pixels to decide: the state stays as it was.
         The tracks that live on are taken up again by the next frame.
         """
-        if self._map is None:
-            state = WAITING
-        else:
-            state = LOST if self._lost_frames else TRACKING
-        return self._publish(state, reason, 0)
+        state = LOST if self._lost_frames else TRACKING
+        return self._publish(WAITING if self._map is None else state, reason, 0)
+
+    @property
+    def _camera(self) -> PinholeCamera:
+        """Whose pixels are worked on."""
+        return self.calibration.view.camera
+
+    def _calibrate(self, active: ActiveMap) -> F64:
+        """Adjust the whole map with its calibration where that is due: (4, 4) what its end made."""
+        known, newest = self.calibration, active.keyframes[-1]
+        due = len(active.keyframes) >= known.next_keyframes and self._finishes(active)
+        if not (due and is_guess(self._parameters.calibration)):
+            return np.eye(4)
+        before = newest.T_world_camera
+        self.calibration = active.adjust_all(self._path, known)
+        self.whole_map = WholeMap()  # what was asked is of another map
+        self._whole = True
+        return newest.T_world_camera @ inverse(before)
 
     @property
     def point_count(self) -> int:
@@ -113,16 +159,12 @@ class Mapper:
         """What is still to be corrected at the end of the stream."""
         if self._map is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
-        correction: tuple[float, ...] = ()
-        whole = self._finishes(self._map)
-        if whole:
+        self._whole = self._finishes(self._map)
+        if self._whole:
             self._map.collect_garbage()
-            found = self._map.adjust_all(self._path)
-            if self._parameters.calibration.sigmas.any():
-                correction = tuple(found.tolist())
+            self.calibration = self._map.adjust_all(self._path, self.calibration)
         self._keyframe_changes.settle(self._map.keyframes)
-        delta = self._publish(TRACKING, "", 0, snapshot=True, whole=whole)
-        return dataclasses.replace(delta, calibration_correction=correction)
+        return self._publish(TRACKING, "", 0, snapshot=True)
 
     def _finishes(self, active: ActiveMap) -> bool:
         limits = self._parameters.window
@@ -143,24 +185,34 @@ class Mapper:
         if self._map is None:
             return self._keyframe_changes.publish(None)
         self._keyframe_changes.settle(self._map.keyframes[: -self._parameters.window.keyframes])
-        return self._keyframe_changes.publish(self._map.keyframes[-1])
+        delta = self._keyframe_changes.publish(self._map.keyframes[-1])
+        seen = self.calibration.view.seen(delta.points_px)
+        return dataclasses.replace(delta, points_px=seen)
+
+    @property
+    def waiting_frames(self) -> list[int]:
+        """Numbers of the frames from which a map may yet start."""
+        return [waiting.frame for waiting in self._waiting.frames]
 
     def _wait(
-        self, frame: int, tracks: FrameTracks, grey: U8 | None, colour: U8 | None
+        self,
+        frame: int,
+        stamp_ns: int,
+        tracks: FrameTracks,
+        grey: U8 | None,
+        colour: U8 | None,
     ) -> MapDelta:
-        waiting = WaitingFrame(
-            frame=frame, ids=tracks.ids, points_px=tracks.points_px, kappas=tracks.kappas
-        )
-        self._waiting = [*self._waiting[1 - self._parameters.start.max_frames :], waiting]
+        self._waiting = self._waiting.then(frame, stamp_ns, tracks, self._camera, self._parameters)
         with self._timer("start"):
-            start = find_start(self._waiting, self._camera, self._parameters)
-        if isinstance(start, str):
-            return self._publish(WAITING, start, 0)
+            found = find_start_of(self._waiting.frames, self.calibration, self._parameters)
+        if isinstance(found, str):
+            return self._publish(WAITING, found, 0)
+        start, self.calibration = found
         with self._timer("start"):
-            inliers = self._begin(start, tracks, grey, colour)
+            inliers = self._begin(start, grey, colour)
         return self._publish(TRACKING, "", inliers)
 
-    def _begin(self, start: Start, tracks: FrameTracks, grey: U8 | None, colour: U8 | None) -> int:
+    def _begin(self, start: Start, grey: U8 | None, colour: U8 | None) -> int:
         """Let the map start, and give poses to the frames that waited, backwards."""
         self._points.cull_all()  # of earlier segments, which have been published
         self._map = ActiveMap(
@@ -168,70 +220,77 @@ class Mapper:
         )
         self._segments += 1
         self._path.forget()
-        self._map.begin(start, self._waiting, grey, colour)
-        keyframes = {keyframe.frame: keyframe for keyframe in self._map.keyframes}
-        T_world_camera = self._map.keyframes[-1].T_world_camera
-        hanging = self._map.keyframes[-1]
-        poses: list[F64] = []
-        inliers = 0
-        for waiting in reversed(self._waiting):
-            _, i, j = np.intersect1d(
-                waiting.ids, start.ids, assume_unique=True, return_indices=True
-            )
-            if waiting.frame in keyframes:
-                hanging = keyframes[waiting.frame]
-                T_world_camera = hanging.T_world_camera
-            if len(i) < self._parameters.localisation.min_inliers:
-                continue
-            located = refine(
-                T_world_camera,
-                start.points_world[j],
-                waiting.points_px[i],
-                self._camera,
-                self._parameters.localisation,
-            )
-            count = int(located.inliers.sum())
-            if count < self._parameters.localisation.min_inliers:
-                continue
-            if waiting.frame not in keyframes:
-                T_world_camera = located.T_world_camera
-            self._add_pose(self._map, waiting.frame, hanging, T_world_camera, count)
-            poses.append(T_world_camera)
-            inliers = inliers or count
-        self._recent_poses = poses[1::-1]
-        self._waiting = []
-        self._since_keyframe = 1
-        return inliers
-
-    def _localise(self, active: ActiveMap, tracks: FrameTracks) -> F64 | None:
-        """T_world_camera of the frame from the tracks of mapped points, None where it fails."""
-        linked = active.linked(MAPPED)
+        self.whole_map = WholeMap()
+        self._map.begin(start, self._waiting.frames, grey, colour)
+        self._calibrate(self._map)
         limits = self._parameters.localisation
-        if len(linked) < limits.min_inliers:
-            return None
-        last, previous = self._recent_poses[-1], self._recent_poses[0]
-        located = locate(
-            [last @ inverse(previous) @ last, last],
-            self._points.xyz[active.links.rows[linked]],
-            tracks.points_px[linked],
-            self._camera,
-            limits,
-            self._generator,
+        placed = list(
+            earlier_poses(start, self._map.keyframes, self._waiting, self._camera, limits)
         )
-        if located.inliers.sum() < limits.min_inliers:
-            return None
-        return located.T_world_camera
+        for each in placed:
+            self._add_pose(self._map, each.frame, each.keyframe, each.T_world_camera, each.inliers)
+        stamps_ns = {waiting.frame: waiting.stamp_ns for waiting in self._waiting.frames}
+        newest, before = placed[0], placed[min(1, len(placed) - 1)]
+        stamps = stamps_ns[before.frame], stamps_ns[newest.frame]
+        poses = before.T_world_camera, newest.T_world_camera
+        self._motion = Motion(stamps_ns=stamps, poses=poses)
+        self._keyframe_ns = self._waiting.frames[-1].stamp_ns
+        self._keyframe_is_new = True
+        self._waiting = Waiting()
+        return newest.inliers
 
-    def _lost(self, active: ActiveMap, frame: int, tracks: FrameTracks) -> MapDelta:
-        """The frame has no pose.  After several such frames the segment is closed."""
+    def _directions(self, active: ActiveMap) -> I64:
+        """Indices of the tracks of candidates that help to place the frame."""
+        return helping_candidates(self._points, active.links.rows)
+
+    def _spread(self, active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
+        last = active.keyframes[-1]
+        return spread_of(self._points, rows, last) if len(directions) else None
+
+    def _localise(
+        self,
+        active: ActiveMap,
+        motion: Motion,
+        stamp_ns: int,
+        tracks: FrameTracks,
+        grey: U8 | None,
+    ) -> F64 | None:
+        """T_world_camera of the frame from the tracks of mapped points, or else from the map's
+        points in the image; None where both fail."""
+        directions = self._directions(active)
+        linked = np.concatenate([active.linked(MAPPED), directions])
+        limits = self._parameters.localisation
+        if len(linked) >= limits.min_inliers:
+            rows = active.links.rows[linked]
+            located = locate(
+                motion.predictions(stamp_ns), self._points.xyz[rows], tracks.points_px[linked],
+                self._camera, limits, self._generator, self._spread(active, rows, directions),
+            )  # fmt: skip
+            if located.inliers.sum() >= limits.min_inliers:
+                return located.T_world_camera
+        if grey is None:
+            return None
+        return recover(
+            motion, stamp_ns, active.nearby(), self._points, tracks.maxima, grey, self._camera,
+            self._parameters, self._generator,
+        )  # fmt: skip
+
+    def _lost(self, active: ActiveMap, frame: int, stamp_ns: int, tracks: FrameTracks) -> MapDelta:
+        """The frame has no pose.  After some time without one the segment is closed.
+
+        Frames are kept meanwhile, so that a new segment has the poses of those that are its own.
+        """
+        assert self._motion is not None
         seen = len(active.linked(MAPPED))
         reason = f"lost: the pose of frame {frame} is not supported, {seen} mapped tracks"
         self._lost_frames += 1
+        self._waiting = self._waiting.then(frame, stamp_ns, tracks, self._camera, self._parameters)
         delta = self._publish(LOST, reason, 0)
-        if self._lost_frames > self._parameters.localisation.max_lost_frames:
+        long = self._motion.lost_s(stamp_ns) > self._parameters.localisation.max_lost_s
+        if long and self._lost_frames >= _LEAST_LOST:
             self._keyframe_changes.settle(active.keyframes)
             self._keyframes = active.next_keyframe_id
-            self._map = None
+            self._map, self._lost_frames = None, 0
         return delta
 
     def _reacquire(
@@ -247,72 +306,70 @@ class Mapper:
         none = Observations(rows=np.zeros(0, np.int32), points_px=np.zeros((0, 2), np.float32))
         if not self._parameters.reacquisition.enabled:
             return T_world_camera, none
-        grid = MaximaGrid.build(tracks.maxima, self._camera.width, self._camera.height)
         reacquired = reacquire(
-            T_world_camera,
-            active.missing(frame),
-            points.xyz,
-            points.kappas,
-            points.patches,
-            grid,
-            grey,
-            self._camera,
-            self._parameters.reacquisition,
-        )
+            T_world_camera, active.missing(frame), points.xyz, points.kappas, points.patches,
+            tracks.maxima, grey, self._camera, self._parameters.reacquisition,
+        )  # fmt: skip
         found = active.take_over(reacquired, tracks)
-        rows, points_px = active.observed(tracks.points_px, found)
+        directions = self._directions(active)
+        rows, points_px = active.observed(tracks.points_px, found, directions)
         located = refine(
-            T_world_camera,
-            points.xyz[rows],
-            points_px,
-            self._camera,
-            self._parameters.localisation,
-            near=True,
-        )
+            T_world_camera, points.xyz[rows], points_px, self._camera,
+            self._parameters.localisation, near=True,
+            spread=self._spread(active, rows, directions),
+        )  # fmt: skip
         linked = active.linked(MAPPED)
         points.kappas[active.links.rows[linked]] = tracks.kappas[linked]
         return located.T_world_camera, found
 
     def _adjust(
         self, active: ActiveMap, T_world_camera: F64, found: Observations, tracks: FrameTracks
-    ) -> tuple[F64, int]:
-        """Eq. 6 over the window and this frame.  Returns its pose and the number of inliers."""
-        limits = self._parameters.localisation
+    ) -> tuple[F64, Support]:
+        """Eq. 6 over the window and this frame.  Returns its pose, and what there is for it."""
         linked = active.linked(MAPPED)
-        errors = reprojection_errors(
-            T_world_camera,
-            self._points.xyz[active.links.rows[linked]],
-            tracks.points_px[linked],
-            self._camera,
-        )
+        xyz = self._points.xyz[active.links.rows[linked]]
+        errors = reprojection_errors(T_world_camera, xyz, tracks.points_px[linked], self._camera)
         active.judge_tracks(linked, errors)
         active.see(T_world_camera, tracks.points_px, found)
-        if self._parameters.window.sweeps > 0:
+        directions = self._directions(active)
+        if self._parameters.window.sweeps > 0 and not len(directions):
             T_world_camera = active.window.sweep_current(self._camera, self._parameters)
-        rows, points_px = active.observed(tracks.points_px, found)
-        errors = reprojection_errors(
-            T_world_camera, self._points.xyz[rows], points_px, self._camera
-        )
-        return T_world_camera, int((errors < limits.inlier_px).sum())
+        rows, points_px = active.observed(tracks.points_px, found, directions)
+        xyz = self._points.xyz[rows]
+        errors = reprojection_errors(T_world_camera, xyz, points_px, self._camera)
+        interval_s = self._motion.interval_s() if self._motion is not None else 0.0
+        return T_world_camera, support_of(
+            tracks, interval_s, points_px, errors < self._parameters.localisation.inlier_px,
+            self._camera, self._parameters.support,
+        )  # fmt: skip
 
-    def _keyframe_is_due(self, active: ActiveMap) -> bool:
+    def _stand(
+        self, active: ActiveMap, T_world_camera: F64, found: Observations, tracks: FrameTracks
+    ) -> tuple[F64, bool]:
+        """Whether the frame stands where the last keyframe does, and its pose then."""
+        candidates = placed_candidates(self._points, active.links.rows)
+        rows, points_px = active.observed(tracks.points_px, found, candidates)
+        spread = spread_of(self._points, rows, active.keyframes[-1])
+        located = refine(
+            T_world_camera, self._points.xyz[rows], points_px, self._camera,
+            self._parameters.localisation, near=True, spread=spread,
+        )  # fmt: skip
+        return (located.T_world_camera if located.stands else T_world_camera), located.stands
+
+    def _keyframe_is_due(self, active: ActiveMap, stamp_ns: int) -> bool:
         limits = self._parameters.keyframe
-        share, flow = active.window.flow_since_keyframe()
+        least = CANDIDATE if len(self._directions(active)) else MAPPED
+        share, flow = active.window.flow_since_keyframe(least)
         unit = self._camera.width / 640.0
         if share < limits.min_shared_share or flow > limits.max_flow_px * unit:
             return True
-        return self._since_keyframe >= limits.max_frames and flow > limits.min_flow_px * unit
+        late = stamp_ns - self._keyframe_ns > 1e9 * limits.max_s
+        return late and flow > limits.min_flow_px * unit
 
-    def _publish(
-        self,
-        state: int,
-        reason: str,
-        inliers: int,
-        snapshot: bool = False,
-        whole: bool = False,
-    ) -> MapDelta:
+    def _publish(self, state: int, reason: str, inliers: int, snapshot: bool = False) -> MapDelta:
         # Now and then everything active is published, for those who came late.
         self._timer = no_stages  # the frame is done: nothing of its caller stays with the map
+        whole, self._whole = self._whole, False
         self._published_frames += 1
         snapshot = snapshot or self._published_frames % self._parameters.snapshot_frames == 0
         active = self._map
@@ -322,13 +379,13 @@ class Mapper:
         else:
             keyframes = active.keyframes if whole else active.window.keyframes
             # Between keyframes only points that the frame sees can move or be new.
-            everything = snapshot or self._since_keyframe <= 1
+            everything = snapshot or self._keyframe_is_new
             rows = active.window.rows if everything else active.window.current_rows()
             if whole:
                 rows = active.mapped_rows()
             centre = active.keyframes[-1].T_world_camera[:3, 3].copy()
             self._changes.remove_points(active.take_removed())
-        return self._changes.publish(
+        delta = self._changes.publish(
             state=state,
             reason=reason,
             segment=self._segments - 1,
@@ -339,3 +396,4 @@ class Mapper:
             centre=centre,
             snapshot=snapshot,
         )
+        return self.calibration.told_with(delta)

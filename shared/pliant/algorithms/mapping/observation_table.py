@@ -106,17 +106,22 @@ def seen_in_state(rows: I32, state: U8, wanted: int, seen: BoolArray, slot: int,
 
 
 @kernel
-def flows(rows: I32, state: U8, wanted: int, u: F32, v: F32, seen: BoolArray) -> tuple[int, F32]:
-    """Points in the wanted state that the last but one slot sees, and how far those moved, px,
-    that the last one sees too."""
+def flows(
+    rows: I32, state: U8, least: int, u: F32, v: F32, seen: BoolArray, H: F64
+) -> tuple[int, F32]:
+    """Points whose state is at least the given one that the last but one slot sees, and how far
+    those moved, px, that the last one sees too, beside the turn H (3, 3) of its pixels."""
     moved = np.empty(rows.size, np.float32)
     before, both = 0, 0
     last = seen.shape[0] - 1
     for n in range(rows.size):
-        if seen[last - 1, n] and state[rows[n]] == wanted:
+        if seen[last - 1, n] and state[rows[n]] >= least:
             before += 1
             if seen[last, n]:
-                du, dv = u[last, n] - u[last - 1, n], v[last, n] - v[last - 1, n]
+                a, b = u[last - 1, n], v[last - 1, n]
+                z = H[2, 0] * a + H[2, 1] * b + H[2, 2]
+                du = u[last, n] - (H[0, 0] * a + H[0, 1] * b + H[0, 2]) / z
+                dv = v[last, n] - (H[1, 0] * a + H[1, 1] * b + H[1, 2]) / z
                 moved[both] = np.sqrt(du * du + dv * dv)
                 both += 1
     return before, moved[:both].copy()
@@ -161,22 +166,6 @@ def has_parallax(
                     count += 1
                     break
     return kept[:count].copy()
-
-
-@kernel
-def choose(order: I64, columns: I32, seen: BoolArray, wanted: int, chosen: BoolArray) -> None:
-    """Let a camera, seen (N,), have ``wanted`` of its columns chosen, the first in the order."""
-    missing = wanted
-    for i in range(columns.size):
-        if chosen[i] and seen[columns[i]]:
-            missing -= 1
-    for k in range(order.size):
-        if missing <= 0:
-            break
-        i = order[k]
-        if not chosen[i] and seen[columns[i]]:
-            chosen[i] = True
-            missing -= 1
 
 
 _MIN_DEPTH = 1e-6

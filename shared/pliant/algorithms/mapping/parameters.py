@@ -15,8 +15,8 @@ class StartParameters(Parameters):
     min_parallax_deg: float = Field(
         default=1.0, gt=0.0, description="Least median parallax of the two frames, degrees"
     )
-    max_frames: int = Field(
-        default=120, ge=2, description="Frames kept while waiting; older ones get no pose"
+    max_s: float = Field(
+        default=4.0, gt=0.0, description="Seconds that frames wait; older ones get no pose"
     )
     min_points: int = Field(
         default=100, ge=30, description="Points that a start must have after adjustment"
@@ -57,8 +57,8 @@ class LocalisationParameters(Parameters):
         le=1.0,
         description="Share of inliers under which the predicted pose is checked against RANSAC",
     )
-    max_lost_frames: int = Field(
-        default=10, ge=0, description="Frames without a pose after which a new segment starts"
+    max_lost_s: float = Field(
+        default=1.0, ge=0.0, description="Seconds without a pose after which a new segment starts"
     )
 
 
@@ -67,14 +67,72 @@ class ReacquisitionParameters(Parameters):
 
     enabled: bool = Field(default=True, description="Look for lost points in every frame")
     radius_px: float = Field(default=2.5, gt=0.0, description="Largest distance to a maximum, px")
-    kappa_ratio: float = Field(
-        default=2.0, ge=1.0, description="Largest ratio of the curvatures, either way"
-    )
     min_zncc: float = Field(
         default=0.8,
         ge=-1.0,
         le=1.0,
         description="Least correlation of the 8x8 patches, where the image is at hand",
+    )
+
+
+class RecoveryParameters(Parameters):
+    """How the camera is found again after frames without a pose."""
+
+    points: int = Field(
+        default=400, ge=30, description="Points looked for far from where they were"
+    )
+    radius_share: float = Field(
+        default=0.01,
+        gt=0.0,
+        description="Radius about the prediction, share of the image width, when nothing was lost",
+    )
+    growth_share_per_s: float = Field(
+        default=0.3, ge=0.0, description="What a second without a pose adds to the radius"
+    )
+    max_radius_share: float = Field(
+        default=0.15, gt=0.0, le=1.0, description="Largest radius, share of the image width"
+    )
+    ransac_samples: int = Field(default=500, ge=1, description="Triples tried by RANSAC")
+    min_agreeing: int = Field(
+        default=15,
+        ge=6,
+        description="Points that must agree for a pose to be looked at more closely",
+    )
+    min_support_share: float = Field(
+        default=0.015,
+        ge=0.0,
+        le=1.0,
+        description="Least share of the points in view that support a pose: wrong ones reach 1 %",
+    )
+    min_agreement: float = Field(
+        default=0.6,
+        ge=0.0,
+        le=1.0,
+        description="Least share of the points found at a pose that support it: wrong ones reach "
+        "half, for what is found is near",
+    )
+
+
+class SupportParameters(Parameters):
+    """When a pose is told as doubtful."""
+
+    settled_s: float = Field(
+        default=0.5, ge=0.0, description="Age at which a track should belong to a point, seconds"
+    )
+    max_contrary_share: float = Field(
+        default=0.12,
+        ge=0.0,
+        le=1.0,
+        description="Share of the image that moves otherwise than the pose says",
+    )
+    min_share: float = Field(
+        default=0.4, ge=0.0, le=1.0, description="Share of the points seen that fit the pose"
+    )
+    min_spread: float = Field(
+        default=0.06,
+        ge=0.0,
+        le=1.0,
+        description="Standard deviation of what fits, share of the image's width or height",
     )
 
 
@@ -88,13 +146,15 @@ class KeyframeParameters(Parameters):
         description="A keyframe is due when fewer than this share of the last one's points remain",
     )
     max_flow_px: float = Field(
-        default=25.0,
+        default=20.0,
         gt=0.0,
-        description="A keyframe is due when the median point moved by this since the last, px "
-        "at an image width of 640",
+        description="A keyframe is due when the median point moved by this since the last, beside "
+        "the turn of the camera, px at an image width of 640",
     )
-    max_frames: int = Field(
-        default=20, ge=1, description="A keyframe is due after this many frames with any motion"
+    max_s: float = Field(
+        default=0.65,
+        gt=0.0,
+        description="A keyframe is due after this many seconds with any motion",
     )
     min_flow_px: float = Field(
         default=3.0, gt=0.0, description="Motion under which no keyframe is made, px at 640"
@@ -104,16 +164,10 @@ class KeyframeParameters(Parameters):
 class WindowParameters(Parameters):
     """The keyframes under adjustment."""
 
-    keyframes: int = Field(default=12, ge=3, description="Keyframes in the window")
+    keyframes: int = Field(default=16, ge=3, description="Keyframes in the window")
     fixed: int = Field(default=2, ge=1, description="Oldest keyframes of the window that stay")
-    points_per_keyframe: int = Field(
-        default=400,
-        ge=50,
-        description="Points of each keyframe, the best observed, that an adjustment by Schur LM "
-        "takes; the others follow alone",
-    )
     keyframe_iterations: int = Field(
-        default=4, ge=1, description="Iterations of Schur LM at a keyframe"
+        default=4, ge=1, description="Most iterations of Schur LM at a keyframe"
     )
     sweeps: int = Field(
         default=2,
@@ -136,9 +190,6 @@ class WindowParameters(Parameters):
     final_iterations: int = Field(
         default=50, ge=1, description="Most iterations of Schur LM at the end of the stream"
     )
-    final_points_per_keyframe: int = Field(
-        default=1200, ge=50, description="As points_per_keyframe, at the end of the stream"
-    )
     final_max_keyframes: int = Field(
         default=1000, ge=3, description="Keyframes above which the final adjustment is left out"
     )
@@ -147,6 +198,25 @@ class WindowParameters(Parameters):
         ge=30,
         description="Keyframes to come back to: beyond (and beyond final_max_keyframes) those most "
         "like another leave the active map, which bounds its memory; they stay in the results",
+    )
+
+
+class WholeMapParameters(Parameters):
+    """Adjustments of the whole map while it grows."""
+
+    growth: float = Field(
+        default=0.15,
+        ge=0.0,
+        description="Share by which the keyframes of a segment grow from one adjustment of all of "
+        "them to the next; 0: only at the end",
+    )
+    distance_frames: int = Field(
+        default=30,
+        ge=1,
+        description="Frames after which the result is taken over; who has not found it waits",
+    )
+    iterations: int = Field(
+        default=5, ge=1, description="Most iterations of Schur LM; the next adjustment goes on"
     )
 
 
@@ -170,8 +240,11 @@ class MappingParameters(Parameters):
     start: StartParameters = StartParameters()
     localisation: LocalisationParameters = LocalisationParameters()
     reacquisition: ReacquisitionParameters = ReacquisitionParameters()
+    recovery: RecoveryParameters = RecoveryParameters()
+    support: SupportParameters = SupportParameters()
     keyframe: KeyframeParameters = KeyframeParameters()
     window: WindowParameters = WindowParameters()
+    whole_map: WholeMapParameters = WholeMapParameters()
     point: PointParameters = PointParameters()
     bundle: BundleParameters = BundleParameters(kernel_sigma_px=1.0)
     calibration: CalibrationUncertainty = CalibrationUncertainty()

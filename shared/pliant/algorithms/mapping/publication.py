@@ -1,12 +1,13 @@
 """What has been published of the map, and so what the next MapDelta and KeyframeDelta say."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64, U8
 from pliant.algorithms.geometry import inverse, matrix_to_pose
-from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.map_delta import KeyframeDelta, MapDelta, MapMoves
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.compiler.kernel import kernel
 
@@ -20,6 +21,11 @@ class MapChanges:
     def __init__(self) -> None:
         self._poses: list[tuple[int, int, int, F64, int]] = []
         self._removed: list[I64] = []
+        self._moves: MapMoves | None = None
+
+    def move(self, moves: MapMoves) -> None:
+        """The whole map moves, before anything else of the frame."""
+        self._moves = moves
 
     def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
         """The pose of a frame is new, and hangs on a keyframe."""
@@ -50,6 +56,7 @@ class MapChanges:
         """
         poses, self._poses = sorted(self._poses, key=lambda pose: pose[0]), []
         removed, self._removed = self._removed, []
+        moves, self._moves = self._moves, None
         moved = [k for k in keyframes if snapshot or _differs(k)]
         for keyframe in moved:
             keyframe.published_pose = keyframe.T_world_camera.copy()
@@ -57,7 +64,7 @@ class MapChanges:
             rows, points.state, points.xyz, points.published_xyz, points.keyframes,
             points.published_keyframes, centre, snapshot,
         )  # fmt: skip
-        return MapDelta(
+        delta = MapDelta(
             state=state,
             reason=reason,
             segment=segment,
@@ -80,9 +87,13 @@ class MapChanges:
             point_keyframes=points.keyframes[rows],
             point_parallax_rad=points.parallax_rad[rows],
             point_sigmas=points.sigmas[rows],
+            point_hosts=points.first_keyframe[rows].astype(np.int64),
             snapshot=snapshot,
             removed_point_ids=np.sort(np.concatenate([*removed, np.zeros(0, np.int64)])),
         )
+        if moves is None:
+            return delta
+        return replace(delta, moved_keyframes=moves.keyframe_ids, moves=moves.moves)
 
 
 @kernel

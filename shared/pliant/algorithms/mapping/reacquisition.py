@@ -1,10 +1,12 @@
 """Mapped points that lost their track are found again among the maxima of a frame.
 
-A point is projected with the pose of the frame; the maximum near it whose curvature and patch fit
-best takes it.  Its patch then refines the position, since an extremum alone is known to half a
-pixel only.  Not in the paper; docs/results.md says what it is worth.
+A point is projected with the pose of the frame; the maximum near it whose patch fits best takes it.
+Of the curvature only the sign counts: its size is the cube of the exposure.  The patch then refines
+the position, since an extremum alone is known to half a pixel only.  Not in the paper;
+docs/results.md says what it is worth.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,10 +26,9 @@ from pliant.algorithms.image.patch_sums import PATCH_PIXELS, PATCH_SIZE, TEMPLAT
 from pliant.algorithms.image.pixels import Pixels, pixels_of
 from pliant.algorithms.mapping.map_store import PATCH_SIDE
 from pliant.algorithms.mapping.parameters import ReacquisitionParameters
-from pliant.compiler.kernel import fast_kernel, kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
-CELL_PX = 8
-"""Side of a cell: larger than any search radius, so that nine cells suffice."""
+_MIN_CELL_PX = 8
 
 _MARGIN_PX = 8.0
 _ALIGN_REACH_PX = np.float32(1.5)
@@ -38,22 +39,28 @@ _FLAT = np.float32(1.0)
 
 
 class MaximaGrid(NamedTuple):
-    """Maxima (M, 3) as (u, v, kappa); those of cell c are ``order[starts[c] : starts[c + 1]]``."""
+    """Maxima (M, 3) as (u, v, kappa); those of cell c are ``order[starts[c] : starts[c + 1]]``.
+
+    cell_px: side of a cell, no less than any search radius, so that nine cells suffice.
+    """
 
     maxima: F32
     starts: I32
     order: I32
     columns: int
     lines: int
+    cell_px: int
 
     @staticmethod
-    def build(maxima: F32, width: int, height: int) -> "MaximaGrid":
-        """Sort the maxima of an image of the given size."""
-        columns, lines = width // CELL_PX + 1, height // CELL_PX + 1
+    def build(maxima: F32, width: int, height: int, radius_px: float) -> "MaximaGrid":
+        """Sort the maxima of an image of the given size.  radius_px: of the widest search."""
+        cell_px = max(_MIN_CELL_PX, math.ceil(radius_px))
+        columns, lines = width // cell_px + 1, height // cell_px + 1
         starts = np.zeros(columns * lines + 1, np.int32)
         order = np.empty(len(maxima), np.int32)
-        _sort_into_cells(maxima, columns, lines, starts, order)
-        return MaximaGrid(maxima, starts, order, columns, lines)
+        grid = MaximaGrid(maxima, starts, order, columns, lines, cell_px)
+        _sort_into_cells(grid)
+        return grid
 
     def nearest(self, points_px: F32, radius_px: float) -> I32:
         """(N,) index of the maximum nearest to each point (N, 2) within the radius, else -1."""
@@ -63,11 +70,13 @@ class MaximaGrid(NamedTuple):
 
 
 @kernel
-def _sort_into_cells(maxima: F32, columns: int, lines: int, starts: I32, order: I32) -> None:
+def _sort_into_cells(grid: MaximaGrid) -> None:
+    maxima, starts, order = grid.maxima, grid.starts, grid.order
+    columns, lines, cell_px = grid.columns, grid.lines, grid.cell_px
     cells = np.empty(maxima.shape[0], np.int32)
     for i in range(maxima.shape[0]):
-        column = min(max(int(maxima[i, 0]) // CELL_PX, 0), columns - 1)
-        line = min(max(int(maxima[i, 1]) // CELL_PX, 0), lines - 1)
+        column = min(max(int(maxima[i, 0]) // cell_px, 0), columns - 1)
+        line = min(max(int(maxima[i, 1]) // cell_px, 0), lines - 1)
         cells[i] = line * columns + column
         starts[cells[i] + 1] += 1
     for c in range(columns * lines):
@@ -83,7 +92,7 @@ def _nearest(points_px: F32, grid: MaximaGrid, radius_px: float, found: I32) -> 
     maxima, columns = grid.maxima, grid.columns
     for i in range(points_px.shape[0]):
         u, v = points_px[i, 0], points_px[i, 1]
-        column, line = int(u) // CELL_PX, int(v) // CELL_PX
+        column, line = int(u) // grid.cell_px, int(v) // grid.cell_px
         best = radius_px * radius_px
         for y in range(max(line - 1, 0), min(line + 2, grid.lines)):
             for x in range(max(column - 1, 0), min(column + 2, columns)):
@@ -112,7 +121,7 @@ class Reacquired:
 class _Wanted(NamedTuple):
     """Points looked for.
 
-    projected: (W, 2) where they should be, px.  kappas: (W,) curvature when last seen.
+    projected: (W, 2) where they should be, px.  kappas: (W,) curvature, of which the sign counts.
     patches: (W, PATCH_SIDE, PATCH_SIDE) grey levels around them then.
     """
 
@@ -125,7 +134,6 @@ class _Limits(NamedTuple):
     """See the fields of ReacquisitionParameters."""
 
     radius_px: float
-    kappa_ratio: float
     min_zncc: float
 
 
@@ -135,15 +143,16 @@ def reacquire(
     xyz: F64,
     kappas: F32,
     patches: U8,
-    grid: MaximaGrid,
+    maxima: F32,
     grey: U8 | None,
     camera: PinholeCamera,
     parameters: ReacquisitionParameters,
 ) -> Reacquired:
     """Match points to the maxima of a frame whose pose is known.
 
-    rows: (R,) points looked for; xyz, kappas and patches are indexed by row.  grey: (H, W), or
-    None: then curvature and distance alone decide.
+    rows: (R,) points looked for; xyz, kappas and patches are indexed by row.  maxima: (M, 3) of
+    the frame.  grey: (H, W), or
+    None: then distance and the sign of the curvature alone decide.
     """
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:3])
     K = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
@@ -151,10 +160,11 @@ def reacquire(
     visible = _project(T_camera_world, rows, xyz, K, projected)
     visible_rows = rows[visible]
     wanted = _Wanted(projected[visible], kappas[visible_rows], patches[visible_rows])
+    grid = MaximaGrid.build(maxima, camera.width, camera.height, parameters.radius_px)
     choice = np.full(len(visible_rows), -1, np.int32)
     points_px = np.zeros((len(visible_rows), 2), np.float32)
     image = np.zeros((0, 0), np.float32) if grey is None else grey.astype(np.float32)
-    limits = _Limits(parameters.radius_px, parameters.kappa_ratio, parameters.min_zncc)
+    limits = _Limits(parameters.radius_px, parameters.min_zncc)
     _match(wanted, grid, pixels_of(image), limits, choice, points_px)
     found = choice >= 0
     return Reacquired(
@@ -163,6 +173,38 @@ def reacquire(
         maxima=choice[found],
         visible=visible_rows,
     )
+
+
+def match_widely(
+    T_world_camera: F64,
+    rows: I32,
+    xyz: F64,
+    kappas: F32,
+    patches: U8,
+    grid: MaximaGrid,
+    grey: U8,
+    camera: PinholeCamera,
+    radius_px: float,
+    count: int,
+    min_zncc: float,
+) -> tuple[I32, F32]:
+    """Match points to the maxima of a frame whose pose is hardly known, by their patches.
+
+    rows, xyz, kappas, patches, grey: as for ``reacquire``.   radius_px: from where T_world_camera
+    shows a point.   count: points looked for, at most.   Returns rows (F,) and pixels (F, 2); some
+    of them are wrong.
+    """
+    T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:3])
+    K = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
+    projected = np.empty((len(rows), 2), np.float32)
+    visible = np.flatnonzero(_project(T_camera_world, rows, xyz, K, projected))
+    visible = visible[:: max(1, -(-len(visible) // count))]
+    rows = rows[visible]
+    wanted = _Wanted(projected[visible], kappas[rows], patches[rows])
+    points_px = np.zeros((len(rows), 2), np.float32)
+    image = pixels_of(grey.astype(np.float32))
+    found = _match_patches(wanted, grid, image, radius_px, min_zncc, points_px)
+    return rows[found], points_px[found]
 
 
 @fast_kernel
@@ -251,15 +293,58 @@ def _match(
         points_px[i, 0], points_px[i, 1] = best_u, best_v
 
 
-@leaf_kernel
+@fast_kernel
+def _match_patches(
+    wanted: _Wanted,
+    grid: MaximaGrid,
+    image: Pixels,
+    radius_px: float,
+    min_zncc: float,
+    points_px: F32,
+) -> BoolArray:
+    """Whether each point has a maximum whose patch is like its own; writes the best one's place."""
+    found = np.zeros(len(wanted.kappas), np.bool_)
+    window = Pixels(np.empty(PATCH_SIDE * PATCH_SIDE, np.float32), PATCH_SIDE, PATCH_SIDE)
+    values = np.empty(TEMPLATE_FLOATS, np.float32)
+    to_origin = np.float32(0.5 * (PATCH_SIZE - 1))
+    for i in range(len(wanted.kappas)):
+        energy = _template_of(wanted.patches[i], window, values)
+        if energy < np.float32(PATCH_PIXELS) * _FLAT * _FLAT:
+            continue
+        template = Template(values, 0, energy, UNIFORM)
+        u, v, known = wanted.projected[i, 0], wanted.projected[i, 1], wanted.kappas[i]
+        column, line = int(u) // grid.cell_px, int(v) // grid.cell_px
+        best, best_zncc = -1, np.float32(0.0)
+        for y in range(max(line - 1, 0), min(line + 2, grid.lines)):
+            begin = y * grid.columns + max(column - 1, 0)
+            end = y * grid.columns + min(column + 1, grid.columns - 1)
+            for k in range(grid.starts[begin], grid.starts[end + 1]):
+                m = int(grid.order[k])
+                distance2 = (grid.maxima[m, 0] - u) ** 2 + (grid.maxima[m, 1] - v) ** 2
+                if distance2 >= radius_px * radius_px or grid.maxima[m, 2] * known <= 0.0:
+                    continue
+                left, top = grid.maxima[m, 0] - to_origin, grid.maxima[m, 1] - to_origin
+                zncc = align_patch(image, left, top, template, 1, _ALIGN_REACH_PX).zncc
+                if zncc > best_zncc:
+                    best, best_zncc = m, zncc
+        if best < 0:
+            continue
+        left, top = grid.maxima[best, 0] - to_origin, grid.maxima[best, 1] - to_origin
+        aligned = align_patch(image, left, top, template, _ITERATIONS, _ALIGN_REACH_PX)
+        if aligned.zncc >= min_zncc:
+            found[i] = True
+            points_px[i, 0], points_px[i, 1] = aligned.u + to_origin, aligned.v + to_origin
+    return found
+
+
+@fast_kernel
 def _two_nearest(
     wanted: _Wanted, i: int, grid: MaximaGrid, limits: _Limits
 ) -> tuple[int, int, float]:
-    """The nearest two maxima of a curvature like the point's, -1 where there is none, and the
+    """The nearest two maxima whose curvature has the point's sign, -1 where there is none, and the
     squared distance of the first."""
     u, v, known = wanted.projected[i, 0], wanted.projected[i, 1], wanted.kappas[i]
-    column, line = int(u) // CELL_PX, int(v) // CELL_PX
-    ratio = limits.kappa_ratio
+    column, line = int(u) // grid.cell_px, int(v) // grid.cell_px
     first, second = -1, -1
     nearest = next_nearest = limits.radius_px * limits.radius_px
     for y in range(max(line - 1, 0), min(line + 2, grid.lines)):
@@ -271,12 +356,7 @@ def _two_nearest(
             kappa = grid.maxima[m, 2]
             distance2 = (grid.maxima[m, 0] - u) ** 2 + (grid.maxima[m, 1] - v) ** 2
             # Signed: a dark feature (kappa > 0) is never taken for a bright one.
-            if (
-                distance2 >= next_nearest
-                or kappa * known <= 0.0
-                or abs(kappa) > ratio * abs(known)
-                or abs(known) > ratio * abs(kappa)
-            ):
+            if distance2 >= next_nearest or kappa * known <= 0.0:
                 continue
             if distance2 < nearest:
                 second, next_nearest = first, nearest
@@ -286,7 +366,7 @@ def _two_nearest(
     return first, second, nearest
 
 
-@leaf_kernel
+@fast_kernel
 def _template_of(patch: U8, window: Pixels, values: F32) -> np.float32:
     """Make the template of a kept patch; returns its energy, 0 where it cannot be placed by."""
     for r in range(PATCH_SIDE):

@@ -11,6 +11,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log
+from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.compiler.kernel import kernel
 
@@ -29,6 +30,13 @@ class Path:
     def add(self, frame: int, keyframe: Keyframe, T_world_camera: F64) -> None:
         """A frame whose pose hangs on a keyframe."""
         self._poses[frame] = (keyframe.id, inverse(keyframe.T_world_camera) @ T_world_camera)
+
+    def scale(self, moves: MapMoves) -> None:
+        """The whole map moves: distances to a keyframe scale with it."""
+        hanging = np.array([keyframe for keyframe, _ in self._poses.values()], np.int64)
+        scales = np.cbrt(np.linalg.det(moves.matrices(hanging)[:, :3, :3]))
+        for frame, scale in zip(self._poses, scales, strict=True):
+            self._poses[frame][1][:3, 3] *= scale
 
     def forget(self) -> None:
         """Nobody will ask any more."""

@@ -7,6 +7,7 @@ support is accepted, so that slow, rotating or still beginnings merely wait.
 """
 
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -40,12 +41,26 @@ _MIN_FRAMES = 3
 _ADJUSTMENTS = 3
 """Rounds of adjusting and removing outliers."""
 
+_LEAST_WAITING = 12
+"""Frames that wait for a start however old they are: a time lapse has no more."""
+
+
+class Stamped(Protocol):
+    """A frame and when it was taken."""
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+
+_F = TypeVar("_F", bound=Stamped)
+
 
 @dataclass(frozen=True, kw_only=True)
 class WaitingFrame:
     """What is kept of a frame until the map starts."""
 
     frame: int
+    stamp_ns: int
     ids: I64
     points_px: F32
     kappas: F32
@@ -80,6 +95,13 @@ class _Pair:
     flow_px: float
 
 
+def keep_waiting(waiting: list[_F], newest: _F, parameters: StartParameters) -> list[_F]:
+    """The waiting frames without those that are too old, and the newest one."""
+    oldest_ns = newest.stamp_ns - 1e9 * parameters.max_s
+    young = [frame for frame in waiting if frame.stamp_ns > oldest_ns]
+    return [*max(young, waiting[1 - _LEAST_WAITING :], key=len), newest]
+
+
 def find_start(
     waiting: list[WaitingFrame], camera: PinholeCamera, parameters: MappingParameters
 ) -> Start | str:
@@ -88,11 +110,9 @@ def find_start(
     if len(waiting) < _MIN_FRAMES:
         return f"too few frames: {len(waiting)} of {_MIN_FRAMES}"
     pairs = _pairs(waiting, camera, start)
-    if not pairs:
-        return f"too few tracks: {_most_shared(waiting)} of {start.min_tracks}"
-    if max(pair.residual_px for pair in pairs) < 2.0 * _NOISE_PX:
-        return _no_parallax(pairs)
-    reason = ""
+    reason = _why_not(pairs, waiting, start)
+    if reason:
+        return reason
     # The more parallax the better; shared tracks count less, for there are many.
     pairs.sort(key=lambda pair: -pair.residual_px * len(pair.indices_newest) ** 0.5)
     for pair in pairs[:2]:
@@ -101,6 +121,23 @@ def find_start(
             return found
         reason = reason or found
     return reason
+
+
+def why_no_start(
+    waiting: list[WaitingFrame], camera: PinholeCamera, parameters: MappingParameters
+) -> str:
+    """Why a camera sees too few tracks or too little parallax for a start; "" where it does not."""
+    if len(waiting) < _MIN_FRAMES:
+        return f"too few frames: {len(waiting)} of {_MIN_FRAMES}"
+    return _why_not(_pairs(waiting, camera, parameters.start), waiting, parameters.start)
+
+
+def _why_not(pairs: list[_Pair], waiting: list[WaitingFrame], start: StartParameters) -> str:
+    if not pairs:
+        return f"too few tracks: {_most_shared(waiting)} of {start.min_tracks}"
+    if max(pair.residual_px for pair in pairs) < 2.0 * _NOISE_PX:
+        return _no_parallax(pairs)
+    return ""
 
 
 def _pairs(

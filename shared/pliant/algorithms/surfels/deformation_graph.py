@@ -9,7 +9,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64, BoolArray
 from pliant.algorithms.surfels.patch_sampling import A, B, F, X
-from pliant.compiler.kernel import fast_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 _OFF_PLANE = 0.3
 """Neighbours are off each other's plane by at most this share of their distance."""
@@ -34,7 +34,7 @@ def no_edges() -> Edges:
     return Edges(np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
-@leaf_kernel
+@fast_kernel
 def own_coordinates(pose: F64, d: F64, out: F64) -> None:
     """Coefficients of a vector in A, B and A x B of a surfel."""
     a0, a1, a2 = pose[A], pose[A + 1], pose[A + 2]
@@ -51,7 +51,7 @@ def own_coordinates(pose: F64, d: F64, out: F64) -> None:
     out[0], out[1], out[2] = (da * bb - db * ab) / det, (db * aa - da * ab) / det, dn
 
 
-@leaf_kernel
+@fast_kernel
 def own_vector(pose: F64, c: F64, out: F64) -> None:
     """The vector of such coefficients, stretched by the surfel's own F: the identity at birth."""
     f11, f12, f22 = pose[F], pose[F + 1], pose[F + 2]
@@ -150,7 +150,7 @@ def edge_rows(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
     return weights, residuals, arms
 
 
-@leaf_kernel
+@fast_kernel
 def _edge_rows(
     poses: F64, edges: Edges, tear: float, weights: F64, residuals: F64, arms: F64
 ) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, Level, X
 from pliant.algorithms.surfels.photometric import FEATURES
-from pliant.compiler.kernel import inner_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 ISOMETRIC, EQUIAREAL, GENERAL = 0, 2, 3
 MODELS = {"isometric": ISOMETRIC, "equiareal": EQUIAREAL, "general": GENERAL}
@@ -28,13 +28,13 @@ MOST_PARAMETERS = RIGID + 3 + 2
 _MIN_STRETCH, _MAX_STRETCH = 0.2, 5.0
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def parameter_count(model: int) -> int:
     """Parameters of a step: 6, those of F, gain and bias."""
     return RIGID + model + 2
 
 
-@leaf_kernel
+@fast_kernel
 def deformation_directions(model: int, pose: F64, k: int) -> tuple[float, float, float]:
     """Derivative of (f11, f12, f22) with respect to the k-th parameter of F."""
     if model == EQUIAREAL:
@@ -45,7 +45,7 @@ def deformation_directions(model: int, pose: F64, k: int) -> tuple[float, float,
     return (1.0, 0.0, 0.0) if k == 0 else ((0.0, 1.0, 0.0) if k == 1 else (0.0, 0.0, 1.0))
 
 
-@leaf_kernel
+@fast_kernel
 def mixing(pose: F64, level: Level, model: int, out: F64) -> None:
     """The (FEATURES, parameters) matrix that mixes the sums' features into Jacobian rows.
 
@@ -91,7 +91,7 @@ def mixing(pose: F64, level: Level, model: int, out: F64) -> None:
     out[9, gain + 1] = 1.0
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def _turn(
     out: F64,
     column: int,
@@ -108,7 +108,7 @@ def _turn(
     out[7, column] = -(n[2][0] * b[0] + n[2][1] * b[1] + n[2][2] * b[2])
 
 
-@leaf_kernel
+@fast_kernel
 def hessian(matrix: F64, share: float, mix: F64, parameters: int, scratch: F64, H: F64) -> None:
     """H = share mix' matrix mix, of the photometric cost alone.
 
@@ -136,13 +136,13 @@ def hessian(matrix: F64, share: float, mix: F64, parameters: int, scratch: F64, 
     H[gain + 1, gain + 1] = s[9, gain + 1] * mix[9, gain + 1]
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def _shifted(f0: float, f1: float, f2: float, f5: float, mix: F64, column: int) -> float:
     """Product with a column of ``mixing`` that shifts the centre: its other rows are zero."""
     return f0 * mix[0, column] + f1 * mix[1, column] + f2 * mix[2, column] + f5 * mix[5, column]
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def _turned(
     f2: float, f3: float, f4: float, f5: float, f6: float, f7: float, mix: F64, column: int
 ) -> float:
@@ -151,7 +151,7 @@ def _turned(
     return left + f5 * mix[5, column] + f6 * mix[6, column] + f7 * mix[7, column]
 
 
-@leaf_kernel
+@fast_kernel
 def gradient(sums: F64, mix: F64, parameters: int, g: F64) -> None:
     """g = mix' sums: half of the gradient of the photometric cost."""
     for row in range(parameters):
@@ -161,7 +161,7 @@ def gradient(sums: F64, mix: F64, parameters: int, g: F64) -> None:
         g[row] = total
 
 
-@leaf_kernel
+@fast_kernel
 def apply_step(pose: F64, step: F64, model: int, out: F64) -> None:
     """Eq. 6: move, turn and deform a surfel.  pose, out: (POSE_FLOATS,)."""
     for k in range(POSE_FLOATS):
@@ -184,7 +184,7 @@ def apply_step(pose: F64, step: F64, model: int, out: F64) -> None:
     out[BIAS] = pose[BIAS] + step[parameters - 1]
 
 
-@leaf_kernel
+@fast_kernel
 def _rotate(pose: F64, start: int, wx: float, wy: float, wz: float) -> None:
     """Turn one tangent by a rotation vector (Rodrigues)."""
     x, y, z = pose[start], pose[start + 1], pose[start + 2]

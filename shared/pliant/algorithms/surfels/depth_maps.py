@@ -15,7 +15,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
-from pliant.compiler.kernel import fast_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 _REWEIGHTINGS = 4
 _TUKEY = 4.685  # 95 % efficiency for Gaussian noise
@@ -113,13 +113,14 @@ def fit_inverse_depth(
                 count += 1
     if count < max(6, size):
         return 0.0
+    xs, ys, qs = xs[:count], ys[:count], qs[:count]
     q0 = 1.0 / start
     scale = 1e9
     residuals = np.empty(count)
     a, b, c = q0, 0.0, 0.0
     inliers, squares = 0, 0.0
     for _ in range(_REWEIGHTINGS):
-        solved, a, b, c = _weighted_plane(xs, ys, qs, count, a, b, c, scale)
+        solved, a, b, c = _weighted_plane(xs, ys, qs, a, b, c, scale)
         if not solved:
             return 0.0
         for k in range(count):
@@ -138,7 +139,7 @@ def fit_inverse_depth(
     return inliers / float(size * size)
 
 
-@leaf_kernel
+@fast_kernel
 def _smallest(values: F64, k: int) -> float:
     """The k-th smallest, from 0, of values that are reordered (Hoare's selection)."""
     first, last = 0, len(values) - 1
@@ -176,11 +177,11 @@ def _nearest_depth(depth: F64, column: int, row: int, radius: int) -> float:
 
 @fast_kernel
 def _weighted_plane(
-    xs: F64, ys: F64, qs: F64, count: int, a: float, b: float, c: float, scale: float
+    xs: F64, ys: F64, qs: F64, a: float, b: float, c: float, scale: float
 ) -> tuple[bool, float, float, float]:
     """Least squares plane with Tukey weights about the plane (a, b, c)."""
     n = sx = sy = sxx = sxy = syy = sq = sxq = syq = 0.0
-    for k in range(count):
+    for k in range(len(xs)):
         x, y, q = xs[k], ys[k], qs[k]
         t = (q - a - b * x - c * y) / scale
         if abs(t) >= 1.0:

@@ -38,7 +38,7 @@ from pliant.algorithms.surfels.surfel_alignment import (
     patch_steps_px,
     solve,
 )
-from pliant.compiler.kernel import fast_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 STEPS, COARSE_STEPS = 3, 2
 """Steps of all surfels, at full size and at half the size."""
@@ -75,7 +75,7 @@ def eliminate_all(
     return out
 
 
-@leaf_kernel
+@fast_kernel
 def _eliminate_all(
     poses: F64, active: U8, level: Level, model: int, work: Workspace, sums: F64, matrices: F64,
     out: Eliminated,
@@ -118,7 +118,7 @@ def _eliminate_all(
                 S[r, c] = total
 
 
-@leaf_kernel
+@fast_kernel
 def _add_edges(
     edges: Edges, arms: F64, w: F64, bend: F64, residuals: F64, x: F64, sign: float, y: F64
 ) -> None:
@@ -156,7 +156,7 @@ def _add_edges(
         y[j, 5] += q0 * v1 - q1 * v0
 
 
-@leaf_kernel
+@fast_kernel
 def _times(S: F64, edges: Edges, arms: F64, w: F64, bend: F64, none: F64, x: F64, y: F64) -> None:
     """y = (S + J' W J) x.  none: residuals that are all zero."""
     for s in range(len(x)):
@@ -167,7 +167,7 @@ def _times(S: F64, edges: Edges, arms: F64, w: F64, bend: F64, none: F64, x: F64
     _add_edges(edges, arms, w, bend, none, x, 1.0, y)
 
 
-@leaf_kernel
+@fast_kernel
 def _add_block(v: F64, w: float, bend: float, side: float, block: F64) -> None:
     """Add a pair's J' W J of one end alone.  v: its arm.  side: -1 for the first end, else 1."""
     squares = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -185,7 +185,7 @@ def _add_block(v: F64, w: float, bend: float, side: float, block: F64) -> None:
         block[3 + k2, k] += cross * v[k1]
 
 
-@leaf_kernel
+@fast_kernel
 def _inverses(
     edges: Edges, arms: F64, w: F64, bend: F64, blocks: F64, L: F64, scale: F64, out: F64
 ) -> None:
@@ -203,7 +203,7 @@ def _inverses(
             invert(L, scale[0], n, scale[1], out[s])
 
 
-@leaf_kernel
+@fast_kernel
 def _precondition(inverses: F64, q: F64, z: F64) -> float:
     """z = -M^-1 q; returns -q . z."""
     total = 0.0
@@ -217,7 +217,7 @@ def _precondition(inverses: F64, q: F64, z: F64) -> float:
     return float(np.float64(total))
 
 
-@leaf_kernel
+@fast_kernel
 def _dot(a: F64, b: F64) -> float:
     total = 0.0
     for s in range(len(a)):
@@ -226,7 +226,7 @@ def _dot(a: F64, b: F64) -> float:
     return float(np.float64(total))
 
 
-@leaf_kernel
+@fast_kernel
 def _add(factor: float, a: F64, out: F64) -> None:
     """out += factor a, without an array in between."""
     for s in range(len(a)):
@@ -234,7 +234,7 @@ def _add(factor: float, a: F64, out: F64) -> None:
             out[s, k] += factor * a[s, k]
 
 
-@leaf_kernel
+@fast_kernel
 def _scale_and_add(factor: float, a: F64, out: F64) -> None:
     """out = factor out + a."""
     for s in range(len(a)):
@@ -358,7 +358,7 @@ def _step(
     damping[looked_at & ~better] *= _GRAPH_LAMBDA_UP * limits.lambda_up
 
 
-@leaf_kernel
+@fast_kernel
 def _step_all(poses: F64, x: F64, own: Eliminated, model: int, step: F64, candidates: F64) -> None:
     others = models.parameter_count(model) - RIGID
     for s in range(len(poses)):

@@ -16,7 +16,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, U8, U32, U64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.pixels import halve
-from pliant.compiler.kernel import fast_kernel, inner_kernel, kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
 X, A, B, F, GAIN, BIAS, POSE_FLOATS = 0, 3, 6, 9, 12, 13, 14
 """Where the parts of a surfel's row begin, and its length."""
@@ -88,7 +88,7 @@ def pack(image: F32) -> U64:
     return out
 
 
-@leaf_kernel
+@fast_kernel
 def _fixed_point(row: F32, out: U64) -> None:
     for k in range(len(out)):
         out[k] = np.uint64(np.int32(row[k] * np.float32(_ONE) + np.float32(0.5)))
@@ -178,7 +178,7 @@ def make_grid(side: int) -> Grid:
     return Grid(side, i.ravel().copy(), j.ravel().copy(), x, y, above, quads, values)
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def homography(pose: F64, level: Level, out: F64) -> bool:
     """The 9 numbers, row by row, that map the grid (i, j, 1) to homogeneous pixels.
 
@@ -199,7 +199,7 @@ def homography(pose: F64, level: Level, out: F64) -> bool:
     return out[8] > 0.0 and largest < _LARGEST
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def sample_patch(h: F64, level: Level, grid: Grid, highlight: float) -> bool:
     """Fill ``grid.values`` with bilinear grey levels; INVALID outside and above ``highlight``.
 
@@ -226,7 +226,7 @@ def sample_patch(h: F64, level: Level, grid: Grid, highlight: float) -> bool:
     return True
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def _wholly_inside(x: F32, y: F32, side: int, right: np.float32, bottom: np.float32) -> bool:
     """Whether the corners lie in the image: in front of the camera a square stays convex."""
     zero, last = np.float32(0.0), side * side - 1
@@ -236,7 +236,7 @@ def _wholly_inside(x: F32, y: F32, side: int, right: np.float32, bottom: np.floa
     return True
 
 
-@leaf_kernel
+@fast_kernel
 def _coordinates(h: F64, i: F32, j: F32, x: F32, y: F32) -> None:
     h0, h1, h2 = np.float32(h[0]), np.float32(h[1]), np.float32(h[2])
     h3, h4, h5 = np.float32(h[3]), np.float32(h[4]), np.float32(h[5])
@@ -248,7 +248,7 @@ def _coordinates(h: F64, i: F32, j: F32, x: F32, y: F32) -> None:
         y[k] = (h3 * i[k] + h4 * j[k] + h5) * w
 
 
-@leaf_kernel
+@fast_kernel
 def _pixels(
     x: F32, y: F32, right: np.float32, bottom: np.float32, width: np.uint32, out: U32
 ) -> None:
@@ -262,19 +262,19 @@ def _pixels(
         out[k] = np.uint32(np.int32(v)) * width + np.uint32(np.int32(u))
 
 
-@leaf_kernel
+@fast_kernel
 def _load(quads: U64, index: U32, out: U64) -> None:
     for k in range(len(out)):
         out[k] = quads[index[k]]
 
 
-@leaf_kernel
+@fast_kernel
 def _pixels_inside(x: F32, y: F32, width: np.uint32, out: U32) -> None:
     for k in range(len(out)):
         out[k] = np.uint32(np.int32(y[k])) * width + np.uint32(np.int32(x[k]))
 
 
-@leaf_kernel
+@fast_kernel
 def _interpolate(
     x: F32, y: F32, right: np.float32, bottom: np.float32, halves: U32, highlight: np.float32,
     out: F32,
@@ -291,7 +291,7 @@ def _interpolate(
         out[k] = value if inside & (value <= highlight) else outside
 
 
-@leaf_kernel
+@fast_kernel
 def _interpolate_inside(x: F32, y: F32, halves: U32, highlight: np.float32, out: F32) -> None:
     outside = np.float32(INVALID)
     for k in range(len(out)):
@@ -299,7 +299,7 @@ def _interpolate_inside(x: F32, y: F32, halves: U32, highlight: np.float32, out:
         out[k] = value if value <= highlight else outside
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def _mixed(upper: np.uint32, lower: np.uint32, u: np.float32, v: np.float32) -> np.float32:
     """Bilinear grey level of two rows of two packed pixels."""
     mask, shift = np.uint32(0xFFFF), np.uint32(16)

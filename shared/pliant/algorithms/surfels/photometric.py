@@ -25,7 +25,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.surfels.patch_sampling import Grid
-from pliant.compiler.kernel import inner_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 FEATURES = 10
 TEMPLATE_IMAGES = 3
@@ -50,13 +50,13 @@ def make_features(side: int) -> F32:
     return features
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def first_inner(grid: Grid) -> int:
     """Where in the grid of a patch, one sample wider on each side, its first sample stands."""
     return grid.side + 1
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def photometric_sums(
     images: F32, grid: Grid, mean: float, gain: float, bias: float, tau: float, blend: float,
     out: F64,
@@ -75,7 +75,7 @@ def photometric_sums(
     )  # fmt: skip
 
 
-@leaf_kernel
+@fast_kernel
 def _sums(
     gi: F32, gj: F32, values: F32, wide: int, t: F32, tu: F32, tv: F32, m: np.float32,
     g: np.float32, b: np.float32, limit: np.float32, blend: np.float32, out: F64,
@@ -112,7 +112,7 @@ def _sums(
     return float(cost + limit * limit * (np.float32(n) - seen)), int(seen)
 
 
-@leaf_kernel
+@fast_kernel
 def feature_matrix(
     images: F32, grid: Grid, mean: float, gain: float, bias: float, tau: float, blend: float,
     features: F32, out: F64,
@@ -129,7 +129,7 @@ def feature_matrix(
     _products(features, out)
 
 
-@leaf_kernel
+@fast_kernel
 def _features(
     values: F32, wide: int, t: F32, tu: F32, tv: F32, m: np.float32, g: np.float32, b: np.float32,
     limit: np.float32, blend: np.float32, features: F32,
@@ -165,13 +165,13 @@ def _features(
     _times(j, d, features[7])
 
 
-@leaf_kernel
+@fast_kernel
 def _times(a: F32, b: F32, out: F32) -> None:
     for k in range(len(out)):
         out[k] = a[k] * b[k]
 
 
-@leaf_kernel
+@fast_kernel
 def _products(features: F32, out: F64) -> None:
     """Scalar products of all rows with each other, four at a time."""
     for row in range(FEATURES):
@@ -191,7 +191,7 @@ def _products(features: F32, out: F64) -> None:
                     out[row, column + m] = out[column + m, row] = sums[m]
 
 
-@leaf_kernel
+@fast_kernel
 def correlation(template: F32, values: F32) -> tuple[float, int]:
     """ZNCC of two patches over the samples that both have, and how many these are."""
     n = sa = sb = saa = sbb = sab = np.float32(0.0)

@@ -32,7 +32,7 @@ from pliant.algorithms.surfels.photometric import (
     make_features,
     photometric_sums,
 )
-from pliant.compiler.kernel import inner_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 MIN_GAIN = 0.05
 _N = models.MOST_PARAMETERS
@@ -130,14 +130,14 @@ class Evaluation(NamedTuple):
     matrices: F64  # (N, FEATURES, FEATURES) or (0, ...)
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def copy(source: F64, target: F64) -> None:
     """Fill ``target``.  An assignment to a slice makes a copy in between."""
     for k in range(len(target)):
         target[k] = source[k]
 
 
-@leaf_kernel
+@fast_kernel
 def factorise(H: F64, n: int, damped: int, damping: float, L: F64, inverse: F64) -> bool:
     """L D L' = H + lambda D_w, with ones on the diagonal of L.
 
@@ -166,7 +166,7 @@ def factorise(H: F64, n: int, damped: int, damping: float, L: F64, inverse: F64)
     return True
 
 
-@leaf_kernel
+@fast_kernel
 def solve(L: F64, inverse: F64, n: int, g: F64, step: F64) -> None:
     """step = -(L D L')^-1 g, for a factor from ``factorise``."""
     for row in range(n):
@@ -181,7 +181,7 @@ def solve(L: F64, inverse: F64, n: int, g: F64, step: F64) -> None:
         step[row] = total
 
 
-@leaf_kernel
+@fast_kernel
 def invert(L: F64, inverse: F64, n: int, scratch: F64, out: F64) -> None:
     """out = (L D L')^-1, the inverse of the factored matrix: many solves are products."""
     for column in range(n):
@@ -190,7 +190,7 @@ def invert(L: F64, inverse: F64, n: int, scratch: F64, out: F64) -> None:
         solve(L, inverse, n, scratch, out[column])
 
 
-@leaf_kernel
+@fast_kernel
 def inverse_diagonal(L: F64, inverse: F64, n: int, count: int, scratch: F64) -> float:
     """Trace of the leading ``count`` x ``count`` block of the inverse of the factored matrix."""
     trace = 0.0
@@ -205,7 +205,7 @@ def inverse_diagonal(L: F64, inverse: F64, n: int, count: int, scratch: F64) -> 
     return float(np.float64(trace))
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def evaluate(
     pose: F64, level: Level, images: F32, mean: float, limits: Limits, work: Workspace, sums: F64
 ) -> tuple[float, int]:
@@ -222,7 +222,7 @@ def evaluate(
     )
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def curvature(
     pose: F64, images: F32, mean: float, limits: Limits, work: Workspace, matrix: F64
 ) -> None:
@@ -233,7 +233,7 @@ def curvature(
     )  # fmt: skip
 
 
-@leaf_kernel
+@fast_kernel
 def _evaluate_all(
     poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
     out: Evaluation,
@@ -269,14 +269,14 @@ def evaluate_all(
     return out
 
 
-@leaf_kernel
+@fast_kernel
 def patch_steps_px(before: F64, after: F64, half: float, out: F64) -> None:
     """``_patch_step_px`` of N patches.  before, after: (N, 9).  out: (N,)."""
     for s in range(len(before)):
         out[s] = _patch_step_px(before[s], after[s], half)
 
 
-@inner_kernel
+@fast_kernel(inline=True)
 def _patch_step_px(before: F64, after: F64, half: float) -> float:
     """How far the farthest of the centre and four corners of a patch moves, pixels."""
     farthest = 0.0
@@ -292,7 +292,7 @@ def _patch_step_px(before: F64, after: F64, half: float) -> float:
     return farthest
 
 
-@leaf_kernel
+@fast_kernel
 def align_all(
     poses: F64, active: U8, equilibrium: Equilibrium, level: Level, templates: Templates,
     limits: Limits, work: Workspace,
@@ -355,14 +355,14 @@ def align_all(
                 break
 
 
-@leaf_kernel
+@fast_kernel
 def _rest_cost(pose: F64, point: F64, weight: float) -> float:
     """omega_E times Eq. 20, DN^2.  point: (3,)."""
     x, y, z = pose[X] - point[0], pose[X + 1] - point[1], pose[X + 2] - point[2]
     return float(weight * (x * x + y * y + z * z))
 
 
-@leaf_kernel
+@fast_kernel
 def _add_rest(pose: F64, point: F64, weight: float, H: F64, g: F64) -> None:
     """Add its matrix and half of its gradient; the position is the first three parameters."""
     for k in range(3):

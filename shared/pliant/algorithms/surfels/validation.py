@@ -22,7 +22,7 @@ from pliant.algorithms.surfels.surfel_alignment import (
     factorise,
     inverse_diagonal,
 )
-from pliant.compiler.kernel import leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 FRONT, INSIDE, VISIBLE, ZNCC, SIGMA, U, V, COLUMNS = 0, 1, 2, 3, 4, 5, 6, 7
 """Columns of a validation: in front of the camera (0 or 1), shares of the texture inside of the
@@ -33,7 +33,7 @@ _MAX_SIGMA = 1e3
 _FAR = 1e6
 
 
-@leaf_kernel
+@fast_kernel
 def validate_all(
     poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
     out: F64,
@@ -76,7 +76,7 @@ def validate_all(
             row[SIGMA] = min(math.sqrt(noise * trace), _MAX_SIGMA)
 
 
-@leaf_kernel
+@fast_kernel
 def _inside(t: F32, x: F32, y: F32, level: Level) -> float:
     """How many samples of a texture lie in the image."""
     zero, one, far = np.float32(0.0), np.float32(1.0), np.float32(_FAR)
@@ -88,7 +88,7 @@ def _inside(t: F32, x: F32, y: F32, level: Level) -> float:
     return float(count)
 
 
-@leaf_kernel
+@fast_kernel
 def _agreeing(
     t: F32, values: F32, mean: float, gain: float, bias: float, tau: float
 ) -> tuple[float, float]:

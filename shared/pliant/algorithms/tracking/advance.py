@@ -30,7 +30,7 @@ from pliant.algorithms.tracking.local_flow import Flow, flow_at
 from pliant.algorithms.tracking.maxima import subpixel_offset
 from pliant.algorithms.tracking.track_table import Track, Tracks
 from pliant.algorithms.tracks import COASTING, EXTREMUM
-from pliant.compiler.kernel import fast_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 AHEAD = 3
 """Tracks by which memory is asked for before it is read."""
@@ -78,7 +78,7 @@ class _Place(NamedTuple):
     accepted: bool
 
 
-@leaf_kernel
+@fast_kernel
 def advance_tracks(
     before: FrameImages,
     now: FrameImages,
@@ -135,13 +135,13 @@ def advance_tracks(
         track.alive = 1 if alive else 0
 
 
-@leaf_kernel
+@fast_kernel
 def _prefetch_record(tracks: Tracks, row: int) -> None:
     prefetch(tracks, row)
     prefetch(tracks, row + 1)
 
 
-@leaf_kernel
+@fast_kernel
 def _prefetch_track(
     image: Pixels,
     kappa_before: Pixels,
@@ -182,7 +182,7 @@ def scan_order(tracks: Tracks, height: int) -> I32:
     return order
 
 
-@leaf_kernel
+@fast_kernel
 def to_octave(position: np.float32, octave: int) -> np.float32:
     """A coordinate of the full-size image in the image of an octave."""
     if octave == 0:
@@ -191,7 +191,7 @@ def to_octave(position: np.float32, octave: int) -> np.float32:
     return (position + half) * half - half
 
 
-@leaf_kernel
+@fast_kernel
 def _from_octave(position: np.float32, octave: int) -> np.float32:
     """A coordinate of the image of an octave in the full-size image."""
     if octave == 0:
@@ -200,21 +200,21 @@ def _from_octave(position: np.float32, octave: int) -> np.float32:
     return (position + half) * np.float32(2.0) - half
 
 
-@leaf_kernel
+@fast_kernel
 def patch_origin(u: np.float32, v: np.float32) -> tuple[int, int]:
     """First pixel of the patch whose centre is within half a pixel of a point."""
     centre = np.float32(0.5 * (PATCH_SIZE - 2))
     return int(np.floor(u - centre)), int(np.floor(v - centre))
 
 
-@leaf_kernel
+@fast_kernel
 def patch_inside(image: Pixels, left: int, top: int) -> bool:
     """Whether a patch and the margin of its gradients lie in the image."""
     right, bottom = left + PATCH_SIZE + 1, top + PATCH_SIZE + 1
     return left >= 1 and top >= 1 and right <= image.width and bottom <= image.height
 
 
-@leaf_kernel
+@fast_kernel
 def _extremum_position(kappa: Pixels, pixel: int, subpixel: bool) -> tuple[np.float32, np.float32]:
     """Position of an extremum: of its pixel, or of the parabola around it."""
     k, width = kappa.values, kappa.width
@@ -226,7 +226,7 @@ def _extremum_position(kappa: Pixels, pixel: int, subpixel: bool) -> tuple[np.fl
     return u, v
 
 
-@leaf_kernel
+@fast_kernel
 def _settle(kappa: Pixels, pixel: int, subpixel: bool, track: Track) -> None:
     """Put a track on an extremum of this frame."""
     u, v = _extremum_position(kappa, pixel, subpixel)
@@ -237,7 +237,7 @@ def _settle(kappa: Pixels, pixel: int, subpixel: bool, track: Track) -> None:
     track.coasted = 0
 
 
-@leaf_kernel
+@fast_kernel
 def _find_extremum(
     kappa_before: Pixels,
     kappa: Pixels,
@@ -273,7 +273,7 @@ def _find_extremum(
     return pixel
 
 
-@leaf_kernel
+@fast_kernel
 def _follow_patch(
     image_before: Pixels,
     image: Pixels,
@@ -322,7 +322,7 @@ def _follow_patch(
     return bool(place.u < right) and bool(place.v < bottom)
 
 
-@leaf_kernel
+@fast_kernel
 def _align_track(
     image: Pixels,
     start_u: np.float32,
@@ -349,7 +349,7 @@ def _align_track(
     return _Place(u, v, bool(accepted and fits))
 
 
-@leaf_kernel
+@fast_kernel
 def _leads_back(
     image_before: Pixels,
     image: Pixels,

@@ -10,7 +10,7 @@ from numba.extending import intrinsic
 from pliant.algorithms.image.pixels import Pixels
 from pliant.algorithms.image.vector_code import call_llvm, load, splat, vector_type
 from pliant.algorithms.tracking.curvature import CURVATURE_BORDER
-from pliant.compiler.kernel import leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 NEIGHBOURS = 8
 STEPS_X = (-1, 0, 1, -1, 1, -1, 0, 1)
@@ -91,7 +91,7 @@ def best_neighbour(
     return signature, codegen
 
 
-@leaf_kernel
+@fast_kernel
 def climb(
     kappa: Pixels, u: np.float32, v: np.float32, sign: np.float32, weight: np.float32,
     sigma: np.float32,

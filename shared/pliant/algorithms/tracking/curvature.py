@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F32
-from pliant.compiler.kernel import leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 BLUR_RADIUS = 3
 """Half-width of the Gaussian in pixels: enough for a sigma up to about 1.3 px."""
@@ -50,7 +50,7 @@ def row_scratch(width: int) -> F32:
     return np.empty((4, width + 2 * BLUR_RADIUS), np.float32)
 
 
-@leaf_kernel
+@fast_kernel
 def _curvature(
     image: NDArray[Any],
     taps: GaussianTaps,
@@ -63,7 +63,7 @@ def _curvature(
         curve_row(image, y, taps, scratch, smooth, kappa)
 
 
-@leaf_kernel
+@fast_kernel
 def clear_border(kappa: F32) -> None:
     """There is no curvature in the first and the last rows."""
     height = kappa.shape[0]
@@ -71,7 +71,7 @@ def clear_border(kappa: F32) -> None:
     kappa[max(height - CURVATURE_BORDER, 0) :] = 0.0
 
 
-@leaf_kernel
+@fast_kernel
 def curve_row(
     image: NDArray[Any], y: int, taps: GaussianTaps, scratch: F32, smooth: F32, kappa: F32
 ) -> None:
@@ -116,7 +116,7 @@ def curve_row(
             )
 
 
-@leaf_kernel
+@fast_kernel
 def _blur_column(
     r0: NDArray[Any],
     a1: NDArray[Any],
@@ -139,7 +139,7 @@ def _blur_column(
         )
 
 
-@leaf_kernel
+@fast_kernel
 def _blur_row(padded: F32, taps: GaussianTaps, out: F32) -> None:
     """Blur along a row that is padded by BLUR_RADIUS on both sides."""
     w0, w1, w2, w3 = taps
@@ -152,7 +152,7 @@ def _blur_row(padded: F32, taps: GaussianTaps, out: F32) -> None:
         )
 
 
-@leaf_kernel
+@fast_kernel
 def _curvature_row(above: F32, centre: F32, below: F32, columns: F32, out: F32) -> None:
     """Eq. 1 for a row.  The inputs begin one pixel before the output, and end one after it.
 

@@ -21,7 +21,7 @@ from pliant.algorithms.image.pixels import Pixels
 from pliant.algorithms.image.vector_code import CACHE_LINE_FLOATS, prefetch
 from pliant.algorithms.tracking.local_flow import CELL_PX, fit_planes, grid_shape
 from pliant.algorithms.tracking.track_table import Patches, Track, Tracks
-from pliant.compiler.kernel import fast_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 WINDOW_SIDE = PATCH_SIZE + 2
 """Of the samples of a patch with the margin of its gradients."""
@@ -79,7 +79,7 @@ def _mean_motion(tracks: Tracks, affine: F32, motion: F32, points: F32, found: B
                 points[row, column, 1] /= n
 
 
-@leaf_kernel
+@fast_kernel
 def turn_templates(
     tracks: Tracks, slopes: F32, affine: F32, patches: Patches, window: Pixels, lagging: I32
 ) -> None:
@@ -106,7 +106,7 @@ def turn_templates(
         m[4], m[5], m[6], m[7] = m[0], m[1], m[2], m[3]
 
 
-@leaf_kernel
+@fast_kernel
 def _deform(tracks: Tracks, slopes: F32, affine: F32, deformations: F32, lagging: I32) -> int:
     """Carry the deformations on.  Writes the rows whose template lags; returns their number."""
     rows, columns = slopes.shape[0], slopes.shape[1]
@@ -133,7 +133,7 @@ def _deform(tracks: Tracks, slopes: F32, affine: F32, deformations: F32, lagging
     return lags
 
 
-@leaf_kernel
+@fast_kernel
 def sample_birth(births: F32, offset: int, track: Track, m: F32, window: F32) -> None:
     """Sample what was kept of a birth as a deformation m = [m00 m01 m10 m11] shows it now.
 
@@ -170,7 +170,7 @@ def sample_birth(births: F32, offset: int, track: Track, m: F32, window: F32) ->
                 out[column] = _blend(births, start, u, v)
 
 
-@leaf_kernel
+@fast_kernel
 def _blend(births: F32, start: np.uint64, u: np.float32, v: np.float32) -> np.float32:
     at_u, at_v = np.int32(u), np.int32(v)
     fu, fv = u - np.float32(at_u), v - np.float32(at_v)
@@ -182,7 +182,7 @@ def _blend(births: F32, start: np.uint64, u: np.float32, v: np.float32) -> np.fl
     return above + fv * (below - above)
 
 
-@leaf_kernel
+@fast_kernel
 def keep_birth(image: Pixels, left: int, top: int, births: F32, offset: int) -> None:
     """Keep the surroundings of a new patch; beyond the image its edge goes on."""
     for row in range(BIRTH_SIZE):

@@ -19,7 +19,7 @@ from pliant.algorithms.image.patch_alignment import (
 )
 from pliant.algorithms.image.patch_sums import GAUSSIAN, PATCH_SIZE, TEMPLATE_FLOATS
 from pliant.algorithms.image.pixels import Pixels, pixels_of
-from pliant.compiler.kernel import fast_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 CELL_PX = 20
 """Side of a cell of the grid in full-size pixels: 32 x 24 cells at 640x480."""
@@ -83,7 +83,7 @@ def local_flow(
     return Flow(grid, affine)
 
 
-@leaf_kernel
+@fast_kernel
 def flow_at(flow: Flow, u: np.float32, v: np.float32) -> tuple[np.float32, np.float32]:
     """Displacement of a pixel: the dominant flow plus the grid's bilinear correction."""
     grid, affine = flow.grid, flow.affine
@@ -115,7 +115,7 @@ def _strongest_of_cells(maxima: F32, points: F32) -> None:
             points[row, column, 2] = kappa
 
 
-@leaf_kernel
+@fast_kernel
 def _align_cells(
     previous: Pixels,
     current: Pixels,
@@ -196,7 +196,7 @@ def fit_planes(flow: F32, found: BoolArray, points: F32, tolerance: np.float32, 
     return agreed
 
 
-@leaf_kernel
+@fast_kernel
 def _fit_planes(
     flow: F32,
     found: BoolArray,
@@ -271,7 +271,7 @@ def _fit_planes(
             agreed[row, column, 1] = v + (sv - slope_x * sx - slope_y * sy) / sw
 
 
-@leaf_kernel
+@fast_kernel
 def _insert_sorted(values: F32, count: int, value: np.float32) -> None:
     # Each place keeps the smaller and passes the larger on: no branch to foretell wrongly.
     for i in range(count):

@@ -19,7 +19,7 @@ from pliant.algorithms.tracking.curvature import (
     gaussian_taps,
     row_scratch,
 )
-from pliant.compiler.kernel import leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 RUN = 32
 """Pixels that one word speaks of."""
@@ -94,7 +94,7 @@ def _limits(min_curvature: float, *, both_signs: bool) -> tuple[np.float32, np.f
     return np.float32(-min_curvature if both_signs else -np.inf), np.float32(min_curvature)
 
 
-@leaf_kernel
+@fast_kernel
 def subpixel_offset(before: np.float32, centre: np.float32, after: np.float32) -> np.float32:
     """Vertex of the parabola through three samples at -1, 0, 1, clamped to +-0.5 px."""
     curve = before - np.float32(2.0) * centre + after
@@ -104,7 +104,7 @@ def subpixel_offset(before: np.float32, centre: np.float32, after: np.float32) -
     return min(max(offset, np.float32(-0.5)), np.float32(0.5))
 
 
-@leaf_kernel
+@fast_kernel
 def _curvature_and_maxima(
     image: NDArray[Any],
     taps: GaussianTaps,
@@ -131,7 +131,7 @@ def _curvature_and_maxima(
     return count
 
 
-@leaf_kernel
+@fast_kernel
 def _find_maxima(
     kappa: F32, width: int, lowest: np.float32, highest: np.float32, pixels: I32, maxima: F32
 ) -> int:
@@ -144,7 +144,7 @@ def _find_maxima(
     return count
 
 
-@leaf_kernel
+@fast_kernel
 def _extrema_of_row(
     kappa: F32,
     width: int,

@@ -167,15 +167,6 @@ class ExtremaTracker:
         )
 
 
-def warm_up() -> None:
-    """Compile every kernel of the tracker, with the types that real frames have."""
-    rng = np.random.default_rng(0)
-    grey = rng.integers(0, 256, (120, 160), np.uint8)
-    tracker = ExtremaTracker(160, 120, TrackingParameters())
-    for _ in range(2):
-        tracker.track(grey)
-
-
 def _pyramid(image: F32) -> list[F32]:
     """The image at 1/2, 1/4 and 1/8 of its size."""
     half = halve(image)

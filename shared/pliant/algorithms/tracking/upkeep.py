@@ -17,7 +17,7 @@ from pliant.algorithms.tracking.advance import (
 from pliant.algorithms.tracking.deformation import keep_birth
 from pliant.algorithms.tracking.track_table import Patches, Track, Tracks
 from pliant.algorithms.tracks import EXTREMUM
-from pliant.compiler.kernel import fast_kernel, leaf_kernel
+from pliant.compiler.kernel import fast_kernel
 
 BINS = 2048
 """Bins of |kappa|, eight to the octave: the upper bits of its float32."""
@@ -133,7 +133,7 @@ def start_tracks(
     return count, free_count
 
 
-@leaf_kernel
+@fast_kernel
 def _take_patch(
     now: FrameImages,
     u: np.float32,
@@ -217,7 +217,7 @@ def remove_doubles(tracks: Tracks, owners: I32) -> None:
         _keep_oldest(tracks, crowded, taken, owners.reshape(-1), width)
 
 
-@leaf_kernel
+@fast_kernel
 def _keep_oldest(
     tracks: Tracks,
     crowded: NDArray[np.uint64],
@@ -245,7 +245,7 @@ def _keep_oldest(
             set_bit(taken, at)
 
 
-@leaf_kernel
+@fast_kernel
 def _pixel(track: Track, width: int) -> int:
     half = np.float32(0.5)
     return int(track.v + half) * width + int(track.u + half)
@@ -257,19 +257,19 @@ def no_bits(height: int, width: int) -> NDArray[np.uint64]:
     return np.zeros(height * width // 64 + 2, np.uint64)
 
 
-@leaf_kernel
+@fast_kernel
 def get_bit(bits: NDArray[np.uint64], at: int) -> bool:
     """Whether the bit of a flat pixel is set."""
     return bool((bits[at >> 6] >> np.uint64(at & 63)) & np.uint64(1))
 
 
-@leaf_kernel
+@fast_kernel
 def set_bit(bits: NDArray[np.uint64], at: int) -> None:
     """Set the bit of a flat pixel."""
     bits[at >> 6] |= np.uint64(1) << np.uint64(at & 63)
 
 
-@leaf_kernel
+@fast_kernel
 def any_around(bits: NDArray[np.uint64], at: int, width: int) -> bool:
     """Whether a bit of a pixel or of its eight neighbours is set."""
     seen = np.uint64(0)
@@ -282,7 +282,7 @@ def any_around(bits: NDArray[np.uint64], at: int, width: int) -> bool:
     return bool(seen & np.uint64(7))
 
 
-@leaf_kernel
+@fast_kernel
 def set_square(
     bits: NDArray[np.uint64], x: int, y: int, reach: int, height: int, width: int
 ) -> None:

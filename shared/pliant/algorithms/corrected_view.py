@@ -34,6 +34,19 @@ class CorrectedView:
         u, v = np.ascontiguousarray(points_px.T)
         return np.stack(ideal_pixels(u, v, self.camera, self._correction), axis=1)
 
+    def seen(self, points_px: F32) -> F32:
+        """(N, 2) pixels of the ideal image in the rectified one: undoes ``pixels``."""
+        if not self._correction.any():
+            return points_px
+        camera = self.camera
+        s, k1, k2 = self._correction.tolist()
+        x = (points_px[:, 0].astype(np.float64) - camera.cx) / camera.fx
+        y = (points_px[:, 1].astype(np.float64) - camera.cy) / camera.fy
+        squared = x * x + y * y
+        factor = np.exp(s) * (1.0 + k1 * squared + k2 * squared**2)
+        u, v = camera.cx + camera.fx * x * factor, camera.cy + camera.fy * y * factor
+        return np.stack([u, v], axis=1).astype(np.float32)
+
     def image(self, pixels: U8) -> U8:
         """(H, W) or (H, W, 3) the ideal image of a rectified one."""
         if not self._correction.any():

@@ -1,0 +1,144 @@
+"""The camera after frames that showed nothing: predicted, looked for about there, and proved.
+
+A camera that is covered, blurred or dark for a moment goes on moving.  Where it is afterwards lies
+the farther from any prediction the longer that took, so that points are looked for in a radius that
+grows with the time since the last pose.  Of the many maxima in it a point takes the one whose patch
+fits best; P3P and RANSAC find the pose that the good ones among these agree on.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse, move_by_similarity, so3_exp, so3_log
+from pliant.algorithms.mapping.localisation import locate, refine
+from pliant.algorithms.mapping.map_store import PointRows
+from pliant.algorithms.mapping.parameters import (
+    MappingParameters,
+    RecoveryParameters,
+)
+from pliant.algorithms.mapping.reacquisition import MaximaGrid, match_widely, reacquire
+
+_NEAR = 0.3
+"""Share of the radius that is searched first: mostly enough, and far less to confuse."""
+
+
+@dataclass(kw_only=True)
+class Motion:
+    """How the camera moved last: T_world_camera (4, 4) of two frames, the newer one last."""
+
+    stamps_ns: tuple[int, int]
+    poses: tuple[F64, F64]
+
+    def then(self, stamp_ns: int, T_world_camera: F64) -> "Motion":
+        """The motion after one more pose."""
+        return Motion(
+            stamps_ns=(self.stamps_ns[1], stamp_ns), poses=(self.poses[1], T_world_camera)
+        )
+
+    def moved(self, S: F64) -> "Motion":
+        """The motion after the world has moved by a similarity (4, 4)."""
+        before, last = (move_by_similarity(S, pose) for pose in self.poses)
+        return Motion(stamps_ns=self.stamps_ns, poses=(before, last))
+
+    def interval_s(self) -> float:
+        """Seconds between the two."""
+        return 1e-9 * (self.stamps_ns[1] - self.stamps_ns[0])
+
+    def lost_s(self, stamp_ns: int) -> float:
+        """Seconds since the last pose."""
+        return 1e-9 * (stamp_ns - self.stamps_ns[1])
+
+    def predictions(self, stamp_ns: int) -> list[F64]:
+        """T_world_camera by constant velocity, and that of a camera that has stopped since."""
+        before, last = self.poses
+        elapsed = self.stamps_ns[1] - self.stamps_ns[0]
+        if elapsed <= 0:
+            return [last]
+        share = (stamp_ns - self.stamps_ns[1]) / elapsed
+        step = inverse(before) @ last
+        moved = np.eye(4)
+        moved[:3, :3] = so3_exp(share * so3_log(step[:3, :3]))
+        moved[:3, 3] = share * step[:3, 3]
+        return [last @ moved, last]
+
+
+def search_radius_px(lost_s: float, camera: PinholeCamera, parameters: RecoveryParameters) -> float:
+    """How far from its prediction a point may be, px, this long after the last pose."""
+    grown = parameters.radius_share + parameters.growth_share_per_s * lost_s
+    return camera.width * min(grown, parameters.max_radius_share)
+
+
+def recover(
+    motion: Motion,
+    stamp_ns: int,
+    rows: I32,
+    points: PointRows,
+    maxima: F32,
+    grey: U8,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    generator: np.random.Generator,
+) -> F64 | None:
+    """T_world_camera of a frame that no track leads to, None where the image does not prove one.
+
+    motion: before.   stamp_ns: of the frame.   rows: of points that it may show.   maxima: (M, 3)
+    of the frame.   grey: (H, W).
+    """
+    own = parameters.recovery
+    predictions = motion.predictions(stamp_ns)
+    radius_px = search_radius_px(motion.lost_s(stamp_ns), camera, own)
+    limits = parameters.localisation.model_copy(update={"ransac_samples": own.ransac_samples})
+    for radius in (_NEAR * radius_px, radius_px):
+        grid = MaximaGrid.build(maxima, camera.width, camera.height, radius)
+        for T_world_camera in predictions:
+            found, points_px = match_widely(
+                T_world_camera, rows, points.xyz, points.kappas, points.patches, grid, grey,
+                camera, radius, own.points, parameters.reacquisition.min_zncc,
+            )  # fmt: skip
+            if len(found) < own.min_agreeing:
+                continue
+            located = locate(
+                [T_world_camera], points.xyz[found], points_px, camera, limits, generator
+            )
+            if located.inliers.sum() < own.min_agreeing:
+                continue
+            proved = _proved(located.T_world_camera, rows, points, maxima, grey, camera, parameters)
+            if proved is not None:
+                return proved
+    return None
+
+
+def _proved(
+    T_world_camera: F64,
+    rows: I32,
+    points: PointRows,
+    maxima: F32,
+    grey: U8,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+) -> F64 | None:
+    """The pose refined by all points found where it shows them, None if these are too few of them.
+
+    Wrong poses find points as well: wherever a maximum is near and its patch looks alike.
+    """
+    narrow = parameters.reacquisition
+    found = reacquire(
+        T_world_camera, rows, points.xyz, points.kappas, points.patches, maxima, grey, camera,
+        narrow,
+    )  # fmt: skip
+    if len(found.rows) < parameters.localisation.min_inliers:
+        return None
+    located = refine(
+        T_world_camera, points.xyz[found.rows], found.points_px, camera, parameters.localisation,
+        near=True,
+    )  # fmt: skip
+    inliers = int(located.inliers.sum())
+    enough = max(
+        parameters.localisation.min_inliers,
+        parameters.recovery.min_support_share * len(found.visible),
+        parameters.recovery.min_agreement * len(found.rows),
+    )
+    return located.T_world_camera if inliers >= enough else None

@@ -1,0 +1,175 @@
+"""A camera whose calibration is a guess: found at the start, and refined while the map grows.
+
+The mapper works on pixels and images of an ideal pinhole camera: those that come, moved by what the
+images have told of the calibration so far.  A start is tried under several focal lengths; then all
+keyframes are adjusted together with the calibration, each time that their number has grown by a
+share, and what comes next is seen by the camera that was found.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.bundle.problem import (
+    BundleProblem,
+    BundleResult,
+    CalibrationUncertainty,
+    shared_intrinsics,
+)
+from pliant.algorithms.bundle.schur import solve_schur
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import CorrectedView, corrected_view
+from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.start import Start, WaitingFrame, find_start, why_no_start
+from pliant.algorithms.tracks import FrameTracks
+
+_GUESS = 0.05
+"""Standard deviation of the log focal length from which on a calibration is a guess."""
+
+_LENS = 0.1
+"""Standard deviations of k1 and k2 of an unknown lens."""
+
+_HYPOTHESES = np.linspace(-2.0, 2.0, 7)
+"""Focal lengths that a start is tried under, in standard deviations of the prior."""
+
+_GROWTH = 1.4
+"""The map is adjusted with its calibration whenever its keyframes are so many times more."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SelfCalibration:
+    """What is known of a camera.
+
+    given: the camera as it was given, of the rectified images.
+    correction: (4,) what is wrong with it, see ``solve_schur``.   covariance: (4, 4) of that.
+    next_keyframes: how many a map must have to be asked again.
+    """
+
+    given: PinholeCamera
+    correction: F64
+    covariance: F64
+    next_keyframes: int = 0
+
+    @staticmethod
+    def of(camera: PinholeCamera, uncertainty: CalibrationUncertainty) -> "SelfCalibration":
+        """Before anything was seen."""
+        return SelfCalibration(camera, np.zeros(4), np.diag(uncertainty.sigmas**2))
+
+    @property
+    def sigmas(self) -> F64:
+        """(4,) standard deviations of the correction."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def view(self) -> CorrectedView:
+        """Moves what is seen to where the camera found so far, were it ideal, would see it."""
+        return corrected_view(self.given, tuple(self.correction.tolist()))
+
+    def ideal(
+        self, tracks: FrameTracks, grey: U8 | None, colour: U8 | None
+    ) -> tuple[FrameTracks, U8 | None, U8 | None]:
+        """Tracks and images of the camera found so far."""
+        view = self.view
+        if view.lens == (0.0, 0.0):
+            return tracks, grey, colour
+        maxima = tracks.maxima.copy()
+        maxima[:, :2] = view.pixels(tracks.maxima[:, :2])
+        moved = dataclasses.replace(tracks, points_px=view.pixels(tracks.points_px), maxima=maxima)
+        images = [None if image is None else view.image(image) for image in (grey, colour)]
+        return moved, images[0], images[1]
+
+    def told_with(self, delta: MapDelta) -> MapDelta:
+        """What is published, with what the map was made with."""
+        if not self.correction.any():
+            return delta
+        return dataclasses.replace(
+            delta,
+            calibration_correction=tuple(self.correction.tolist()),
+            calibration_sigmas=tuple(self.sigmas.tolist()),
+        )
+
+    def corrected(self, correction: F64, covariance: F64, keyframes: int) -> "SelfCalibration":
+        """With what so many keyframes told of it."""
+        following = max(keyframes + 1, int(np.ceil(_GROWTH * keyframes)))
+        return SelfCalibration(self.given, correction, covariance, following)
+
+
+def widened(parameters: MappingParameters, focal_sigma: float) -> MappingParameters:
+    """For a camera whose source says how far its log focal length may be wrong; 0: calibrated.
+
+    Who guesses the focal length knows nothing of the lens either.  What is held stays held.
+    """
+    prior = parameters.calibration
+    if focal_sigma <= prior.focal or prior.focal == 0.0:
+        return parameters
+    wider: dict[str, float] = {"focal": focal_sigma}
+    if focal_sigma > _GUESS:
+        wider |= {"k1": max(prior.k1, _LENS), "k2": max(prior.k2, _LENS)}
+    return parameters.model_copy(update={"calibration": prior.model_copy(update=wider)})
+
+
+def is_guess(uncertainty: CalibrationUncertainty) -> bool:
+    """Whether a calibration is so uncertain that a map needs a better one first."""
+    return uncertainty.focal > _GUESS
+
+
+def find_start_of(
+    waiting: list[WaitingFrame], known: SelfCalibration, parameters: MappingParameters
+) -> tuple[Start, SelfCalibration] | str:
+    """As ``find_start``, and what the start tells of the camera where that is a guess still."""
+    if is_guess(parameters.calibration) and not known.next_keyframes:
+        return _find_start_of_guess(waiting, known, parameters)
+    found = find_start(waiting, known.view.camera, parameters)
+    return found if isinstance(found, str) else (found, known)
+
+
+def _find_start_of_guess(
+    waiting: list[WaitingFrame], known: SelfCalibration, parameters: MappingParameters
+) -> tuple[Start, SelfCalibration] | str:
+    """The start under the focal length with which it agrees best with itself.
+
+    Where any of the focal lengths explains the flow by a turn alone, it waits: a wrong one sees
+    parallax in every turn.
+    """
+    sigma = parameters.calibration.focal
+    tried = [known.correction + np.array([k * sigma, 0.0, 0.0, 0.0]) for k in _HYPOTHESES]
+    cameras = [corrected_view(known.given, tuple(each.tolist())).camera for each in tried]
+    reasons = [why_no_start(waiting, camera, parameters) for camera in cameras[::-1]]
+    if any(reasons):
+        return next(filter(None, reasons))
+    best: tuple[float, Start, F64] | None = None
+    reason = ""
+    for correction, camera in zip(tried, cameras, strict=True):
+        found = find_start(waiting, camera, parameters)
+        if isinstance(found, str):
+            reason = reason or found
+            continue
+        refined = _refine(found, camera, parameters)
+        cost = refined.final_cost / len(found.points_px)
+        if best is None or cost < best[0]:
+            poses, points = refined.T_world_camera, refined.points_world
+            start = dataclasses.replace(found, T_world_camera=poses, points_world=points)
+            best = cost, start, correction + refined.correction
+    if best is None:
+        return reason
+    _, start, correction = best
+    following = int(np.ceil(_GROWTH * len(start.frames)))
+    return start, SelfCalibration(known.given, correction, known.covariance, following)
+
+
+def _refine(start: Start, camera: PinholeCamera, parameters: MappingParameters) -> BundleResult:
+    """The start with its focal length free."""
+    count = len(start.frames)
+    problem = BundleProblem(
+        T_world_camera=start.T_world_camera,
+        points_world=start.points_world,
+        camera_index=start.keyframe_index,
+        point_index=start.point_index,
+        points_px=start.points_px,
+        intrinsics=shared_intrinsics(camera, count),
+        fixed_cameras=np.arange(count) == 0,
+    )
+    uncertainty = parameters.calibration.model_copy(update={"k1": 0.0, "k2": 0.0, "readout": 0.0})
+    return solve_schur(problem, parameters.bundle, uncertainty=uncertainty)

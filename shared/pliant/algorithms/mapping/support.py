@@ -1,0 +1,82 @@
+"""Whether what supports a pose is the world: enough of what is seen, and all over the image.
+
+A few dozen inliers always agree with some motion, and those of a large moving object agree well.
+What does not belong to them shows it: parts of the image where tracks live on and no point of the
+map is.  They are counted by area, so that the texture of a thing does not decide how large it is.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, I64, BoolArray
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.mapping.parameters import SupportParameters
+from pliant.algorithms.tracks import FrameTracks
+
+_COLUMNS, _LINES = 8, 6
+"""Cells of the image: each is for a pose, against it, or shows too little."""
+
+_LEAST_SEEN = 5
+"""Tracks without which a cell says nothing."""
+
+_FEW = 0.2
+"""A cell is against a pose with fewer inliers than this share of its tracks."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Support:
+    """What there is for a pose.
+
+    inliers: points where the pose shows them.   share: of the points seen.   contrary: share of the
+    cells with tracks in which hardly any point is where the pose shows it.   spread: standard
+    deviation of the inliers as a share of width or height, whichever is less.
+    """
+
+    inliers: int
+    share: float
+    contrary: float
+    spread: float
+
+
+def support_of(
+    tracks: FrameTracks,
+    interval_s: float,
+    points_px: F32,
+    inliers: BoolArray,
+    camera: PinholeCamera,
+    parameters: SupportParameters,
+) -> Support:
+    """tracks: of the frame.   interval_s: between two frames.   points_px: (N, 2) of the points
+    seen, of which ``inliers`` (N,) fit.
+    """
+    # Those that had time to become points.
+    settled_px = tracks.points_px[tracks.ages * interval_s >= parameters.settled_s]
+    count = int(np.count_nonzero(inliers))
+    fitting = points_px[inliers]
+    supported, settled = _per_cell(fitting, camera), _per_cell(settled_px, camera)
+    telling = settled >= _LEAST_SEEN
+    size = np.array([camera.width, camera.height])
+    return Support(
+        inliers=count,
+        share=count / max(len(points_px), 1),
+        contrary=float((supported < _FEW * settled)[telling].mean()) if telling.any() else 0.0,
+        spread=float(np.min(fitting.std(axis=0) / size)) if count else 0.0,
+    )
+
+
+def doubt(support: Support, parameters: SupportParameters) -> str:
+    """Why the pose may not be that of the camera in the world; "" where nothing speaks for it."""
+    if support.contrary > parameters.max_contrary_share:
+        return f"doubtful: {support.contrary:.0%} of the image moves otherwise"
+    if support.share < parameters.min_share:
+        return f"doubtful: {support.share:.0%} of the points seen are where the pose has them"
+    if support.spread < parameters.min_spread:
+        return "doubtful: all that is seen of the map lies in one place of the image"
+    return ""
+
+
+def _per_cell(points_px: F32, camera: PinholeCamera) -> I64:
+    column = np.clip((points_px[:, 0] * _COLUMNS / camera.width).astype(int), 0, _COLUMNS - 1)
+    line = np.clip((points_px[:, 1] * _LINES / camera.height).astype(int), 0, _LINES - 1)
+    return np.bincount(line * _COLUMNS + column, minlength=_COLUMNS * _LINES)

@@ -1,0 +1,164 @@
+"""The mapper of a camera whose calibration is a guess.
+
+A map that begins under a wrong focal length keeps what that cost it: points that were turned down,
+poses of frames between keyframes.  So a first map is made on trial, only to find the calibration,
+and the frames that it took wait as they do for a start.  Once the focal length is known, or no more
+frames can wait, the map begins anew with all of them and with the camera that was found.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pliant.algorithms.arrays import U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDelta
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.self_calibration import is_guess, widened
+from pliant.algorithms.mapping.start import keep_waiting
+from pliant.algorithms.mapping.whole_map import WholeMap
+from pliant.algorithms.stages import StageTimer, no_stages
+from pliant.algorithms.tracks import FrameTracks
+
+_KNOWN = 0.01
+"""Standard deviation of the log focal length under which a map can begin for good."""
+
+
+class _Taken(NamedTuple):
+    """What came of a frame."""
+
+    frame: int
+    stamp_ns: int
+    tracks: FrameTracks
+    grey: U8 | None
+    colour: U8 | None
+
+
+class TrialMapper:
+    """A mapper that waits until it knows its camera: what it is told and tells is a ``Mapper``'s.
+
+    mapper: on trial, or for good.    taken: while it is on trial, the newest frames.
+    first: of those that the trial gave a pose.
+    """
+
+    def __init__(self, camera: PinholeCamera, parameters: MappingParameters, seed: int) -> None:
+        self._anew = (camera, parameters, seed)
+        self._mapper = Mapper(camera, parameters, seed)
+        self._taken: list[_Taken] = []
+        self._on_trial = True
+        self._first: int | None = None
+
+    def process(
+        self,
+        frame: int,
+        stamp_ns: int,
+        tracks: FrameTracks,
+        grey: U8 | None,
+        colour: U8 | None,
+        timer: StageTimer = no_stages,
+    ) -> MapDelta:
+        """As ``Mapper.process``."""
+        delta = self._mapper.process(frame, stamp_ns, tracks, grey, colour, timer)
+        if not self._on_trial:
+            return delta
+        taken = _Taken(frame, stamp_ns, tracks, grey, colour)
+        kept = keep_waiting(self._taken, taken, self._anew[1].start)
+        uncertain = float(self._mapper.calibration.sigmas[0])
+        if delta.state == TRACKING:
+            if self._first is None:
+                self._first = int(delta.pose_frames.min())
+            if uncertain < _KNOWN or kept[0].frame > self._first:
+                self._taken.append(taken)
+                return self._begin(timer)
+        self._taken = kept
+        told = delta.reason or f"the focal length is known to {100.0 * uncertain:.1f} %"
+        return _nothing(delta, told)
+
+    def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
+        """As ``Mapper.skip``."""
+        delta = self._mapper.skip(frame, reason)
+        return _nothing(delta, reason) if self._on_trial else delta
+
+    @property
+    def waiting_frames(self) -> list[int]:
+        """As ``Mapper.waiting_frames``."""
+        if self._on_trial:
+            return [taken.frame for taken in self._taken]
+        return self._mapper.waiting_frames
+
+    @property
+    def whole_map(self) -> WholeMap:
+        """As ``Mapper.whole_map``."""
+        return self._mapper.whole_map
+
+    @property
+    def point_count(self) -> int:
+        """As ``Mapper.point_count``."""
+        return 0 if self._on_trial else self._mapper.point_count
+
+    def finish(self) -> MapDelta:
+        """As ``Mapper.finish``; a trial that lasts until then ends with it."""
+        begun = self._begin(no_stages) if self._on_trial and self._first is not None else None
+        final = self._mapper.finish()
+        return final if begun is None else _joined([begun, final])
+
+    def publish_keyframes(self) -> KeyframeDelta:
+        """As ``Mapper.publish_keyframes``."""
+        if self._on_trial:
+            return Mapper(*self._anew).publish_keyframes()
+        return self._mapper.publish_keyframes()
+
+    def _begin(self, timer: StageTimer) -> MapDelta:
+        """Map all that was taken with the camera that the trial has found."""
+        self._mapper = Mapper(*self._anew, calibration=self._mapper.calibration)
+        self._on_trial = False
+        deltas: list[MapDelta] = []
+        for taken in self._taken:
+            deltas.append(self._mapper.process(*taken, timer))
+            self._mapper.whole_map = WholeMap()  # nobody has the map yet that it would move
+        self._taken = []
+        return _joined(deltas)
+
+
+def mapper_for(
+    camera: PinholeCamera, parameters: MappingParameters, seed: int, focal_sigma: float = 0.0
+) -> Mapper | TrialMapper:
+    """The mapper of a camera, as well as its calibration is known: see ``widened``."""
+    parameters = widened(parameters, focal_sigma)
+    kind = TrialMapper if is_guess(parameters.calibration) else Mapper
+    return kind(camera, parameters, seed)
+
+
+_ARRAYS = [field.name for field in dataclasses.fields(MapDelta) if "Annotated" in str(field.type)]
+_KEYS = {"pose": "pose_frames", "keyframe": "keyframe_ids", "point": "point_ids"}
+"""By what the rows of arrays are told apart whose names begin so."""
+
+
+def _nothing(delta: MapDelta, reason: str) -> MapDelta:
+    """What is told of a frame on trial."""
+    empty: dict[str, Any] = {name: getattr(delta, name)[:0] for name in _ARRAYS}
+    return dataclasses.replace(
+        delta, state=WAITING, reason=reason, segment=-1, inliers=0, snapshot=False,
+        calibration_correction=(), calibration_sigmas=(), **empty,
+    )  # fmt: skip
+
+
+def _joined(deltas: list[MapDelta]) -> MapDelta:
+    """The changes of the first frames of a map as one: of what changed more than once, the last.
+
+    Points that went before anybody heard of them are left out.
+    """
+    removed = np.concatenate([delta.removed_point_ids for delta in deltas])
+    joined: dict[str, Any] = {"removed_point_ids": removed[:0]}
+    for kind, key in _KEYS.items():
+        ids = np.concatenate([getattr(delta, key) for delta in deltas])
+        _, last = np.unique(ids[::-1], return_index=True)
+        rows = np.sort(len(ids) - 1 - last)
+        if kind == "point":
+            rows = rows[~np.isin(ids[rows], removed)]
+        for name in _ARRAYS:
+            if name.startswith((f"{kind}_", f"{kind}s_")):
+                joined[name] = np.concatenate([getattr(delta, name) for delta in deltas])[rows]
+    return dataclasses.replace(deltas[-1], **joined)

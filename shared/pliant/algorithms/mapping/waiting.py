@@ -1,0 +1,145 @@
+"""Poses of the frames that waited for a map: backwards from where it starts.
+
+They are placed by the points of the start.  Those before, which see too few of them, have but
+turned, or the map would have started there: they stand where the first one that is placed does,
+turned as the tracks that each shares with the next one tell.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.epipolar import rotation_between
+from pliant.algorithms.mapping.localisation import refine
+from pliant.algorithms.mapping.map_store import Keyframe
+from pliant.algorithms.mapping.parameters import LocalisationParameters, MappingParameters
+from pliant.algorithms.mapping.start import Start, WaitingFrame, keep_waiting
+from pliant.algorithms.tracks import FrameTracks
+
+_SAMPLE = 400
+"""Tracks that tell a rotation."""
+
+_KEPT_TURNS = 2000
+"""Bounds the memory of a camera that never moves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Turn:
+    """How the camera turned from a frame to the next.
+
+    R_next_frame: (3, 3) maps rays of the frame to the next one's.   inliers: tracks that agree.
+    """
+
+    frame: int
+    R_next_frame: F64
+    inliers: int
+
+
+def turn_between(
+    frame: WaitingFrame,
+    following: WaitingFrame,
+    camera: PinholeCamera,
+    parameters: LocalisationParameters,
+) -> Turn:
+    """The rotation that explains the tracks of two frames best."""
+    _, i, j = np.intersect1d(frame.ids, following.ids, assume_unique=True, return_indices=True)
+    if len(i) < parameters.min_inliers:
+        return Turn(frame=frame.frame, R_next_frame=np.eye(3), inliers=0)
+    every = max(1, len(i) // _SAMPLE)
+    before = camera.normalise(frame.points_px[i[::every]].astype(np.float64))
+    after = camera.normalise(following.points_px[j[::every]].astype(np.float64))
+    gate = parameters.inlier_px / camera.fx
+    R, residuals = rotation_between(before, after, scale=gate)
+    inliers = int((residuals < gate).mean() * len(i))
+    return Turn(frame=frame.frame, R_next_frame=R, inliers=inliers)
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """Frames from which a map may yet start, and the turns of all since the last that was placed.
+
+    turns: one for each of the frames but the newest, and for earlier ones.
+    """
+
+    frames: list[WaitingFrame] = field(default_factory=list[WaitingFrame])
+    turns: list[Turn] = field(default_factory=list[Turn])
+
+    def then(
+        self,
+        frame: int,
+        stamp_ns: int,
+        tracks: FrameTracks,
+        camera: PinholeCamera,
+        parameters: MappingParameters,
+    ) -> "Waiting":
+        """With one frame more."""
+        newest = WaitingFrame(
+            frame=frame, stamp_ns=stamp_ns, ids=tracks.ids, points_px=tracks.points_px,
+            kappas=tracks.kappas,
+        )  # fmt: skip
+        turns = self.turns
+        if self.frames:
+            turn = turn_between(self.frames[-1], newest, camera, parameters.localisation)
+            turns = [*turns[1 - _KEPT_TURNS :], turn]
+        return Waiting(keep_waiting(self.frames, newest, parameters.start), turns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EarlierPose:
+    """T_world_camera of a frame, and the keyframe that it hangs on."""
+
+    frame: int
+    keyframe: Keyframe
+    T_world_camera: F64
+    inliers: int
+
+
+def earlier_poses(
+    start: Start,
+    keyframes: list[Keyframe],
+    waiting: Waiting,
+    camera: PinholeCamera,
+    parameters: LocalisationParameters,
+) -> Iterator[EarlierPose]:
+    """The newest first.  keyframes: of the map that starts."""
+    keyframe_at = {each.frame: each for each in keyframes}
+    frames = {each.frame: each for each in waiting.frames}
+    turned = {each.frame: each for each in waiting.turns}
+    hanging = keyframes[-1]
+    T_world_camera = hanging.T_world_camera
+    unbroken = True
+    for frame in sorted(frames.keys() | turned.keys(), reverse=True):
+        here, inliers = T_world_camera, 0
+        if frame in frames:
+            here, inliers = _place(T_world_camera, start, frames[frame], camera, parameters)
+        if frame in keyframe_at:
+            hanging = keyframe_at[frame]
+            here = hanging.T_world_camera
+        elif inliers < parameters.min_inliers and unbroken and frame in turned:
+            inliers = turned[frame].inliers
+            here = T_world_camera.copy()
+            here[:3, :3] = here[:3, :3] @ turned[frame].R_next_frame
+        unbroken = frame in keyframe_at or inliers >= parameters.min_inliers
+        if not unbroken:
+            continue
+        T_world_camera = here
+        yield EarlierPose(
+            frame=frame, keyframe=hanging, T_world_camera=T_world_camera, inliers=inliers
+        )
+
+
+def _place(
+    T_world_camera: F64,
+    start: Start,
+    frame: WaitingFrame,
+    camera: PinholeCamera,
+    parameters: LocalisationParameters,
+) -> tuple[F64, int]:
+    _, i, j = np.intersect1d(frame.ids, start.ids, assume_unique=True, return_indices=True)
+    if len(i) < parameters.min_inliers:
+        return T_world_camera, 0
+    located = refine(T_world_camera, start.points_world[j], frame.points_px[i], camera, parameters)
+    return located.T_world_camera, int(located.inliers.sum())

@@ -1,0 +1,169 @@
+"""The whole map, adjusted beside the frames: when it is asked for, found, and taken over.
+
+The window corrects what is new; what drifts beyond it only all keyframes together can tell.  Their
+adjustment takes longer than a frame, so it works on a copy of the map and its result is taken over
+a fixed number of frames later.  How long it took decides nothing: who has not got it by then waits.
+
+Meanwhile the map has grown and the window has moved.  So the result is not where the points are,
+but how the map around each keyframe moves: one similarity for each, as drift is small within what
+a keyframe sees.  The window and all that is new move rigidly with the last keyframe that has left
+the window.  The first keyframe stays, and with it place and scale of the beginning.  Lens and
+focal length are found anew each time; the readout of a rolling shutter is not, as frames are
+located without it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse, matrix_to_pose, move_by_similarity
+from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.final_adjustment import ListedMap, adjust_listed, list_map
+from pliant.algorithms.mapping.map_store import FREE
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.rolling_shutter import Path
+
+_MIN_DEPTH = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """A copy of the map of a frame, to be adjusted.
+
+    keyframe_ids: (M,).   seen: what they see.   settled: how many of them, the oldest, have left
+    the window.
+    """
+
+    frame: int
+    keyframe_ids: I64
+    settled: int
+    seen: ListedMap
+    camera: PinholeCamera
+    parameters: MappingParameters
+
+
+@dataclass(kw_only=True)
+class WholeMap:
+    """Asks for an adjustment whenever the segment has grown by a share: all of them together cost
+    a small multiple of the last.
+
+    due: keyframes at which it asks again.    question: asked, and not yet taken over.
+    answer: of the question, where somebody has found it already.
+    """
+
+    due: float = 0.0
+    question: Question | None = None
+    answer: MapMoves | None = None
+
+    def ask(self, frame: int, active: ActiveMap) -> None:
+        """Ask for the adjustment of the map as it is after a frame, where that is due."""
+        parameters = active.parameters
+        window, growth = parameters.window.keyframes, parameters.whole_map.growth
+        count = len(active.keyframes)
+        # While the window has half of the map it does well by itself.
+        if self.question is not None or growth == 0.0 or count < max(2 * window, self.due):
+            return
+        self.due = (1.0 + growth) * count
+        self.question = Question(
+            frame=frame,
+            keyframe_ids=np.array([keyframe.id for keyframe in active.keyframes], np.int64),
+            settled=count - window,
+            seen=list_map(
+                active.keyframes, active.points, active.camera, parameters.window.lens_radius
+            ),
+            camera=active.camera,
+            parameters=parameters,
+        )
+
+    def is_due(self, frame: int) -> bool:
+        """Whether the answer is taken over before a frame is worked on."""
+        question = self.question
+        if question is None:
+            return False
+        return frame >= question.frame + question.parameters.whole_map.distance_frames
+
+    def take(self, frame: int) -> MapMoves | None:
+        """How the map moves before a frame is worked on; None where it does not."""
+        if self.question is None or not self.is_due(frame):
+            return None
+        answer = find_moves(self.question) if self.answer is None else self.answer
+        self.question = self.answer = None
+        return answer
+
+
+def find_moves(question: Question) -> MapMoves:
+    """How each settled keyframe moves with what hangs on it."""
+    before, xyz = question.seen.T_world_camera, question.seen.xyz
+    seen = replace(question.seen, T_world_camera=before.copy(), xyz=xyz.copy())
+    adjust_listed(
+        seen,
+        question.camera,
+        question.parameters,
+        iterations=question.parameters.whole_map.iterations,
+    )
+    settled = slice(0, question.settled)
+    scales = _scales(seen, _depths(seen, before, xyz), question.settled)
+    T = seen.T_world_camera[settled].copy()
+    # Nothing holds the scale of a map: that of its beginning stays.
+    T[:, :3, 3] = T[0, :3, 3] + (T[:, :3, 3] - T[0, :3, 3]) / scales[0]
+    scales /= scales[0]
+    moved = T @ inverse(before[settled])
+    moved[:, :3, 3] = (
+        T[:, :3, 3]
+        - scales[:, None] * (moved[:, :3, :3] @ before[settled][:, :3, 3, None])[:, :, 0]
+    )
+    return MapMoves(
+        keyframe_ids=question.keyframe_ids[settled],
+        moves=np.column_stack([matrix_to_pose(moved), scales]),
+    )
+
+
+def _depths(seen: ListedMap, T_world_camera: F64, xyz: F64) -> F64:
+    """(O,) of each observed point in the camera that observes it."""
+    T = T_world_camera[seen.camera]
+    return np.einsum("oi,oi->o", xyz[seen.point] - T[:, :3, 3], T[:, :3, 2])
+
+
+def _scales(seen: ListedMap, before: F64, count: int) -> F64:
+    """(count,) by how much what each of the first keyframes sees has grown: the median."""
+    after = _depths(seen, seen.T_world_camera, seen.xyz)
+    usable = (before > _MIN_DEPTH) & (after > _MIN_DEPTH)
+    cameras = seen.camera[usable]
+    ratios = after[usable] / before[usable]
+    ends = np.searchsorted(cameras, np.arange(count + 1))
+    scales = np.ones(count)
+    for slot in range(count):
+        some = ratios[ends[slot] : ends[slot + 1]]
+        if len(some):
+            scales[slot] = np.median(some)
+    return scales
+
+
+def move_map(active: ActiveMap, moves: MapMoves, path: Path) -> F64:
+    """Move the map and its frames.  Returns the similarity (4, 4) of its newest keyframe."""
+    keyframes, points, window = active.keyframes, active.points, active.window
+    S = moves.matrices(np.array([keyframe.id for keyframe in keyframes], np.int64))
+    poses = move_by_similarity(S, np.array([keyframe.T_world_camera for keyframe in keyframes]))
+    for keyframe, move, T_world_camera in zip(keyframes, S, poses, strict=True):
+        still = keyframe.published_pose is not None and np.array_equal(
+            keyframe.published_pose, keyframe.T_world_camera
+        )
+        keyframe.T_world_camera = T_world_camera
+        if still:  # who reads of the move finds the pose
+            keyframe.published_pose = T_world_camera.copy()
+        if keyframe.focus is not None:
+            keyframe.focus = move[:3, :3] @ keyframe.focus + move[:3, 3]
+    used = slice(0, points.count)  # candidates have a provisional place, too
+    here = (points.state[used] != FREE) & (points.segment[used] == active.segment)
+    rows = np.flatnonzero(here)
+    hosts = points.first_keyframe[rows].astype(np.int64)
+    points.xyz[rows] = moves.points(points.xyz[rows], hosts)
+    points.published_xyz[rows] = moves.points(points.published_xyz[rows], hosts)
+    turned = moves.matrices(hosts)[:, :3, :3] @ points.spread[rows][:, :, None]
+    points.spread[rows] = turned[:, :, 0]
+    window.move(S[-1])
+    path.scale(moves)
+    return S[-1]

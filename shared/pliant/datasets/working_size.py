@@ -1,0 +1,116 @@
+"""A source at the size that it is worked on: what is larger than its details is made smaller.
+
+The first frames say it, so the same source gives the same size.  Everything behind the source,
+the recording too, has the smaller images and their camera, and knows nothing of larger ones.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import cast
+
+import cv2
+
+from pliant.algorithms.arrays import U8
+from pliant.algorithms.image.sharpness import (
+    LEAST_SIDE_PX,
+    LONGEST_SIDE_PX,
+    resized,
+    size_at,
+    working_side,
+)
+from pliant.datasets.base import BrokenFrame, Dataset, SourceFrame
+from pliant.datasets.calibration import Calibration
+from pliant.datasets.rectifier import decode
+
+_LOOKED_AT, _STEP = 7, 5
+"""Frames that say how sharp a source is, and how far they lie apart: cameras begin out of focus."""
+
+
+class SmallerImages:
+    """A source of frames, made smaller one by one; what does not decode stays as it is."""
+
+    def __init__(self, source: Dataset, side: int) -> None:
+        """side: pixels along the longer side, fewer than the source's.
+
+        source_size: (width, height) that they come in.
+        """
+        whole = source.calibration
+        self._source = source
+        self._side = side
+        self.source_size = (whole.width, whole.height)
+        self.calibration = _smaller(whole, side)
+        self.name = source.name
+        self.is_live = source.is_live
+        self.frame_count = source.frame_count
+        self.ground_truth_path: Path | None = source.ground_truth_path
+        to = f"{self.calibration.width}x{self.calibration.height}"
+        self.note = f"images of {whole.width}x{whole.height} px are worked on at {to} px"
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        for frame in self._source:
+            yield frame if frame.dropped else self._made_smaller(frame)
+
+    def _made_smaller(self, frame: SourceFrame) -> SourceFrame:
+        try:
+            pixels = decode(frame)
+        except BrokenFrame:
+            return frame  # told when it is rectified
+        height, width = pixels.shape[:2]
+        if (width, height) != self.source_size:
+            return frame
+        pixels = resized(pixels, self._side)
+        height, width = pixels.shape[:2]
+        return replace(
+            frame,
+            encoding="mono8" if pixels.ndim == 2 else "rgb8",
+            data=pixels.tobytes(),
+            width=width,
+            height=height,
+            made_from=f"{frame.encoding} of {self.source_size[0]}x{self.source_size[1]} px",
+        )
+
+
+def at_working_size(source: Dataset, longest_side_px: int = 0) -> Dataset:
+    """The source itself, or its images made smaller.  longest_side_px: 0 lets them say it.
+
+    A camera's first images say little, and it would give others after a restart: of those it is
+    the limit alone that counts.
+    """
+    longer = max(source.calibration.width, source.calibration.height)
+    side = longest_side_px or _side_of(source, longer)
+    return SmallerImages(source, side) if side < longer else source
+
+
+def _side_of(source: Dataset, longer: int) -> int:
+    if longer <= LEAST_SIDE_PX or source.is_live:
+        return min(longer, LONGEST_SIDE_PX)
+    images: list[U8] = []
+    for frame in islice(source, 0, _LOOKED_AT * _STEP, _STEP):
+        try:
+            pixels = decode(frame)
+        except BrokenFrame:
+            continue
+        if pixels.ndim == 3:
+            pixels = cast(U8, cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+        images.append(resized(pixels, LONGEST_SIDE_PX))
+    return working_side(images) if images else min(longer, LONGEST_SIDE_PX)
+
+
+def _smaller(camera: Calibration, side: int) -> Calibration:
+    return at_size(camera, *size_at(camera.width, camera.height, side))
+
+
+def at_size(camera: Calibration, width: int, height: int) -> Calibration:
+    """The camera of resized images; that of depth images, which stay, is as it was."""
+    across, down = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * across,
+        fy=camera.fy * down,
+        cx=(camera.cx + 0.5) * across - 0.5,
+        cy=(camera.cy + 0.5) * down - 0.5,
+    )

@@ -1,0 +1,170 @@
+"""The calibration that a run leaves: the source's, with what the images told of it."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.bundle.problem import CalibrationUncertainty
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import corrected_view
+from pliant.algorithms.geometry import pose_to_matrix, so3_log
+from pliant.datasets.calibration import Calibration, calibration_from_yaml
+from pliant.datasets.working_size import at_size
+from pliant.errors import CalibrationError
+from pliant.results.run import Run
+
+_GRID = 24
+"""Points across the image to which a lens is fitted."""
+
+_FITS = 10
+"""Gauss-Newton steps of that fit: it starts within a few percent."""
+
+_KNOWN = 0.05
+"""Standard deviation of the log focal length above which it counts as unknown."""
+
+_CONTRADICTED = 2.0
+"""Standard deviations of the calibration's prior from which on the images contradict it."""
+
+_SURE = 3.0
+"""Standard deviations of what was found that must lie between the two as well."""
+
+_FORWARD = math.cos(math.radians(15.0))
+_TURN_DEG = 20.0
+"""Motion that leaves the focal length open: along the axis, or turning by less than this."""
+
+
+def found_calibration(run: Run) -> Calibration | None:
+    """The source's calibration, at the size of its images, corrected as its last segment is.
+
+    Its ``focal_sigma`` says what is still open: a map that was made with a wrong one is bent, and
+    so what it says of it is as far off as the two differ.  None where there is no stream.
+    """
+    if run.stream is None or not run.stream.calibration:
+        return None
+    given, stream = calibration_from_yaml(run.stream.calibration), run.stream
+    size = stream.source_width or given.width, stream.source_height or given.height
+    correction = run.calibration_correction
+    if len(correction) < 3:
+        return at_size(given, *size)
+    found = _corrected(given, run.stream.camera, correction)
+    sigma = run.calibration_sigmas[0] if run.calibration_sigmas else 0.0
+    sigma = max(sigma, abs(correction[0])) if _is_contradicted(run) else sigma
+    usual = CalibrationUncertainty().focal
+    found = at_size(found, *size)
+    return replace(found, focal_sigma=min(sigma, 1.0) if sigma > usual else 0.0)
+
+
+def _corrected(
+    given: Calibration, camera: PinholeCamera, correction: tuple[float, ...]
+) -> Calibration:
+    """camera: the rectified one, of which the correction speaks.
+
+    The focal length alone where no lens of the source's model is near what was found.
+    """
+    s, k1, k2 = correction[:3]
+    factor = math.exp(s)
+    scaled = replace(given, fx=given.fx * factor, fy=given.fy * factor)
+    if k1 == 0.0 and k2 == 0.0 and not given.lens.distorts:
+        return scaled
+    try:
+        if given.model == "pinhole":
+            return replace(scaled, model="pinhole-radtan", distortion=(k1, k2, 0.0, 0.0, 0.0))
+        return _fitted(scaled, given, camera, correction)
+    except CalibrationError:
+        return scaled
+
+
+def _fitted(
+    start: Calibration, given: Calibration, camera: PinholeCamera, correction: tuple[float, ...]
+) -> Calibration:
+    """Least squares of focal lengths and coefficients: the product of two lenses is none."""
+    u, v = np.meshgrid(
+        np.linspace(0.0, camera.width - 1.0, _GRID), np.linspace(0.0, camera.height - 1.0, _GRID)
+    )
+    px = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float32)
+    view = corrected_view(camera, correction)
+    plane = view.camera.normalise(view.pixels(px).astype(np.float64))
+    wanted = given.lens.project(camera.normalise(px.astype(np.float64)))
+    unit = np.array([start.fx, start.fy, *np.ones(len(start.distortion))])
+    values = np.array([start.fx, start.fy, *start.distortion]) / unit
+
+    def lens(values: F64) -> F64:
+        fx, fy, *coefficients = (values * unit).tolist()
+        changed = replace(start.lens, fx=fx, fy=fy, coefficients=tuple(coefficients))
+        return changed.project(plane).ravel()
+
+    for _ in range(_FITS):
+        now = lens(values)
+        J = np.stack([(lens(values + 1e-6 * e) - now) * 1e6 for e in np.eye(len(values))], axis=1)
+        values = values + np.linalg.lstsq(J, wanted.ravel() - now, rcond=1e-10)[0]
+    fx, fy, *coefficients = (values * unit).tolist()
+    return replace(start, fx=fx, fy=fy, distortion=tuple(coefficients))
+
+
+def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
+    """What a user should know of the calibration in one line; "" where it is as was said."""
+    correction, sigmas = run.calibration_correction, run.calibration_sigmas
+    if run.stream is None or len(correction) < 3 or len(sigmas) < 3:
+        return ""
+    camera = run.stream.camera
+    focal = camera.fx * math.exp(correction[0])
+    fov = math.degrees(2.0 * math.atan(0.5 * camera.width / focal))
+    known = f"{fov:.1f} degrees across, +-{100.0 * sigmas[0]:.1f} %"
+    if run.stream.focal_sigma > 0.0:
+        if sigmas[0] > _KNOWN:
+            return f"the focal length stays unknown ({known}){_why(final)}: give --calibration"
+        return f"the focal length was found ({known}): calibration.yaml is for the next run"
+    if not _is_contradicted(run):
+        return ""
+    return (
+        f"the images contradict the calibration: focal length {math.exp(correction[0]):.3f} times "
+        f"what was given (+-{100.0 * sigmas[0]:.1f} %), k1 {correction[1]:+.3f}, "
+        f"{_corner_px(camera, correction):.0f} px at the corner; run again with calibration.yaml"
+    )
+
+
+def _is_contradicted(run: Run) -> bool:
+    """Whether the images do not agree with a calibration that was no guess."""
+    correction, sigmas = run.calibration_correction, run.calibration_sigmas
+    if run.stream is None or run.stream.focal_sigma > 0.0 or len(sigmas) < 2:
+        return False
+    priors = CalibrationUncertainty().sigmas[:2].tolist()
+    return any(
+        abs(q) > max(_CONTRADICTED * prior, _SURE * sigma)
+        for q, prior, sigma in zip(correction[:2], priors, sigmas[:2], strict=True)
+    )
+
+
+def _corner_px(camera: PinholeCamera, correction: tuple[float, ...]) -> float:
+    """How far a point moves that the given camera sees in its farthest corner."""
+    corners = np.array(
+        [(u, v) for u in (0.0, camera.width - 1.0) for v in (0.0, camera.height - 1.0)], np.float32
+    )
+    view = corrected_view(camera, correction)
+    plane = camera.normalise(corners.astype(np.float64))
+    own = np.array([view.camera.fx, view.camera.fy])
+    seen = view.seen((plane * own + (camera.cx, camera.cy)).astype(np.float32))
+    return float(np.linalg.norm(seen - corners, axis=1).max())
+
+
+def _why(final: dict[int, Any]) -> str:
+    """What in the motion of the frames leaves a focal length open, in words."""
+    poses = [pose_to_matrix(pose) for _, (_, pose) in sorted(final.items())]
+    if len(poses) < 2:
+        return ""
+    T = np.array(poses)
+    turns = np.degrees(
+        np.linalg.norm([so3_log(T[0, :3, :3].T @ each[:3, :3]) for each in T], axis=1)
+    )
+    steps = np.diff(T[:, :3, 3], axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    along = np.abs(np.einsum("nk,nk->n", steps, T[:-1, :3, 2]))
+    reasons: list[str] = []
+    if lengths.sum() > 0.0 and along.sum() > _FORWARD * lengths.sum():
+        reasons.append("the camera moves straight ahead")
+    if turns.max() < _TURN_DEG:
+        reasons.append(f"it turns by {turns.max():.0f} degrees only")
+    return ", as " + " and ".join(reasons) if reasons else ""

@@ -1,0 +1,42 @@
+"""What a rigid run is worth, for who has no truth to compare it with: good, doubtful or bad."""
+
+from pliant.algorithms.map_delta import TRACKING
+from pliant.map_history import MapHistory
+
+GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
+
+_WHOLE = 0.9
+"""Share of the frames with a pose in one segment that a good run has."""
+_LITTLE = 0.5
+"""With a smaller one a run is bad."""
+_DOUBTS = 0.25
+"""Share of doubtful poses above which a run is.  Good sequences have up to a sixth."""
+
+
+def doubtful_frames(history: MapHistory) -> list[int]:
+    """Frames whose pose was told as doubtful."""
+    return [
+        frame
+        for frame, (state, reason) in sorted(history.states.items())
+        if state == TRACKING and reason and frame in history.frames
+    ]
+
+
+def judge(*, frames: int, in_segments: list[int], doubtful: int) -> tuple[str, str]:
+    """Good, doubtful or bad, and why.
+
+    frames: of the sequence.   in_segments: poses in each segment of the map.   doubtful: poses told
+    as such.
+    """
+    longest, posed = max(in_segments, default=0), sum(in_segments)
+    if not longest:
+        return BAD, "there is no map"
+    share = longest / max(frames, 1)
+    told = f"{share:.0%} of the frames have a pose in the largest segment"
+    if share < _LITTLE:
+        return BAD, told
+    if doubtful > _DOUBTS * posed:
+        return DOUBTFUL, f"{doubtful / posed:.0%} of the poses are doubtful: something large moves?"
+    if share < _WHOLE:
+        return DOUBTFUL, told
+    return GOOD, told if longest < frames else "all frames have a pose in one segment"

@@ -1,0 +1,165 @@
+"""Points without parallax: where they are put, what they say of a pose, and what comes of it."""
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, Scene, looking
+from test_mapper import run, trajectory_error
+
+from pliant.algorithms.bundle.projection import move_camera
+from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
+from pliant.algorithms.mapping.directions import linearise, place, refine_pose_spread
+
+K = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
+
+
+def surroundings(count=20000, **kwargs):
+    """Points on all sides, at 3 to 8 times the unit."""
+    generator = np.random.default_rng(3)
+    points = generator.normal(size=(count, 3))
+    points *= generator.uniform(3.0, 8.0, (count, 1)) / np.linalg.norm(points, axis=1)[:, None]
+    kappas = generator.uniform(5.0, 500.0, count).astype(np.float32)
+    return Scene(points, kappas, **kwargs)
+
+
+def seen_from(poses, points):
+    px = np.array([CAMERA.project(transform(inverse(T), points)) for T in poses])
+    u, v = np.ascontiguousarray(np.moveaxis(px, 2, 0)).astype(np.float32)
+    return u, v
+
+
+def test_a_point_without_parallax_is_as_far_as_the_map_and_uncertain():
+    points = np.array([[0.3, 0.2, 2.0], [-0.5, 0.1, 9.0]])
+    poses = np.array([looking((0, 0, 0), (0.0, 0.1 * k, 0.0)) for k in range(3)])
+    u, v = seen_from(poses, points)
+    seen = np.ones((3, 3), np.bool_)
+    u, v = (np.pad(each, ((0, 0), (0, 1))) for each in (u, v))
+    seen[:, 2] = False
+    xyz, spread = place(poses, u, v, seen, np.arange(3, dtype=np.int32), CAMERA, 0.2)
+    np.testing.assert_allclose(np.linalg.norm(xyz[:2], axis=1), 5.0, rtol=1e-3)
+    np.testing.assert_allclose(spread[:2], 0.5 * xyz[:2], rtol=1e-3)
+    np.testing.assert_allclose(np.cross(xyz[:2], points), 0.0, atol=1e-3)
+    assert np.isnan(xyz[2]).all()
+    assert np.isnan(spread[2]).all()
+
+
+def test_parallax_tells_the_distance_and_how_well_it_is_known():
+    points = np.array([[0.3, 0.2, 2.0], [-0.5, 0.1, 9.0], [0.0, 0.0, 1e4]])
+    poses = np.array([looking((0.2 * k, 0, 0)) for k in range(4)])
+    u, v = seen_from(poses, points)
+    xyz, spread = place(
+        poses, u, v, np.ones_like(u, np.bool_), np.arange(3, dtype=np.int32), CAMERA, 0.2
+    )
+    np.testing.assert_allclose(xyz[:2], points[:2], rtol=2e-2)
+    share = np.linalg.norm(spread, axis=1) / np.linalg.norm(xyz, axis=1)
+    assert share[0] < share[1] < 0.1
+    assert xyz[2, 2] > 50.0
+
+
+def uncertain_view(seed=0):
+    generator = np.random.default_rng(seed)
+    T = looking((0.1, -0.2, 0.05), (0.02, -0.03, 0.01))
+    X = generator.uniform((-2, -2, 3), (2, 2, 8), (40, 3))
+    spread = X * generator.uniform(0.0, 0.5, (40, 1))
+    px = CAMERA.project(transform(inverse(T), X)) + generator.normal(0, 2.0, (40, 2))
+    return T, X, spread, px.astype(np.float32)
+
+
+def twelve(T_world_camera):
+    T = inverse(T_world_camera)
+    return np.concatenate([T[:3, :3].reshape(-1), T[:3, 3]])
+
+
+def test_the_normal_equations_are_those_of_finite_differences():
+    T, X, spread, px = uncertain_view()
+    pose, normal, squared = twelve(T), np.zeros(28), np.zeros(40)
+    linearise(pose, X, spread, px, K, 4.0, squared, normal)
+    moved = transform(inverse(T), X)
+    local = np.einsum("ij,nj->ni", inverse(T)[:3, :3], spread)
+    shift = (CAMERA.project(moved + 1e-5 * local) - CAMERA.project(moved - 1e-5 * local)) / 2e-5
+    W = np.linalg.inv(np.eye(2) + np.einsum("ni,nj->nij", shift, shift))
+
+    def residuals(step):
+        out = np.zeros(12)
+        move_camera(pose, step, out)
+        return px - CAMERA.project(X @ out[:9].reshape(3, 3).T + out[9:])
+
+    r = residuals(np.zeros(6))
+    expected = np.einsum("ni,nij,nj->n", r, W, r)
+    np.testing.assert_allclose(squared, expected, rtol=1e-6)
+    assert normal[27] == pytest.approx((expected / (1 + expected / 4.0)).sum())
+    k = 1.0 / (1.0 + expected / 4.0) ** 2
+    J = np.stack([(residuals(-1e-6 * e) - residuals(1e-6 * e)) / 2e-6 for e in np.eye(6)], axis=2)
+    H = np.einsum("n,nia,nij,njb->ab", k, J, W, J)
+    np.testing.assert_allclose(normal[:21], H[np.tril_indices(6)], rtol=1e-5, atol=1e-3)
+    g = np.einsum("n,nia,nij,nj->a", k, J, W, r)
+    np.testing.assert_allclose(normal[21:27], g, rtol=1e-5, atol=1e-3)
+
+
+def refined(true, X, spread, noise_px=0.2):
+    generator = np.random.default_rng(1)
+    px = CAMERA.project(transform(inverse(true), X)) + generator.normal(0, noise_px, (len(X), 2))
+    return refine_pose_spread(
+        looking((0, 0, 0), (0.01, 0.0, 0.0)), X, spread, px.astype(np.float32), CAMERA,
+        kernel_sigma_px=2.0, standing=np.zeros(3),
+    )  # fmt: skip
+
+
+def test_a_camera_that_turns_among_directions_stands_still():
+    X = np.random.default_rng(0).uniform((-2, -2, 3), (2, 2, 8), (500, 3))
+    true = looking((0, 0, 0), (0.02, -0.03, 0.04))
+    T, squared, stands = refined(true, X, 0.5 * X)
+    assert stands
+    assert not T[:3, 3].any()
+    assert np.linalg.norm(so3_log(T[:3, :3].T @ true[:3, :3])) < 1e-4
+    assert (squared < 1.0).mean() > 0.99
+
+
+def test_points_of_the_map_tell_a_step_and_wrong_depths_do_not_bend_it():
+    X = np.random.default_rng(0).uniform((-2, -2, 3), (2, 2, 8), (500, 3))
+    true = looking((0.2, 0, 0.05), (0.02, -0.03, 0.04))
+    spread = 0.5 * X
+    spread[:100] = 0.0
+    seen_at = X.copy()
+    generator = np.random.default_rng(1)
+    seen_at[100:] *= generator.uniform(0.7, 1.4, (400, 1))
+    px = CAMERA.project(transform(inverse(true), X)) + generator.normal(0, 0.2, (500, 2))
+    T, _, stands = refine_pose_spread(
+        looking((0.15, 0, 0)), seen_at, spread, px.astype(np.float32), CAMERA,
+        kernel_sigma_px=2.0, standing=np.zeros(3),
+    )  # fmt: skip
+    assert not stands
+    assert np.linalg.norm(T[:3, 3] - true[:3, 3]) < 5e-3
+    assert np.linalg.norm(so3_log(T[:3, :3].T @ true[:3, :3])) < 1e-3
+
+
+def full_turn(axis, before=20, turn=90, after=20):
+    axis = np.array(axis, np.float64)
+    walk = [(0.06 * k, 0.01 * np.sin(k), 0.0) for k in range(before + after)]
+    poses = [looking(p) for p in walk[:before]]
+    for k in range(1, turn + 1):
+        T = looking(walk[before - 1])
+        T[:3, :3] = so3_exp(2.0 * np.pi * k / turn * axis)
+        poses.append(T)
+    return poses + [looking(p) for p in walk[before:]]
+
+
+@pytest.mark.parametrize("axis", [(0, 1, 0), (1, 0, 0), (0, 0, 1)])
+def test_a_full_turn_on_the_spot_stays_in_one_map(axis):
+    poses = full_turn(axis)
+    published, _ = run(surroundings().frames(poses))
+    assert sorted(published.poses) == list(range(len(poses)))
+    assert {segment for _, _, segment in published.poses.values()} == {0}
+    error, _ = trajectory_error(published, poses)
+    assert error < 1e-3
+
+
+def test_frames_that_turned_before_the_map_started_get_poses():
+    turned = [looking((0, 0, 0), (0.0, 0.04 * (k - 150), 0.0)) for k in range(150)]
+    poses = turned + [looking((0.06 * k, 0.02 * k * k / 20, 0.0)) for k in range(20)]
+    published, _ = run(surroundings().frames(poses))
+    assert sorted(published.poses) == list(range(len(poses)))
+    error, (_, R, _) = trajectory_error(published, poses)
+    assert error < 2e-3
+    for k in (0, 75, 149):
+        turn = poses[k][:3, :3].T @ R @ published.pose(k)[:3, :3]
+        assert np.degrees(np.linalg.norm(so3_log(turn))) < 0.5

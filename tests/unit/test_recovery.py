@@ -1,0 +1,128 @@
+"""A camera that was covered, or in the dark, goes on in its map as soon as it sees it again."""
+
+import cv2
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
+from test_mapper import Published, trajectory_error
+
+from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.map_delta import LOST, TRACKING
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters, RecoveryParameters
+from pliant.algorithms.mapping.recovery import Motion, search_radius_px
+from pliant.algorithms.tracks import FrameTracks
+
+_SIDE = 13
+
+
+def textures(count: int) -> list[np.ndarray]:
+    """A square of its own for each point."""
+    noise = np.random.default_rng(7).uniform(0, 255, (count, _SIDE, _SIDE)).astype(np.float32)
+    return [cv2.GaussianBlur(one, (0, 0), 1.2) for one in noise]
+
+
+def picture(scene: Scene, squares: list[np.ndarray], T_world_camera: F64) -> U8:
+    """The image of the scene: the square of each point where it is seen, near ones in front."""
+    points = transform(inverse(T_world_camera), scene.points)
+    image = np.full((CAMERA.height, CAMERA.width), 120, np.float32)
+    for i in np.argsort(-points[:, 2]).tolist():
+        if points[i, 2] < 0.1:
+            continue
+        u, v = CAMERA.project(points[i : i + 1])[0] - 0.5 * (_SIDE - 1)
+        x, y = int(np.floor(u)), int(np.floor(v))
+        if min(x, y) < 0 or x + _SIDE >= CAMERA.width or y + _SIDE >= CAMERA.height:
+            continue
+        shift = np.array([[1.0, 0.0, u - x], [0.0, 1.0, v - y]])
+        square = cv2.warpAffine(squares[i], shift, (_SIDE, _SIDE), borderMode=cv2.BORDER_REFLECT)
+        image[y : y + _SIDE, x : x + _SIDE] = square
+    return image.astype(np.uint8)
+
+
+def dark(_: FrameTracks) -> tuple[FrameTracks, U8]:
+    """Nothing to be seen."""
+    return FrameTracks.empty(), np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+
+
+def covered(tracks: FrameTracks) -> tuple[FrameTracks, U8]:
+    """Something else, full of texture, and no track of before."""
+    generator = np.random.default_rng(len(tracks.ids))
+    noise = generator.uniform(0, 255, (CAMERA.height, CAMERA.width)).astype(np.float32)
+    n = 4000
+    places = generator.uniform((10, 10), (CAMERA.width - 10, CAMERA.height - 10), (n, 2))
+    maxima = np.column_stack([places, generator.uniform(5.0, 500.0, n)]).astype(np.float32)
+    seen = FrameTracks(
+        ids=10_000_000 + np.arange(n), points_px=maxima[:, :2].copy(), ages=np.zeros(n, np.int32),
+        kappas=maxima[:, 2].copy(), states=np.zeros(n, np.uint8), maxima=maxima,
+        dominant_flow=np.eye(2, 3),
+    )  # fmt: skip
+    return seen, cv2.GaussianBlur(noise, (0, 0), 1.2).astype(np.uint8)
+
+
+def anew(tracks: FrameTracks) -> FrameTracks:
+    """The same tracks as others: a tracker ends all of them in a frame that shows nothing."""
+    kept = {name: getattr(tracks, name) for name in vars(tracks)}
+    return FrameTracks(**{**kept, "ids": tracks.ids + 1_000_000})
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """A scene, the camera's poses, and what it sees."""
+    scene, poses = Scene.box(500, noise_px=0.1), sideways(36, step=0.04)
+    squares = textures(len(scene.points))
+    return scene, poses, [picture(scene, squares, T) for T in poses], list(scene.frames(poses))
+
+
+@pytest.mark.parametrize("spoil", [dark, covered])
+@pytest.mark.parametrize("count", [1, 3, 10])
+def test_the_map_goes_on_after_frames_that_show_nothing_of_it(seen, spoil, count):
+    _, poses, images, frames = seen
+    mapper, published = Mapper(CAMERA, MappingParameters(), 0), Published()
+    blind = range(20, 20 + count)
+    for k, (tracks, grey) in enumerate(zip(frames, images, strict=True)):
+        now = spoil(tracks) if k in blind else (anew(tracks) if k > blind[0] else tracks, grey)
+        published.apply(mapper.process(k, k * INTERVAL_NS, now[0], now[1], None))
+    published.apply(mapper.finish())
+    assert [k for k, state in enumerate(published.states) if state == LOST] == list(blind)
+    assert set(range(len(poses))) - set(published.poses) == set(blind)
+    assert {segment for _, _, segment in published.poses.values()} == {0}
+    error, _ = trajectory_error(published, poses)
+    assert error < 2e-3
+
+
+def test_another_place_is_not_taken_for_the_map(seen):
+    """A long loss: then the frames that were kept meanwhile are those of another map."""
+    _, poses, images, frames = seen
+    elsewhere = Scene.box(500, seed=9, noise_px=0.1)
+    squares = textures(len(elsewhere.points))[::-1]
+    mapper, published = Mapper(CAMERA, MappingParameters(), 0), Published()
+    for k in range(22):
+        published.apply(mapper.process(k, k * INTERVAL_NS, frames[k], images[k], None))
+    after = list(elsewhere.frames(poses))
+    for k, tracks in enumerate(after):
+        grey = picture(elsewhere, squares, poses[k])
+        delta = mapper.process(22 + k, (22 + k) * INTERVAL_NS, anew(tracks), grey, None)
+        published.apply(delta)
+    segments = [segment for _, (_, _, segment) in sorted(published.poses.items())]
+    assert segments == [0] * 22 + [1] * len(after)
+    assert published.states[22] == LOST
+    assert published.states[-1] == TRACKING
+
+
+def test_time_not_frames_decides_how_far_the_camera_has_gone():
+    first, second = looking((0.0, 0.0, 0.0)), looking((0.1, 0.0, 0.0), (0.0, 0.02, 0.0))
+    motion = Motion(stamps_ns=(0, INTERVAL_NS), poses=(first, second))
+    moved, still = motion.predictions(4 * INTERVAL_NS)
+    expected = np.linalg.matrix_power(inverse(first) @ second, 4)
+    np.testing.assert_allclose(moved[:3, :3], expected[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(moved[:3, 3], [0.4, 0.0, 0.0], atol=0.02)
+    np.testing.assert_array_equal(still, second)
+    assert len(Motion(stamps_ns=(5, 5), poses=(first, first)).predictions(9)) == 1
+
+
+def test_the_search_grows_with_the_time_without_a_pose_and_has_an_end():
+    parameters = RecoveryParameters()
+    radii = [search_radius_px(s, CAMERA, parameters) for s in (0.03, 0.3, 100.0)]
+    assert 0.0 < radii[0] < radii[1] < radii[2]
+    assert radii[2] == parameters.max_radius_share * CAMERA.width

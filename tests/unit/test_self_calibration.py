@@ -1,0 +1,102 @@
+"""A camera whose calibration is a guess: what is found, how sure it is, what is told meanwhile."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
+from test_mapper import Published, trajectory_error
+
+from pliant.algorithms.bundle.problem import CalibrationUncertainty
+from pliant.algorithms.map_delta import TRACKING, WAITING
+from pliant.algorithms.mapping import trial
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.self_calibration import widened
+from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
+
+PARAMETERS = MappingParameters()
+GUESS_SIGMA = 0.3
+
+
+def guessed(factor):
+    return replace(CAMERA, fx=CAMERA.fx * factor, fy=CAMERA.fy * factor)
+
+
+def run(frames, factor, parameters=PARAMETERS):
+    mapper, published = mapper_for(guessed(factor), parameters, 0, GUESS_SIGMA), Published()
+    for frame, tracks in enumerate(frames):
+        published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+    final = mapper.finish()
+    return published.apply(final), final
+
+
+def found_focal(factor, final):
+    return guessed(factor).fx * np.exp(final.calibration_correction[0]) / CAMERA.fx
+
+
+@pytest.fixture(scope="module")
+def turning():
+    poses = sideways(60)
+    return poses, list(Scene.box(death=0.02).frames(poses))
+
+
+@pytest.mark.parametrize("factor", [0.65, 1.5])
+def test_a_wrong_focal_length_is_found_and_the_path_is_that_of_a_calibrated_camera(turning, factor):
+    poses, frames = turning
+    published, final = run(frames, factor)
+    sigma = final.calibration_sigmas[0]
+    assert sigma < 0.04
+    assert abs(found_focal(factor, final) - 1.0) < min(0.02, 3.0 * sigma)
+    assert sorted(published.poses) == list(range(len(poses)))
+    assert trajectory_error(published, poses)[0] < 1e-3
+
+
+def test_frames_on_trial_wait_and_then_all_get_their_poses_at_once(turning, monkeypatch):
+    monkeypatch.setattr(trial, "_KNOWN", 0.1)
+    poses, frames = turning
+    published, _ = run(frames, 0.65)
+    begun = published.states.index(TRACKING)
+    assert 5 < begun < len(poses) - 1
+    assert set(published.states[:begun]) == {WAITING}
+    assert "focal length is known to" in published.reasons[begun - 1]
+    assert sorted(published.poses) == list(range(len(poses)))
+
+
+def test_keyframes_tell_the_pixels_of_the_image_not_of_the_camera_that_was_found(turning):
+    _, frames = turning
+    mapper = mapper_for(guessed(0.65), PARAMETERS, 0, GUESS_SIGMA)
+    for frame, tracks in enumerate(frames):
+        mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+    final = mapper.finish()
+    told = mapper.publish_keyframes()
+    frame_of = dict(zip(final.keyframe_ids.tolist(), final.keyframe_frames.tolist(), strict=True))
+    at = 0
+    for keyframe, count in zip(told.keyframe_ids.tolist(), told.counts.tolist(), strict=True):
+        seen = frames[frame_of[keyframe]].points_px
+        px = told.points_px[at : at + count]
+        at += count
+        nearest = np.linalg.norm(px[:, None] - seen[None], axis=2).min(axis=1)
+        assert np.median(nearest) < 0.01
+
+
+def test_straight_ahead_leaves_the_focal_length_open_and_says_so():
+    poses = [looking((0.0, 0.0, 0.05 * k)) for k in range(40)]
+    _, final = run(Scene.box(death=0.02).frames(poses), 1.2)
+    assert final.calibration_sigmas[0] > 0.05
+
+
+def test_a_turn_alone_starts_no_map_under_any_focal_length():
+    poses = [looking((0.0, 0.0, 0.0), (0.0, 0.01 * k, 0.0)) for k in range(30)]
+    published, _ = run(Scene.box().frames(poses), 1.5)
+    assert set(published.states) == {WAITING}
+    assert not published.poses
+
+
+def test_only_a_guess_is_tried_and_what_is_held_stays_held():
+    assert isinstance(mapper_for(CAMERA, PARAMETERS, 0), Mapper)
+    assert isinstance(mapper_for(CAMERA, PARAMETERS, 0, 0.03), Mapper)
+    assert isinstance(mapper_for(CAMERA, PARAMETERS, 0, 0.3), TrialMapper)
+    held = MappingParameters(calibration=CalibrationUncertainty(focal=0.0))
+    assert widened(held, 0.3) is held
+    assert widened(PARAMETERS, 0.3).calibration.k1 > PARAMETERS.calibration.k1

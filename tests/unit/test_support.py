@@ -1,0 +1,92 @@
+"""What counts for a pose and for a run: share and spread over the image, not inliers alone."""
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
+
+from pliant.algorithms.map_delta import TRACKING
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters, SupportParameters
+from pliant.algorithms.mapping.support import doubt, support_of
+from pliant.algorithms.tracks import FrameTracks
+from pliant.results.judgement import BAD, DOUBTFUL, GOOD, judge
+
+
+def doubt_of(points, inliers, settled):
+    """settled: where tracks are that had time to become points."""
+    n, parameters = len(settled), SupportParameters()
+    tracks = FrameTracks(
+        ids=np.arange(n), points_px=settled, ages=np.full(n, 30, np.int32),
+        kappas=np.ones(n, np.float32), states=np.zeros(n, np.uint8),
+        maxima=np.zeros((0, 3), np.float32), dominant_flow=np.eye(2, 3),
+    )  # fmt: skip
+    found = support_of(tracks, 1e-9 * INTERVAL_NS, points, inliers, CAMERA, parameters)
+    return doubt(found, parameters)
+
+
+def places(count, left=0.0, right=1.0, seed=0):
+    generator = np.random.default_rng(seed)
+    low, high = (left * CAMERA.width, 0.0), (right * CAMERA.width, CAMERA.height)
+    return generator.uniform(low, high, (count, 2)).astype(np.float32)
+
+
+def test_points_all_over_the_image_leave_no_doubt():
+    points = places(1000)
+    assert doubt_of(points, np.ones(1000, np.bool_), points) == ""
+    assert doubt_of(points, np.ones(1000, np.bool_), places(0)) == ""
+
+
+def test_half_an_image_of_tracks_without_points_is_doubtful():
+    points = places(1000, right=0.5)
+    told = doubt_of(points, np.ones(1000, np.bool_), np.concatenate([points, places(500, 0.5)]))
+    assert told == "doubtful: 50% of the image moves otherwise"
+
+
+def test_few_that_fit_and_all_in_one_place_are_doubtful():
+    points = places(1000)
+    few = np.arange(1000) < 300
+    assert doubt_of(points, few, points).startswith("doubtful: 30% of the points seen")
+    corner = places(200, right=0.1)
+    assert "one place" in doubt_of(corner, np.ones(200, np.bool_), corner)
+    assert doubt_of(places(0), np.zeros(0, np.bool_), places(0)).startswith("doubtful")
+
+
+def test_a_large_moving_thing_is_told_of():
+    """The right half of what is seen moves by itself: its tracks fit no point, the pose stands."""
+    poses, scene = sideways(50), Scene.box(1500, noise_px=0.1)
+    reasons = {}
+    for other in (False, True):
+        mapper = Mapper(CAMERA, MappingParameters(), 0)
+        for k, tracks in enumerate(scene.frames(poses)):
+            points_px = tracks.points_px.copy()
+            if other:
+                moves = points_px[:, 0] > 0.45 * CAMERA.width
+                step = 40.0 * np.sin(0.7 * k)
+                points_px[moves] += np.array([0.0, step], np.float32)
+            kept = {name: getattr(tracks, name) for name in vars(tracks)}
+            maxima = np.column_stack([points_px, tracks.kappas])
+            now = FrameTracks(**{**kept, "points_px": points_px, "maxima": maxima})
+            delta = mapper.process(k, k * INTERVAL_NS, now, None, None)
+            if delta.state == TRACKING:
+                reasons.setdefault(other, []).append(delta.reason)
+    assert not any(reasons[False])
+    assert sum(r.startswith("doubtful") for r in reasons[True]) > 0.5 * len(reasons[True])
+
+
+@pytest.mark.parametrize(
+    ("frames", "in_segments", "doubtful", "word"),
+    [
+        (100, [100], 10, GOOD),
+        (100, [93], 0, GOOD),
+        (100, [100], 40, DOUBTFUL),
+        (100, [60, 40], 0, DOUBTFUL),
+        (100, [40, 30, 30], 0, BAD),
+        (100, [20], 0, BAD),
+        (100, [], 0, BAD),
+        (0, [], 0, BAD),
+    ],
+)
+def test_a_run_is_judged_with_a_reason(frames, in_segments, doubtful, word):
+    found, reason = judge(frames=frames, in_segments=in_segments, doubtful=doubtful)
+    assert found == word
+    assert reason

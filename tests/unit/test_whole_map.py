@@ -1,0 +1,184 @@
+"""Adjustments of the whole map beside the frames: asked, found, taken over, and folded."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, Scene, looking
+
+from pliant.algorithms.geometry import (
+    align_umeyama,
+    inverse,
+    matrix_to_pose,
+    move_by_similarity,
+    similarity_to_matrix,
+    so3_exp,
+    transform,
+)
+from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import (
+    MappingParameters,
+    WholeMapParameters,
+    WindowParameters,
+)
+from pliant.algorithms.mapping.whole_map import find_moves, move_map
+from pliant.map_history import MapHistory
+from pliant.state import load_state, save_state
+from pliant_services.nodes.bundle_adjustment import Beside
+
+FRAMES = 150
+GROWING = MappingParameters(
+    window=WindowParameters(keyframes=6, keyframe_iterations=2),
+    whole_map=WholeMapParameters(growth=0.2, distance_frames=7),
+)
+AT_THE_END = GROWING.model_copy(update={"whole_map": WholeMapParameters(growth=0.0)})
+
+
+def similarity(scale, rotation_vector, t):
+    R = np.eye(4)
+    R[:3, :3], R[:3, 3] = so3_exp(np.array(rotation_vector, np.float64)), t
+    return np.concatenate([matrix_to_pose(R), [scale]])
+
+
+def path(frames):
+    """A camera that slides along a wall of points."""
+    return [looking((0.06 * k, 0.03 * np.sin(0.3 * k), 0.0)) for k in range(frames)]
+
+
+def fold(parameters, *, frames=FRAMES, beside=False, killed=False):
+    """The mapper, its deltas, and what a reader makes of them.
+
+    beside: the answer is found in a thread.   killed: the mapper is another one in every frame.
+    """
+    asking = Beside()
+    mapper, history, deltas = Mapper(CAMERA, parameters, 0), MapHistory(), []
+    generator = np.random.default_rng(0)
+    points = generator.uniform((-4.0, -3.0, 3.0), (14.0, 3.0, 9.0), (1500, 3))
+    kappas = generator.uniform(5.0, 500.0, len(points)).astype(np.float32)
+    tracks = Scene(points, kappas, death=0.02).frames(path(frames))
+    for frame, some in enumerate(tracks):
+        if killed and mapper.whole_map.question is not None:
+            mapper = load_state(save_state(mapper))
+        if beside:
+            asking.ask(mapper.whole_map)
+            asking.answer(mapper.whole_map, frame)
+        deltas.append(mapper.process(frame, frame * 33_000_000, some, None, None))
+        history.apply(deltas[-1], frame=frame, stamp_ns=frame)
+    return mapper, deltas, history
+
+
+@pytest.fixture(scope="module")
+def grown():
+    return fold(GROWING)
+
+
+def test_what_is_not_listed_moves_with_what_is_listed_before_it():
+    moves = MapMoves(
+        keyframe_ids=np.array([3, 5]),
+        moves=np.array([similarity(2.0, (0, 0, 0.1), (1, 2, 3)), similarity(0.5, (0, 1, 0), 0)]),
+    )
+    S = moves.matrices(np.array([0, 3, 4, 5, 9]))
+    first, last = similarity_to_matrix(moves.moves)
+    np.testing.assert_array_equal(S, [np.eye(4), first, first, last, last])
+    moved = moves.points(np.array([[1.0, 0, 0], [1, 0, 0]]), np.array([0, 4]))
+    np.testing.assert_allclose(moved[0], (1, 0, 0))
+    np.testing.assert_allclose(moved[1], 2 * so3_exp(np.array([0, 0, 0.1]))[:, 0] + (1, 2, 3))
+
+
+def test_adjustments_come_at_their_distance_and_seldom(grown):
+    _, deltas, _ = grown
+    asked = [k for k, delta in enumerate(deltas) if len(delta.moved_keyframes)]
+    keyframes = [len(deltas[k].moved_keyframes) for k in asked]
+    assert len(asked) >= 2
+    assert all(b - a > GROWING.whole_map.distance_frames for a, b in pairwise(asked))
+    assert all(b >= 1.1 * a for a, b in pairwise(keyframes))
+    _, deltas, _ = fold(AT_THE_END, frames=60)
+    assert not any(len(delta.moved_keyframes) for delta in deltas)
+
+
+@pytest.mark.parametrize("how", ["beside", "killed"])
+def test_where_the_answer_was_found_changes_nothing(grown, how):
+    _, deltas, _ = grown
+    _, others, _ = fold(GROWING, **{how: True})
+    for one, other in zip(deltas, others, strict=True):
+        for name, value in vars(one).items():
+            np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
+
+
+def test_readers_have_the_map_that_the_mapper_has(grown):
+    mapper, _, history = grown
+    active = mapper._map
+    for keyframe in active.keyframes:
+        known = history.keyframes[keyframe.id].pose_world_camera
+        np.testing.assert_allclose(known, matrix_to_pose(keyframe.T_world_camera), atol=1e-9)
+    rows = active.mapped_rows()
+    told = rows[np.isfinite(active.points.published_xyz[rows, 0])]
+    points = history.points()
+    order = np.argsort(active.points.ids[told])
+    np.testing.assert_array_equal(points.ids, active.points.ids[told][order])
+    published = active.points.published_xyz[told][order]
+    np.testing.assert_allclose(points.positions, published, atol=1e-9)
+    np.testing.assert_array_equal(points.hosts, active.points.first_keyframe[told][order])
+
+
+def test_a_drifted_map_comes_back():
+    """Scale that drifts along the keyframes, and what hangs on them with it, is taken out."""
+    mapper, _, _ = fold(AT_THE_END, frames=120)
+    active = mapper._map
+    ids = np.array([keyframe.id for keyframe in active.keyframes])
+    usual = error(active)
+    drift = np.array([similarity(1.002**k, (0, 0, 0), (0, 0, 0)) for k in range(len(ids))])
+    move_map(active, MapMoves(keyframe_ids=ids, moves=drift), mapper._path)
+    drifted = error(active)
+    assert drifted > 10.0 * usual
+    active.parameters = GROWING.model_copy(update={"window": WindowParameters(keyframes=3)})
+    mapper.whole_map.ask(120, active)
+    moves = find_moves(mapper.whole_map.question)
+    assert len(moves.keyframe_ids) == len(ids) - 3
+    move_map(active, moves, mapper._path)
+    assert error(active) < 0.7 * drifted  # the kernel takes the rest for outliers
+
+
+def error(active):
+    """Sim(3) RMSE of the keyframes."""
+    true = np.array(path(FRAMES))[[keyframe.frame for keyframe in active.keyframes], :3, 3]
+    at = np.array([keyframe.T_world_camera[:3, 3] for keyframe in active.keyframes])
+    scale, R, t = align_umeyama(at, true, with_scale=True)
+    return np.sqrt(((scale * at @ R.T + t - true) ** 2).sum(axis=1).mean())
+
+
+def test_a_common_move_changes_nothing_that_a_camera_sees(grown):
+    mapper, _, _ = fold(GROWING, frames=40)
+    active = mapper._map
+    rows = active.mapped_rows()
+    last = active.keyframes[-1]
+    before = transform(inverse(last.T_world_camera), active.points.xyz[rows])
+    one = similarity(1.7, (0.1, -0.2, 0.3), (4, 5, 6))
+    first = np.array([active.keyframes[0].id])
+    S = move_map(active, MapMoves(keyframe_ids=first, moves=one[None]), mapper._path)
+    after = transform(inverse(last.T_world_camera), active.points.xyz[rows])
+    np.testing.assert_allclose(after, 1.7 * before, atol=1e-9)
+    np.testing.assert_allclose(S, similarity_to_matrix(one))
+
+
+def test_poses_of_frames_scale_with_the_map_around_them(grown):
+    _, deltas, _ = grown
+    history = MapHistory()
+    for frame, delta in enumerate(deltas[:40]):
+        history.apply(delta, frame=frame, stamp_ns=frame)
+    before = {frame: pose for frame, (_, pose) in history.final().items()}
+    one = similarity(2.0, (0, 0.1, 0), (1, 1, 1))
+    nothing = {
+        name: value[:0]
+        for name, value in vars(deltas[40]).items()
+        if isinstance(value, np.ndarray) and value.ndim
+    }
+    nothing.update(moved_keyframes=np.array([0]), moves=one[None])
+    history.apply(replace(deltas[40], **nothing), frame=40, stamp_ns=40)
+    assert len(before) > 30
+    for frame, pose in before.items():
+        T = similarity_to_matrix(np.append(pose, 1.0))
+        expected = matrix_to_pose(move_by_similarity(similarity_to_matrix(one), T))
+        np.testing.assert_allclose(history.final()[frame][1], expected, atol=1e-9)
