@@ -192,6 +192,28 @@ def test_one_more_interruption_changes_neither_the_words_nor_the_code(
     assert (done.returncode, done.stderr) == expected
 
 
+@pytest.mark.parametrize(
+    ("kind", "raised", "expected"),
+    [("SIGINT", "signal.default_int_handler", 130), ("SIGTERM", "lambda *_: sys.exit(143)", 143)],
+)
+def test_an_interruption_in_a_destructor_is_not_lost(kind: str, raised: str, expected: int) -> None:
+    """Python prints what a handler raises there, and goes on."""
+    code = (
+        "import os, signal, sys, threading; from pliant_services import cli\n"
+        "from pliant_services.cli import commands\n"
+        "class Closed:\n"
+        f"    def __del__(self): os.kill(os.getpid(), signal.{kind}); list(range(9))\n"
+        "def app(**options):\n"
+        f"    signal.signal(signal.{kind}, {raised})\n"
+        "    Closed()\n"
+        "    threading.Event().wait()\n"
+        "cli.app = app\n"
+        "cli.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, "Traceback" in done.stderr) == (expected, False), done.stderr
+
+
 def test_what_a_signal_ends_without_a_word_does_not_wait_either() -> None:
     code = (
         "import sys, threading; from pliant_services import cli\n"

@@ -12,6 +12,7 @@ import typer
 
 from pliant import __version__
 from pliant.errors import PliantError, SourceLostError
+from pliant_services.runtime.interruptions import deliver_swallowed_interruptions
 
 app = typer.Typer(
     name="pliant",
@@ -59,6 +60,7 @@ def main(application: typer.Typer | None = None) -> None:
     for kind in _INTERRUPTIONS:
         if signal.getsignal(kind) == signal.SIG_DFL:  # not under nohup
             signal.signal(kind, signal.default_int_handler)
+    deliver_swallowed_interruptions()
     try:
         run_and_exit(application or app)
     except KeyboardInterrupt:  # one more, just before it was ignored
