@@ -58,9 +58,6 @@ def test_points_go_that_no_keyframe_and_no_track_sees() -> None:
     assert sorted(again.tolist()) == [0, 4]  # no new memory
     points.promote(again)
     assert len(set(points.ids[[0, 1, 2, 3, 4]].tolist())) == 5  # ids are never reused
-    points.cull_all()
-    assert points.culled == 7
-    assert sorted(points.allocate(6).tolist()) == list(range(6))
 
 
 def test_the_active_map_stays_as_it_is_where_the_camera_comes_back() -> None:

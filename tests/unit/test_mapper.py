@@ -8,7 +8,11 @@ from pliant.algorithms.arrays import check_arrays
 from pliant.algorithms.geometry import align_umeyama, move_by_similarity, pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.parameters import (
+    MappingParameters,
+    WholeMapParameters,
+    WindowParameters,
+)
 from pliant.algorithms.tracks import FrameTracks
 
 PARAMETERS = MappingParameters()
@@ -191,26 +195,58 @@ def test_noise_and_empty_frames_start_no_map():
     assert "too few tracks: 0 of 100" in published.reasons
 
 
-def test_after_a_loss_a_new_segment_starts():
-    poses = sideways(40)
+def cut(poses, at):
+    """Every track is cut at a frame, and nothing is seen for longer than the mapper waits."""
     frames = list(Scene.box().frames(poses))
-    # Every track is cut at frame 20, and nothing is seen for longer than the mapper waits.
-    dark = [FrameTracks.empty()] * 12
+    dark = [FrameTracks.empty()] * 40
     offset = 1_000_000
     after = [
         FrameTracks(
             ids=f.ids + offset, points_px=f.points_px, ages=f.ages, kappas=f.kappas,
             states=f.states, maxima=np.zeros((0, 3), np.float32), dominant_flow=f.dominant_flow,
         )
-        for f in frames[20:]
+        for f in frames[at:]
     ]  # fmt: skip
-    published, _ = run(frames[:20] + dark + after)
+    return frames[:at] + dark + after
+
+
+def test_after_a_loss_a_new_segment_starts():
+    published, _ = run(cut(sideways(40), 20))
     assert LOST in published.states
     assert {segment for _, _, segment in published.poses.values()} == {0, 1}
-    assert all(k not in published.poses for k in range(20, 31))
+    assert all(k not in published.poses for k in range(20, 60))
     assert published.states[-2] == TRACKING
     lost = published.reasons[published.states.index(LOST)]
     assert lost.startswith("lost:")
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_a_segment_is_adjusted_as_if_it_were_alone(again):
+    """Also where no other follows."""
+    poses, window = sideways(70), WindowParameters(keyframes=5)
+    frames = cut(poses, 45)
+    only = WholeMapParameters(growth=0.0)
+    parameters = MappingParameters(window=window, whole_map=only)
+    alone, _ = run(frames[:45], parameters)
+    published, deltas = run(frames if again else frames[:85], parameters)
+    first = [k for k, (_, _, segment) in published.poses.items() if segment == 0]
+    assert sorted(first) == list(range(45))
+    for k in first:
+        np.testing.assert_allclose(published.pose(k), alone.pose(k), atol=1e-12)
+    assert len(deltas[-1].keyframe_ids) == len(published.keyframes) > window.keyframes
+    left = window.model_copy(update={"final_adjustment": False})
+    given_up, _ = run(frames, MappingParameters(window=left, whole_map=only))
+    assert any(abs(given_up.pose(k) - alone.pose(k)).max() > 1e-6 for k in first)
+
+
+def test_segments_are_given_back_beyond_the_most_keyframes():
+    """The oldest first: they stay as they were published."""
+    frames = cut(sideways(40), 20)
+    window = WindowParameters(final_max_keyframes=5)
+    published, deltas = run(frames, MappingParameters(window=window))
+    told = deltas[-1].keyframe_segments.tolist()
+    assert set(told) == {1}
+    assert {segment for _, _, segment in published.poses.values()} == {0, 1}
 
 
 def test_a_short_gap_is_bridged():

@@ -365,6 +365,12 @@ class ActiveMap:
         self.rebuild_window()
         return known
 
+    def close(self) -> None:
+        """The segment does not go on: what could only have become a part of it is given back."""
+        self.links = TrackLinks()
+        self.collect_garbage()
+        self.window = self._window([], fixed=0, outside=0)
+
     def mapped_rows(self) -> I32:
         """Rows of all points of the segment, oldest first."""
         rows = self.points.mapped(self.segment)

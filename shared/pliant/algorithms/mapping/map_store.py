@@ -95,12 +95,6 @@ class PointRows:
         self.culled += len(rows)
         self.free(rows)
 
-    def cull_all(self) -> None:
-        """Give back every row: no segment goes on."""
-        used = self.state[: self.count]
-        self.culled += int(np.count_nonzero(used == MAPPED))
-        self.free(np.flatnonzero(used != FREE).astype(np.int32))
-
     def promote(self, rows: I32) -> None:
         """Make candidates points of the map: they get their ids, in the order given."""
         self.state[rows] = MAPPED

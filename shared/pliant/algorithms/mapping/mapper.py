@@ -20,6 +20,7 @@ from pliant.algorithms.mapping.directions import (
     placed_candidates,
     spread_of,
 )
+from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.localisation import locate, refine
 from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe, Observations, PointRows
 from pliant.algorithms.mapping.observation_table import reprojection_errors
@@ -65,6 +66,7 @@ class Mapper:
         self._keyframe_changes = KeyframeChanges(self._points)
         self._waiting = Waiting()
         self._map: ActiveMap | None = None
+        self._earlier = EarlierSegments()
         self._segments = 0
         self._keyframes = 0
         self._motion: Motion | None = None
@@ -157,6 +159,7 @@ class Mapper:
 
     def finish(self) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
+        self._earlier.adjust()
         if self._map is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         self._whole = self._finishes(self._map)
@@ -214,19 +217,23 @@ class Mapper:
 
     def _begin(self, start: Start, grey: U8 | None, colour: U8 | None) -> int:
         """Let the map start, and give poses to the frames that waited, backwards."""
-        self._points.cull_all()  # of earlier segments, which have been published
+        limits = self._parameters.window
+        kept = limits.final_max_keyframes if limits.final_adjustment else 0
+        self._earlier.make_room(self._points, kept)
         self._map = ActiveMap(
             self._segments, self._points, self._keyframes, self._camera, self._parameters
         )
         self._segments += 1
-        self._path.forget()
+        self._path = Path()
         self.whole_map = WholeMap()
         self._map.begin(start, self._waiting.frames, grey, colour)
         self._calibrate(self._map)
-        limits = self._parameters.localisation
         placed = list(
-            earlier_poses(start, self._map.keyframes, self._waiting, self._camera, limits)
-        )
+            earlier_poses(
+                start, self._map.keyframes, self._waiting, self._camera,
+                self._parameters.localisation,
+            )
+        )  # fmt: skip
         for each in placed:
             self._add_pose(self._map, each.frame, each.keyframe, each.T_world_camera, each.inliers)
         stamps_ns = {waiting.frame: waiting.stamp_ns for waiting in self._waiting.frames}
@@ -288,6 +295,7 @@ class Mapper:
         delta = self._publish(LOST, reason, 0)
         long = self._motion.lost_s(stamp_ns) > self._parameters.localisation.max_lost_s
         if long and self._lost_frames >= _LEAST_LOST:
+            self._earlier.keep(active, self._path, self.calibration)
             self._keyframe_changes.settle(active.keyframes)
             self._keyframes = active.next_keyframe_id
             self._map, self._lost_frames = None, 0
@@ -385,6 +393,10 @@ class Mapper:
                 rows = active.mapped_rows()
             centre = active.keyframes[-1].T_world_camera[:3, 3].copy()
             self._changes.remove_points(active.take_removed())
+        for earlier in self._earlier.adjusted:
+            keyframes = [*keyframes, *earlier.keyframes]
+            rows = np.concatenate([rows, earlier.mapped_rows()])
+            self._changes.remove_points(earlier.take_removed())
         delta = self._changes.publish(
             state=state,
             reason=reason,

@@ -1,0 +1,41 @@
+"""Segments of the map that do not go on: kept until the end, when each is adjusted as a whole."""
+
+from typing import NamedTuple
+
+from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.map_store import PointRows
+from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
+
+
+class _Earlier(NamedTuple):
+    """A segment, the poses of its frames, and the calibration whose pixels its keyframes have."""
+
+    map: ActiveMap
+    path: Path
+    calibration: SelfCalibration
+
+
+class EarlierSegments:
+    """adjusted: those that have been adjusted, oldest first."""
+
+    def __init__(self) -> None:
+        self.adjusted: list[ActiveMap] = []
+        self._kept: list[_Earlier] = []
+
+    def keep(self, active: ActiveMap, path: Path, calibration: SelfCalibration) -> None:
+        """A segment has lost its camera."""
+        active.close()
+        self._kept.append(_Earlier(active, path, calibration))
+
+    def make_room(self, points: PointRows, max_keyframes: int) -> None:
+        """Give back the oldest segments, which have been published, beyond so many keyframes of
+        all together."""
+        while sum(len(each.map.keyframes) + each.map.culled for each in self._kept) > max_keyframes:
+            points.cull(self._kept.pop(0).map.mapped_rows())
+
+    def adjust(self) -> None:
+        """Adjust each of them, no earlier than the end of the stream."""
+        for earlier in self._kept:
+            earlier.map.adjust_all(earlier.path, earlier.calibration)
+        self.adjusted = [earlier.map for earlier in self._kept]
