@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, U8
+from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.bundle.calibration import ideal_pixels
 from pliant.algorithms.camera import PinholeCamera
 
@@ -13,14 +13,15 @@ from pliant.algorithms.camera import PinholeCamera
 class CorrectedView:
     """Moves what was seen to where the ideal camera would have seen it.
 
-    correction: (s, k1, k2, ...) as MapDelta.calibration_correction, or () for none.  What a rolling
-    shutter does is left: it moves pixels along the image, which depth hardly feels.
+    correction: as MapDelta.calibration_correction, or () for none.  What a rolling shutter does is
+    left: it moves pixels along the image, which depth hardly feels.
     camera: the ideal camera.
     """
 
     def __init__(self, camera: PinholeCamera, correction: tuple[float, ...]) -> None:
         self.camera = camera
-        self._correction = np.array(correction[:3] if len(correction) >= 3 else (0.0, 0.0, 0.0))
+        s, k1, k2, a, b = parts_of(correction)
+        self._correction = np.array([s, k1, k2, 0.0, a, b])
 
     @property
     def lens(self) -> tuple[float, float]:
@@ -39,12 +40,9 @@ class CorrectedView:
         if not self._correction.any():
             return points_px
         camera = self.camera
-        s, k1, k2 = self._correction.tolist()
         x = (points_px[:, 0].astype(np.float64) - camera.cx) / camera.fx
         y = (points_px[:, 1].astype(np.float64) - camera.cy) / camera.fy
-        squared = x * x + y * y
-        factor = np.exp(s) * (1.0 + k1 * squared + k2 * squared**2)
-        u, v = camera.cx + camera.fx * x * factor, camera.cy + camera.fy * y * factor
+        u, v = self._seen(x, y)
         return np.stack([u, v], axis=1).astype(np.float32)
 
     def image(self, pixels: U8) -> U8:
@@ -52,23 +50,35 @@ class CorrectedView:
         if not self._correction.any():
             return pixels
         camera = self.camera
-        s, k1, k2 = self._correction.tolist()
-        x = (np.arange(camera.width) - camera.cx) / camera.fx
-        y = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
-        squared = x * x + y * y
-        factor = np.exp(s) * (1.0 + k1 * squared + k2 * squared**2)
-        u = (x * factor * camera.fx + camera.cx).astype(np.float32)
-        v = (y * factor * camera.fy + camera.cy).astype(np.float32)
+        x: F64 = (np.arange(camera.width, dtype=np.float64) - camera.cx) / camera.fx
+        y: F64 = (np.arange(camera.height, dtype=np.float64)[:, None] - camera.cy) / camera.fy
+        u, v = (each.astype(np.float32) for each in self._seen(x, y))
         moved = cv2.remap(pixels, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
         return np.asarray(moved, np.uint8)
 
+    def _seen(self, x: F64, y: F64) -> tuple[F64, F64]:
+        """Pixels of the rectified image that see points of the plane z = 1."""
+        camera = self.camera
+        s, k1, k2, _, a, b = self._correction.tolist()
+        squared = x * x + y * y
+        factor = 1.0 + k1 * squared + k2 * squared**2
+        u = camera.cx + np.exp(s) * camera.fx * (x * factor + a)
+        return u, camera.cy + np.exp(s) * camera.fy * (y * factor + b)
+
+
+def parts_of(correction: tuple[float, ...]) -> tuple[float, float, float, float, float]:
+    """(s, k1, k2, a, b) of a correction, also of a recording from before the last two."""
+    known = (*correction, *np.zeros(6))[:6] if len(correction) >= 3 else np.zeros(6)
+    s, k1, k2, _, a, b = (float(each) for each in known)
+    return s, k1, k2, a, b
+
 
 def corrected_view(camera: PinholeCamera, correction: tuple[float, ...]) -> CorrectedView:
-    """The view whose camera has the focal length that was found, so that its pixels move least.
+    """The view whose camera is the pinhole that was found, so that its pixels move least.
 
     camera: the one that was believed in.    correction: as of ``CorrectedView``.
     """
-    s, k1, k2 = correction[:3] if len(correction) >= 3 else (0.0, 0.0, 0.0)
-    factor = float(np.exp(s))
-    found = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+    s, k1, k2, a, b = parts_of(correction)
+    fx, fy = camera.fx * float(np.exp(s)), camera.fy * float(np.exp(s))
+    found = replace(camera, fx=fx, fy=fy, cx=camera.cx + fx * a, cy=camera.cy + fy * b)
     return CorrectedView(found, (0.0, k1, k2))

@@ -69,10 +69,11 @@ class MapDelta:
     removed_point_ids: points that no longer exist (wrong, or merged into another).
     moved_keyframes, moves: how the whole map moved before all else of this update: ``MapMoves``.
         Keyframes and points move; of poses that hang on a keyframe, the distance to it scales.
-    calibration_correction: (s, k1, k2, readout), what the last adjustment found wrong with the
-        calibration: a point of the map at (x, y) on the plane z = 1 is seen in the rectified image
-        at ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx``, likewise v, and a rolling shutter takes the
-        rows of a frame in this share of the frame interval.   () where nothing was estimated.
+    calibration_correction: (s, k1, k2, readout, a, b), what the last adjustment found wrong with
+        the calibration: a point of the map at (x, y) on the plane z = 1 is seen in the rectified
+        image at ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx``, likewise v with b, and a rolling
+        shutter takes the rows of a frame in this share of the frame interval.   () where nothing
+        was estimated.
     calibration_sigmas: standard deviation of each of these, at residuals of 1 px.
     snapshot: every keyframe and point of the active window is in it, changed or not.
     """

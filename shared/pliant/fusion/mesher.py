@@ -14,7 +14,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import CorrectedView, corrected_view
+from pliant.algorithms.corrected_view import CorrectedView, corrected_view, parts_of
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints, Surface
@@ -106,7 +106,7 @@ class Mesher:
         self._views: dict[int, CorrectedView] = {}
         self._surfaces = KeyframeSurfaces(camera, parameters.surface)
         self._live: LiveMesh | None = None
-        self._focal = 0.0
+        self._frozen = parts_of(())
         self._segment = -1
         self._pending: list[tuple[int, bool]] = []
         self.note = ""
@@ -138,11 +138,18 @@ class Mesher:
         """A segment is made with a corrected calibration."""
         if not self._views and not self._spool.keyframes():
             # Nothing was fused yet: where the focal length was a guess, all of the view is wanted.
-            self._focal = correction[0]
+            self._frozen = parts_of(correction)
             self._camera = corrected_view(self._camera, correction).camera
             self._surfaces = KeyframeSurfaces(self._camera, self._parameters.surface)
-        rest = (correction[0] - self._focal, *correction[1:3])
-        self._views[segment] = CorrectedView(self._camera, rest)
+        self._views[segment] = self._left_of(correction)
+
+    def _left_of(self, correction: tuple[float, ...]) -> CorrectedView:
+        """What of a correction is left beside the pinhole that was frozen."""
+        s, k1, k2, a, b = parts_of(correction)
+        s0, _, _, a0, b0 = self._frozen
+        share = float(np.exp(s0 - s))
+        rest = (s - s0, k1, k2, 0.0, a - share * a0, b - share * b0)
+        return CorrectedView(self._camera, rest)
 
     def fuse(self, *, newest_only: bool = False, timer: StageTimer = no_stages) -> list[LiveChange]:
         """Fuse what waits; returns what changed.
@@ -262,7 +269,7 @@ class Mesher:
 
     def _view(self, keyframe: int) -> CorrectedView:
         """As the calibration has it with which the segment of the keyframe was made."""
-        none = CorrectedView(self._camera, (-self._focal, 0.0, 0.0) if self._focal else ())
+        none = self._left_of(())
         return self._views.get(self._map.keyframes[keyframe].segment, none)
 
     def _pose(self, keyframe: int) -> F64:

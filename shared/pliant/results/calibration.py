@@ -9,7 +9,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import corrected_view
+from pliant.algorithms.corrected_view import corrected_view, parts_of
 from pliant.algorithms.geometry import pose_to_matrix, so3_log
 from pliant.datasets.calibration import Calibration, calibration_from_yaml
 from pliant.datasets.working_size import at_size
@@ -64,9 +64,9 @@ def _corrected(
 
     The focal length alone where no lens of the source's model is near what was found.
     """
-    s, k1, k2 = correction[:3]
-    factor = math.exp(s)
-    scaled = replace(given, fx=given.fx * factor, fy=given.fy * factor)
+    s, k1, k2, a, b = parts_of(correction)
+    fx, fy = given.fx * math.exp(s), given.fy * math.exp(s)
+    scaled = replace(given, fx=fx, fy=fy, cx=given.cx + fx * a, cy=given.cy + fy * b)
     if k1 == 0.0 and k2 == 0.0 and not given.lens.distorts:
         return scaled
     try:
@@ -88,20 +88,21 @@ def _fitted(
     view = corrected_view(camera, correction)
     plane = view.camera.normalise(view.pixels(px).astype(np.float64))
     wanted = given.lens.project(camera.normalise(px.astype(np.float64)))
-    unit = np.array([start.fx, start.fy, *np.ones(len(start.distortion))])
-    values = np.array([start.fx, start.fy, *start.distortion]) / unit
+    pinhole = [start.fx, start.fy, start.cx, start.cy]
+    unit = np.array([*pinhole, *np.ones(len(start.distortion))])
+    values = np.array([*pinhole, *start.distortion]) / unit
 
     def lens(values: F64) -> F64:
-        fx, fy, *coefficients = (values * unit).tolist()
-        changed = replace(start.lens, fx=fx, fy=fy, coefficients=tuple(coefficients))
+        fx, fy, cx, cy, *coefficients = (values * unit).tolist()
+        changed = replace(start.lens, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=tuple(coefficients))
         return changed.project(plane).ravel()
 
     for _ in range(_FITS):
         now = lens(values)
         J = np.stack([(lens(values + 1e-6 * e) - now) * 1e6 for e in np.eye(len(values))], axis=1)
         values = values + np.linalg.lstsq(J, wanted.ravel() - now, rcond=1e-10)[0]
-    fx, fy, *coefficients = (values * unit).tolist()
-    return replace(start, fx=fx, fy=fy, distortion=tuple(coefficients))
+    fx, fy, cx, cy, *coefficients = (values * unit).tolist()
+    return replace(start, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(coefficients))
 
 
 def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
@@ -145,8 +146,8 @@ def _corner_px(camera: PinholeCamera, correction: tuple[float, ...]) -> float:
     )
     view = corrected_view(camera, correction)
     plane = camera.normalise(corners.astype(np.float64))
-    own = np.array([view.camera.fx, view.camera.fy])
-    seen = view.seen((plane * own + (camera.cx, camera.cy)).astype(np.float32))
+    own = view.camera
+    seen = view.seen((plane * (own.fx, own.fy) + (own.cx, own.cy)).astype(np.float32))
     return float(np.linalg.norm(seen - corners, axis=1).max())
 
 

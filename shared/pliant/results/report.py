@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from pliant.algorithms.corrected_view import parts_of
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_density import count_distinct, well_observed
 from pliant.results.calibration import calibration_verdict
@@ -122,8 +123,10 @@ def _correction(run: Run) -> dict[str, float] | None:
     correction, sigmas = run.calibration_correction, run.calibration_sigmas
     if len(correction) < 3:
         return None
-    s, k1, k2, readout = (*correction, 0.0)[:4]  # recordings from before the readout have three
+    s, k1, k2, a, b = parts_of(correction)
+    readout = correction[3] if len(correction) > 3 else 0.0
     found = {"focal_factor": float(np.exp(s)), "k1": k1, "k2": k2, "readout": readout}
+    found |= {"principal_x": a, "principal_y": b}
     if sigmas:
         found["focal_sigma"] = sigmas[0]
     return {name: round(value, 6) for name, value in found.items()}

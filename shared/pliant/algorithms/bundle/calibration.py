@@ -1,8 +1,9 @@
 """A calibration that all cameras share as a further unknown of bundle adjustment.
 
-The projection is ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx`` with r^2 = x^2 + y^2 on the plane
-z = 1, likewise for v, and the unknowns of the calibration are q = (s, k1, k2, readout).  The
-derivative by one of the first three is ``K (x, y)^T h_q`` with K = diag(fx e^s, fy e^s) and
+The projection is ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx`` with r^2 = x^2 + y^2 on the
+plane z = 1, likewise for v with b, and the unknowns are q = (s, k1, k2, readout, a, b), where
+(a, b) is how far off the principal point is.  At (a, b) = 0 the derivative by one of the first
+three is ``K (x, y)^T h_q`` with K = diag(fx e^s, fy e^s) and
 
     h = (1 + k1 r^2 + k2 r^4,  r^2,  r^4)       for  s, k1, k2.
 
@@ -13,7 +14,9 @@ So a calibration unknown moves the point on the plane z = 1 as if by
     A_q = (x, y)^T rho_q,     rho_q = h_q / (1 + 3 k1 r^2 + 5 k2 r^4),     F A_q = d(u, v) / dq.
 
 The fourth unknown is the readout of a rolling shutter, as a share of the frame interval: it moves
-an observation by the readout times its flow, so that ``A = F^-1 flow``.  An unknown enters the
+an observation by the readout times its flow, so that ``A = F^-1 flow``.  The last two move all
+of them alike: ``A = D^-1 (1, 0)^T`` and ``D^-1 (0, 1)^T``; and where they are not 0, s moves by
+``D^-1 (a, b)^T`` besides.  An unknown enters the
 Hessian of Eq. 7 like a column of B (see ``projection``): with M and e of that module its blocks are
 
     H_qq = sum A^T M A     H_qc = sum A^T M B     H_qp = sum A^T M P     - g_q = sum A^T e.
@@ -31,7 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32
+from pliant.algorithms.arrays import F32, F64, I32, BoolArray
 from pliant.algorithms.bundle.layout import BLOCK
 from pliant.algorithms.bundle.normal_equations import RECORD, SHARED
 from pliant.algorithms.bundle.packed_layout import PackedLayout, Slots
@@ -94,7 +97,7 @@ class SharedCalibration:
             raise ValueError("an unknown calibration must be that of all cameras")
         sigmas = uncertainty.sigmas
         self.layout = layout
-        self.given: F64 = np.array([0.0, lens[0, 0], lens[0, 1], 0.0])
+        self.given: F64 = np.array([0.0, lens[0, 0], lens[0, 1], 0.0, 0.0, 0.0])
         self.start: F64 = self.given if start is None else start.copy()
         self.unknown = sigmas > 0.0
         self.unknown[3] &= layout.flow.size > 0
@@ -106,6 +109,7 @@ class SharedCalibration:
         layout = self.layout
         pinhole = layout.cameras.pinhole.copy()
         pinhole[:, :2] *= np.exp(q[0])
+        pinhole[:, 2:] += pinhole[:, :2] * q[4:]
         lens = np.tile(q[1:3], (len(pinhole), 1))
         cameras = layout.cameras._replace(pinhole=pinhole, lens=lens)
         if not self.unknown[3]:
@@ -118,8 +122,8 @@ class SharedCalibration:
         """What departing from the given calibration costs, px^2."""
         return 0.5 * float(self.precision @ (q - self.given) ** 2)
 
-    def linearise(self, cameras: Cameras, records: F64) -> SharedBlocks:
-        """The blocks in the state of the records."""
+    def linearise(self, cameras: Cameras, records: F64, q: F64) -> SharedBlocks:
+        """The blocks in the state of the records, at a calibration."""
         layout = self.layout
         blocks = SharedBlocks(
             own=np.zeros((SHARED, SHARED)),
@@ -127,15 +131,24 @@ class SharedCalibration:
             cameras=np.zeros((len(layout.free), 6 * SHARED)),
             points=np.zeros((layout.points.shape[1], 3 * SHARED)),
         )
-        _add_shared(cameras, layout.slots, layout.flow, self.unknown, records, blocks)
+        _add_shared(cameras, layout.slots, layout.flow, self.unknown, q[4:], records, blocks)
         return blocks
 
 
 @fast_kernel
 def _add_shared(
-    cameras: Cameras, slots: Slots, flow: F32, unknown: Any, records: F64, blocks: SharedBlocks
+    cameras: Cameras,
+    slots: Slots,
+    flow: F32,
+    unknown: BoolArray,
+    principal: F64,
+    records: F64,
+    blocks: SharedBlocks,
 ) -> None:
-    """Add up the blocks.  records: (O + 1, RECORD) of ``normal_equations``."""
+    """Add up the blocks.
+
+    principal: (2,) a, b.    records: (O + 1, RECORD) of ``normal_equations``.
+    """
     local = np.empty(RECORD * BLOCK)
     A = np.zeros(2 * SHARED * BLOCK)
     for b in range(slots.camera.size):
@@ -144,14 +157,11 @@ def _add_shared(
             at = np.uint32(slots.place[b, i])
             for k in range(RECORD):
                 local[k * BLOCK + i] = records[at, k]
-        _moves(cameras, m, local, A)
+        _moves(cameras, m, principal, local, A)
         if unknown[3]:
             _readout_moves(cameras, m, local, flow[0, b], flow[1, b], A)
-        for q in range(SHARED):
-            if not unknown[q]:
-                A[2 * q * BLOCK : 2 * (q + 1) * BLOCK] = 0.0
-        _add_own(local, A, blocks.own, blocks.gradient, blocks.cameras[m])
-        _add_points(cameras, m, slots.point[b], local, A, blocks.points)
+        _add_own(local, A, unknown, blocks.own, blocks.gradient, blocks.cameras[m])
+        _add_points(cameras, m, slots.point[b], local, A, unknown, blocks.points)
 
 
 @fast_kernel
@@ -162,37 +172,50 @@ def _shares(n2: Any, k1: Any, k2: Any) -> Any:
 
 
 @fast_kernel
-def _moves(cameras: Cameras, m: int, local: F64, A: F64) -> None:
+def _inverse_of_lens(x: Any, y: Any, k1: Any, k2: Any) -> Any:
+    """D^-1, which is symmetric, by Sherman and Morrison: (xx, xy, yy)."""
+    n2 = x * x + y * y
+    d, e = 1.0 + n2 * (k1 + k2 * n2), 2.0 * k1 + 4.0 * k2 * n2
+    t = e / (d * (d + e * n2))
+    return 1.0 / d - t * x * x, -t * x * y, 1.0 / d - t * y * y
+
+
+@fast_kernel
+def _moves(cameras: Cameras, m: int, principal: F64, local: F64, A: F64) -> None:
     """Write A (SHARED x 2 x BLOCK) of one camera and block but for the readout."""
     k1, k2 = cameras.lens[m, 0], cameras.lens[m, 1]
+    a, c = principal[0], principal[1]
     for i in range(BLOCK):
         x, y = local[i], local[BLOCK + i]
         s0, s1, s2 = _shares(x * x + y * y, k1, k2)
-        A[i], A[BLOCK + i] = s0 * x, s0 * y
+        d0, d1, d2 = _inverse_of_lens(x, y, k1, k2)
+        A[i], A[BLOCK + i] = s0 * x + d0 * a + d1 * c, s0 * y + d1 * a + d2 * c
         A[2 * BLOCK + i], A[3 * BLOCK + i] = s1 * x, s1 * y
         A[4 * BLOCK + i], A[5 * BLOCK + i] = s2 * x, s2 * y
+        A[8 * BLOCK + i], A[9 * BLOCK + i] = d0, d1
+        A[10 * BLOCK + i], A[11 * BLOCK + i] = d1, d2
 
 
 @fast_kernel
 def _readout_moves(cameras: Cameras, m: int, local: F64, fu: F32, fv: F32, A: F64) -> None:
-    """``A = D^-1 K^-1 flow``, the inverse by Sherman and Morrison."""
+    """``A = D^-1 K^-1 flow``."""
     K, k1, k2 = pinhole_of(cameras, m), cameras.lens[m, 0], cameras.lens[m, 1]
     for i in range(BLOCK):
-        x, y = local[i], local[BLOCK + i]
-        n2 = x * x + y * y
+        d0, d1, d2 = _inverse_of_lens(local[i], local[BLOCK + i], k1, k2)
         a, c = fu[i] / K[0], fv[i] / K[1]
-        d, e = 1.0 + n2 * (k1 + k2 * n2), 2.0 * k1 + 4.0 * k2 * n2
-        t = e * (x * a + y * c) / (d + e * n2)
-        A[6 * BLOCK + i] = (a - t * x) / d
-        A[7 * BLOCK + i] = (c - t * y) / d
+        A[6 * BLOCK + i], A[7 * BLOCK + i] = d0 * a + d1 * c, d1 * a + d2 * c
 
 
 @fast_kernel
-def _add_own(local: F64, A: F64, own: F64, gradient: F64, cross: F64) -> None:
+def _add_own(local: F64, A: F64, unknown: BoolArray, own: F64, gradient: F64, cross: F64) -> None:
     """Add ``A^T M A``, ``A^T e`` and ``A^T M B`` (SHARED x 6 by rows)."""
     for q in range(SHARED):
+        if not unknown[q]:
+            continue
         Aq = A[2 * q * BLOCK :]
         for p in range(q + 1):
+            if not unknown[p]:
+                continue
             Ap = A[2 * p * BLOCK :]
             h = 0.0
             for i in range(BLOCK):
@@ -220,7 +243,9 @@ def _add_own(local: F64, A: F64, own: F64, gradient: F64, cross: F64) -> None:
 
 
 @fast_kernel
-def _add_points(cameras: Cameras, m: int, point: I32, local: F64, A: F64, points: F64) -> None:
+def _add_points(
+    cameras: Cameras, m: int, point: I32, local: F64, A: F64, unknown: BoolArray, points: F64
+) -> None:
     """Add ``A^T M P`` (SHARED x 3 by rows) of one camera and block to its points."""
     T = motion_of(cameras, m)
     for i in range(BLOCK):
@@ -228,6 +253,8 @@ def _add_points(cameras: Cameras, m: int, point: I32, local: F64, A: F64, points
         m00, m01, m11 = local[3 * BLOCK + i], local[4 * BLOCK + i], local[5 * BLOCK + i]
         p0, p1, p2, q0, q1, q2 = point_rows(T, local[i], local[BLOCK + i], local[2 * BLOCK + i])
         for q in range(SHARED):
+            if not unknown[q]:
+                continue
             Aq = A[2 * q * BLOCK :]
             a, c = apply_metric(m00, (m01,), m11, Aq[i], Aq[BLOCK + i])
             points[n, 3 * q] += a * p0 + c * q0
@@ -238,20 +265,21 @@ def _add_points(cameras: Cameras, m: int, point: I32, local: F64, A: F64, points
 def ideal_pixels(u: F32, v: F32, camera: PinholeCamera, correction: F64) -> tuple[F32, F32]:
     """Move pixels (N,) of the image to where ``camera``, were it right, would have seen them.
 
-    correction: (4,) of ``solve_schur``; what the readout does is not undone here.  Newton's
+    correction: (6,) of ``solve_schur``; what the readout does is not undone here.  Newton's
     method on the radius, to rounding for corrections under which the radius still grows with the
     angle; elsewhere the nearest it gets.
     """
-    s, k1, k2 = correction[:3].tolist()
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    wanted = np.exp(-s) * np.hypot(x, y).astype(np.float64)
+    s, k1, k2, _, a, b = correction.tolist()
+    x = np.exp(-s) / camera.fx * (u - camera.cx) - a
+    y = np.exp(-s) / camera.fy * (v - camera.cy) - b
+    wanted = np.hypot(x, y).astype(np.float64)
     r = wanted.copy()
     for _ in range(_NEWTON_STEPS):
         r2 = r * r
         slope = np.maximum(1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2), _LEAST_SLOPE)
         r -= (r * (1.0 + r2 * (k1 + k2 * r2)) - wanted) / slope
         r = np.clip(r, 0.0, _FARTHEST * wanted)
-    share = np.exp(-s) * np.divide(r, wanted, out=np.ones_like(r), where=wanted > 0.0)
+    share = np.divide(r, wanted, out=np.ones_like(r), where=wanted > 0.0)
     return (
         (camera.cx + camera.fx * x * share).astype(np.float32),
         (camera.cy + camera.fy * y * share).astype(np.float32),

@@ -43,7 +43,7 @@ from pliant.compiler.kernel import fast_kernel
 
 RECORD, FACTOR = 8, 9
 """Numbers kept of an observation, and of a point."""
-SHARED = 4
+SHARED = 6
 """Unknowns of a shared calibration: see ``calibration``."""
 _SINGULAR = 1e-14
 
@@ -297,12 +297,10 @@ def eliminate_points(
             continue
         last, a = np.uintp(b.shape[0] - 1), np.uintp(count)
         rows[a] = last
-        for q in range(6):
-            e0 = e1 = e2 = 0.0
-            if q < SHARED:
-                e0 = shared[n, 3 * q] * i00
-                e1 = (shared[n, 3 * q + 1] - l10 * e0) * i11
-                e2 = (shared[n, 3 * q + 2] - l20 * e0 - l21 * e1) * i22
+        for q in range(SHARED):
+            e0 = shared[n, 3 * q] * i00
+            e1 = (shared[n, 3 * q + 1] - l10 * e0) * i11
+            e2 = (shared[n, 3 * q + 2] - l20 * e0 - l21 * e1) * i22
             U[a, q], U[a, 6 + q], U[a, 12 + q] = e0, e1, e2
             b[last, q] -= e0 * y0 + e1 * y1 + e2 * y2
         for second in range(count + 1):

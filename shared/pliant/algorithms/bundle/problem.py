@@ -77,6 +77,12 @@ class CalibrationUncertainty(Parameters):
         description="Standard deviation of the readout of a rolling shutter, as a share of the "
         "frame interval; 0: every row is taken at once",
     )
+    principal_point: float = Field(
+        default=0.0,
+        ge=0.0,
+        description="Standard deviation of the principal point across and down, as a share of the "
+        "focal length; 0 holds it",
+    )
     prior_px: float = Field(
         default=1.0,
         gt=0.0,
@@ -86,8 +92,9 @@ class CalibrationUncertainty(Parameters):
 
     @property
     def sigmas(self) -> F64:
-        """(4,) of the focal factor's logarithm, k1, k2 and the readout."""
-        return np.array([self.focal, self.k1, self.k2, self.readout])
+        """(6,) of the focal factor's logarithm, k1, k2, the readout and the principal point."""
+        point = self.principal_point
+        return np.array([self.focal, self.k1, self.k2, self.readout, point, point])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,8 +172,8 @@ class BundleResult:
     squared_residuals: px^2 without kernel or weight; inf where the point lies behind the camera.
         One for each observation of a ``BundleProblem`` (O,); (M, N) for a ``BundleWindow``, inf
         where nothing is observed.  Observations left out as not finite: inf.
-    correction: (4,) of the calibration, where it was unknown: see ``solve_schur``.
-    covariance: (4, 4) of the correction, where residuals have a standard deviation of 1 px.
+    correction: (6,) of the calibration, where it was unknown: see ``solve_schur``.
+    covariance: (6, 6) of the correction, where residuals have a standard deviation of 1 px.
     """
 
     T_world_camera: F64
@@ -177,8 +184,8 @@ class BundleResult:
     converged: bool
     squared_residuals: F32
     costs: F64 = field(default_factory=lambda: np.zeros(0))
-    correction: F64 = field(default_factory=lambda: np.zeros(4))
-    covariance: F64 = field(default_factory=lambda: np.zeros((4, 4)))
+    correction: F64 = field(default_factory=lambda: np.zeros(6))
+    covariance: F64 = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 def shared_intrinsics(camera: PinholeCamera, count: int) -> F64:

@@ -65,13 +65,13 @@ def solve_schur(
     does not raise the cost.
 
     uncertainty: of the calibration, which is then a further unknown that all cameras share; None:
-    it is right.  Of the result, ``correction`` (s, k1, k2, readout) says that the observations
-    follow ``u = fx e^s (1 + k1 r^2 + k2 r^4) x + cx + readout flow``, likewise for v, and the
-    costs include the prior, at k1 and k2 of the problem's intrinsics.  start: (4,) the correction
-    to begin from, None: the middle of the prior.  Several views tell the focal
-    length from rotation, and from parallax that differs across the image.  Where they cannot (no
-    rotation, one plane, forward motion) the prior holds it, as ``covariance`` then says.  Raises
-    ValueError where cameras differ in their lenses.
+    it is right.  Of the result, ``correction`` (s, k1, k2, readout, a, b) says that the
+    observations follow ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx + readout flow``, likewise
+    for v with b, and the costs include the prior, at k1 and k2 of the problem's intrinsics.
+    start: (6,) the correction to begin from, None: the middle of the prior.  Several views tell the
+    focal length from rotation, and from parallax that differs across the image.  Where they cannot
+    (no rotation, one plane, forward motion) the prior holds it, as ``covariance`` then says.
+    Raises ValueError where cameras differ in their lenses.
     """
     layout = build_packed_layout(problem)
     calibration = None
@@ -180,7 +180,7 @@ class SchurSystem:
         shared = no_shared_blocks()
         if self.calibration is not None:
             cost += self.calibration.prior_cost(q)
-            shared = self.calibration.linearise(cameras, records)
+            shared = self.calibration.linearise(cameras, records, q)
         return State(motion, points, q, cost, records, normal, shared)
 
     def step(self, state: State, damping: float) -> State | None:

@@ -90,7 +90,7 @@ def adjust_listed(
 ) -> BundleResult:
     """Schur LM over all but the first keyframe, all points that two see, and the calibration.
 
-    ``seen`` is changed, but for its observations.  start: (4,) correction of the calibration to
+    ``seen`` is changed, but for its observations.  start: (6,) correction of the calibration to
     begin from.
     """
     chosen = np.bincount(seen.point, minlength=len(seen.rows)) >= 2

@@ -31,6 +31,9 @@ _GUESS = 0.05
 _LENS = 0.1
 """Standard deviations of k1 and k2 of an unknown lens."""
 
+_PRINCIPAL_POINT = 0.03
+"""Standard deviation of an unknown principal point, as a share of the focal length."""
+
 _HYPOTHESES = np.linspace(-2.0, 2.0, 7)
 """Focal lengths that a start is tried under, in standard deviations of the prior."""
 
@@ -43,7 +46,7 @@ class SelfCalibration:
     """What is known of a camera.
 
     given: the camera as it was given, of the rectified images.
-    correction: (4,) what is wrong with it, see ``solve_schur``.   covariance: (4, 4) of that.
+    correction: (6,) what is wrong with it, see ``solve_schur``.   covariance: (6, 6) of that.
     next_keyframes: how many a map must have to be asked again.
     """
 
@@ -55,11 +58,11 @@ class SelfCalibration:
     @staticmethod
     def of(camera: PinholeCamera, uncertainty: CalibrationUncertainty) -> "SelfCalibration":
         """Before anything was seen."""
-        return SelfCalibration(camera, np.zeros(4), np.diag(uncertainty.sigmas**2))
+        return SelfCalibration(camera, np.zeros(6), np.diag(uncertainty.sigmas**2))
 
     @property
     def sigmas(self) -> F64:
-        """(4,) standard deviations of the correction."""
+        """(6,) standard deviations of the correction."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     @property
@@ -107,6 +110,7 @@ def widened(parameters: MappingParameters, focal_sigma: float) -> MappingParamet
     wider: dict[str, float] = {"focal": focal_sigma}
     if focal_sigma > _GUESS:
         wider |= {"k1": max(prior.k1, _LENS), "k2": max(prior.k2, _LENS)}
+        wider["principal_point"] = max(prior.principal_point, _PRINCIPAL_POINT)
     return parameters.model_copy(update={"calibration": prior.model_copy(update=wider)})
 
 
@@ -134,7 +138,7 @@ def _find_start_of_guess(
     parallax in every turn.
     """
     sigma = parameters.calibration.focal
-    tried = [known.correction + np.array([k * sigma, 0.0, 0.0, 0.0]) for k in _HYPOTHESES]
+    tried = [known.correction + k * sigma * np.eye(6)[0] for k in _HYPOTHESES]
     cameras = [corrected_view(known.given, tuple(each.tolist())).camera for each in tried]
     reasons = [why_no_start(waiting, camera, parameters) for camera in cameras[::-1]]
     if any(reasons):
@@ -171,5 +175,6 @@ def _refine(start: Start, camera: PinholeCamera, parameters: MappingParameters) 
         intrinsics=shared_intrinsics(camera, count),
         fixed_cameras=np.arange(count) == 0,
     )
-    uncertainty = parameters.calibration.model_copy(update={"k1": 0.0, "k2": 0.0, "readout": 0.0})
+    held = {"k1": 0.0, "k2": 0.0, "readout": 0.0, "principal_point": 0.0}
+    uncertainty = parameters.calibration.model_copy(update=held)
     return solve_schur(problem, parameters.bundle, uncertainty=uncertainty)
