@@ -17,10 +17,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import cv2
 
-from pliant.algorithms.map_delta import KeyframeDelta, MapDelta, MapMoves
+from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
-from pliant.algorithms.mapping.whole_map import Question, WholeMap, find_moves
+from pliant.algorithms.mapping.whole_map import Answer, Question, WholeMap, find_moves
 from pliant.bus.base import Bus, join, receive, receive_one, resume
 from pliant.config import Config
 from pliant.messages import topics
@@ -100,7 +100,7 @@ class Beside:
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, "whole map")
         self._asked: Question | None = None
-        self._found: Future[MapMoves] | None = None
+        self._found: Future[Answer] | None = None
 
     def ask(self, whole_map: WholeMap) -> None:
         """Begin with what the mapper has asked."""

@@ -25,8 +25,9 @@ def _track() -> None:
 
 
 def _map() -> None:
-    """Start a map, extend it, lose some tracks and then all, and find them again."""
+    """Start a map, extend it, lose some tracks and then all, find them again, close a loop."""
     from pliant.algorithms.geometry import so3_exp
+    from pliant.algorithms.mapping.loops import Loop
     from pliant.algorithms.mapping.mapper import Mapper
     from pliant.algorithms.mapping.parameters import MappingParameters
 
@@ -53,6 +54,9 @@ def _map() -> None:
             dominant_flow=np.eye(2, 3),
         )
         mapper.process(frame, 33_333_333 * frame, tracks, grey, colour)
+    none = np.zeros((0, 2), np.int64)
+    loop = Loop(old=0, new=5, S_old_new=np.eye(4), rows=none.astype(np.int32), ids=none)
+    mapper.whole_map.loops.append(loop)
     mapper.finish()
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray, Shape
-from pliant.algorithms.geometry import similarity_to_matrix
+from pliant.algorithms.geometry import matrix_to_pose, similarity_to_matrix
 
 WAITING, TRACKING, LOST = 0, 1, 2
 """State of the map after a frame: not started, localised, or lost (a new segment must start)."""
@@ -30,6 +30,14 @@ class MapMoves:
         """(N, 4, 4) the similarity of each of the keyframes (N,), by id."""
         table = np.concatenate([np.eye(4)[None], similarity_to_matrix(self.moves)])
         return table[np.searchsorted(self.keyframe_ids, keyframes, side="right")]
+
+    def then(self, moves: "MapMoves") -> "MapMoves":
+        """Both as one, these first."""
+        ids = np.union1d(self.keyframe_ids, moves.keyframe_ids)
+        S = moves.matrices(ids) @ self.matrices(ids)
+        scales = np.cbrt(np.linalg.det(S[:, :3, :3]))
+        S[:, :3, :3] /= scales[:, None, None]
+        return MapMoves(keyframe_ids=ids, moves=np.column_stack([matrix_to_pose(S), scales]))
 
     def points(self, xyz: F64, hosts: I64) -> F64:
         """Points (N, 3) that hang on keyframes (N,), moved."""

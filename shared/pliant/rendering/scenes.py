@@ -213,6 +213,64 @@ def _corridor() -> BuiltinScene:
     return BuiltinScene(scene, path, frames=360)
 
 
+def _court() -> BuiltinScene:
+    """Four corridors about a court, flown through once around, 104 m, and 8 m on."""
+    side, width = 26.0, 2.4  # of the square in the middle of the corridors; of a corridor
+    half, rng = 0.5 * side, np.random.default_rng(9)
+    outer, inner = side + width, side - width
+    solids = [
+        _solid("walls", "room", (0, 0, 1.25), (outer, outer, 2.5), _STONE, texels=140),
+        _solid("court", "box", (0, 0, 1.25), (inner, inner, 2.499), _PLASTER, texels=140),
+    ]
+    materials = [_PRINT, _POSTER, _WOOD, _PAPER, _CLOTH, _METAL, _GREEN]
+    for i in range(100):
+        material = materials[int(rng.integers(7))]
+        along = -half - 0.5 + (i % 25 + rng.random()) * (side + 1.0) / 25
+        across = 1.0 if i % 2 else -1.0
+        depth, length, height = 0.1 + 0.2 * rng.random(), 0.3 + 0.5 * rng.random(), rng.random()
+        if across < 0.0:  # not where the corridor turns about the court
+            along = float(np.clip(along, -half + 1.8, half - 1.8))
+        low = 0.0 if i % 3 else 1.0
+        tall = 0.4 + height
+        x, y = along, half + across * 0.5 * (width - depth)
+        yaw = 90.0 * (i // 25)
+        cos, sin = round(np.cos(np.deg2rad(yaw))), round(np.sin(np.deg2rad(yaw)))
+        centre = (cos * x - sin * y, sin * x + cos * y, low + 0.5 * tall)
+        size = (length, depth, tall)
+        solids.append(_solid(f"thing {i}", "box", centre, size, material, yaw_deg=yaw, texels=300))
+    lights = tuple(
+        (float(x), float(y), 2.3)
+        for x in np.linspace(-half, half, 5)
+        for y in np.linspace(-half, half, 5)
+        if max(abs(x), abs(y)) == half
+    )
+    scene = Scene(
+        name="court", solids=tuple(solids), lights=lights, depth_scale=5e-4, ambient=0.7, seed=41
+    )
+    # Half a metre between control points; a B-spline of them cuts the corners.
+    s = np.arange(0.0, 4.0 * side + 14.0, 0.5)
+    at = np.array([_on_square(float(each), side) for each in s])
+    sway = 0.15 * np.sin(0.7 * s)
+    positions = [
+        (float(x), float(y), float(1.3 + 0.08 * np.sin(each)))
+        for (x, y), each in zip(at + 0.5 * sway[:, None], s, strict=True)
+    ]
+    ahead = [_on_square(float(each) + 3.0, side) for each in s]
+    targets = [(x, y, 1.2) for x, y in ahead]
+    keep = round((4.0 * side + 8.0) / 0.5)
+    path = SplinePath(positions[:keep], targets[:keep], duration_s=36.0, tremble_m=0.006)
+    return BuiltinScene(scene, path, frames=1080)
+
+
+def _on_square(along: float, side: float) -> tuple[float, float]:
+    """A place on the outline of a square about (0, 0), from the middle of one side on."""
+    part = (along / side + 0.5) % 4.0
+    across = (part % 1.0 - 0.5) * side
+    return [
+        (across, -0.5 * side), (0.5 * side, across), (-across, 0.5 * side), (-0.5 * side, -across)
+    ][int(part)]  # fmt: skip
+
+
 def _tabletop_full() -> BuiltinScene:
     return _tabletop("tabletop", frames=240, width=640, texels=800.0)
 
@@ -226,5 +284,6 @@ SCENES: dict[str, Callable[[], BuiltinScene]] = {
     "room": _room,
     "tabletop": _tabletop_full,
     "corridor": _corridor,
+    "court": _court,
     "tiny": _tiny,
 }

@@ -16,6 +16,7 @@ from pliant.algorithms.mapping.covisibility import (
     seen_by_none,
 )
 from pliant.algorithms.mapping.final_adjustment import adjust_keyframes
+from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.map_store import (
     CANDIDATE,
     MAPPED,
@@ -221,6 +222,22 @@ class ActiveMap:
         points.alias[old] = new
         points.first_keyframe[new] = min(points.first_keyframe[old], points.first_keyframe[new])
         points.published_keyframes[new] = -1  # others are told on what it hangs
+
+    def join(self, loop: Loop) -> None:
+        """Points that a loop has shown to be the same become one, as far as they still exist."""
+        points = self.points
+        alive = points.ids[loop.rows] == loop.ids
+        alive &= points.state[loop.rows] == MAPPED
+        for old, new in loop.rows[alive.all(axis=1)].tolist():
+            if points.state[old] == MAPPED and points.state[new] == MAPPED and old != new:
+                self._merge(new, old)
+        linked = self.links.rows != UNLINKED
+        rows = points.alias[self.links.rows[linked]]
+        # A point with two tracks keeps the older one.
+        _, first = np.unique(rows, return_index=True)
+        once = np.full(len(rows), UNLINKED, np.int32)
+        once[first] = rows[first]
+        self.links.rows[linked] = once
 
     def _note_removed(self, rows: I32) -> None:
         """Points go that have been published; nobody knows of the others."""

@@ -33,7 +33,7 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_sta
 from pliant.algorithms.mapping.start import Start
 from pliant.algorithms.mapping.support import Support, doubt, support_of
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses
-from pliant.algorithms.mapping.whole_map import WholeMap, move_map
+from pliant.algorithms.mapping.whole_map import Answer, WholeMap, move_map
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracks import FrameTracks
 
@@ -94,9 +94,8 @@ class Mapper:
         if self._map is None or self._motion is None:
             return self._wait(frame, stamp_ns, tracks, grey, colour)
         with self._timer("whole map"):
-            if (moves := self.whole_map.take(frame)) is not None:
-                self._motion = self._motion.moved(move_map(self._map, moves, self._path))
-                self._changes.move(moves)
+            if (answer := self.whole_map.take(frame)) is not None:
+                self._motion = self._motion.moved(self._take(self._map, answer))
         self._map.links.follow(tracks.ids)
         with self._timer("localisation"):
             located = self._localise(self._map, self._motion, stamp_ns, tracks, grey)
@@ -157,12 +156,24 @@ class Mapper:
         """Points of the map now, of all segments."""
         return self._points.culled + int(np.count_nonzero(self._points.state == MAPPED))
 
+    def _take(self, active: ActiveMap, answer: Answer) -> F64:
+        """Move the map, and join what is one.  Returns the similarity (4, 4) of its end."""
+        S = move_map(active, answer.moves, self._path)
+        for loop in answer.loops:
+            active.join(loop)
+        self._changes.move(answer.moves)
+        return S
+
     def finish(self) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
         self._earlier.adjust()
         if self._map is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         self._whole = self._finishes(self._map)
+        while self.whole_map.loops or (self.whole_map.question and self.whole_map.question.loops):
+            self.whole_map.ask(0, self._map)
+            if (answer := self.whole_map.settle()) is not None:
+                self._take(self._map, answer)
         if self._whole:
             self._map.collect_garbage()
             self.calibration = self._map.adjust_all(self._path, self.calibration)

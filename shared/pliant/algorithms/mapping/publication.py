@@ -25,7 +25,7 @@ class MapChanges:
 
     def move(self, moves: MapMoves) -> None:
         """The whole map moves, before anything else of the frame."""
-        self._moves = moves
+        self._moves = moves if self._moves is None else self._moves.then(moves)
 
     def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
         """The pose of a frame is new, and hangs on a keyframe."""

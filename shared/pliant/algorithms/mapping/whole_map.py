@@ -10,9 +10,13 @@ a keyframe sees.  The window and all that is new move rigidly with the last keyf
 the window.  The first keyframe stays, and with it place and scale of the beginning.  Lens and
 focal length are found anew each time; the readout of a rolling shutter is not, as frames are
 located without it.
+
+A place that is recognised asks at once, and then the window moves as the rest does: what drifted
+since drifted in the window, too.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +26,7 @@ from pliant.algorithms.geometry import inverse, matrix_to_pose, move_by_similari
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.final_adjustment import ListedMap, adjust_listed, list_map
+from pliant.algorithms.mapping.loops import Loop, close_loops
 from pliant.algorithms.mapping.map_store import FREE
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import Path
@@ -33,8 +38,8 @@ _MIN_DEPTH = 1e-6
 class Question:
     """A copy of the map of a frame, to be adjusted.
 
-    keyframe_ids: (M,).   seen: what they see.   settled: how many of them, the oldest, have left
-    the window.
+    keyframe_ids: (M,).   seen: what they see.   settled: how many of them, the oldest, move each
+    by itself.   loops: to be closed.   hosts, sigmas: (N,) of the points that are seen.
     """
 
     frame: int
@@ -43,6 +48,16 @@ class Question:
     seen: ListedMap
     camera: PinholeCamera
     parameters: MappingParameters
+    loops: list[Loop] = field(default_factory=list)
+    hosts: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    sigmas: F64 = field(default_factory=lambda: np.zeros(0))
+
+
+class Answer(NamedTuple):
+    """How the map moves, and the loops that were closed: their points are to be joined."""
+
+    moves: MapMoves
+    loops: list[Loop]
 
 
 @dataclass(kw_only=True)
@@ -51,12 +66,14 @@ class WholeMap:
     a small multiple of the last.
 
     due: keyframes at which it asks again.    question: asked, and not yet taken over.
-    answer: of the question, where somebody has found it already.
+    answer: of the question, where somebody has found it already.    loops: to be closed by the
+    next question.
     """
 
     due: float = 0.0
     question: Question | None = None
-    answer: MapMoves | None = None
+    answer: Answer | None = None
+    loops: list[Loop] = field(default_factory=list)
 
     def ask(self, frame: int, active: ActiveMap) -> None:
         """Ask for the adjustment of the map as it is after a frame, where that is due."""
@@ -64,18 +81,25 @@ class WholeMap:
         window, growth = parameters.window.keyframes, parameters.whole_map.growth
         count = len(active.keyframes)
         # While the window has half of the map it does well by itself.
-        if self.question is not None or growth == 0.0 or count < max(2 * window, self.due):
+        early = growth == 0.0 or count < max(2 * window, self.due)
+        if self.question is not None or (early and not self.loops):
             return
         self.due = (1.0 + growth) * count
+        loops, self.loops = self.loops, []
+        points = active.points
+        seen = list_map(active.keyframes, points, active.camera, parameters.window.lens_radius)
+        keyframe_ids = np.array([keyframe.id for keyframe in active.keyframes], np.int64)
+        hosts = np.searchsorted(keyframe_ids, points.first_keyframe[seen.rows], side="right") - 1
         self.question = Question(
             frame=frame,
-            keyframe_ids=np.array([keyframe.id for keyframe in active.keyframes], np.int64),
-            settled=count - window,
-            seen=list_map(
-                active.keyframes, active.points, active.camera, parameters.window.lens_radius
-            ),
+            keyframe_ids=keyframe_ids,
+            settled=count if loops else count - window,
+            seen=seen,
             camera=active.camera,
             parameters=parameters,
+            loops=loops,
+            hosts=np.maximum(hosts, 0),
+            sigmas=points.sigmas[seen.rows].astype(np.float64),
         )
 
     def is_due(self, frame: int) -> bool:
@@ -85,19 +109,33 @@ class WholeMap:
             return False
         return frame >= question.frame + question.parameters.whole_map.distance_frames
 
-    def take(self, frame: int) -> MapMoves | None:
+    def take(self, frame: int) -> Answer | None:
         """How the map moves before a frame is worked on; None where it does not."""
-        if self.question is None or not self.is_due(frame):
+        return self.settle() if self.is_due(frame) else None
+
+    def settle(self) -> Answer | None:
+        """As ``take``, no matter how long ago it was asked."""
+        if self.question is None:
             return None
         answer = find_moves(self.question) if self.answer is None else self.answer
         self.question = self.answer = None
+        moves = answer.moves
+        for n, loop in enumerate(self.loops):  # the worlds that they tell of have moved
+            old, new = moves.matrices(np.array([loop.old, loop.new]))
+            self.loops[n] = loop._replace(S_old_new=old @ loop.S_old_new @ np.linalg.inv(new))
         return answer
 
 
-def find_moves(question: Question) -> MapMoves:
+def find_moves(question: Question) -> Answer:
     """How each settled keyframe moves with what hangs on it."""
     before, xyz = question.seen.T_world_camera, question.seen.xyz
+    depths, loops = _depths(question.seen, before, xyz), question.loops
     seen = replace(question.seen, T_world_camera=before.copy(), xyz=xyz.copy())
+    if loops:
+        seen, kept, loops = close_loops(
+            seen, question.keyframe_ids, question.hosts, question.sigmas, loops, question.camera.fx
+        )
+        depths = depths[kept]
     adjust_listed(
         seen,
         question.camera,
@@ -105,7 +143,7 @@ def find_moves(question: Question) -> MapMoves:
         iterations=question.parameters.whole_map.iterations,
     )
     settled = slice(0, question.settled)
-    scales = _scales(seen, _depths(seen, before, xyz), question.settled)
+    scales = _scales(seen, depths, question.settled)
     T = seen.T_world_camera[settled].copy()
     # Nothing holds the scale of a map: that of its beginning stays.
     T[:, :3, 3] = T[0, :3, 3] + (T[:, :3, 3] - T[0, :3, 3]) / scales[0]
@@ -115,10 +153,11 @@ def find_moves(question: Question) -> MapMoves:
         T[:, :3, 3]
         - scales[:, None] * (moved[:, :3, :3] @ before[settled][:, :3, 3, None])[:, :, 0]
     )
-    return MapMoves(
+    moves = MapMoves(
         keyframe_ids=question.keyframe_ids[settled],
         moves=np.column_stack([matrix_to_pose(moved), scales]),
     )
+    return Answer(moves, loops)
 
 
 def _depths(seen: ListedMap, T_world_camera: F64, xyz: F64) -> F64:

@@ -1,0 +1,154 @@
+"""A place that the map has seen before: where the drift since then goes, and which points are one.
+
+Place recognition proves that two keyframes look at the same thing, and how the world of the newer
+one lies in that of the older one.  That is spread over all keyframes between them by the graph of
+their similarities, points move with the keyframes on which they hang, those that are the same
+become one, and the adjustment of the whole map, which begins from there, does the rest.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I32, I64
+from pliant.algorithms.bundle.pose_graph import Edges, optimise_pose_graph
+from pliant.algorithms.geometry import inverse, move_by_similarity
+from pliant.algorithms.mapping.final_adjustment import ListedMap
+from pliant.compiler.kernel import kernel
+
+_COVISIBLE_SHARE = 0.3
+"""Share of the points of the lesser keyframe that two share which have an edge."""
+
+_ACCEPTED = 0.5
+"""Weight of a loop under which the others contradict it."""
+
+
+class Loop(NamedTuple):
+    """Two keyframes that look at the same place.
+
+    old, new: ids of the keyframes.    S_old_new: (4, 4) similarity that moves the world as the new
+    one knows it to where the old one knows it.    rows, ids: (n, 2) of points that are the same,
+    the old one first.
+    """
+
+    old: int
+    new: int
+    S_old_new: F64
+    rows: I32
+    ids: I64
+
+
+def close_loops(
+    seen: ListedMap,
+    keyframe_ids: I64,
+    hosts: I64,
+    sigmas: F64,
+    loops: list[Loop],
+    focal_px: float,
+) -> tuple[ListedMap, I64, list[Loop]]:
+    """The map after the loops have been closed, not adjusted yet.
+
+    keyframe_ids: (M,) of its cameras, ascending.   hosts: (N,) camera on which each point hangs.
+    sigmas: (N,) of depths, a share of them.   Returns it, with the kept observations, indices into
+    those of ``seen``, and the loops that were not contradicted.
+    """
+    ends = np.searchsorted(keyframe_ids, [(loop.old, loop.new) for loop in loops])
+    edges = _edges(seen, sigmas, loops, ends.astype(np.int32), focal_px)
+    S = seen.T_world_camera
+    found, weights = optimise_pose_graph(S, edges, np.arange(len(S)) == 0)
+    moves = found @ inverse(S)
+    fits = weights[len(weights) - len(loops) :] > _ACCEPTED
+    accepted = [loop for loop, fit in zip(loops, fits, strict=True) if fit]
+    moved = moves[hosts]
+    xyz = (moved[:, :3, :3] @ seen.xyz[:, :, None])[:, :, 0] + moved[:, :3, 3]
+    point = _joined(seen, accepted)
+    # One camera sees one point at one place.
+    both = seen.camera.astype(np.int64) * len(seen.rows) + point
+    _, kept = np.unique(both, return_index=True)
+    kept = np.sort(kept)
+    closed = replace(
+        seen, T_world_camera=move_by_similarity(moves, S), xyz=xyz, camera=seen.camera[kept],
+        point=point[kept], px=seen.px[kept], weights=seen.weights[kept],
+    )  # fmt: skip
+    return closed, kept, accepted
+
+
+def _joined(seen: ListedMap, loops: list[Loop]) -> I32:
+    """(O,) the point of each observation, the old one for both."""
+    alias = np.arange(len(seen.rows), dtype=np.int32)
+    order = np.argsort(seen.rows)
+    for loop in loops:
+        place = np.searchsorted(seen.rows, loop.rows, sorter=order)
+        place = order[np.minimum(place, len(order) - 1)]
+        known = (seen.rows[place] == loop.rows).all(axis=1)
+        for old, new in place[known].tolist():
+            while alias[old] != old:
+                old = int(alias[old])
+            while alias[new] != new:
+                new = int(alias[new])
+            alias[new] = old
+    while (alias[alias] != alias).any():
+        alias = alias[alias]
+    return alias[seen.point]
+
+
+def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px: float) -> Edges:
+    """Between keyframes that follow each other or meet again, then the loops.
+
+    How well two keyframes lie to each other is what one point tells, at 1 px: the errors that add
+    up to drift are those that all their points share.
+    """
+    M = len(seen.T_world_camera)
+    order = np.argsort(seen.point, kind="stable")
+    starts = np.searchsorted(seen.point[order], np.arange(len(seen.rows) + 1))
+    shared = np.zeros((M, M), np.int32)
+    _count_shared(seen.camera[order], starts, shared)
+    own = np.diag(shared)
+    enough = shared >= _COVISIBLE_SHARE * np.minimum(own[:, None], own[None])
+    # Of those that see the same without a break, each next pair has told all.
+    since = np.arange(M)[:, None] - np.arange(M)
+    nearest = np.where(enough | (since < 0), np.iinfo(np.int64).max, since).min(axis=1)
+    enough &= since >= nearest[:, None]
+    enough[np.arange(1, M), np.arange(M - 1)] = True
+    j, i = np.nonzero(np.tril(enough, -1))
+    S = seen.T_world_camera
+    Z = inverse(S[i]) @ S[j]
+    of_loops = [
+        inverse(S[old]) @ loop.S_old_new @ S[new]
+        for loop, (old, new) in zip(loops, ends.tolist(), strict=True)
+    ]
+    i, j = np.concatenate([np.column_stack([i, j]), ends]).astype(np.int32).T
+    depth, sigma = _medians(seen, sigmas)
+    bearing = np.full(len(i), 1.0 / focal_px)
+    return Edges(
+        i=i.copy(), j=j.copy(), Z=np.concatenate([Z, np.array(of_loops).reshape(-1, 4, 4)]),
+        sigmas=np.column_stack([bearing] * 3 + [bearing * depth[j]] * 3 + [sigma[j]]),
+        doubtful=np.arange(len(i)) >= len(i) - len(loops),
+    )  # fmt: skip
+
+
+@kernel
+def _count_shared(camera: I32, starts: I64, shared: I32) -> None:
+    """camera: of each observation, by points; those of point n: ``starts[n] : starts[n + 1]``."""
+    for n in range(starts.size - 1):
+        for a in range(starts[n], starts[n + 1]):
+            for c in range(starts[n], a + 1):
+                shared[camera[a], camera[c]] += 1
+                if a != c:
+                    shared[camera[c], camera[a]] += 1
+
+
+def _medians(seen: ListedMap, sigmas: F64) -> tuple[F64, F64]:
+    """(M,) depth and its sigma of what each keyframe sees."""
+    T = seen.T_world_camera[seen.camera]
+    depths = np.einsum("oi,oi->o", seen.xyz[seen.point] - T[:, :3, 3], T[:, :3, 2])
+    M = len(seen.T_world_camera)
+    ends = np.searchsorted(seen.camera, np.arange(M + 1))
+    depth, sigma = np.ones(M), np.ones(M)
+    for m in range(M):
+        some = slice(ends[m], ends[m + 1])
+        if ends[m] < ends[m + 1]:
+            depth[m] = max(float(np.median(depths[some])), 1e-6)
+            sigma[m] = max(float(np.median(sigmas[seen.point[some]])), 1e-6)
+    return depth, sigma

@@ -1,0 +1,184 @@
+"""A place that is seen again: drift goes, and points that were mapped twice become one."""
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
+from test_mapper import Published, trajectory_error
+from test_whole_map import error_of, similarity
+
+from pliant.algorithms.geometry import align_umeyama, inverse, transform
+from pliant.algorithms.map_delta import TRACKING, MapMoves
+from pliant.algorithms.mapping.loops import Loop
+from pliant.algorithms.mapping.map_store import MAPPED
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import (
+    MappingParameters,
+    ReacquisitionParameters,
+    WholeMapParameters,
+    WindowParameters,
+)
+from pliant.algorithms.mapping.whole_map import move_map
+from pliant.state import load_state, save_state
+
+AWAY = 80
+PARAMETERS = MappingParameters(
+    window=WindowParameters(keyframes=5, keyframe_iterations=2),
+    reacquisition=ReacquisitionParameters(enabled=False),
+    whole_map=WholeMapParameters(growth=0.0, distance_frames=3),
+)
+
+
+def there_and_back():
+    """A camera that goes along a wall, and comes back."""
+    return [
+        looking((0.08 * k, 0.03 * np.sin(0.3 * k), 0.0)) for k in [*range(AWAY), *range(AWAY)[::-1]]
+    ]
+
+
+@pytest.fixture(scope="module")
+def world():
+    generator = np.random.default_rng(0)
+    points = generator.uniform((-4.0, -3.0, 3.0), (11.0, 3.0, 9.0), (1500, 3))
+    kappas = generator.uniform(5.0, 500.0, len(points)).astype(np.float32)
+    scene = Scene(points, kappas, death=0.01)
+    return scene, list(scene.frames([*there_and_back(), *there_and_back()[:10]]))
+
+
+@pytest.fixture
+def drifted(world):
+    """A map whose points were mapped again on the way back, and whose scale drifts on the way."""
+    scene, frames = world
+    mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
+    for k, tracks in enumerate(frames[: 2 * AWAY]):
+        published.apply(mapper.process(k, k * INTERVAL_NS, tracks, None, None))
+    active = mapper._map
+    ids = np.array([keyframe.id for keyframe in active.keyframes])
+    drift = np.array([similarity(1.005**k, (0, 1e-3 * k, 0), (0, 0, 0)) for k in range(len(ids))])
+    mapper._motion = mapper._motion.moved(
+        drifting := move_map(active, moves := MapMoves(keyframe_ids=ids, moves=drift), mapper._path)
+    )
+    mapper._changes.move(moves)
+    assert drifting[0, 0] > 1.1
+    return scene, frames, mapper, published
+
+
+def recognised(scene, mapper, *, wrong=False):
+    """The loop between the first keyframe and the last, by what they see of the scene."""
+    active, points = mapper._map, mapper._points
+    old, new = active.keyframes[0], active.keyframes[-1]
+    seen = []
+    for keyframe in (old, new):
+        px = CAMERA.project(transform(inverse(there_and_back()[keyframe.frame]), scene.points))
+        rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
+        at = keyframe.points_px[points.state[keyframe.rows] == MAPPED]
+        apart = np.linalg.norm(at[:, None] - px[None], axis=2)
+        which = apart.argmin(axis=1)
+        good = apart.min(axis=1) < 1.0
+        seen.append(dict(zip(which[good].tolist(), rows[good].tolist(), strict=True)))
+    both = sorted(set(seen[0]) & set(seen[1]))
+    rows = np.array([(seen[0][k], seen[1][k]) for k in both], np.int32)
+    rows = rows[rows[:, 0] != rows[:, 1]]
+    S = np.eye(4)
+    scale, R, t = align_umeyama(points.xyz[rows[:, 1]], points.xyz[rows[:, 0]], with_scale=True)
+    S[:3, :3], S[:3, 3] = scale * R, t
+    if wrong:
+        S[:3, 3] += (3.0, 0.0, 2.0)
+    return Loop(old=old.id, new=new.id, S_old_new=S, rows=rows, ids=points.ids[rows])
+
+
+def error(active):
+    return error_of(active, there_and_back())
+
+
+def close(mapper):
+    mapper.whole_map.ask(2 * AWAY, mapper._map)
+    answer = mapper.whole_map.settle()
+    mapper._motion = mapper._motion.moved(mapper._take(mapper._map, answer))
+    return answer
+
+
+def test_a_loop_takes_out_the_drift_and_joins_the_points(drifted):
+    scene, _, mapper, _ = drifted
+    loop, active = recognised(scene, mapper), mapper._map
+    assert len(loop.rows) > 100
+    before, count = error(active), mapper.point_count
+    mapper.whole_map.loops.append(loop)
+    answer = close(mapper)
+    assert answer.loops == [loop]
+    assert len(answer.moves.keyframe_ids) == len(active.keyframes)
+    assert error(active) < 0.05 * before
+    assert mapper.point_count == count - len(loop.rows)
+    active.collect_garbage()
+    shared = np.intersect1d(active.keyframes[0].rows, active.keyframes[-1].rows)
+    assert np.isin(loop.rows[:, 0], shared).mean() > 0.9
+
+
+def test_the_map_goes_on_and_readers_have_it(drifted):
+    scene, frames, mapper, published = drifted
+    mapper.whole_map.loops.append(recognised(scene, mapper))
+    mapper.whole_map.ask(2 * AWAY - 1, mapper._map)
+    for k in range(2 * AWAY, 2 * AWAY + 10):
+        mapper = load_state(save_state(mapper))
+        published.apply(mapper.process(k, k * INTERVAL_NS, frames[k], None, None))
+        mapper.publish_keyframes()
+    assert published.states[-1] == TRACKING
+    active = mapper._map
+    for keyframe in active.keyframes:
+        np.testing.assert_allclose(
+            published.keyframes[keyframe.id], keyframe.T_world_camera, atol=1e-9
+        )
+    assert len(published.points) == mapper.point_count
+    share, _ = trajectory_error(published, [*there_and_back(), *there_and_back()[:10]])
+    assert share < 2e-3
+
+
+def test_a_loop_of_the_last_frames_is_closed_at_the_end(drifted):
+    scene, _, mapper, published = drifted
+    mapper.whole_map.loops.append(recognised(scene, mapper))
+    published.apply(mapper.finish())
+    share, _ = trajectory_error(published, there_and_back())
+    assert share < 1e-3
+
+
+def test_a_loop_that_waits_moves_with_the_map(drifted):
+    scene, _, mapper, _ = drifted
+    loop = recognised(scene, mapper)
+    mapper.whole_map.loops.append(loop)
+    mapper.whole_map.ask(0, mapper._map)
+    mapper.whole_map.loops.append(loop)
+    close(mapper)
+    (waiting,) = mapper.whole_map.loops
+    before, after = (np.linalg.norm(each.S_old_new - np.eye(4)) for each in (loop, waiting))
+    assert after < 0.4 * before
+
+
+def test_a_loop_that_others_contradict_is_left_out(drifted):
+    scene, _, mapper, _ = drifted
+    good, bad = recognised(scene, mapper), recognised(scene, mapper, wrong=True)
+    ids = [keyframe.id for keyframe in mapper._map.keyframes]
+    others = [good._replace(old=ids[0], new=ids[-1]) for _ in range(2)]
+    mapper.whole_map.loops += [bad, *others]
+    answer = close(mapper)
+    assert answer.loops == others
+    assert error(mapper._map) < 0.03
+
+
+def test_points_that_have_gone_are_not_joined(drifted):
+    scene, _, mapper, _ = drifted
+    loop = recognised(scene, mapper)
+    count = mapper.point_count
+    mapper._map._remove(loop.rows[:5, 0])
+    mapper._map.join(loop)
+    assert mapper.point_count == count - 5 - (len(loop.rows) - 5)
+
+
+def test_moves_follow_each_other():
+    first = MapMoves(
+        keyframe_ids=np.array([2, 5]),
+        moves=np.array([similarity(2.0, (0, 0, 1), (1, 0, 0)), similarity(0.5, (0, 1, 0), 0)]),
+    )
+    then = MapMoves(keyframe_ids=np.array([3]), moves=similarity(1.5, (1, 0, 0), (0, 2, 0))[None])
+    some = np.arange(8)
+    np.testing.assert_allclose(
+        first.then(then).matrices(some), then.matrices(some) @ first.matrices(some), atol=1e-12
+    )
