@@ -69,17 +69,17 @@ def test_the_blocks_are_those_of_finite_differences(calibration):
     q = np.array(calibration)
     system = calibrating_system(problem, EXACT, FREE)
     layout = system.layout
-    state = system.linearise(layout.cameras.motion, layout.points, q)
+    system.linearise(system.state(layout.cameras.motion, layout.points, q))
     J, r = calibration_jacobian(problem, q)
     H, g, M = J.T @ J, J.T @ r, len(layout.free)
-    np.testing.assert_allclose(state.shared.own, np.tril(H), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(state.shared.gradient, g, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(system.shared.own, np.tril(H), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(system.shared.gradient, g, rtol=1e-5, atol=1e-3)
     other = -numeric_jacobian(with_lens(problem, *q[:3], *q[4:]))
     cross = (J.T @ other[:, : 6 * M]).reshape(SHARED, M, 6).transpose(1, 0, 2).reshape(M, -1)
     near = 1e-5 * np.abs(cross).max()
-    np.testing.assert_allclose(state.shared.cameras, cross, rtol=1e-5, atol=near)
+    np.testing.assert_allclose(system.shared.cameras, cross, rtol=1e-5, atol=near)
     cross = (J.T @ other[:, 6 * M :]).reshape(SHARED, -1, 3).transpose(1, 0, 2)
-    found = state.shared.points[layout.column]
+    found = system.shared.points[layout.column]
     near = 1e-5 * np.abs(cross).max()
     np.testing.assert_allclose(found, cross.reshape(len(found), -1), rtol=1e-5, atol=near)
 

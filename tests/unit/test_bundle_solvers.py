@@ -109,10 +109,8 @@ def test_window_and_list_are_the_same_problem(solver):
     listed, dense = solver(problem, ROBUST), solver(to_window(problem), ROBUST)
     np.testing.assert_allclose(dense.T_world_camera, listed.T_world_camera, atol=1e-4)
     np.testing.assert_allclose(dense.points_world, listed.points_world, atol=3e-3)
-    assert dense.squared_residuals.shape == (5, 60)
-    at = (problem.camera_index, problem.point_index)
-    assert np.isfinite(dense.squared_residuals[at]).all()
-    assert np.isfinite(dense.squared_residuals).sum() == len(problem.camera_index)
+    assert dense.final_cost == pytest.approx(listed.final_cost, rel=1e-4)
+    assert len(dense.squared_residuals) == 0
 
 
 @pytest.mark.parametrize("solver", [solve_schur, solve_subspace])

@@ -178,7 +178,7 @@ def test_colours_are_those_of_the_nearest_pixel():
     px = np.array([[0.4, 0.4], [3.6, 2.2], [99.0, -7.0]], np.float32)
     expected = [image[0, 0], image[2, 4], image[0, 4]]
     np.testing.assert_array_equal(sample_colours(image, px), expected)
-    grey = np.ascontiguousarray(image[..., 1])
+    grey = np.ascontiguousarray(image[..., 1:2])
     np.testing.assert_array_equal(sample_colours(grey, px)[:, 0], [e[1] for e in expected])
 
 

@@ -1,6 +1,7 @@
 """Images and pixels as the corrected camera sees them, where the calibration was found wrong."""
 
 from dataclasses import replace
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -49,12 +50,17 @@ class CorrectedView:
         """(H, W) or (H, W, 3) the ideal image of a rectified one."""
         if not self._correction.any():
             return pixels
+        moved = cv2.remap(pixels, *self._places, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+        return np.asarray(moved, np.uint8)
+
+    @cached_property
+    def _places(self) -> tuple[F32, F32]:
+        """(H, W) pixel of the rectified image that each of the ideal one shows: u, v."""
         camera = self.camera
         x: F64 = (np.arange(camera.width, dtype=np.float64) - camera.cx) / camera.fx
         y: F64 = (np.arange(camera.height, dtype=np.float64)[:, None] - camera.cy) / camera.fy
-        u, v = (each.astype(np.float32) for each in self._seen(x, y))
-        moved = cv2.remap(pixels, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
-        return np.asarray(moved, np.uint8)
+        u, v = self._seen(x, y)
+        return u.astype(np.float32), v.astype(np.float32)
 
     def _seen(self, x: F64, y: F64) -> tuple[F64, F64]:
         """Pixels of the rectified image that see points of the plane z = 1."""
@@ -73,6 +79,7 @@ def parts_of(correction: tuple[float, ...]) -> tuple[float, float, float, float,
     return s, k1, k2, a, b
 
 
+@lru_cache(maxsize=4)
 def corrected_view(camera: PinholeCamera, correction: tuple[float, ...]) -> CorrectedView:
     """The view whose camera is the pinhole that was found, so that its pixels move least.
 

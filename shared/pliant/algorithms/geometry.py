@@ -39,40 +39,29 @@ def so3_log(R: F64) -> F64:
     return vector * scale[..., None]
 
 
+def _products_of_quaternion() -> F64:
+    """(3, 3, 4, 4) by which a rotation becomes ``4 q q^T``, less the identity."""
+    Q = np.zeros((3, 3, 4, 4))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for of in range(4):
+            Q[i, i, of, of] = 1.0 if of in (i, 3) else -1.0
+        Q[i, j, i, j] = Q[i, j, j, i] = Q[j, i, i, j] = Q[j, i, j, i] = 1.0
+        Q[k, j, i, 3] = Q[k, j, 3, i] = 1.0
+        Q[j, k, i, 3] = Q[j, k, 3, i] = -1.0
+    return Q
+
+
+_PRODUCTS = _products_of_quaternion().reshape(9, 16)
+
+
 def quat_from_rotation(R: F64) -> F64:
     """(..., 3, 3) rotations to (..., 4) unit quaternions (x, y, z, w) with w >= 0."""
     m = np.asarray(R, np.float64)
-    # Four candidates, each exact where its own component is large (Shepperd); take the largest.
-    t = np.stack(
-        [
-            1.0 + m[..., 0, 0] - m[..., 1, 1] - m[..., 2, 2],
-            1.0 - m[..., 0, 0] + m[..., 1, 1] - m[..., 2, 2],
-            1.0 - m[..., 0, 0] - m[..., 1, 1] + m[..., 2, 2],
-            1.0 + m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2],
-        ],
-        axis=-1,
-    )
-    xy, xz, yz = (
-        m[..., 0, 1] + m[..., 1, 0],
-        m[..., 0, 2] + m[..., 2, 0],
-        m[..., 1, 2] + m[..., 2, 1],
-    )
-    wx, wy, wz = (
-        m[..., 2, 1] - m[..., 1, 2],
-        m[..., 0, 2] - m[..., 2, 0],
-        m[..., 1, 0] - m[..., 0, 1],
-    )
-    candidates = np.stack(
-        [
-            np.stack([t[..., 0], xy, xz, wx], axis=-1),
-            np.stack([xy, t[..., 1], yz, wy], axis=-1),
-            np.stack([xz, yz, t[..., 2], wz], axis=-1),
-            np.stack([wx, wy, wz, t[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
-    best = np.argmax(t, axis=-1)[..., None, None]
-    quat = np.take_along_axis(candidates, best, axis=-2)[..., 0, :]
+    # Each row is a multiple of q, exact where its own component is large (Shepperd).
+    candidates = (m.reshape(-1, 9) @ _PRODUCTS).reshape(-1, 4, 4) + np.eye(4)
+    best = np.argmax(np.diagonal(candidates, axis1=1, axis2=2), axis=1)
+    quat = candidates[np.arange(len(best)), best].reshape(*m.shape[:-2], 4)
     quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
     return np.where(quat[..., 3:4] < 0.0, -quat, quat)
 

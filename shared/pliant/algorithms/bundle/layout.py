@@ -130,11 +130,9 @@ def points_of(layout: Unknowns, problem: AnyProblem, points: F64) -> F64:
     return out
 
 
-def residuals_of(layout: Layout, problem: AnyProblem, squared: F32) -> F32:
+def residuals_of(layout: Layout, problem: BundleProblem, squared: F32) -> F32:
     """From (M, P) squared residuals to those of the problem's own observations."""
-    if isinstance(problem, BundleProblem):
-        return _gather(problem.camera_index, problem.point_index, layout.column, squared)
-    return np.ascontiguousarray(squared[:, : problem.u.shape[1]])
+    return _gather(problem.camera_index, problem.point_index, layout.column, squared)
 
 
 def columns_of(problem: AnyProblem) -> I64:

@@ -38,6 +38,7 @@ from pliant.algorithms.bundle.projection import (
     pinhole_of,
     point_rows,
     residual,
+    robust_cost,
 )
 from pliant.compiler.kernel import fast_kernel
 
@@ -70,8 +71,8 @@ def linearise_observations(
     limits: Limits,
     records: F64,
     normal: F64,
-) -> float:
-    """Write the records and every camera's own part; returns the cost, px^2.
+) -> None:
+    """Write the records and every camera's own part.
 
     points: (3, P).     records: (O + 1, RECORD), the last one a dump.
     normal: (M, 27) lower triangle of each H_cc by rows, then the negative gradient.
@@ -79,14 +80,10 @@ def linearise_observations(
     local = np.empty(RECORD * BLOCK)
     near = np.empty((3, BLOCK))
     normal[:] = 0.0
-    total = 0.0
     for b in range(slots.camera.size):
         m = slots.camera[b]
-        for i in range(BLOCK):
-            n = np.uint32(slots.point[b, i])
-            for k in range(3):
-                near[k, i] = points[k, n]
-        total += _linearise(
+        _gather(points, slots.point[b], near)
+        _linearise(
             motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m),
             near[0], near[1], near[2], slots.u[b], slots.v[b], slots.w[b], limits, local,
         )  # fmt: skip
@@ -95,20 +92,25 @@ def linearise_observations(
             at = np.uint32(slots.place[b, i])
             for k in range(RECORD):
                 records[at, k] = local[k * BLOCK + i]
-    return 0.5 * total
+
+
+@fast_kernel
+def _gather(points: F64, columns: I32, near: F64) -> None:
+    for i in range(BLOCK):
+        n = np.uint32(columns[i])
+        for k in range(3):
+            near[k, i] = points[k, n]
 
 
 @fast_kernel
 def _linearise(
     T: Any, K: Any, lens: Any, X: F64, Y: F64, Z: F64, u: F32, v: F32, w: F32, limits: Limits,
     local: F64,
-) -> float:  # fmt: skip
-    total = 0.0
+) -> None:  # fmt: skip
     for i in range(BLOCK):
-        x, y, iz, m00, m01, m11, e0, e1, cost = observe(
+        x, y, iz, m00, m01, m11, e0, e1, _ = observe(
             1.0, T, K, lens, X[i], Y[i], Z[i], u[i], v[i], w[i], limits
         )
-        total += cost
         local[i] = x
         local[BLOCK + i] = y
         local[2 * BLOCK + i] = iz
@@ -117,6 +119,31 @@ def _linearise(
         local[5 * BLOCK + i] = m11
         local[6 * BLOCK + i] = e0
         local[7 * BLOCK + i] = e1
+
+
+@fast_kernel
+def cost_of_observations(cameras: Cameras, points: F64, slots: Slots, limits: Limits) -> float:
+    """``0.5 sum w rho(r^2)``, px^2.  points: (3, P)."""
+    near = np.empty((3, BLOCK))
+    total = 0.0
+    for b in range(slots.camera.size):
+        m = slots.camera[b]
+        _gather(points, slots.point[b], near)
+        total += _cost(
+            motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m),
+            near[0], near[1], near[2], slots.u[b], slots.v[b], slots.w[b], limits,
+        )  # fmt: skip
+    return 0.5 * total
+
+
+@fast_kernel
+def _cost(
+    T: Any, K: Any, lens: Any, X: F64, Y: F64, Z: F64, u: F32, v: F32, w: F32, limits: Limits
+) -> float:
+    total = 0.0
+    for i in range(BLOCK):
+        _, _, _, front, du, dv = residual(1.0, T, K, lens, X[i], Y[i], Z[i], u[i], v[i], limits)
+        total += robust_cost(1.0, du, dv, w[i], front, limits)
     return total
 
 

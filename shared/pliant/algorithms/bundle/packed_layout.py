@@ -56,7 +56,7 @@ class Places(NamedTuple):
 class PackedLayout(Unknowns):
     """One problem as packed lists.
 
-    place: (K,) of each of the problem's own observations, -1 where it is left out.
+    place: (K,) of each observation of a ``BundleProblem``, -1 where it is left out; else (0,).
     flow: (2, B, BLOCK) the readout flow of each slot, px; (2, 0, BLOCK): there is none.
     """
 
@@ -70,61 +70,92 @@ def build_packed_layout(problem: AnyProblem) -> PackedLayout:
     """Bring a problem into the packed layout.  Nothing in the problem is changed."""
     N, usable = len(problem.points_world), finite_points(problem.points_world)
     unknowns = unknowns_of(problem, columns_of(problem), usable, N)
-    flow = np.zeros((0, 2), np.float32)
-    if isinstance(problem, BundleProblem):
-        camera_index, point_index = problem.camera_index, problem.point_index
-        u, v = (np.ascontiguousarray(each) for each in problem.points_px.T)
-        weights = weights_of(problem)
-        flow = flow if problem.readout_flow is None else problem.readout_flow
-    else:
-        camera_index, point_index = list_seen(problem.weights)
-        at = (camera_index, point_index)
-        u, v, weights = problem.u[at], problem.v[at], problem.weights[at]
+    if not isinstance(problem, BundleProblem):
+        counts, start = _count(problem.u, problem.v, problem.weights, usable)
+        slots, places, first = _room(counts, start)
+        _pack_window(problem.u, problem.v, problem.weights, usable, first, slots, places)
+        place, flow = np.zeros(0, np.int32), np.zeros((2, 0, BLOCK), np.float32)
+        return PackedLayout(**vars(unknowns), slots=slots, places=places, place=place, flow=flow)
+    camera_index, point_index = problem.camera_index, problem.point_index
+    u, v = (np.ascontiguousarray(each) for each in problem.points_px.T)
+    weights = weights_of(problem)
     order, counts, start = _sort(
         camera_index, point_index, u, v, weights, usable, unknowns.column,
         len(unknowns.free), N,
     )  # fmt: skip
-    blocks = -(-counts // BLOCK)
-    shape = (int(blocks.sum()), BLOCK)
-    slots = Slots(
-        camera=np.repeat(np.arange(len(blocks), dtype=np.int32), blocks),
-        point=np.zeros(shape, np.int32),
-        place=np.full(shape, len(order), np.int32),
-        u=np.zeros(shape, np.float32),
-        v=np.zeros(shape, np.float32),
-        w=np.zeros(shape, np.float32),
-    )
-    places = Places(start, start.copy(), np.zeros(len(order), np.int32))
+    slots, places, first = _room(counts, start)
     place = np.full(len(u), _NOWHERE, np.int32)
     slot = _pack(
-        camera_index, point_index, unknowns.column, order,
-        BLOCK * (np.cumsum(blocks) - blocks), slots, places, place,
+        camera_index, point_index, unknowns.column, order, first, slots, places, place
     )  # fmt: skip
     for values, into in ((u, slots.u), (v, slots.v), (weights, slots.w)):
         into.reshape(-1)[slot] = values[order]
-    moved = np.zeros((2, len(slots.u) if len(flow) else 0, BLOCK), np.float32)
-    if len(flow):
+    flow = problem.readout_flow
+    moved = np.zeros((2, 0 if flow is None else len(slots.u), BLOCK), np.float32)
+    if flow is not None:
         moved.reshape(2, -1)[:, slot] = flow[order].T
     return PackedLayout(**vars(unknowns), slots=slots, places=places, place=place, flow=moved)
 
 
+def _room(counts: I64, start: I64) -> tuple[Slots, Places, I64]:
+    """Room for so many observations of each camera (M,), and the first slot of each.
+
+    start: (P,) first place of each point.
+    """
+    blocks, observations = -(-counts // BLOCK), int(counts.sum())
+    shape = (int(blocks.sum()), BLOCK)
+    slots = Slots(
+        camera=np.repeat(np.arange(len(blocks), dtype=np.int32), blocks),
+        point=np.zeros(shape, np.int32),
+        place=np.full(shape, observations, np.int32),
+        u=np.zeros(shape, np.float32),
+        v=np.zeros(shape, np.float32),
+        w=np.zeros(shape, np.float32),
+    )
+    places = Places(start, start.copy(), np.zeros(observations, np.int32))
+    return slots, places, BLOCK * (np.cumsum(blocks) - blocks)
+
+
 @kernel
-def list_seen(weights: F32) -> tuple[I32, I32]:
-    """Camera and point of every cell with a weight."""
-    M, N = weights.shape
-    count = 0
-    for m in range(M):
-        for n in range(N):
-            count += weights[m, n] > 0.0
-    camera, point = np.empty(count, np.int32), np.empty(count, np.int32)
-    at = 0
-    for m in range(M):
-        for n in range(N):
-            if weights[m, n] > 0.0:
-                camera[at] = m
-                point[at] = n
-                at += 1
-    return camera, point
+def _usable(u: float, v: float, weight: float) -> bool:
+    return weight > 0.0 and np.isfinite(u) and np.isfinite(v)
+
+
+@kernel
+def _count(u: F32, v: F32, weights: F32, usable: BoolArray) -> tuple[I64, I64]:
+    """(M,) usable observations of each camera of a window, (N,) start of each point."""
+    counts, of_point = np.zeros(weights.shape[0], np.int64), np.zeros(usable.size, np.int64)
+    for m in range(weights.shape[0]):
+        for n in range(usable.size):
+            if usable[n] and _usable(u[m, n], v[m, n], weights[m, n]):
+                counts[m] += 1
+                of_point[n] += 1
+    return counts, np.cumsum(of_point) - of_point
+
+
+@kernel
+def _pack_window(
+    u: F32,
+    v: F32,
+    weights: F32,
+    usable: BoolArray,
+    first: I64,
+    slots: Slots,
+    places: Places,
+) -> None:
+    for m in range(weights.shape[0]):
+        b, i = first[m] // BLOCK, 0
+        for n in range(usable.size):
+            if usable[n] and _usable(u[m, n], v[m, n], weights[m, n]):
+                at = places.stop[n]
+                places.stop[n] += 1
+                places.camera[at] = m
+                slots.point[b, i] = n
+                slots.place[b, i] = at
+                slots.u[b, i], slots.v[b, i], slots.w[b, i] = u[m, n], v[m, n], weights[m, n]
+                i += 1
+                if i == BLOCK:
+                    b, i = b + 1, 0
 
 
 @kernel
@@ -144,8 +175,7 @@ def _sort(
     of_point = np.zeros(points, np.int64)
     good = np.zeros(camera_index.size, np.bool_)
     for k in range(camera_index.size):
-        finite = np.isfinite(u[k]) and np.isfinite(v[k])
-        good[k] = usable[point_index[k]] and finite and weights[k] > 0.0
+        good[k] = usable[point_index[k]] and _usable(u[k], v[k], weights[k])
         if good[k]:
             counts[camera_index[k]] += 1
             of_point[column[point_index[k]]] += 1

@@ -170,10 +170,11 @@ class BundleResult:
     costs: the cost at the start and after each iteration.
     converged: the decrease became small, as opposed to the iterations running out.
     squared_residuals: px^2 without kernel or weight; inf where the point lies behind the camera.
-        One for each observation of a ``BundleProblem`` (O,); (M, N) for a ``BundleWindow``, inf
-        where nothing is observed.  Observations left out as not finite: inf.
+        One for each observation of a ``BundleProblem`` (O,), inf for those left out as not finite;
+        none (0,) for a ``BundleWindow``.
     correction: (6,) of the calibration, where it was unknown: see ``solve_schur``.
-    covariance: (6, 6) of the correction, where residuals have a standard deviation of 1 px.
+    covariance: (6, 6) of the correction, where residuals have a standard deviation of 1 px, if it
+        was asked for.
     """
 
     T_world_camera: F64

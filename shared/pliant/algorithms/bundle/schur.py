@@ -9,7 +9,6 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, BoolArray
 from pliant.algorithms.bundle.calibration import (
     LOWER,
-    SharedBlocks,
     SharedCalibration,
     no_shared_blocks,
 )
@@ -18,6 +17,7 @@ from pliant.algorithms.bundle.normal_equations import (
     FACTOR,
     RECORD,
     SHARED,
+    cost_of_observations,
     eliminate_points,
     linearise_observations,
     scratch_for,
@@ -27,17 +27,16 @@ from pliant.algorithms.bundle.normal_equations import (
 from pliant.algorithms.bundle.packed_layout import (
     PackedLayout,
     Places,
+    Slots,
     build_packed_layout,
-    list_seen,
 )
 from pliant.algorithms.bundle.problem import (
     AnyProblem,
     BundleParameters,
-    BundleProblem,
     BundleResult,
     CalibrationUncertainty,
 )
-from pliant.algorithms.bundle.projection import limits_of, move_cameras
+from pliant.algorithms.bundle.projection import Cameras, limits_of, move_cameras
 from pliant.algorithms.bundle.reduced import LOWER as LOWER6
 from pliant.algorithms.bundle.reduced import find_pattern, solve_reduced
 from pliant.compiler.kernel import kernel
@@ -58,6 +57,7 @@ def solve_schur(
     *,
     uncertainty: CalibrationUncertainty | None = None,
     start: F64 | None = None,
+    with_covariance: bool = False,
 ) -> BundleResult:
     """Minimise Eq. 6 over all movable cameras and points by damped Gauss-Newton steps.
 
@@ -67,7 +67,8 @@ def solve_schur(
     uncertainty: of the calibration, which is then a further unknown that all cameras share; None:
     it is right.  Of the result, ``correction`` (s, k1, k2, readout, a, b) says that the
     observations follow ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx + readout flow``, likewise
-    for v with b, and the costs include the prior, at k1 and k2 of the problem's intrinsics.
+    for v with b, and the costs include the prior, at k1 and k2 of the problem's intrinsics;
+    with_covariance: the result tells how far to believe it.
     start: (6,) the correction to begin from, None: the middle of the prior.  Several views tell the
     focal length from rotation, and from parallax that differs across the image.  Where they cannot
     (no rotation, one plane, forward motion) the prior holds it, as ``covariance`` then says.
@@ -79,10 +80,6 @@ def solve_schur(
         calibration = SharedCalibration(layout, problem.intrinsics[:, 4:], uncertainty, start)
     system = SchurSystem(layout, parameters, calibration)
     state, costs, converged = _iterate(system, parameters, on_iteration)
-    squared = system.squared_residuals(state)
-    if not isinstance(problem, BundleProblem):
-        listed, squared = squared, np.full(problem.u.shape, np.inf, np.float32)
-        squared[list_seen(problem.weights)] = listed
     return BundleResult(
         T_world_camera=poses_of(layout, problem, state.motion),
         points_world=points_of(layout, problem, state.points),
@@ -90,27 +87,23 @@ def solve_schur(
         final_cost=costs[-1],
         iterations=len(costs) - 1,
         converged=converged,
-        squared_residuals=squared,
+        squared_residuals=system.squared_residuals(state),
         costs=np.array(costs),
         correction=state.calibration,
-        covariance=system.calibration_covariance(state),
+        covariance=system.calibration_covariance(state)
+        if with_covariance
+        else np.zeros((SHARED, SHARED)),
     )
 
 
 @dataclass(frozen=True)
 class State:
-    """Cameras (M, 12), points (3, P), a calibration (SHARED,), and all that no damping changes.
-
-    records, normal: see ``normal_equations``.    shared: see ``calibration``.
-    """
+    """Cameras (M, 12), points (3, P), a calibration (SHARED,) and the cost, px^2."""
 
     motion: F64
     points: F64
     calibration: F64
     cost: float
-    records: F64
-    normal: F64
-    shared: SharedBlocks
 
 
 def _iterate(
@@ -138,7 +131,10 @@ def _iterate(
 
 
 class SchurSystem:
-    """Linearises states of one problem and takes damped steps from them."""
+    """Linearises states of one problem and takes damped steps from them.
+
+    normal: see ``normal_equations``.    shared: see ``calibration``; both of the state ``at``.
+    """
 
     def __init__(
         self,
@@ -157,8 +153,10 @@ class SchurSystem:
         self.pattern = find_pattern(met, bordered=calibration is not None)
         self._position = free
         self._position[self._moving] = self.pattern.position
-        # Two states live at a time: the current one and the trial.
-        self._records = [np.empty((len(layout.places.camera) + 1, RECORD)) for _ in range(2)]
+        self.at: State | None = None
+        self.normal = np.empty((M, 27))
+        self.shared = no_shared_blocks()
+        self._records = np.empty((len(layout.places.camera) + 1, RECORD))
         self._factors = np.empty((layout.points.shape[1], FACTOR))
         self._S = np.empty((len(self.pattern.row), 36))
         self._scratch = scratch_for(M)
@@ -166,25 +164,31 @@ class SchurSystem:
     def start(self) -> State:
         """The state that the problem starts from."""
         start = np.zeros(SHARED) if self.calibration is None else self.calibration.start
-        return self.linearise(self.layout.cameras.motion, self.layout.points, start)
+        return self.state(self.layout.cameras.motion, self.layout.points, start)
 
-    def linearise(self, motion: F64, points: F64, q: F64, other: F64 | None = None) -> State:
-        """The state of given cameras, points and calibration; ``other``: records that must stay."""
-        records = self._records[0] if other is not self._records[0] else self._records[1]
-        normal = np.empty((len(motion), 27))
-        cameras, slots = self.layout.cameras, self.layout.slots
-        if self.calibration is not None:
-            cameras, slots = self.calibration.at(q)
-        cameras = cameras._replace(motion=motion)
-        cost = linearise_observations(cameras, points, slots, self.limits, records, normal)
-        shared = no_shared_blocks()
+    def state(self, motion: F64, points: F64, q: F64) -> State:
+        """The state of given cameras, points and calibration."""
+        cameras, slots = self._seen_by(motion, q)
+        cost = cost_of_observations(cameras, points, slots, self.limits)
         if self.calibration is not None:
             cost += self.calibration.prior_cost(q)
-            shared = self.calibration.linearise(cameras, records, q)
-        return State(motion, points, q, cost, records, normal, shared)
+        return State(motion, points, q, cost)
+
+    def linearise(self, state: State) -> None:
+        """Bring all that no damping changes to a state."""
+        if state is self.at:
+            return
+        cameras, slots = self._seen_by(state.motion, state.calibration)
+        linearise_observations(
+            cameras, state.points, slots, self.limits, self._records, self.normal
+        )  # fmt: skip
+        if self.calibration is not None:
+            self.shared = self.calibration.linearise(cameras, self._records, state.calibration)
+        self.at = state
 
     def step(self, state: State, damping: float) -> State | None:
         """The state after one damped Gauss-Newton step; None where it has no solution."""
+        self.linearise(state)
         S, b, diagonal = self._reduced_system(state, damping)
         solution = solve_reduced(self.pattern, S, b, damping * diagonal)
         if solution is None:
@@ -196,11 +200,10 @@ class SchurSystem:
             change = solution[-1, :SHARED].copy()
         moved = np.empty_like(state.points)
         substitute(
-            state.records, state.shared.points, self.layout.places, state.motion, steps, change,
+            self._records, self.shared.points, self.layout.places, state.motion, steps, change,
             self._factors, state.points, moved,
         )  # fmt: skip
-        motion, q = move_cameras(state.motion, steps), state.calibration + change
-        return self.linearise(motion, moved, q, state.records)
+        return self.state(move_cameras(state.motion, steps), moved, state.calibration + change)
 
     def calibration_covariance(self, state: State) -> F64:
         """(SHARED, SHARED) of the calibration with all else unknown, at residuals of 1 px.
@@ -210,6 +213,7 @@ class SchurSystem:
         covariance = np.zeros((SHARED, SHARED))
         if self.calibration is None:
             return covariance
+        self.linearise(state)
         S, b, diagonal = self._reduced_system(state, _GAUGE_DAMPING)
         for k in np.flatnonzero(self.calibration.unknown):
             b[:] = 0.0
@@ -219,21 +223,22 @@ class SchurSystem:
         return covariance
 
     def _reduced_system(self, state: State, damping: float) -> tuple[F64, F64, F64]:
-        """Of Eq. 9: S without damping, the right side (N, 6) and diag(H) (N, 6)."""
+        """Of Eq. 9, at a linearised state: S without damping, the right side (N, 6) and diag(H)
+        (N, 6)."""
         pattern, layout, S = self.pattern, self.layout, self._S
         N = len(pattern.start) - 1
         b, diagonal = np.zeros((2, N, 6))
         S[:] = 0.0
         eliminate_points(
-            state.records, state.shared.points, layout.places, self._position, state.motion,
+            self._records, self.shared.points, layout.places, self._position, state.motion,
             damping, pattern.block, self._scratch, self._factors, S, b,
         )  # fmt: skip
-        at, normal = self._position[self._moving], state.normal[self._moving]
+        at, normal = self._position[self._moving], self.normal[self._moving]
         S[pattern.start[at, None], 6 * LOWER6[0] + LOWER6[1]] += normal[:, :21]
         b[at] += normal[:, 21:]
         diagonal[at] = normal[:, np.flatnonzero(LOWER6[0] == LOWER6[1])]
         if self.calibration is not None:
-            shared, prior = state.shared, self.calibration.precision
+            shared, prior = self.shared, self.calibration.precision
             own = shared.own + np.diag(prior)
             S[pattern.start[-2], 6 * LOWER[0] + LOWER[1]] += own[LOWER]
             S[pattern.block[-1, at], : 6 * SHARED] += shared.cameras[self._moving]
@@ -242,13 +247,19 @@ class SchurSystem:
             diagonal[-1, :SHARED] = np.diag(own)
         return S, b, diagonal
 
-    def squared_residuals(self, state: State) -> F32:
-        """px^2 of the problem's own observations; inf where left out, or behind the camera."""
+    def _seen_by(self, motion: F64, q: F64) -> tuple[Cameras, Slots]:
+        """Cameras and observations of a state."""
         cameras, slots = self.layout.cameras, self.layout.slots
         if self.calibration is not None:
-            cameras, slots = self.calibration.at(state.calibration)
-        squared = np.full(len(state.records), np.inf, np.float32)
-        cameras = cameras._replace(motion=state.motion)
+            cameras, slots = self.calibration.at(q)
+        return cameras._replace(motion=motion), slots
+
+    def squared_residuals(self, state: State) -> F32:
+        """px^2 of the observations of a ``BundleProblem``; inf where left out, or behind."""
+        if not self.layout.place.size:
+            return np.zeros(0, np.float32)
+        cameras, slots = self._seen_by(state.motion, state.calibration)
+        squared = np.full(len(self._records), np.inf, np.float32)
         squared_residuals(cameras, state.points, slots, self.limits, squared)
         squared[-1] = np.inf
         return squared[self.layout.place]

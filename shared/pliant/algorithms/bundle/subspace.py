@@ -23,6 +23,7 @@ from pliant.algorithms.bundle.layout import (
 from pliant.algorithms.bundle.problem import (
     AnyProblem,
     BundleParameters,
+    BundleProblem,
     BundleResult,
 )
 from pliant.algorithms.bundle.projection import (
@@ -177,7 +178,10 @@ def make_result(
     parameters: BundleParameters,
 ) -> BundleResult:
     """The answer in the terms of the problem."""
-    squared = squared_residuals(layout, motion, points, parameters)
+    squared = np.zeros(0, np.float32)
+    if isinstance(problem, BundleProblem):
+        table = squared_residuals(layout, motion, points, parameters)
+        squared = residuals_of(layout, problem, table)
     return BundleResult(
         T_world_camera=poses_of(layout, problem, motion),
         points_world=points_of(layout, problem, points),
@@ -185,7 +189,7 @@ def make_result(
         final_cost=costs[-1],
         iterations=len(costs) - 1,
         converged=converged,
-        squared_residuals=residuals_of(layout, problem, squared),
+        squared_residuals=squared,
         costs=np.array(costs),
     )
 

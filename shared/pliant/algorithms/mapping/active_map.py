@@ -136,8 +136,7 @@ class ActiveMap:
 
     def linked(self, state: int) -> I64:
         """Indices of the living tracks whose row has the given state."""
-        rows = self.links.rows
-        return np.flatnonzero((rows != UNLINKED) & (self.points.state[rows] == state))
+        return self.links.in_state(self.points.state, state)
 
     def nearby(self) -> I32:
         """Rows of the mapped points of the window and of the keyframes near it."""
@@ -330,6 +329,7 @@ class ActiveMap:
 
     def _paint(self, rows: I32, points_px: F32, image: U8 | None) -> None:
         if image is not None:
+            image = image.reshape(*image.shape[:2], -1)
             self.points.colours[rows] = sample_colours(image, points_px)
 
     def _append_keyframe(

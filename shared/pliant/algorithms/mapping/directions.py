@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.bundle.projection import move_camera, solve_camera
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
@@ -64,15 +64,29 @@ def spread_of(points: PointRows, rows: I32, last: Keyframe) -> Spread:
 
 def placed_candidates(points: PointRows, rows: I32) -> I64:
     """Indices of the rows, UNLINKED among them, that are candidates with a provisional place."""
-    candidate = (rows != UNLINKED) & (points.state[rows] == CANDIDATE)
-    return np.flatnonzero(candidate & np.isfinite(points.spread[rows, 0]))
+    return _placed(rows, points.state, points.spread)[0]
 
 
 def helping_candidates(points: PointRows, rows: I32) -> I64:
     """As ``placed_candidates``; none where so many of the rows are mapped that they suffice."""
-    others = placed_candidates(points, rows)
-    mapped = np.count_nonzero((rows != UNLINKED) & (points.state[rows] == MAPPED))
+    others, mapped = _placed(rows, points.state, points.spread)
     return others if mapped < _MAPPED_SHARE * (mapped + len(others)) else others[:0]
+
+
+@kernel
+def _placed(rows: I32, state: U8, spread: F64) -> tuple[I64, int]:
+    """Indices of the rows that are candidates with a place, and how many rows are mapped."""
+    placed = np.empty(rows.size, np.int64)
+    count, mapped = 0, 0
+    for i in range(rows.size):
+        row = rows[i]
+        if row == UNLINKED:
+            continue
+        mapped += state[row] == MAPPED
+        if state[row] == CANDIDATE and np.isfinite(spread[row, 0]):
+            placed[count] = i
+            count += 1
+    return placed[:count].copy(), mapped
 
 
 def place(

@@ -63,7 +63,10 @@ def adjust_keyframes(
             seen.T_world_camera, motions, seen.xyz, seen.camera, seen.point, seen.px, before.camera
         )
     iterations = parameters.window.final_iterations
-    found = adjust_listed(seen, camera, parameters, iterations=iterations, start=known.correction)
+    found = adjust_listed(
+        seen, camera, parameters, iterations=iterations, start=known.correction,
+        with_covariance=True,
+    )  # fmt: skip
     known = known.corrected(found.correction, found.covariance, len(keyframes))
     view = known.view
     if seen.flow is not None:
@@ -87,6 +90,7 @@ def adjust_listed(
     *,
     iterations: int,
     start: F64 | None = None,
+    with_covariance: bool = False,
 ) -> BundleResult:
     """Schur LM over all but the first keyframe, all points that two see, and the calibration.
 
@@ -97,7 +101,9 @@ def adjust_listed(
     bundle = parameters.bundle.model_copy(update={"max_iterations": iterations})
     uncertainty = parameters.calibration if parameters.calibration.sigmas.any() else None
     problem = _problem(seen, chosen, camera)
-    found = solve_schur(problem, bundle, uncertainty=uncertainty, start=start)
+    found = solve_schur(
+        problem, bundle, uncertainty=uncertainty, start=start, with_covariance=with_covariance
+    )
     seen.xyz[chosen] = found.points_world
     seen.T_world_camera = found.T_world_camera
     return found

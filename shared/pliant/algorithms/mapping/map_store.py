@@ -133,9 +133,7 @@ class Keyframe:
 
     def keep(self, mask: BoolArray) -> None:
         """Forget the observations that are not in the mask."""
-        if mask.all():
-            return
-        self.rows, self.points_px = self.rows[mask], self.points_px[mask]
+        self.rows, self.points_px = _kept(self.rows, self.points_px, mask)
 
     def follow_aliases(self, points: PointRows) -> None:
         """Let observations of merged rows stand for the rows that took them in."""
@@ -143,6 +141,20 @@ class Keyframe:
             return
         self.rows, first = np.unique(points.alias[self.rows], return_index=True)
         self.points_px = self.points_px[first]
+
+
+@kernel
+def _kept(rows: I32, points_px: F32, mask: BoolArray) -> tuple[I32, F32]:
+    count = mask.sum()
+    if count == rows.size:
+        return rows, points_px
+    out, out_px = np.empty(count, np.int32), np.empty((count, 2), np.float32)
+    at = 0
+    for i in range(rows.size):
+        if mask[i]:
+            out[at], out_px[at, 0], out_px[at, 1] = rows[i], points_px[i, 0], points_px[i, 1]
+            at += 1
+    return out, out_px
 
 
 @kernel
@@ -177,6 +189,21 @@ class TrackLinks:
         _carry_over(self.ids, self.rows, ids, rows)
         self.ids, self.rows = ids, rows
 
+    def in_state(self, state: U8, wanted: int) -> I64:
+        """Indices of the tracks whose row has the wanted state.  state: of all rows."""
+        return _in_state(self.rows, state, wanted)
+
+
+@kernel
+def _in_state(rows: I32, state: U8, wanted: int) -> I64:
+    found = np.empty(rows.size, np.int64)
+    count = 0
+    for i in range(rows.size):
+        if rows[i] != UNLINKED and state[rows[i]] == wanted:
+            found[count] = i
+            count += 1
+    return found[:count].copy()
+
 
 @kernel
 def _carry_over(ids: I64, rows: I32, new_ids: I64, new_rows: I32) -> None:
@@ -190,13 +217,11 @@ def _carry_over(ids: I64, rows: I32, new_ids: I64, new_rows: I32) -> None:
 
 @kernel
 def sample_colours(image: U8, points_px: F32) -> U8:
-    """(N, 3) RGB of the pixel nearest to each point; image (H, W, 3) or (H, W)."""
+    """(N, 3) RGB of the pixel nearest to each point; image (H, W, 3), or grey (H, W, 1)."""
     colours = np.empty((points_px.shape[0], 3), np.uint8)
-    flat = image.reshape(image.shape[0], image.shape[1], -1)
-    channels = flat.shape[2]
     for i in range(points_px.shape[0]):
-        column = min(max(int(points_px[i, 0] + 0.5), 0), flat.shape[1] - 1)
-        line = min(max(int(points_px[i, 1] + 0.5), 0), flat.shape[0] - 1)
+        column = min(max(int(points_px[i, 0] + 0.5), 0), image.shape[1] - 1)
+        line = min(max(int(points_px[i, 1] + 0.5), 0), image.shape[0] - 1)
         for k in range(3):
-            colours[i, k] = flat[line, column, min(k, channels - 1)]
+            colours[i, k] = image[line, column, min(k, image.shape[2] - 1)]
     return colours

@@ -121,11 +121,13 @@ class Reacquired:
 class _Wanted(NamedTuple):
     """Points looked for.
 
-    projected: (W, 2) where they should be, px.  kappas: (W,) curvature, of which the sign counts.
-    patches: (W, PATCH_SIDE, PATCH_SIDE) grey levels around them then.
+    projected: (W, 2) where they should be, px.     rows: (W,) of the points.
+    kappas: curvature of every row, of which the sign counts.
+    patches: (..., PATCH_SIDE, PATCH_SIDE) grey levels around every row then.
     """
 
     projected: F32
+    rows: I32
     kappas: F32
     patches: U8
 
@@ -159,7 +161,7 @@ def reacquire(
     projected = np.empty((len(rows), 2), np.float32)
     visible = _project(T_camera_world, rows, xyz, K, projected)
     visible_rows = rows[visible]
-    wanted = _Wanted(projected[visible], kappas[visible_rows], patches[visible_rows])
+    wanted = _Wanted(projected[visible], visible_rows, kappas, patches)
     grid = MaximaGrid.build(maxima, camera.width, camera.height, parameters.radius_px)
     choice = np.full(len(visible_rows), -1, np.int32)
     points_px = np.zeros((len(visible_rows), 2), np.float32)
@@ -200,7 +202,7 @@ def match_widely(
     visible = np.flatnonzero(_project(T_camera_world, rows, xyz, K, projected))
     visible = visible[:: max(1, -(-len(visible) // count))]
     rows = rows[visible]
-    wanted = _Wanted(projected[visible], kappas[rows], patches[rows])
+    wanted = _Wanted(projected[visible], rows, kappas, patches)
     points_px = np.zeros((len(rows), 2), np.float32)
     image = pixels_of(grey.astype(np.float32))
     found = _match_patches(wanted, grid, image, radius_px, min_zncc, points_px)
@@ -261,7 +263,7 @@ def _match(
     window = Pixels(np.empty(PATCH_SIDE * PATCH_SIDE, np.float32), PATCH_SIDE, PATCH_SIDE)
     values = np.empty(TEMPLATE_FLOATS, np.float32)
     to_origin = np.float32(0.5 * (PATCH_SIZE - 1))
-    for i in range(len(wanted.kappas)):
+    for i in range(wanted.rows.size):
         first, second, distance2 = _two_nearest(wanted, i, grid, limits)
         if first < 0:
             continue
@@ -271,7 +273,7 @@ def _match(
             best, best_score = first, 1.0 / (1.0 + distance2)
             best_u, best_v = maxima[best, 0], maxima[best, 1]
         else:
-            energy = _template_of(wanted.patches[i], window, values)
+            energy = _template_of(wanted.patches[wanted.rows[i]], window, values)
             if energy < np.float32(PATCH_PIXELS) * _FLAT * _FLAT:
                 continue
             template = Template(values, 0, energy, UNIFORM)
@@ -303,16 +305,17 @@ def _match_patches(
     points_px: F32,
 ) -> BoolArray:
     """Whether each point has a maximum whose patch is like its own; writes the best one's place."""
-    found = np.zeros(len(wanted.kappas), np.bool_)
+    found = np.zeros(wanted.rows.size, np.bool_)
     window = Pixels(np.empty(PATCH_SIDE * PATCH_SIDE, np.float32), PATCH_SIDE, PATCH_SIDE)
     values = np.empty(TEMPLATE_FLOATS, np.float32)
     to_origin = np.float32(0.5 * (PATCH_SIZE - 1))
-    for i in range(len(wanted.kappas)):
-        energy = _template_of(wanted.patches[i], window, values)
+    for i in range(wanted.rows.size):
+        energy = _template_of(wanted.patches[wanted.rows[i]], window, values)
         if energy < np.float32(PATCH_PIXELS) * _FLAT * _FLAT:
             continue
         template = Template(values, 0, energy, UNIFORM)
-        u, v, known = wanted.projected[i, 0], wanted.projected[i, 1], wanted.kappas[i]
+        u, v = wanted.projected[i, 0], wanted.projected[i, 1]
+        known = wanted.kappas[wanted.rows[i]]
         column, line = int(u) // grid.cell_px, int(v) // grid.cell_px
         best, best_zncc = -1, np.float32(0.0)
         for y in range(max(line - 1, 0), min(line + 2, grid.lines)):
@@ -343,7 +346,7 @@ def _two_nearest(
 ) -> tuple[int, int, float]:
     """The nearest two maxima whose curvature has the point's sign, -1 where there is none, and the
     squared distance of the first."""
-    u, v, known = wanted.projected[i, 0], wanted.projected[i, 1], wanted.kappas[i]
+    u, v, known = wanted.projected[i, 0], wanted.projected[i, 1], wanted.kappas[wanted.rows[i]]
     column, line = int(u) // grid.cell_px, int(v) // grid.cell_px
     first, second = -1, -1
     nearest = next_nearest = limits.radius_px * limits.radius_px

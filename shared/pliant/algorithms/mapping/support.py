@@ -13,6 +13,7 @@ from pliant.algorithms.arrays import F32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping.parameters import SupportParameters
 from pliant.algorithms.tracks import FrameTracks
+from pliant.compiler.kernel import kernel
 
 _COLUMNS, _LINES = 8, 6
 """Cells of the image: each is for a pose, against it, or shows too little."""
@@ -54,9 +55,10 @@ def support_of(
     settled_px = tracks.points_px[tracks.ages * interval_s >= parameters.settled_s]
     count = int(np.count_nonzero(inliers))
     fitting = points_px[inliers]
-    supported, settled = _per_cell(fitting, camera), _per_cell(settled_px, camera)
+    width, height = camera.width, camera.height
+    supported, settled = _per_cell(fitting, width, height), _per_cell(settled_px, width, height)
     telling = settled >= _LEAST_SEEN
-    size = np.array([camera.width, camera.height])
+    size = np.array([width, height])
     return Support(
         inliers=count,
         share=count / max(len(points_px), 1),
@@ -76,7 +78,11 @@ def doubt(support: Support, parameters: SupportParameters) -> str:
     return ""
 
 
-def _per_cell(points_px: F32, camera: PinholeCamera) -> I64:
-    column = np.clip((points_px[:, 0] * _COLUMNS / camera.width).astype(int), 0, _COLUMNS - 1)
-    line = np.clip((points_px[:, 1] * _LINES / camera.height).astype(int), 0, _LINES - 1)
-    return np.bincount(line * _COLUMNS + column, minlength=_COLUMNS * _LINES)
+@kernel
+def _per_cell(points_px: F32, width: int, height: int) -> I64:
+    counts = np.zeros(_COLUMNS * _LINES, np.int64)
+    for i in range(points_px.shape[0]):
+        column = min(max(int(points_px[i, 0] * _COLUMNS / width), 0), _COLUMNS - 1)
+        line = min(max(int(points_px[i, 1] * _LINES / height), 0), _LINES - 1)
+        counts[line * _COLUMNS + column] += 1
+    return counts

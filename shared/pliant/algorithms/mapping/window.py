@@ -202,12 +202,8 @@ class Window:
     def forget(self, columns: I32, bad: BoolArray) -> None:
         """Forget observations of the keyframes: (M, C) mask over ``columns``."""
         for slot, keyframe in enumerate(self.keyframes):
-            wrong = columns[bad[slot]]
-            if len(wrong):
-                self.seen[slot, wrong] = False
-                rejected = np.zeros(len(self.columns), np.bool_)
-                rejected[self.rows[wrong]] = True
-                keyframe.keep(~rejected[keyframe.rows])
+            self.seen[slot, columns[bad[slot]]] = False
+            keyframe.keep(self.seen[slot, self.columns[keyframe.rows]])
 
     def update_statistics(self, camera: PinholeCamera) -> None:
         """Keyframes, parallax and uncertainty of the points of the self."""
