@@ -7,7 +7,7 @@ is frozen and refuses unknown keys, also nested ones.
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError
@@ -151,7 +151,7 @@ def load_config(
     if seed is not None:
         content["seed"] = seed
     try:
-        return Config.model_validate(content)
+        return Config.model_validate(_over(Config().model_dump(), content))
     except ValidationError as error:
         raise ConfigError(_explain(error, file)) from None
 
@@ -161,13 +161,14 @@ def config_yaml(config: Config) -> str:
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
-def describe(model: type[BaseModel] = Config, prefix: str = "") -> list[tuple[str, str, str]]:
+def describe(group: BaseModel | None = None, prefix: str = "") -> list[tuple[str, str, str]]:
     """(key, default, meaning) of every parameter."""
     rows: list[tuple[str, str, str]] = []
-    for name, info in model.model_fields.items():
-        default: Any = info.get_default(call_default_factory=True)
+    group = Config() if group is None else group
+    for name, info in type(group).model_fields.items():
+        default: Any = getattr(group, name)
         if isinstance(default, BaseModel):
-            rows += describe(type(default), f"{prefix}{name}.")
+            rows += describe(default, f"{prefix}{name}.")
         else:
             rows.append((prefix + name, str(default), " ".join((info.description or "").split())))
     return rows
@@ -202,6 +203,16 @@ def _apply(content: dict[str, Any], override: str) -> None:
         if not isinstance(level, dict):
             raise ConfigError(f"--set {override}: {parent} is a value, not a group of keys")
     level[last] = value
+
+
+def _over(defaults: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    """What is said, over the defaults of the group: these may be others than those of its class."""
+    merged = dict(defaults)
+    for key, value in content.items():
+        group = defaults.get(key)
+        both = isinstance(group, dict) and isinstance(value, dict)
+        merged[key] = _over(cast(Any, group), value) if both else value
+    return merged
 
 
 def _explain(error: ValidationError, file: Path | None) -> str:

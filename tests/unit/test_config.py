@@ -21,6 +21,16 @@ def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
     assert (config.bus.window, config.seed) == (9, 5)
 
 
+def test_what_is_set_of_a_group_leaves_its_other_defaults() -> None:
+    """Also where the defaults of a group are not those of its class."""
+    defaults = Config()
+    config = load_config(None, ["bundle_adjustment.bundle.max_sweeps=7"])
+    solver = defaults.bundle_adjustment.bundle.model_copy(update={"max_sweeps": 7})
+    assert config.bundle_adjustment.bundle == solver
+    told = {key: default for key, default, _ in describe()}
+    assert told["bundle_adjustment.bundle.kernel_sigma_px"] == str(solver.kernel_sigma_px)
+
+
 @pytest.mark.parametrize(
     ("override", "complaint"),
     [
