@@ -74,6 +74,26 @@ def test_observations_of_merged_rows_become_one():
 
 
 @settings(max_examples=50)
+@given(seed=st.integers(0, 2**31), share=st.floats(0.0, 1.0))
+def test_merged_rows_are_followed_as_numpy_would(seed, share):
+    rng = np.random.default_rng(seed)
+    points = PointRows()
+    points.allocate(40)
+    merged = rng.random(40) < share
+    merged[7] = False
+    points.alias[:40][merged] = rng.choice(np.flatnonzero(~merged), int(merged.sum()))
+    rows = np.flatnonzero(rng.random(40) < 0.7).astype(np.int32)
+    px = rng.normal(size=(len(rows), 2)).astype(np.float32)
+    keyframe = Keyframe(
+        id=0, frame=0, segment=0, T_world_camera=np.eye(4), rows=rows, points_px=px
+    )  # fmt: skip
+    keyframe.follow_aliases(points)
+    expected, first = np.unique(points.alias[rows], return_index=True)
+    np.testing.assert_array_equal(keyframe.rows, expected)
+    np.testing.assert_array_equal(keyframe.points_px, px[first])
+
+
+@settings(max_examples=50)
 @given(st.lists(st.sets(st.integers(0, 40)), min_size=1, max_size=6))
 def test_links_follow_living_tracks_and_drop_dead_ones(frames):
     links, expected = TrackLinks(), {}

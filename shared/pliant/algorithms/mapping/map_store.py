@@ -137,10 +137,7 @@ class Keyframe:
 
     def follow_aliases(self, points: PointRows) -> None:
         """Let observations of merged rows stand for the rows that took them in."""
-        if not _has_aliases(self.rows, points.alias):
-            return
-        self.rows, first = np.unique(points.alias[self.rows], return_index=True)
-        self.points_px = self.points_px[first]
+        self.rows, self.points_px = _follow_aliases(self.rows, self.points_px, points.alias)
 
 
 @kernel
@@ -158,11 +155,37 @@ def _kept(rows: I32, points_px: F32, mask: BoolArray) -> tuple[I32, F32]:
 
 
 @kernel
-def _has_aliases(rows: I32, alias: I32) -> bool:
-    found = 0
+def _follow_aliases(rows: I32, points_px: F32, alias: I32) -> tuple[I32, F32]:
+    """Ascending rows stay so, each once: of two observations that of the lower row is kept."""
+    merged = np.empty(rows.size, np.int32)
+    count = 0
     for i in range(rows.size):
-        found += alias[rows[i]] != rows[i]
-    return found > 0
+        if alias[rows[i]] != rows[i]:
+            # Few have merged since the last keyframe, so that they are sorted as they come.
+            at = count
+            while at > 0 and alias[rows[merged[at - 1]]] > alias[rows[i]]:
+                merged[at] = merged[at - 1]
+                at -= 1
+            merged[at] = i
+            count += 1
+    if count == 0:
+        return rows, points_px
+    out, out_px = np.empty(rows.size, np.int32), np.empty((rows.size, 2), np.float32)
+    size, own, other = 0, 0, 0
+    while own < rows.size or other < count:
+        if own < rows.size and alias[rows[own]] != rows[own]:
+            own += 1
+            continue
+        i = merged[min(other, count - 1)]
+        if other == count or (own < rows.size and (rows[own], own) < (alias[rows[i]], i)):
+            i, own = own, own + 1
+        else:
+            other += 1
+        row = alias[rows[i]]
+        if size == 0 or out[size - 1] != row:
+            out[size], out_px[size, 0], out_px[size, 1] = row, points_px[i, 0], points_px[i, 1]
+            size += 1
+    return out[:size].copy(), out_px[:size].copy()
 
 
 @dataclass(frozen=True, kw_only=True)
