@@ -328,8 +328,8 @@ class ActiveMap:
         return new
 
     def _paint(self, rows: I32, points_px: F32, image: U8 | None) -> None:
-        if image is not None:
-            image = image.reshape(*image.shape[:2], -1)
+        if image is not None and image.size:
+            image = image if image.ndim == 3 else image[:, :, None]
             self.points.colours[rows] = sample_colours(image, points_px)
 
     def _append_keyframe(
