@@ -36,6 +36,18 @@ def tracking(
     _print(measure(source, load_config(None, overrides or []), frames))
 
 
+@app.command()
+def places(sources: Sources, overrides: Overrides = None) -> None:
+    """How often the place of a frame is recognised, in its own map and in those of the others.
+
+    scripts/bench places built-in:room built-in:tabletop
+    """
+    from benchmarks.places import measure
+    from pliant.config import load_config
+
+    _print(measure(sources, load_config(None, overrides or [])))
+
+
 @app.command("surfel-speed")
 def surfel_speed(
     source: Annotated[

@@ -188,6 +188,18 @@ def test_the_mesh_of_a_world_that_is_over_goes() -> None:
     assert len(canvas.corners()) == 3
 
 
+def test_the_mesh_of_a_world_that_goes_on_comes_back() -> None:
+    canvas = Drawn()
+    scene = scene_on(canvas)
+    for segment in (0, 1):
+        scene.take_blocks(AT, update(one_block(1, 2, segment), segment=segment))
+    scene.begin(AT, 0)
+    assert not canvas.meshes
+    scene.take_blocks(AT, update(one_block(2, 3, 1), segment=1))  # late
+    scene.take_blocks(AT, update(one_block(3, 4, 2), segment=0))
+    assert {segment for segment, _ in canvas.meshes} == {0}
+
+
 def test_some_triangles_bring_their_vertices_along() -> None:
     _, mesh = pieces("fine", 3)
     some = some_triangles(mesh, mesh.triangles[10:20])

@@ -30,6 +30,8 @@ def _map() -> None:
     from pliant.algorithms.mapping.loops import Loop
     from pliant.algorithms.mapping.mapper import Mapper
     from pliant.algorithms.mapping.parameters import MappingParameters
+    from pliant.algorithms.places.features import describe, match
+    from pliant.algorithms.places.index import PlaceIndex
 
     frames, n = 11, 400
     camera = PinholeCamera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
@@ -58,6 +60,10 @@ def _map() -> None:
     loop = Loop(old=0, new=5, S_old_new=np.eye(4), rows=none.astype(np.int32), ids=none)
     mapper.whole_map.loops.append(loop)
     mapper.finish()
+    seen, places = describe(grey), PlaceIndex()
+    places.add(0, seen)
+    places.query(seen)
+    match(seen, seen)
 
 
 def _mesh() -> None:

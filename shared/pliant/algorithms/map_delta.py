@@ -11,7 +11,7 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray, Shape
 from pliant.algorithms.geometry import matrix_to_pose, similarity_to_matrix
 
 WAITING, TRACKING, LOST = 0, 1, 2
-"""State of the map after a frame: not started, localised, or lost (a new segment must start)."""
+"""State of the map after a frame: not started, localised, or lost."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,8 @@ class MapDelta:
 
     state: WAITING, TRACKING or LOST.
     reason: why the map cannot start or was lost; when TRACKING why the pose is doubtful, mostly "".
-    segment: id of the map segment; segments are never joined.   -1 before the first.
+    segment: id of the map segment that the camera is in, or was in last; an earlier one goes on
+        where its place is recognised.  Segments are never joined.   -1 before the first.
     inliers: points that support this frame's pose (reprojection error < 1.5 px).
     pose_frames: frames whose pose is new or changed; includes this frame when it is localised.
     pose_segments, pose_keyframes: the segment and the keyframe id on which each of them hangs.
@@ -129,8 +130,8 @@ class KeyframeDelta:
     """Observations of keyframes.  Poses and points are in the MapDelta of the same frame.
 
     A keyframe is published twice: when it is new, and when nothing about it will change any more
-    but by the final adjustment, as it has left the window, its segment was lost, or the stream has
-    ended.
+    but by an adjustment of the whole map, as it has left the window, its camera was lost, or the
+    stream has ended.
 
     new: id of the keyframe that this frame became; -1 where it became none.
     keyframe_ids: keyframes whose observations follow.    settled: whether they will not change.

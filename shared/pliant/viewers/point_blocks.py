@@ -48,6 +48,10 @@ class PointBlocks:
             self._alive[self._doubtful] = False
             self._doubtful[:] = False
 
+    def draw_again(self) -> None:
+        """Whoever draws has none of the points."""
+        self._touch(np.flatnonzero(self._alive))
+
     def move(self, moves: MapMoves) -> None:
         """The whole map moves, points with the keyframes on which they hang."""
         ids = np.flatnonzero(self._alive)

@@ -45,7 +45,7 @@ _EXIF_WITHIN = 1 << 16
 
 @dataclass
 class _World:
-    """The segment of the map that is being built."""
+    """A segment of the map."""
 
     segment: int = -1
     points: PointBlocks = field(default_factory=PointBlocks)
@@ -61,6 +61,7 @@ class Scene:
         self._rectifier: Rectifier | None = None
         self._camera: PinholeCamera | None = None
         self._world = _World()
+        self._worlds: dict[int, _World] = {}
         self._expected = 0
         self._drawn = -REDRAW_FRAMES
         self._last = Moment(0, 0)
@@ -134,14 +135,8 @@ class Scene:
             self._notice_gap(at, sequence)
         self._last = at
         world = self._world
-        if update.segment > world.segment:
-            if world.segment >= 0:
-                self._draw_map(at)
-                self._canvas.whole_map(at, world.segment, world.points)
-                self.mesh.begin(at, update.segment)
-                self._canvas.forget(at, world.segment)
-            world = self._world = _World(segment=update.segment)
-            self._drawn = at.frame - REDRAW_FRAMES
+        if update.segment not in (-1, world.segment):
+            world = self._enter(at, update.segment)
         if len(update.moved_keyframes):
             self._move_map(update.map_moves())
         mine = update.keyframe_segments == world.segment
@@ -164,6 +159,20 @@ class Scene:
             self._canvas.camera(at, view.camera, view.lens)
         if final or at.frame - self._drawn >= REDRAW_FRAMES:
             self._draw_map(at)
+
+    def _enter(self, at: Moment, segment: int) -> _World:
+        """A new world begins, or an earlier one goes on; the one before is drawn no more."""
+        before = self._world
+        if before.segment >= 0:
+            self._draw_map(at)
+            self._canvas.whole_map(at, before.segment, before.points)
+            self.mesh.begin(at, segment)
+            self._canvas.forget(at, before.segment)
+        world = self._world = self._worlds.setdefault(segment, _World(segment=segment))
+        world.points.draw_again()
+        world.moved = bool(world.keyframes)
+        self._drawn = at.frame - REDRAW_FRAMES
+        return world
 
     def _move_map(self, moves: MapMoves) -> None:
         """The whole map moves: keyframes, and points with those on which they hang."""

@@ -15,7 +15,7 @@ EMPTY = unwelded(no_blocks())
 
 
 class SceneMesh:
-    """The mesh of one segment of the map, the newest; those of worlds that are over are not drawn.
+    """The mesh of one segment of the map, the one that the camera is in; no other one is drawn.
 
     One surface is seen at a time: two of the same room would flicker through each other.  The
     final mesh takes the place of the live one; the fine one is shown, and the coarse one only where
@@ -25,6 +25,7 @@ class SceneMesh:
     def __init__(self, canvas: Canvas) -> None:
         self._canvas = canvas
         self.segment = -1
+        self._newest = -1
         self._live = MeshGroups()
         self._pieces: list[MeshPiece] = []
         self._rank = 0
@@ -36,17 +37,18 @@ class SceneMesh:
         return self._rank > 0
 
     def begin(self, at: Moment, segment: int) -> None:
-        """A new world: what was drawn in the one before goes."""
-        if segment <= self.segment:
+        """A new world, or an earlier one again: what was drawn in the one before goes."""
+        if segment == self.segment:
             return
         self._clear(at)
-        self.segment = segment
+        self.segment, self._newest = segment, max(segment, self._newest)
         self._live, self._pieces, self._rank = MeshGroups(), [], 0
 
     def take_blocks(self, at: Moment, update: MeshUpdate) -> None:
         """Draw the groups that changed."""
-        self.begin(at, update.segment)
-        if update.segment < self.segment or self.is_final:
+        if update.segment > self._newest:
+            self.begin(at, update.segment)
+        if update.segment != self.segment or self.is_final:
             return
         self._live.take(update)
         for name in self._live.take_changed():
@@ -54,9 +56,10 @@ class SceneMesh:
 
     def take_piece(self, at: Moment, piece: MeshPiece) -> None:
         """Draw a final mesh once all its pieces are there."""
-        self.begin(at, piece.segment)
+        if piece.segment > self._newest:
+            self.begin(at, piece.segment)
         rank = _RANK.get(piece.level, 0)
-        if piece.segment < self.segment or rank <= self._rank:
+        if piece.segment != self.segment or rank <= self._rank:
             return
         if piece.piece == 0 or (self._pieces and self._pieces[0].level != piece.level):
             self._pieces = []

@@ -64,8 +64,9 @@ class ActiveMap:
 
     points: rows shared by all segments.    keyframes: of this segment, oldest first.
     window: those under adjustment.    links: rows of the living tracks.
-    culled: keyframes that it has forgotten.   removed_ids: points removed since the last call of
-    ``take_removed``.
+    culled: keyframes that it has forgotten.   since: index of the first keyframe after the camera
+    was last recognised: older ones do not move any more.   removed_ids: points removed since the
+    last call of ``take_removed``.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class ActiveMap:
         self.parameters = parameters
         self.keyframes: list[Keyframe] = []
         self.culled = 0
+        self.since = 0
         self.links = TrackLinks()
         self.window = self._window([], fixed=0, outside=0)
         self._next_keyframe_id = first_keyframe_id
@@ -355,23 +357,47 @@ class ActiveMap:
     def rebuild_window(self) -> None:
         """The newest keyframes move; older ones that see the same points are fixed."""
         sizes = self.parameters.window
-        moving = self.keyframes[-sizes.keyframes :]
-        outside = self.keyframes[: -sizes.keyframes]
-        for keyframe in outside[-1:]:
-            self._leave_window(keyframe)
+        first = self._first_of_window()
+        moving = self.keyframes[first:]
+        outside = self.keyframes[:first]
+        if first > self.since:
+            self._leave_window(outside[-1])
         if len(self.keyframes) > max(sizes.kept_keyframes, sizes.final_max_keyframes):
             # Not the one that has just left: it is not published yet.
-            self._cull(self.keyframes.pop(most_redundant(outside[:-1])))
-            outside = self.keyframes[: -sizes.keyframes]
+            redundant = most_redundant(outside[:-1])
+            self._cull(self.keyframes.pop(redundant))
+            self.since -= redundant < self.since
+            outside = self.keyframes[: -len(moving)]
         older = near_keyframes(outside, moving[-1], _NEAR_KEYFRAMES)
-        if older:
-            fixed = most_shared(older, moving, self.points)[: sizes.fixed]
-        else:
-            fixed = []
+        # What was there before the camera was recognised takes the place of what will be.
+        count = max(sizes.fixed, sizes.keyframes - len(moving))
+        fixed = most_shared(older, moving, self.points)[:count] if older else []
+        self._look_at(older, fixed, moving)
+
+    def _look_at(
+        self, older: list[Keyframe], fixed: list[Keyframe], moving: list[Keyframe]
+    ) -> None:
         chosen = sorted(fixed, key=lambda keyframe: keyframe.id) + moving
         prior = max(len(fixed), min(2, len(moving) - 1))
         self.window = self._window(chosen, fixed=prior, outside=len(fixed))
         self._nearby = rows_of(older, self.window.rows, len(self.points.state))
+
+    def resume(self, seen: Keyframe, next_keyframe_id: int) -> None:
+        """The camera has been recognised, and sees what a keyframe saw: the map goes on from there.
+
+        What has been mapped stays where it is; the next frame is a keyframe.
+        """
+        self.links = TrackLinks()
+        self.collect_garbage()
+        for keyframe in self.keyframes[self._first_of_window() :]:
+            self._leave_window(keyframe)
+        self.since, self._next_keyframe_id = len(self.keyframes), next_keyframe_id
+        older = most_shared(self.keyframes, [seen], self.points)[:_NEAR_KEYFRAMES]
+        self._look_at(older, older[: self.parameters.window.keyframes], [])
+
+    def _first_of_window(self) -> int:
+        """Index of the first keyframe that may move."""
+        return max(self.since, len(self.keyframes) - self.parameters.window.keyframes)
 
     def adjust_all(self, path: Path, known: SelfCalibration) -> SelfCalibration:
         """Adjust all but the first keyframe and the calibration, from what is known of it."""

@@ -1,6 +1,9 @@
-"""Segments of the map that do not go on: kept until the end, when each is adjusted as a whole."""
+"""Segments of the map that lost their camera: kept until they are recognised, or until the end,
+when each is adjusted as a whole."""
 
 from typing import NamedTuple
+
+import numpy as np
 
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.map_store import PointRows
@@ -27,6 +30,17 @@ class EarlierSegments:
         """A segment has lost its camera."""
         active.close()
         self._kept.append(_Earlier(active, path, calibration))
+
+    def maps(self, calibration: SelfCalibration) -> list[ActiveMap]:
+        """Those whose keyframes have the pixels of a calibration, oldest first."""
+        known = calibration.correction
+        return [e.map for e in self._kept if np.array_equal(e.calibration.correction, known)]
+
+    def take(self, segment: int) -> tuple[ActiveMap, Path]:
+        """A segment goes on."""
+        (taken,) = (each for each in self._kept if each.map.segment == segment)
+        self._kept = [each for each in self._kept if each is not taken]
+        return taken.map, taken.path
 
     def make_room(self, points: PointRows, max_keyframes: int) -> None:
         """Give back the oldest segments, which have been published, beyond so many keyframes of

@@ -28,12 +28,15 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.reacquisition import reacquire
 from pliant.algorithms.mapping.recovery import Motion, recover
+from pliant.algorithms.mapping.relocalisation import Place, relocalise
 from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, is_guess
 from pliant.algorithms.mapping.start import Start
 from pliant.algorithms.mapping.support import Support, doubt, support_of
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses
-from pliant.algorithms.mapping.whole_map import Answer, WholeMap, move_map
+from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held, move_map
+from pliant.algorithms.places.features import describe
+from pliant.algorithms.places.index import PlaceIndex
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracks import FrameTracks
 
@@ -42,6 +45,9 @@ _TELLING = 500
 
 _LEAST_LOST = 3
 """Frames without a pose before a map is given up, however long that takes: of a time lapse."""
+
+_PLACES = 5
+"""That look most like a frame are looked at more closely."""
 
 
 class Mapper:
@@ -70,7 +76,10 @@ class Mapper:
         self._waiting = Waiting()
         self._map: ActiveMap | None = None
         self._earlier = EarlierSegments()
+        self._places = PlaceIndex()
+        self._spans: list[tuple[int, int]] = []
         self._segments = 0
+        self._segment = -1  # that the camera is in, or was in last
         self._keyframes = 0
         self._motion: Motion | None = None
         self._lost_frames = 0
@@ -94,14 +103,14 @@ class Mapper:
         """
         self._timer = timer
         tracks, grey, colour = self.calibration.ideal(tracks, grey, colour)
+        if self._map is not None and self._motion is not None:
+            with self._timer("whole map"):
+                if (answer := self.whole_map.take(frame)) is not None:
+                    self._motion = self._motion.moved(self._take(self._map, answer))
+            self._map.links.follow(tracks.ids)
+        located = self._locate(stamp_ns, tracks, grey)
         if self._map is None or self._motion is None:
             return self._wait(frame, stamp_ns, tracks, grey, colour)
-        with self._timer("whole map"):
-            if (answer := self.whole_map.take(frame)) is not None:
-                self._motion = self._motion.moved(self._take(self._map, answer))
-        self._map.links.follow(tracks.ids)
-        with self._timer("localisation"):
-            located = self._localise(self._map, self._motion, stamp_ns, tracks, grey)
         if located is None:
             return self._lost(self._map, frame, stamp_ns, tracks)
         with self._timer("reacquisition"):
@@ -121,6 +130,8 @@ class Mapper:
             self._motion = self._motion.moved(self._calibrate(self._map))
             T_world_camera = hanging.T_world_camera
             self._keyframe_ns = stamp_ns
+            with self._timer("places"):
+                self._remember(hanging, grey)
         self._lost_frames, self._waiting = 0, Waiting()
         self._motion = self._motion.then(stamp_ns, T_world_camera)
         self._add_pose(self._map, frame, hanging, T_world_camera, support.inliers)
@@ -161,10 +172,11 @@ class Mapper:
 
     def _take(self, active: ActiveMap, answer: Answer) -> F64:
         """Move the map, and join what is one.  Returns the similarity (4, 4) of its end."""
-        S = move_map(active, answer.moves, self._path)
+        moves = held(answer.moves, self._spans, active.segment)
+        S = move_map(active, moves, self._path)
         for loop in answer.loops:
             active.join(loop)
-        self._changes.move(answer.moves)
+        self._changes.move(moves)
         return S
 
     def finish(self) -> MapDelta:
@@ -237,7 +249,7 @@ class Mapper:
         self._map = ActiveMap(
             self._segments, self._points, self._keyframes, self._camera, self._parameters
         )
-        self._segments += 1
+        self._segment, self._segments = self._segments, self._segments + 1
         self._path = Path()
         self.whole_map = WholeMap()
         self._map.begin(start, self._waiting.frames, grey, colour)
@@ -251,6 +263,8 @@ class Mapper:
         for each in placed:
             self._add_pose(self._map, each.frame, each.keyframe, each.T_world_camera, each.inliers)
         stamps_ns = {waiting.frame: waiting.stamp_ns for waiting in self._waiting.frames}
+        self._spans.append((self._keyframes, self._map.segment))
+        self._remember(self._map.keyframes[-1], grey)
         newest, before = placed[0], placed[min(1, len(placed) - 1)]
         stamps = stamps_ns[before.frame], stamps_ns[newest.frame]
         poses = before.T_world_camera, newest.T_world_camera
@@ -267,6 +281,76 @@ class Mapper:
     def _spread(self, active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
         last = active.keyframes[-1]
         return spread_of(self._points, rows, last) if len(directions) else None
+
+    def _locate(self, stamp_ns: int, tracks: FrameTracks, grey: U8 | None) -> F64 | None:
+        """T_world_camera of the frame where it goes on, or else where it was seen before."""
+        if self._map is not None and self._motion is not None:
+            with self._timer("places"):
+                earlier = self._earlier.maps(self.calibration) if self._keyframe_is_new else []
+                larger = [m for m in earlier if len(m.keyframes) > len(self._map.keyframes)]
+                located = self._recognise(larger, stamp_ns, tracks, grey)
+            if located is not None:
+                return located
+            with self._timer("localisation"):
+                located = self._localise(self._map, self._motion, stamp_ns, tracks, grey)
+            if located is not None:
+                return located
+        with self._timer("places"):
+            maps = [self._map] if self._map is not None else []
+            maps += self._earlier.maps(self.calibration)
+            return self._recognise(maps, stamp_ns, tracks, grey)
+
+    def _recognise(
+        self, maps: list[ActiveMap], stamp_ns: int, tracks: FrameTracks, grey: U8 | None
+    ) -> F64 | None:
+        """T_world_camera in the one of the maps that the image shows, which then goes on."""
+        if grey is None or not maps:
+            return None
+        view, seen = self.calibration.view, describe(grey)
+        segments = {k.id: (k, active.keyframes) for active in maps for k in active.keyframes}
+        places: list[Place] = []
+        for keyframe, segment in (segments[i] for i in self._places.query(seen) if i in segments):
+            features = self._places.features[keyframe.id]
+            there = dataclasses.replace(features, points_px=view.pixels(features.points_px))
+            places.append(Place(keyframe=keyframe, features=there, segment=segment))
+        found = relocalise(
+            seen, places[:_PLACES], self._points, tracks.maxima, grey, self._camera,
+            self._parameters, self._generator,
+        )  # fmt: skip
+        if found is None:
+            return None
+        self._go_on(found.keyframe, tracks)
+        stamps, poses = (stamp_ns, stamp_ns), (found.T_world_camera, found.T_world_camera)
+        self._motion = Motion(stamps_ns=stamps, poses=poses)
+        return found.T_world_camera
+
+    def _go_on(self, seen: Keyframe, tracks: FrameTracks) -> None:
+        """Go on in the segment of a keyframe, at the place that it saw."""
+        active = self._map
+        if active is not None:
+            self._keyframe_changes.settle(active.keyframes)
+            self._keyframes = active.next_keyframe_id
+        if active is None or active.segment != seen.segment:
+            if active is not None:
+                self._earlier.keep(active, self._path, self.calibration)
+            active, self._path = self._earlier.take(seen.segment)
+            self._map, self.whole_map = active, WholeMap()
+        self.whole_map.withdraw()  # nobody knows how what is new would move
+        self._segment = active.segment
+        active.resume(seen, self._keyframes)
+        active.links.follow(tracks.ids)
+        self._spans.append((self._keyframes, active.segment))
+
+    def _remember(self, keyframe: Keyframe, grey: U8 | None) -> None:
+        """A keyframe is a place to come back to; those that the map has forgotten are not."""
+        if grey is None or self._map is None:
+            return
+        seen = describe(grey)
+        px = self.calibration.view.seen(seen.points_px)
+        self._places.add(keyframe.id, dataclasses.replace(seen, points_px=px))
+        maps = [self._map, *self._earlier.maps(self.calibration)]
+        known = {k.id for active in maps for k in active.keyframes}
+        self._places.forget(self._places.features.keys() - known)
 
     def _localise(
         self,
@@ -369,6 +453,8 @@ class Mapper:
         self, active: ActiveMap, T_world_camera: F64, found: Observations, tracks: FrameTracks
     ) -> tuple[F64, bool]:
         """Whether the frame stands where the last keyframe does, and its pose then."""
+        if active.since == len(active.keyframes):
+            return T_world_camera, False  # nobody knows where it was before
         candidates = placed_candidates(self._points, active.links.rows)
         rows, points_px = active.observed(tracks.points_px, found, candidates)
         for every in (max(1, len(rows) // _TELLING), 1):  # a few tell of most that they moved
@@ -384,6 +470,8 @@ class Mapper:
         return T_standing, True
 
     def _keyframe_is_due(self, active: ActiveMap, stamp_ns: int) -> bool:
+        if active.since == len(active.keyframes):
+            return True  # the camera has been recognised
         limits = self._parameters.keyframe
         least = CANDIDATE if len(self._directions(active)) else MAPPED
         share, flow = active.window.flow_since_keyframe(least)
@@ -419,7 +507,7 @@ class Mapper:
         delta = self._changes.publish(
             state=state,
             reason=reason,
-            segment=self._segments - 1,
+            segment=self._segment,
             inliers=inliers,
             keyframes=keyframes,
             points=self._points,

@@ -13,7 +13,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, move_by_similarity, so3_exp, so3_log
-from pliant.algorithms.mapping.localisation import locate, refine
+from pliant.algorithms.mapping.localisation import Localisation, locate, refine
 from pliant.algorithms.mapping.map_store import PointRows
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -105,13 +105,16 @@ def recover(
             )
             if located.inliers.sum() < own.min_agreeing:
                 continue
-            proved = _proved(located.T_world_camera, rows, points, maxima, grey, camera, parameters)
+            proved = prove(
+                located.T_world_camera, rows, points, maxima, grey, camera, parameters,
+                own.min_agreement,
+            )  # fmt: skip
             if proved is not None:
-                return proved
+                return proved.T_world_camera
     return None
 
 
-def _proved(
+def prove(
     T_world_camera: F64,
     rows: I32,
     points: PointRows,
@@ -119,9 +122,11 @@ def _proved(
     grey: U8,
     camera: PinholeCamera,
     parameters: MappingParameters,
-) -> F64 | None:
+    min_agreement: float,
+) -> Localisation | None:
     """The pose refined by all points found where it shows them, None if these are too few of them.
 
+    min_agreement: least share of the points found that support it, see ``RecoveryParameters``.
     Wrong poses find points as well: wherever a maximum is near and its patch looks alike.
     """
     narrow = parameters.reacquisition
@@ -139,6 +144,6 @@ def _proved(
     enough = max(
         parameters.localisation.min_inliers,
         parameters.recovery.min_support_share * len(found.visible),
-        parameters.recovery.min_agreement * len(found.rows),
+        min_agreement * len(found.rows),
     )
-    return located.T_world_camera if inliers >= enough else None
+    return located if inliers >= enough else None

@@ -82,6 +82,8 @@ class WholeMap:
         count = len(active.keyframes)
         # While the window has half of the map it does well by itself.
         early = growth == 0.0 or count < max(2 * window, self.due)
+        # The window would move with what was there before the camera was recognised.
+        early = early or (active.since > 0 and count - active.since <= window)
         if self.question is not None or (early and not self.loops):
             return
         self.due = (1.0 + growth) * count
@@ -101,6 +103,12 @@ class WholeMap:
             hosts=np.maximum(hosts, 0),
             sigmas=points.sigmas[seen.rows].astype(np.float64),
         )
+
+    def withdraw(self) -> None:
+        """What was asked is not taken over; its loops are asked for again."""
+        if self.question is not None:
+            self.loops = [*self.question.loops, *self.loops]
+        self.question = self.answer = None
 
     def is_due(self, frame: int) -> bool:
         """Whether the answer is taken over before a frame is worked on."""
@@ -158,6 +166,23 @@ def find_moves(question: Question) -> Answer:
         moves=np.column_stack([matrix_to_pose(moved), scales]),
     )
     return Answer(moves, loops)
+
+
+def held(moves: MapMoves, spans: list[tuple[int, int]], segment: int) -> MapMoves:
+    """The moves of one segment, told so that what hangs on others' keyframes stays.
+
+    spans: (first keyframe id, segment) of all keyframes, ascending: a segment that was recognised
+    goes on after others.
+    """
+    ids, rows = moves.keyframe_ids, moves.moves
+    for first, of in spans:
+        at = int(np.searchsorted(ids, first))
+        if at == 0 or (at < len(ids) and ids[at] == first):
+            continue
+        still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0])
+        row = rows[min(at, len(rows) - 1)] if of == segment else still
+        ids, rows = np.insert(ids, at, first), np.insert(rows, at, row, axis=0)
+    return MapMoves(keyframe_ids=ids, moves=rows)
 
 
 def _depths(seen: ListedMap, T_world_camera: F64, xyz: F64) -> F64:

@@ -1,0 +1,186 @@
+"""A camera that nobody can predict: recognised by what its image looks like.
+
+Keyframes are remembered as places.  One that looks like the frame proposes a pose by P3P and RANSAC
+over corners that look alike; it counts only where the map's own points prove it, as after any loss,
+and where no other place is proved nearly as well: what looks the same in two places shows neither.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pliant.algorithms.absolute_pose import pose_by_ransac
+from pliant.algorithms.arrays import F32, F64, U8, BoolArray
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse, so3_log, transform
+from pliant.algorithms.mapping.covisibility import most_shared, rows_of
+from pliant.algorithms.mapping.localisation import refine
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.reacquisition import MaximaGrid
+from pliant.algorithms.mapping.recovery import prove
+from pliant.algorithms.places.features import Features, match
+
+_NEAR_SHARE = 0.0125
+"""Of the image's width: a corner is as far as the nearest point of the map within."""
+
+_NEAR_KEYFRAMES = 16
+"""Whose points prove a pose."""
+
+_SAME_TURN_RAD = np.radians(5.0)
+_SAME_SHIFT = 0.1
+"""Poses closer than this, as a share of the depth, are one."""
+
+_AS_GOOD = 0.5
+"""A place with this share of the inliers of another one is as good."""
+
+_MOST = 0.5
+"""Of the corners that look alike: in another place a tenth agrees on a pose."""
+
+
+class _Proposed(NamedTuple):
+    """A pose, the corners (n, 2) of the frame that agree on it, and their share of those that look
+    alike."""
+
+    T_world_camera: F64
+    corners_px: F32
+    share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """A keyframe that may be what the camera sees, the corners of its image, and all keyframes of
+    its segment, oldest first."""
+
+    keyframe: Keyframe
+    features: Features
+    segment: list[Keyframe]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recognised:
+    """T_world_camera of a frame that sees what a keyframe saw, and how many points prove it."""
+
+    keyframe: Keyframe
+    T_world_camera: F64
+    inliers: int
+
+
+def relocalise(
+    seen: Features,
+    places: list[Place],
+    points: PointRows,
+    maxima: F32,
+    grey: U8,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    generator: np.random.Generator,
+) -> Recognised | None:
+    """The pose of a frame from the places that look like it, None where no single one is proved.
+
+    seen, maxima (M, 3), grey (H, W): of the frame.
+    """
+    own = parameters.recovery
+    best: Recognised | None = None
+    rivals: list[Recognised] = []
+    for place in places:
+        proposed = _propose(seen, place, points, camera, parameters, generator)
+        if proposed is None:
+            continue
+        near = most_shared(place.segment, [place.keyframe], points)[:_NEAR_KEYFRAMES]
+        rows = rows_of(near, np.zeros(0, np.int32), len(points.state))
+        rows = rows[points.state[rows] == MAPPED]
+        proved = prove(
+            proposed.T_world_camera, rows, points, maxima, grey, camera, parameters,
+            0.0 if _speaks_for_itself(proposed, camera, parameters) else own.min_agreement,
+        )  # fmt: skip
+        if proved is None:
+            continue
+        found = Recognised(
+            keyframe=place.keyframe,
+            T_world_camera=proved.T_world_camera,
+            inliers=int(proved.inliers.sum()),
+        )
+        if best is not None and _is_same(best, found, place, points):
+            best = max(best, found, key=lambda each: each.inliers)
+            continue
+        if best is not None:
+            rivals.append(min(best, found, key=lambda each: each.inliers))
+            found = max(best, found, key=lambda each: each.inliers)
+        best = found
+    if best is None:
+        return None
+    return None if any(rival.inliers > _AS_GOOD * best.inliers for rival in rivals) else best
+
+
+def corners_in_map(
+    keyframe: Keyframe, features: Features, points: PointRows, camera: PinholeCamera
+) -> tuple[F64, BoolArray]:
+    """(n, 3) where in the world the corners of a keyframe are, and whether that is known: as deep
+    as the point of the map beside them."""
+    seen = points.state[keyframe.rows] == MAPPED
+    rows, points_px = keyframe.rows[seen], keyframe.points_px[seen]
+    radius_px = _NEAR_SHARE * camera.width
+    beside = np.column_stack([points_px, np.zeros(len(rows), np.float32)])
+    grid = MaximaGrid.build(beside, camera.width, camera.height, radius_px)
+    nearest = grid.nearest(features.points_px, radius_px)
+    depth = np.zeros(len(nearest))
+    known = nearest >= 0
+    T_camera_world = inverse(keyframe.T_world_camera)
+    depth[known] = transform(T_camera_world, points.xyz[rows[nearest[known]]])[:, 2]
+    known &= depth > 0.0
+    rays = np.column_stack([camera.normalise(features.points_px.astype(np.float64)), depth * 0 + 1])
+    return transform(keyframe.T_world_camera, rays * depth[:, None]), known
+
+
+def _propose(
+    seen: Features,
+    place: Place,
+    points: PointRows,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    generator: np.random.Generator,
+) -> _Proposed | None:
+    """The pose that most corners agree on which look like those of a place."""
+    limits, own = parameters.localisation, parameters.recovery
+    pairs = match(seen, place.features)
+    world, known = corners_in_map(place.keyframe, place.features, points, camera)
+    pairs = pairs[known[pairs[:, 1]]]
+    if len(pairs) < own.min_agreeing:
+        return None
+    xyz, points_px = world[pairs[:, 1]], seen.points_px[pairs[:, 0]]
+    found = pose_by_ransac(
+        xyz, camera.normalise(points_px.astype(np.float64)), generator,
+        gate=limits.ransac_gate_px / camera.fx, samples=own.ransac_samples,
+    )  # fmt: skip
+    if found is None or found[1].sum() < own.min_agreeing:
+        return None
+    T_world_camera = refine(found[0], xyz, points_px, camera, limits).T_world_camera
+    return _Proposed(T_world_camera, points_px[found[1]], float(found[1].mean()))
+
+
+def _speaks_for_itself(
+    proposed: _Proposed, camera: PinholeCamera, parameters: MappingParameters
+) -> bool:
+    """Whether the corners leave no doubt: many, most of those that look alike, all over the image.
+
+    The map's points agree less where a shutter that rolls or motion blurs the frame.
+    """
+    size = np.array([camera.width, camera.height])
+    spread = (proposed.corners_px.std(axis=0) / size).min()
+    return (
+        len(proposed.corners_px) >= parameters.localisation.min_inliers
+        and proposed.share >= _MOST
+        and spread >= parameters.support.min_spread
+    )
+
+
+def _is_same(a: Recognised, b: Recognised, place: Place, points: PointRows) -> bool:
+    if a.keyframe.segment != b.keyframe.segment:
+        return False
+    between = inverse(a.T_world_camera) @ b.T_world_camera
+    rows = place.keyframe.rows[points.state[place.keyframe.rows] == MAPPED]
+    depth = np.median(transform(inverse(b.T_world_camera), points.xyz[rows])[:, 2])
+    turn = float(np.linalg.norm(so3_log(between[:3, :3])))
+    return turn < _SAME_TURN_RAD and float(np.linalg.norm(between[:3, 3])) < _SAME_SHIFT * depth

@@ -1,0 +1,1 @@
+"""Places that were seen before: described, looked up, and verified."""

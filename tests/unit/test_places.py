@@ -1,0 +1,125 @@
+"""Corners of an image, and the index that finds the places that look like it."""
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.places.features import Features, describe, match
+from pliant.algorithms.places.index import PlaceIndex, words_of
+from pliant.state import load_state, save_state
+
+
+def noise(seed: int, height: int = 240, width: int = 320) -> np.ndarray:
+    """A picture that is like no other."""
+    grey = np.random.default_rng(seed).uniform(0, 255, (height, width)).astype(np.float32)
+    soft = cv2.GaussianBlur(grey, (0, 0), 2.0)
+    return (255.0 * (soft - soft.min()) / (soft.max() - soft.min())).astype(np.uint8)
+
+
+def bits(generator: np.random.Generator, count: int) -> Features:
+    """Corners with descriptors of chance."""
+    px = generator.uniform(0.0, 300.0, (count, 2)).astype(np.float32)
+    descriptors = generator.integers(0, 256, (count, 32), np.uint8)
+    return Features(points_px=px, descriptors=descriptors)
+
+
+def blurred(features: Features, generator: np.random.Generator, share: float) -> Features:
+    """The same corners in another order, with a share of the bits of each turned over."""
+    order = generator.permutation(len(features.descriptors))
+    known = np.unpackbits(features.descriptors[order], axis=1)
+    turned = known ^ (generator.random(known.shape) < share)
+    return Features(points_px=features.points_px[order], descriptors=np.packbits(turned, axis=1))
+
+
+def test_corners_are_found_again_where_the_camera_turned_and_came_nearer():
+    grey = noise(1)
+    centre, turn, scale = (159.5, 119.5), 40.0, 1.7
+    M = cv2.getRotationMatrix2D(centre, turn, scale)
+    moved = cv2.warpAffine(grey, M, (320, 240), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT)
+    a, b = describe(grey), describe((0.5 * moved).astype(np.uint8))  # and in half the light
+    pairs = match(a, b)
+    expected = a.points_px[pairs[:, 0]] @ M[:, :2].T + M[:, 2]
+    errors = np.linalg.norm(expected - b.points_px[pairs[:, 1]], axis=1)
+    assert np.count_nonzero(errors < 3.0) >= 40
+    assert np.mean(errors < 3.0) > 0.7
+    assert len(match(a, describe(noise(2)))) < 10
+
+
+def test_an_image_of_nothing_has_no_corners():
+    features = describe(np.full((48, 64), 90, np.uint8))
+    assert features.points_px.shape == (0, 2)
+    assert features.descriptors.shape == (0, 32)
+    assert match(features, describe(noise(1))).shape == (0, 2)
+    index = PlaceIndex()
+    index.add(3, features)
+    assert index.query(describe(noise(1))) == []
+
+
+def test_matches_are_those_of_plain_numpy():
+    generator = np.random.default_rng(0)
+    a = bits(generator, 60)
+    b = blurred(a, generator, 0.15)
+    distance = (
+        np.unpackbits(a.descriptors, axis=1)[:, None] != np.unpackbits(b.descriptors, axis=1)
+    ).sum(axis=2)
+    expected: list[list[int]] = []
+    for i, row in enumerate(distance):
+        j, following = np.argsort(row, kind="stable")[:2]
+        clear = row[j] <= 64 and row[j] <= 0.85 * row[following]
+        if clear and np.argmin(distance[:, j]) == i:
+            expected.append([i, int(j)])
+    assert len(expected) > 40
+    assert match(a, b).tolist() == expected
+
+
+def test_places_are_found_by_half_of_their_corners():
+    generator = np.random.default_rng(1)
+    index, places = PlaceIndex(), [bits(generator, 200) for _ in range(300)]
+    for number, place in enumerate(places):
+        index.add(10 * number, place)
+    for number in range(0, 300, 7):
+        seen = blurred(places[number], generator, 0.12)
+        others = bits(generator, 100)
+        half = Features(
+            points_px=np.concatenate([seen.points_px[:100], others.points_px]),
+            descriptors=np.concatenate([seen.descriptors[:100], others.descriptors]),
+        )
+        assert index.query(half)[0] == 10 * number
+
+
+def test_what_is_forgotten_is_found_no_more_and_leaves_no_trace():
+    generator = np.random.default_rng(2)
+    index, places = PlaceIndex(), [bits(generator, 50) for _ in range(200)]
+    for number, place in enumerate(places):
+        index.add(number, place)
+    for number in range(150):
+        index.forget([number, 1000])
+        assert number not in index.query(places[number])
+    fresh = PlaceIndex()
+    for number in range(150, 200):
+        fresh.add(number, places[number])
+    assert index.used < 2 * 150 * len(words_of(places[0].descriptors))
+    index.forget(range(160))
+    for number in range(160, 200):
+        assert index.query(places[number])[0] == number
+    assert sorted(index.features) == list(range(160, 200))
+
+
+def test_the_index_is_kept_in_a_checkpoint():
+    generator = np.random.default_rng(3)
+    index, places = PlaceIndex(), [bits(generator, 40) for _ in range(5)]
+    for number, place in enumerate(places):
+        index.add(number, place)
+    again = load_state(save_state(index))
+    again.add(9, places[0])
+    index.add(9, places[0])
+    assert again.query(places[0]) == index.query(places[0])
+    assert again.query(places[0])[:2] == [0, 9]
+
+
+def test_a_keyframe_takes_less_than_50_kilobytes():
+    features = describe(noise(4, 480, 640))
+    index = PlaceIndex()
+    index.add(0, features)
+    used = features.points_px.nbytes + features.descriptors.nbytes
+    assert len(features.points_px) > 600
+    assert used + index.used * index.entries.itemsize * 2 <= 50_000
