@@ -26,8 +26,10 @@ def _track() -> None:
 
 def _map() -> None:
     """Start a map, extend it, lose some tracks and then all, find them again, close a loop."""
+    from pliant.algorithms.absolute_pose import pose_by_ransac
     from pliant.algorithms.geometry import so3_exp
     from pliant.algorithms.mapping.loops import Loop
+    from pliant.algorithms.mapping.map_store import Keyframe, PointRows
     from pliant.algorithms.mapping.mapper import Mapper
     from pliant.algorithms.mapping.parameters import MappingParameters
     from pliant.algorithms.places.features import describe, match
@@ -60,6 +62,13 @@ def _map() -> None:
     loop = Loop(old=0, new=5, S_old_new=np.eye(4), rows=none.astype(np.int32), ids=none)
     mapper.whole_map.loops.append(loop)
     mapper.finish()
+    # What few frames need: a pose that no prediction led to, points that have merged.
+    pose_by_ransac(points, camera.normalise(px), generator, gate=0.1, samples=1)
+    keyframe = Keyframe(
+        id=0, frame=0, segment=0, T_world_camera=np.eye(4), rows=np.zeros(1, np.int32),
+        points_px=px[:1],
+    )  # fmt: skip
+    keyframe.follow_aliases(PointRows())
     seen, places = describe(grey), PlaceIndex()
     places.add(0, seen)
     places.query(seen)
