@@ -63,6 +63,7 @@ def _map() -> None:
     mapper.whole_map.loops.append(loop)
     mapper.finish()
     # What few frames need: a pose that no prediction led to, points that have merged.
+    px = camera.project(points).astype(np.float32)
     pose_by_ransac(points, camera.normalise(px), generator, gate=0.1, samples=1)
     keyframe = Keyframe(
         id=0, frame=0, segment=0, T_world_camera=np.eye(4), rows=np.zeros(1, np.int32),
