@@ -66,7 +66,7 @@ class _Run:
         """What the map says to an image, and in how many ms the index.
 
         stamp_ns: of one of its own frames."""
-        index: PlaceIndex = self.mapper._places  # pyright: ignore[reportPrivateUsage]
+        index: PlaceIndex = self.mapper._places.index  # pyright: ignore[reportPrivateUsage]
         known = {k.id: k for k in self.keyframes if self.is_apart(k, stamp_ns)}
         begin = time.process_time()
         seen = describe(grey)

@@ -182,3 +182,24 @@ def test_moves_follow_each_other():
     np.testing.assert_allclose(
         first.then(then).matrices(some), then.matrices(some) @ first.matrices(some), atol=1e-12
     )
+
+
+def test_a_place_that_looks_alike_is_too_far_for_drift(world):
+    """The same door at both ends of a wall: the map would have had to slip by its whole length."""
+    _, frames = world
+    mapper = Mapper(CAMERA, PARAMETERS, 0)
+    for k, tracks in enumerate(frames[:AWAY]):
+        mapper.process(k, k * INTERVAL_NS, tracks, None, None)
+    active, points = mapper._map, mapper._points
+    first, last = active.keyframes[0], active.keyframes[-1]
+    S = first.T_world_camera @ inverse(last.T_world_camera)
+    rows = np.column_stack([k.rows[points.state[k.rows] == MAPPED][:200] for k in (first, last)])
+    before = error_of(active, there_and_back())
+    loops = [
+        Loop(old=first.id, new=k.id, S_old_new=S, rows=rows, ids=points.ids[rows])
+        for k in active.keyframes[-2:]
+    ]
+    mapper.whole_map.loops += loops
+    answer = close(mapper)
+    assert answer.loops == []
+    assert error_of(active, there_and_back()) < max(1.2 * before, 0.01)

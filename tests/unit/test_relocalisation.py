@@ -115,8 +115,8 @@ def test_what_is_mapped_elsewhere_stays_where_one_segment_moves():
 def place_of(mapper: Mapper, number: int) -> Place:
     active = mapper._map
     assert active is not None
-    keyframe = next(k for k in active.keyframes[number:] if k.id in mapper._places.features)
-    features = mapper._places.features[keyframe.id]
+    keyframe = next(k for k in active.keyframes[number:] if k.id in mapper._places.index.features)
+    features = mapper._places.index.features[keyframe.id]
     return Place(keyframe=keyframe, features=features, segment=active.keyframes)
 
 

@@ -20,6 +20,9 @@ from pliant.compiler.kernel import kernel
 _COVISIBLE_SHARE = 0.3
 """Share of the points of the lesser keyframe that two share which have an edge."""
 
+_DEPTHS = 10.0
+"""Square root of how many depths of a keyframe have errors that nothing shares."""
+
 _ACCEPTED = 0.5
 """Weight of a loop under which the others contradict it."""
 
@@ -97,7 +100,8 @@ def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px:
     """Between keyframes that follow each other or meet again, then the loops.
 
     How well two keyframes lie to each other is what one point tells, at 1 px: the errors that add
-    up to drift are those that all their points share.
+    up to drift are those that all their points share.  But of depths, and so of scale, each point
+    has an error of its own, as little as its parallax tells.
     """
     M = len(seen.T_world_camera)
     order = np.argsort(seen.point, kind="stable")
@@ -123,7 +127,7 @@ def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px:
     bearing = np.full(len(i), 1.0 / focal_px)
     return Edges(
         i=i.copy(), j=j.copy(), Z=np.concatenate([Z, np.array(of_loops).reshape(-1, 4, 4)]),
-        sigmas=np.column_stack([bearing] * 3 + [bearing * depth[j]] * 3 + [sigma[j]]),
+        sigmas=np.column_stack([bearing] * 3 + [bearing * depth[j]] * 3 + [sigma[j] / _DEPTHS]),
         doubtful=np.arange(len(i)) >= len(i) - len(loops),
     )  # fmt: skip
 

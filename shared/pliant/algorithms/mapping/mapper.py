@@ -6,6 +6,7 @@ over the window at keyframes and re-acquisition of points that lost their track.
 """
 
 import dataclasses
+from itertools import islice
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from pliant.algorithms.mapping.directions import (
     spread_of,
 )
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
+from pliant.algorithms.mapping.known_places import KnownPlaces
 from pliant.algorithms.mapping.localisation import locate, refine
 from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe, Observations, PointRows
 from pliant.algorithms.mapping.observation_table import reprojection_errors
@@ -29,6 +31,7 @@ from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.reacquisition import reacquire
 from pliant.algorithms.mapping.recovery import Motion, recover
 from pliant.algorithms.mapping.relocalisation import Place, relocalise
+from pliant.algorithms.mapping.revisits import Revisits
 from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, is_guess
 from pliant.algorithms.mapping.start import Start
@@ -36,7 +39,6 @@ from pliant.algorithms.mapping.support import Support, doubt, support_of
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses
 from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held, move_map
 from pliant.algorithms.places.features import describe
-from pliant.algorithms.places.index import PlaceIndex
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracks import FrameTracks
 
@@ -76,7 +78,8 @@ class Mapper:
         self._waiting = Waiting()
         self._map: ActiveMap | None = None
         self._earlier = EarlierSegments()
-        self._places = PlaceIndex()
+        self._places = KnownPlaces()
+        self._revisits = Revisits()
         self._spans: list[tuple[int, int]] = []
         self._segments = 0
         self._segment = -1  # that the camera is in, or was in last
@@ -131,7 +134,7 @@ class Mapper:
             T_world_camera = hanging.T_world_camera
             self._keyframe_ns = stamp_ns
             with self._timer("places"):
-                self._remember(hanging, grey)
+                self._remember(self._map, hanging, grey)
         self._lost_frames, self._waiting = 0, Waiting()
         self._motion = self._motion.then(stamp_ns, T_world_camera)
         self._add_pose(self._map, frame, hanging, T_world_camera, support.inliers)
@@ -185,7 +188,7 @@ class Mapper:
         if self._map is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         self._whole = self._finishes(self._map)
-        while self.whole_map.loops or (self.whole_map.question and self.whole_map.question.loops):
+        while self.whole_map.loops or self.whole_map.closing:
             self.whole_map.ask(0, self._map)
             if (answer := self.whole_map.settle()) is not None:
                 self._take(self._map, answer)
@@ -264,7 +267,7 @@ class Mapper:
             self._add_pose(self._map, each.frame, each.keyframe, each.T_world_camera, each.inliers)
         stamps_ns = {waiting.frame: waiting.stamp_ns for waiting in self._waiting.frames}
         self._spans.append((self._keyframes, self._map.segment))
-        self._remember(self._map.keyframes[-1], grey)
+        self._remember(self._map, self._map.keyframes[-1], grey)
         newest, before = placed[0], placed[min(1, len(placed) - 1)]
         stamps = stamps_ns[before.frame], stamps_ns[newest.frame]
         poses = before.T_world_camera, newest.T_world_camera
@@ -306,15 +309,10 @@ class Mapper:
         """T_world_camera in the one of the maps that the image shows, which then goes on."""
         if grey is None or not maps:
             return None
-        view, seen = self.calibration.view, describe(grey)
-        segments = {k.id: (k, active.keyframes) for active in maps for k in active.keyframes}
-        places: list[Place] = []
-        for keyframe, segment in (segments[i] for i in self._places.query(seen) if i in segments):
-            features = self._places.features[keyframe.id]
-            there = dataclasses.replace(features, points_px=view.pixels(features.points_px))
-            places.append(Place(keyframe=keyframe, features=there, segment=segment))
+        seen = describe(grey)
+        like = islice(self._places.like(seen, maps, self.calibration.view), _PLACES)
         found = relocalise(
-            seen, places[:_PLACES], self._points, tracks.maxima, grey, self._camera,
+            seen, list(like), self._points, tracks.maxima, grey, self._camera,
             self._parameters, self._generator,
         )  # fmt: skip
         if found is None:
@@ -341,16 +339,19 @@ class Mapper:
         active.links.follow(tracks.ids)
         self._spans.append((self._keyframes, active.segment))
 
-    def _remember(self, keyframe: Keyframe, grey: U8 | None) -> None:
-        """A keyframe is a place to come back to; those that the map has forgotten are not."""
-        if grey is None or self._map is None:
+    def _remember(self, active: ActiveMap, keyframe: Keyframe, grey: U8 | None) -> None:
+        """A keyframe is a place to come back to, and may be one that was seen before."""
+        if grey is None:
             return
-        seen = describe(grey)
-        px = self.calibration.view.seen(seen.points_px)
-        self._places.add(keyframe.id, dataclasses.replace(seen, points_px=px))
-        maps = [self._map, *self._earlier.maps(self.calibration)]
-        known = {k.id for active in maps for k in active.keyframes}
-        self._places.forget(self._places.features.keys() - known)
+        seen, view = describe(grey), self.calibration.view
+        if self._finishes(active) and not self.whole_map.closing:
+            self.whole_map.loops += self._revisits.look(
+                Place(keyframe=keyframe, features=seen, segment=active.keyframes),
+                self._places.like(seen, [active], view), self._points, self._camera,
+                self._parameters,
+            )  # fmt: skip
+        maps = [active, *self._earlier.maps(self.calibration)]
+        self._places.remember(keyframe, seen, maps, view)
 
     def _localise(
         self,

@@ -75,6 +75,11 @@ class WholeMap:
     answer: Answer | None = None
     loops: list[Loop] = field(default_factory=list)
 
+    @property
+    def closing(self) -> bool:
+        """Whether loops are being closed."""
+        return self.question is not None and len(self.question.loops) > 0
+
     def ask(self, frame: int, active: ActiveMap) -> None:
         """Ask for the adjustment of the map as it is after a frame, where that is due."""
         parameters = active.parameters
@@ -91,6 +96,7 @@ class WholeMap:
         points = active.points
         seen = list_map(active.keyframes, points, active.camera, parameters.window.lens_radius)
         keyframe_ids = np.array([keyframe.id for keyframe in active.keyframes], np.int64)
+        loops = [loop for loop in loops if np.isin((loop.old, loop.new), keyframe_ids).all()]
         hosts = np.searchsorted(keyframe_ids, points.first_keyframe[seen.rows], side="right") - 1
         self.question = Question(
             frame=frame,

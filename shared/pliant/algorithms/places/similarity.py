@@ -14,6 +14,9 @@ from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.geometry import hat, so3_exp
 
 _ROUNDS = 10
+_MOST = 1.0
+"""Turn and change of the log scale within one round."""
+
 _MIN_DEPTH = 1e-6
 
 
@@ -53,7 +56,7 @@ def similarity_by_ransac(
     S = _closed_form(pairs.xyz_b[triples], pairs.xyz_a[triples])
     if not len(S):
         return None
-    costs = np.array([np.minimum(_squared(each, pairs), gate * gate).sum() for each in S])
+    costs = np.minimum(_squared(S, pairs), gate * gate).sum(axis=1)
     best = S[int(np.argmin(costs))]
     for _ in range(2):  # with those that agree after the first round
         agreeing = _squared(best, pairs) < gate * gate
@@ -72,6 +75,8 @@ def refine_similarity(S_a_b: F64, pairs: Pairs, *, scale: float) -> F64:
         H = np.einsum("nri,n,nrj->ij", J, weights, J)
         g = np.einsum("nri,n,nr->i", J, weights, residuals)
         step = -np.linalg.solve(H + 1e-12 * np.trace(H) * np.eye(7), g)
+        if not np.abs(step[[0, 1, 2, 6]]).max() < _MOST:
+            break  # nothing holds it
         S_a_b = moved(S_a_b, step)
         if np.abs(step).max() < 1e-10:
             break
@@ -103,8 +108,8 @@ def residuals_of(S_a_b: F64, pairs: Pairs) -> tuple[F64, F64]:
 
 
 def _project(X: F64) -> F64:
-    z = np.where(np.abs(X[:, 2:]) < _MIN_DEPTH, _MIN_DEPTH, X[:, 2:])
-    return X[:, :2] / z
+    z = np.where(np.abs(X[..., 2:]) < _MIN_DEPTH, _MIN_DEPTH, X[..., 2:])
+    return X[..., :2] / z
 
 
 def _slope(X: F64) -> F64:
@@ -117,12 +122,15 @@ def _slope(X: F64) -> F64:
 
 
 def _squared(S_a_b: F64, pairs: Pairs) -> F64:
-    """(N,) the larger squared error of each pair in the two images; infinite behind a camera."""
-    Y = pairs.xyz_b @ S_a_b[:3, :3].T + S_a_b[:3, 3]
-    Z = (pairs.xyz_a - S_a_b[:3, 3]) @ np.linalg.inv(S_a_b[:3, :3]).T
-    a = ((_project(Y) - pairs.seen_a) ** 2).sum(axis=1)
-    b = ((_project(Z) - pairs.seen_b) ** 2).sum(axis=1)
-    return np.where((Y[:, 2] > 0.0) & (Z[:, 2] > 0.0), np.maximum(a, b), np.inf)
+    """(..., N) the larger squared error of each pair in the two images under similarities
+    (..., 4, 4); infinite behind a camera."""
+    A, t = np.swapaxes(S_a_b[..., :3, :3], -1, -2), S_a_b[..., None, :3, 3]
+    Y = pairs.xyz_b @ A + t
+    Z = (pairs.xyz_a - t) @ np.linalg.inv(A)
+    a = ((_project(Y) - pairs.seen_a) ** 2).sum(axis=-1)
+    b = ((_project(Z) - pairs.seen_b) ** 2).sum(axis=-1)
+    front = (Y[..., 2] > 0.0) & (Z[..., 2] > 0.0)
+    return np.where(front, np.maximum(a, b), np.inf)
 
 
 def _closed_form(source: F64, target: F64) -> F64:

@@ -1,0 +1,90 @@
+"""Places of a segment that the camera comes back to: found at keyframes, believed when told twice.
+
+Where the map has not drifted by more than a few pixels, points are found again by where they are,
+and the keyframes share them.  A place that looks like a new keyframe without sharing points with it
+has drifted away, or only looks alike.  One that is the same goes on being so: keyframes that follow
+each other must tell of the same drift.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import so3_log
+from pliant.algorithms.mapping.loops import Loop
+from pliant.algorithms.mapping.map_store import MAPPED, PointRows
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.relocalisation import Place
+from pliant.algorithms.mapping.same_place import same_place
+
+_WITHIN = 3
+"""Keyframes within which another one must tell the same."""
+
+_SAME_TURN_RAD = np.radians(2.0)
+_SAME_SHIFT = 0.05
+"""Drifts are the same within this turn, and this share of the depth: of scale, too."""
+
+
+@dataclass(kw_only=True)
+class Revisits:
+    """waiting: what one keyframe has told, until another one tells the same."""
+
+    waiting: list[Loop] = field(default_factory=list[Loop])
+
+    def look(
+        self,
+        new: Place,
+        places: Iterable[Place],
+        points: PointRows,
+        camera: PinholeCamera,
+        parameters: MappingParameters,
+    ) -> list[Loop]:
+        """The loops that a new keyframe proves: with the place that looks most like it, if any.
+
+        places: of the segment that look like it, the most alike first.
+        """
+        keyframe = new.keyframe
+        mine = np.zeros(len(points.state), np.bool_)
+        mine[keyframe.rows] = True
+        mine &= points.state == MAPPED
+        self.waiting = [loop for loop in self.waiting if keyframe.id - loop.new <= _WITHIN]
+        window = {k.id for k in new.segment[-parameters.window.keyframes :]}
+        # Its own, so that no frame is located otherwise because something was looked at here.
+        generator = np.random.default_rng(keyframe.id)
+        for old in places:
+            shares = int(mine[old.keyframe.rows].sum())
+            if old.keyframe.id in window or shares >= parameters.localisation.min_inliers:
+                continue
+            found = same_place(old, new, points, camera, parameters, generator)
+            if isinstance(found, str):
+                return []
+            rows = found.rows[found.rows[:, 0] != found.rows[:, 1]]
+            loop = Loop(
+                old=old.keyframe.id, new=keyframe.id, S_old_new=found.S_old_new, rows=rows,
+                ids=points.ids[rows],
+            )  # fmt: skip
+            agreeing = [each for each in self.waiting if _agree(each, loop, new, points)]
+            self.waiting = [] if agreeing else [*self.waiting, loop]
+            return [*agreeing, loop] if agreeing else []
+        return []
+
+
+def _agree(one: Loop, other: Loop, new: Place, points: PointRows) -> bool:
+    """Whether loops of two keyframes take what the newer one sees to the same place."""
+    if one.new == other.new:
+        return False
+    keyframe = new.keyframe
+    between: F64 = np.linalg.inv(other.S_old_new) @ one.S_old_new
+    scale = float(np.cbrt(np.linalg.det(between[:3, :3])))
+    turn = float(np.linalg.norm(so3_log(between[:3, :3] / scale)))
+    centre = keyframe.T_world_camera[:3, 3]
+    rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
+    if len(rows) == 0:
+        return False
+    depth = float(np.median((points.xyz[rows] - centre) @ keyframe.T_world_camera[:3, 2]))
+    shift = float(np.linalg.norm(between[:3, :3] @ centre + between[:3, 3] - centre))
+    close = shift < _SAME_SHIFT * depth and abs(np.log(scale)) < _SAME_SHIFT
+    return close and turn < _SAME_TURN_RAD

@@ -1,0 +1,145 @@
+"""Which keyframes are asked whether a place is seen again, and when that is believed."""
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
+from test_mapper import Published, trajectory_error
+from test_recovery import picture, textures
+
+from pliant.algorithms.mapping import revisits
+from pliant.algorithms.mapping.map_store import Keyframe, PointRows
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import (
+    MappingParameters,
+    ReacquisitionParameters,
+    WholeMapParameters,
+    WindowParameters,
+)
+from pliant.algorithms.mapping.relocalisation import Place
+from pliant.algorithms.mapping.revisits import Revisits
+from pliant.algorithms.mapping.same_place import SamePlace
+from pliant.state import load_state, save_state
+
+PARAMETERS = MappingParameters(window=WindowParameters(keyframes=3))
+COUNT, EACH = 20, 50
+
+
+@pytest.fixture
+def segment():
+    """Keyframes that share no points with each other, which lie 4 units ahead of each."""
+    points = PointRows()
+    keyframes = []
+    for number in range(COUNT):
+        rows = points.allocate(EACH)
+        points.promote(rows)
+        points.xyz[rows] = (float(number), 0.0, 4.0)
+        keyframes.append(
+            Keyframe(
+                id=number, frame=number, segment=0, rows=rows,
+                T_world_camera=looking((float(number), 0.0, 0.0)),
+                points_px=np.zeros((EACH, 2), np.float32),
+            )
+        )  # fmt: skip
+    return points, keyframes
+
+
+def drift(shift, scale=1.0):
+    S = np.diag([scale, scale, scale, 1.0])
+    S[0, 3] = shift
+    return S
+
+
+def look(own, monkeypatch, segment, newest, proves, alike=None):
+    """What the newest of the keyframes tells.  proves: the drift by id of the old one.  Also who
+    was asked."""
+    points, keyframes = segment
+    asked = []
+
+    def same_place(old, new, *_):
+        asked.append(old.keyframe.id)
+        S = proves.get(old.keyframe.id)
+        if S is None:
+            return "nothing agrees"
+        rows = np.column_stack([old.keyframe.rows[:40], new.keyframe.rows[:40]])
+        return SamePlace(S_old_new=S, rows=rows)
+
+    monkeypatch.setattr(revisits, "same_place", same_place)
+    known = keyframes[: newest + 1]
+    places = [Place(keyframe=k, features=None, segment=known) for k in known]
+    some = [places[k] for k in alike or proves if k < newest]
+    return own.look(places[-1], some, points, CAMERA, PARAMETERS), asked
+
+
+def test_two_keyframes_must_tell_the_same(monkeypatch, segment):
+    own = Revisits()
+    assert look(own, monkeypatch, segment, 10, {1: drift(-3.0)})[0] == []
+    loops, _ = look(own, monkeypatch, segment, 11, {2: drift(-3.05)})
+    assert [(loop.old, loop.new) for loop in loops] == [(1, 10), (2, 11)]
+    points, _ = segment
+    for loop in loops:
+        np.testing.assert_array_equal(loop.ids, points.ids[loop.rows])
+    assert own.waiting == []
+
+
+@pytest.mark.parametrize(
+    "other", [drift(-2.0), drift(-3.0, 1.2), looking((-3.0, 0, 0), (0, 0.1, 0))]
+)
+def test_keyframes_that_contradict_each_other_prove_nothing(monkeypatch, segment, other):
+    own = Revisits()
+    look(own, monkeypatch, segment, 10, {1: drift(-3.0)})
+    assert look(own, monkeypatch, segment, 11, {2: other})[0] == []
+    # Whichever of them a third one agrees with.
+    loops, _ = look(own, monkeypatch, segment, 12, {2: drift(-3.0)})
+    assert [(loop.old, loop.new) for loop in loops] == [(1, 10), (2, 12)]
+
+
+def test_one_keyframe_is_no_witness_for_itself(monkeypatch, segment):
+    own = Revisits()
+    for _ in range(2):
+        assert look(own, monkeypatch, segment, 10, {1: drift(-3.0)})[0] == []
+
+
+def test_what_was_told_long_ago_counts_no_more(monkeypatch, segment):
+    own = Revisits()
+    look(own, monkeypatch, segment, 10, {1: drift(-3.0)})
+    assert look(own, monkeypatch, segment, 14, {2: drift(-3.0)})[0] == []
+
+
+def test_neither_the_window_nor_what_shares_points_is_asked(monkeypatch, segment):
+    points, keyframes = segment
+    keyframes[10].rows = np.concatenate([keyframes[10].rows, keyframes[5].rows])
+    _, asked = look(Revisits(), monkeypatch, segment, 10, {}, alike=[9, 8, 5, 4, 3, 2, 1])
+    assert asked == [4]
+    points.state[keyframes[5].rows] = 0
+    _, asked = look(Revisits(), monkeypatch, segment, 10, {}, alike=[9, 8, 5, 4, 3, 2, 1])
+    assert asked == [5]
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_the_mapper_closes_a_loop_that_it_sees(killed):
+    """Along a wall and back, where lost points are never found: they are mapped twice, until
+    the place is recognised."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform((-4.0, -3.0, 3.0), (17.0, 3.0, 7.0), (1300, 3))
+    scene = Scene(points, generator.uniform(5.0, 500.0, len(points)).astype(np.float32))
+    poses = [looking((0.26 * min(k, 100 - k), 0.02 * np.sin(0.3 * k), 0.0)) for k in range(100)]
+    squares = textures(len(points))
+    parameters = MappingParameters(
+        window=WindowParameters(keyframes=5),
+        reacquisition=ReacquisitionParameters(min_zncc=1.0),
+        whole_map=WholeMapParameters(growth=0.0, distance_frames=3),
+    )
+    mapper, published, moved = Mapper(CAMERA, parameters, 0), Published(), []
+    for k, tracks in enumerate(scene.frames(poses)):
+        if killed and mapper.whole_map.closing:
+            mapper = load_state(save_state(mapper))
+        grey = picture(scene, squares, poses[k])
+        delta = mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
+        published.apply(delta)
+        moved.append(len(delta.moved_keyframes))
+    assert sum(count > 0 for count in moved) >= 1
+    keyframes = mapper._map.keyframes
+    assert len(np.intersect1d(keyframes[0].rows, keyframes[-1].rows)) >= 30
+    assert mapper.point_count < 1.3 * len(points)
+    published.apply(mapper.finish())
+    assert trajectory_error(published, poses)[0] < 1e-3
