@@ -46,15 +46,31 @@ class Scene:
         kappas = generator.uniform(5.0, 500.0, count).astype(np.float32)
         return Scene(points, kappas, seed=seed, **kwargs)
 
-    def frames(self, poses):
-        """FrameTracks of every pose."""
+    def _px(self, T_world_camera):
+        camera_points = transform(inverse(T_world_camera), self.points)
+        return CAMERA.project(np.where(camera_points[:, 2:] > 0.1, camera_points, 1.0))
+
+    def frames(self, poses, *, later=None, readout=0.0):
+        """FrameTracks of every pose.
+
+        later(t): the pose after t frames, where the readout takes that share of the interval.
+        """
         generator = np.random.default_rng(self.seed + 1)
         track_of = np.full(len(self.points), -1, np.int64)
         born = np.zeros(len(self.points), np.int32)
         next_id = 0
         for frame, T_world_camera in enumerate(poses):
             camera_points = transform(inverse(T_world_camera), self.points)
-            px = CAMERA.project(np.where(camera_points[:, 2:] > 0.1, camera_points, 1.0))
+            px = self._px(T_world_camera)
+            if readout:
+                # Quadratic in the time since the middle row, which depends on the row again.
+                before, after = (self._px(later(frame + 0.5 * side)) for side in (-1, 1))
+                slope, bend = after - before, 2.0 * (after + before - 2.0 * px)
+                middle = px
+                for _ in range(5):
+                    row = np.clip(px[:, 1:], 0.0, CAMERA.height - 1.0)
+                    t = readout * (row - 0.5 * (CAMERA.height - 1)) / CAMERA.height
+                    px = middle + t * slope + t * t * bend
             px += generator.normal(0.0, self.noise_px, px.shape)
             inside = (camera_points[:, 2] > 0.1) & (px > 10).all(axis=1)
             inside &= (px < (CAMERA.width - 10, CAMERA.height - 10)).all(axis=1)

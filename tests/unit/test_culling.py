@@ -22,6 +22,7 @@ def keyframe(number: int, x: float, rows: list[int], focus: tuple[float, ...] | 
         T_world_camera=T_world_camera,
         rows=np.array(rows, np.int32),
         points_px=np.zeros((len(rows), 2), np.float32),
+        rolled_px=np.zeros((len(rows), 2), np.float32),
         focus=None if focus is None else np.array(focus),
     )
 

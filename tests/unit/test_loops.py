@@ -91,9 +91,9 @@ def error(active):
 
 
 def close(mapper):
-    mapper.whole_map.ask(2 * AWAY, mapper._map)
+    mapper.whole_map.ask(2 * AWAY, mapper._map, mapper._path, 0.0)
     answer = mapper.whole_map.settle()
-    mapper._motion = mapper._motion.moved(mapper._take(mapper._map, answer))
+    mapper._take_over(mapper._map, mapper._motion, answer)
     return answer
 
 
@@ -116,7 +116,7 @@ def test_a_loop_takes_out_the_drift_and_joins_the_points(drifted):
 def test_the_map_goes_on_and_readers_have_it(drifted):
     scene, frames, mapper, published = drifted
     mapper.whole_map.loops.append(recognised(scene, mapper))
-    mapper.whole_map.ask(2 * AWAY - 1, mapper._map)
+    mapper.whole_map.ask(2 * AWAY - 1, mapper._map, mapper._path, 0.0)
     for k in range(2 * AWAY, 2 * AWAY + 10):
         mapper = load_state(save_state(mapper))
         published.apply(mapper.process(k, k * INTERVAL_NS, frames[k], None, None))
@@ -144,7 +144,7 @@ def test_a_loop_that_waits_moves_with_the_map(drifted):
     scene, _, mapper, _ = drifted
     loop = recognised(scene, mapper)
     mapper.whole_map.loops.append(loop)
-    mapper.whole_map.ask(0, mapper._map)
+    mapper.whole_map.ask(0, mapper._map, mapper._path, 0.0)
     mapper.whole_map.loops.append(loop)
     close(mapper)
     (waiting,) = mapper.whole_map.loops

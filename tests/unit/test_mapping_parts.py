@@ -67,10 +67,12 @@ def test_observations_of_merged_rows_become_one():
         id=0, frame=0, segment=0, T_world_camera=np.eye(4),
         rows=np.array([1, 2, 5], np.int32),
         points_px=np.array([[1, 1], [2, 2], [5, 5]], np.float32),
+        rolled_px=np.array([[0, 1], [0, 2], [0, 5]], np.float32),
     )  # fmt: skip
     keyframe.follow_aliases(points)
     assert keyframe.rows.tolist() == [1, 2]
     assert keyframe.points_px.tolist() == [[1, 1], [2, 2]]
+    assert keyframe.rolled_px.tolist() == [[0, 1], [0, 2]]
 
 
 @settings(max_examples=50)
@@ -85,12 +87,14 @@ def test_merged_rows_are_followed_as_numpy_would(seed, share):
     rows = np.flatnonzero(rng.random(40) < 0.7).astype(np.int32)
     px = rng.normal(size=(len(rows), 2)).astype(np.float32)
     keyframe = Keyframe(
-        id=0, frame=0, segment=0, T_world_camera=np.eye(4), rows=rows, points_px=px
+        id=0, frame=0, segment=0, T_world_camera=np.eye(4), rows=rows, points_px=px,
+        rolled_px=2.0 * px,
     )  # fmt: skip
     keyframe.follow_aliases(points)
     expected, first = np.unique(points.alias[rows], return_index=True)
     np.testing.assert_array_equal(keyframe.rows, expected)
     np.testing.assert_array_equal(keyframe.points_px, px[first])
+    np.testing.assert_array_equal(keyframe.rolled_px, 2.0 * px[first])
 
 
 @settings(max_examples=50)
@@ -262,7 +266,8 @@ def keyframe_at(number, x):
     pose[0, 3] = x
     return Keyframe(
         id=number, frame=number, segment=0, T_world_camera=pose, rows=np.array([number], np.int32),
-        points_px=np.zeros((1, 2), np.float32), focus=np.array([x, 0.0, 5.0]),
+        points_px=np.zeros((1, 2), np.float32), rolled_px=np.zeros((1, 2), np.float32),
+        focus=np.array([x, 0.0, 5.0]),
     )  # fmt: skip
 
 

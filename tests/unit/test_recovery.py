@@ -112,13 +112,14 @@ def test_another_place_is_not_taken_for_the_map(seen):
 
 def test_time_not_frames_decides_how_far_the_camera_has_gone():
     first, second = looking((0.0, 0.0, 0.0)), looking((0.1, 0.0, 0.0), (0.0, 0.02, 0.0))
-    motion = Motion(stamps_ns=(0, INTERVAL_NS), poses=(first, second))
+    motion = Motion(frames=(0, 1), stamps_ns=(0, INTERVAL_NS), poses=(first, second))
     moved, still = motion.predictions(4 * INTERVAL_NS)
     expected = np.linalg.matrix_power(inverse(first) @ second, 4)
     np.testing.assert_allclose(moved[:3, :3], expected[:3, :3], atol=1e-12)
     np.testing.assert_allclose(moved[:3, 3], [0.4, 0.0, 0.0], atol=0.02)
     np.testing.assert_array_equal(still, second)
-    assert len(Motion(stamps_ns=(5, 5), poses=(first, first)).predictions(9)) == 1
+    at_once = Motion(frames=(1, 1), stamps_ns=(5, 5), poses=(first, first))
+    assert len(at_once.predictions(9)) == 1
 
 
 def test_the_search_grows_with_the_time_without_a_pose_and_has_an_end():

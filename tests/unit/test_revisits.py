@@ -38,6 +38,7 @@ def segment():
                 id=number, frame=number, segment=0, rows=rows,
                 T_world_camera=looking((float(number), 0.0, 0.0)),
                 points_px=np.zeros((EACH, 2), np.float32),
+                rolled_px=np.zeros((EACH, 2), np.float32),
             )
         )  # fmt: skip
     return points, keyframes

@@ -1,12 +1,20 @@
 """Rolling shutter: the motion at a keyframe, and what it does to observations."""
 
+import mapping_scene
 import numpy as np
 import pytest
+from mapping_scene import INTERVAL_NS, Scene, looking
 
+from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse, so3_exp
+from pliant.algorithms.geometry import align_umeyama, inverse, so3_exp
 from pliant.algorithms.mapping.map_store import Keyframe
-from pliant.algorithms.mapping.rolling_shutter import Path, readout_flow
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.recovery import Motion
+from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame, readout_flow
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.map_history import MapHistory
 
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
 OMEGA, NU = np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.01, 0.02])
@@ -24,7 +32,7 @@ def keyframe(number, T_world_camera):
     none = np.zeros(0, np.int32)
     return Keyframe(
         id=number, frame=10 * number, segment=0, T_world_camera=T_world_camera, rows=none,
-        points_px=np.zeros((0, 2), np.float32),
+        points_px=np.zeros((0, 2), np.float32), rolled_px=np.zeros((0, 2), np.float32),
     )  # fmt: skip
 
 
@@ -68,3 +76,143 @@ def test_the_flow_is_what_the_readout_does_to_the_projection(t):
     expected = share[:, None] * velocity
     expected[7] = 0.0
     np.testing.assert_allclose(flow, expected, rtol=1e-3, atol=1e-3)
+
+
+def taken_at_once(world):
+    """(q, p) of points (N, 3): where pose(0.0) shows them, and where a readout of READOUT does."""
+
+    def px(t, X):
+        T = pose(t)
+        return CAMERA.project((X - T[:3, 3])[None] @ T[:3, :3])[0]
+
+    q = np.array([px(0.0, X) for X in world])
+    p = q.copy()
+    for _ in range(20):
+        times = READOUT * (p[:, 1] - 239.5) / 480.0
+        p = np.array([px(t, X) for t, X in zip(times, world, strict=True)])
+    return q.astype(np.float32), p.astype(np.float32)
+
+
+READOUT = 0.7
+MOTION = np.array([*OMEGA, *NU])
+
+
+def test_what_a_readout_has_moved_is_moved_back():
+    rng = np.random.default_rng(1)
+    world = rng.uniform((-1.5, -1.0, 3.0), (1.5, 1.0, 6.0), (200, 3))
+    q, p = taken_at_once(world)
+    rolled = RolledFrame(CAMERA, READOUT, MOTION, 0.25)
+    error = np.linalg.norm(p - rolled.shifts(p, 1.0 / world[:, 2]) - q, axis=1)
+    assert np.linalg.norm(p - q, axis=1).max() > 2.5
+    assert error.max() < 0.03  # the motion is taken as straight
+    # Found in an image of a common depth, and then put where its own depth puts it.
+    common = p - rolled.shifts(p)
+    points_px, shifts = rolled.found(common, 1.0 / world[:, 2])
+    assert np.linalg.norm(points_px - q, axis=1).max() < 0.03
+    np.testing.assert_allclose(points_px + shifts, p, atol=0.01)
+
+
+def test_an_image_is_as_if_taken_at_once():
+    rolled = RolledFrame(CAMERA, READOUT, MOTION, 0.25)
+    u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    for seen in np.array([[100.3, 40.8], [320.0, 239.5], [560.7, 420.2]], np.float32):
+        blob = 250.0 * np.exp(-((u - seen[0]) ** 2 + (v - seen[1]) ** 2) / 18.0)
+        image = rolled.image(np.round(blob).astype(np.uint8)).astype(np.float64)
+        centre = np.array([(image * u).sum(), (image * v).sum()]) / image.sum()
+        np.testing.assert_allclose(centre, seen - rolled.shifts(seen[None])[0], atol=0.1)
+
+
+def test_a_motion_goes_on_to_change_as_it_did():
+    frames, poses = (3, 4), (pose(-2.0), pose(-1.0))
+    steady = Motion(frames=frames, stamps_ns=(0, 1), poses=poses)
+    np.testing.assert_allclose(steady.velocity_at(5, pose(0.0)), MOTION, rtol=0.05, atol=1e-3)
+    faster = Motion(frames=frames, stamps_ns=(0, 1), poses=(pose(-1.0), pose(-1.0)))
+    assert np.linalg.norm(faster.velocity_at(5, pose(0.0))) > 1.2 * np.linalg.norm(MOTION)
+
+
+class Shaken:
+    """A hand-held camera that slides along a box of points, with this readout."""
+
+    def __init__(self, readout, frames=100):
+        self.frames, self.readout = frames, readout
+        self.poses = [self.at(k) for k in range(frames)]
+
+    def at(self, t):
+        shake = np.array([np.sin(0.3 * t), np.cos(0.25 * t), 0.6 * np.sin(0.2 * t)])
+        position = (0.04 * t, 0.0, 0.0) + 0.1 * shake
+        return looking(position, (0.04 * np.sin(0.27 * t), 0.04 * np.cos(0.2 * t), 0.0))
+
+    def mapped(self, *, prior=0.1, known=0.0):
+        """The mapper, the history at its end, and the tracks and keyframes of each frame.
+
+        prior: of the readout.   known: the readout that the mapper is told.
+        """
+        parameters = MappingParameters(calibration=CalibrationUncertainty(readout=prior))
+        calibration = SelfCalibration.of(mapping_scene.CAMERA, parameters.calibration)
+        calibration = calibration.with_readout(known, 1e-3)
+        mapper = Mapper(mapping_scene.CAMERA, parameters, 0, calibration)
+        history, tracks, keyframes = MapHistory(), [], []
+        for frame, some in enumerate(
+            Scene.box().frames(self.poses, later=self.at, readout=self.readout)
+        ):
+            tracks.append(some)
+            delta = mapper.process(frame, frame * INTERVAL_NS, some, None, None)
+            history.apply(delta, frame=frame, stamp_ns=frame)
+            keyframes.append(mapper.publish_keyframes())
+        return mapper, history, tracks, keyframes
+
+    def error(self, history, poses):
+        """Sim(3) RMSE of the causal or final poses."""
+        at = history.trajectory(poses).T_world_camera[:, :3, 3]
+        true = np.array(self.poses)[sorted(poses), :3, 3]
+        scale, R, t = align_umeyama(at, true, with_scale=True)
+        return np.sqrt(((scale * at @ R.T + t - true) ** 2).sum(axis=1).mean())
+
+
+@pytest.fixture(scope="module")
+def rolling():
+    shaken = Shaken(0.6)
+    return shaken, *shaken.mapped()
+
+
+def test_the_readout_is_found_and_straightens_the_map(rolling):
+    shaken, mapper, history, _, _ = rolling
+    assert mapper.calibration.readout == pytest.approx(0.6, abs=0.03)
+    final = finished(mapper, history)
+    _, straight, _, _ = Shaken(0.0).mapped()
+    bent, without, _, _ = shaken.mapped(prior=0.0)
+    assert shaken.error(history, final) < 0.5 * shaken.error(without, finished(bent, without))
+    assert shaken.error(straight, straight.causal) < shaken.error(history, final)
+    assert mapper.calibration.readout == pytest.approx(0.6, abs=0.02)
+
+
+def finished(mapper, history):
+    """The final poses."""
+    history.apply(mapper.finish(), frame=99, stamp_ns=99, final=True)
+    return history.final()
+
+
+def test_frames_with_a_known_readout_are_as_good_as_if_taken_at_once():
+    shaken, straight = Shaken(0.6), Shaken(0.0)
+    _, history, _, _ = shaken.mapped(known=0.6)
+    _, best, _, _ = straight.mapped()
+    reached = shaken.error(history, history.causal)
+    assert reached < 1.5 * straight.error(best, best.causal)
+
+
+def test_published_is_what_was_seen():
+    mapper, _, tracks, keyframes = Shaken(0.6, frames=60).mapped(known=0.6)
+    newest = mapper._map.keyframes[-1]
+    assert np.abs(newest.rolled_px).max() > 0.5
+    told = next(delta for delta in reversed(keyframes) if delta.new >= 0)
+    seen = tracks[newest.frame].points_px
+    told_px = told.points_px[-told.counts[-1] :]
+    nearest = np.abs(told_px[:, None] - seen[None]).max(axis=2).min(axis=1)
+    assert len(told_px) > 100
+    assert np.quantile(nearest, 0.9) < 1e-3
+
+
+def test_a_global_shutter_stays_one():
+    mapper, _, _, _ = Shaken(0.0, frames=60).mapped()
+    assert mapper.calibration.readout == 0.0
+    assert not any(keyframe.rolled_px.any() for keyframe in mapper._map.keyframes)

@@ -134,7 +134,7 @@ def test_a_drifted_map_comes_back():
     drifted = error(active)
     assert drifted > 10.0 * usual
     active.parameters = GROWING.model_copy(update={"window": WindowParameters(keyframes=3)})
-    mapper.whole_map.ask(120, active)
+    mapper.whole_map.ask(120, active, mapper._path, 0.0)
     moves = find_moves(mapper.whole_map.question).moves
     assert len(moves.keyframe_ids) == len(ids) - 3
     move_map(active, moves, mapper._path)

@@ -32,6 +32,7 @@ def _map() -> None:
     from pliant.algorithms.mapping.map_store import Keyframe, PointRows
     from pliant.algorithms.mapping.mapper import Mapper
     from pliant.algorithms.mapping.parameters import MappingParameters
+    from pliant.algorithms.mapping.self_calibration import SelfCalibration
     from pliant.algorithms.places.features import describe, match
     from pliant.algorithms.places.index import PlaceIndex
 
@@ -42,7 +43,9 @@ def _map() -> None:
     kappas = generator.uniform(1.0, 100.0, n).astype(np.float32)
     grey = generator.integers(0, 256, (240, 320), np.uint8)
     colour = np.repeat(grey[:, :, None], 3, axis=2)
-    mapper = Mapper(camera, MappingParameters(), seed=0)
+    parameters = MappingParameters()
+    known = SelfCalibration.of(camera, parameters.calibration).with_readout(0.11, 0.01)
+    mapper = Mapper(camera, parameters, seed=0, calibration=known)
     for frame in range(frames):
         step = min(frame, frames - 2)
         turned = points @ so3_exp(np.array([0.0, 0.01 * step, 0.0])).T
@@ -67,7 +70,7 @@ def _map() -> None:
     pose_by_ransac(points, camera.normalise(px), generator, gate=0.1, samples=1)
     keyframe = Keyframe(
         id=0, frame=0, segment=0, T_world_camera=np.eye(4), rows=np.zeros(1, np.int32),
-        points_px=px[:1],
+        points_px=px[:1], rolled_px=px[:1],
     )  # fmt: skip
     keyframe.follow_aliases(PointRows())
     seen, places = describe(grey), PlaceIndex()

@@ -36,7 +36,7 @@ from pliant.algorithms.mapping.observation_table import (
 )
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, Reacquired, cut_patches
-from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.window import Window
@@ -54,6 +54,8 @@ _NEAR_KEYFRAMES = 24
 
 _CLEAR_SHARE = 0.7
 """Share of the least parallax under which noise does not make rays differ enough."""
+
+_MIN_DEPTH = 1e-6
 
 _MAX_STRIKES = 3
 """Bad frames in a row after which a track is taken from its point."""
@@ -133,6 +135,7 @@ class ActiveMap:
                 start.T_world_camera[k],
                 np.concatenate([rows[start.point_index[supported]], self.links.rows[j[others]]]),
                 np.concatenate([start.points_px[supported], frames[number].points_px[i[others]]]),
+                None,
             )
         self._settle(self.keyframes[-1], grey)
 
@@ -191,7 +194,10 @@ class ActiveMap:
         for old, to in zip(former[taken].tolist(), new[taken].tolist(), strict=True):
             if old != UNLINKED:
                 self._merge(old, to)
-        return Observations(rows=reacquired.rows[alone], points_px=reacquired.points_px[alone])
+        points_px = reacquired.points_px[alone]
+        return Observations(
+            rows=reacquired.rows[alone], points_px=points_px, rolled_px=np.zeros_like(points_px)
+        )
 
     def _same_depth(self, a: I32, b: I32) -> BoolArray:
         """Whether points that lie on nearly the same ray are as far from the newest keyframe."""
@@ -283,6 +289,7 @@ class ActiveMap:
         frame: int,
         T_world_camera: F64,
         points_px: F32,
+        rolled_px: F32,
         found: Observations,
         grey: U8 | None,
         colour: U8 | None,
@@ -290,7 +297,7 @@ class ActiveMap:
     ) -> Keyframe:
         """Make the frame a keyframe and adjust the window.
 
-        points_px: of all living tracks.    found: points that it sees without a track.
+        points_px, rolled_px: of all living tracks.   found: points that it sees without a track.
         turned: whether it stands where the last one does.
         """
         new = self._link_new_tracks(points_px)
@@ -301,6 +308,7 @@ class ActiveMap:
             T_world_camera,
             np.concatenate([self.links.rows, found.rows]),
             np.concatenate([points_px, found.points_px]),
+            np.concatenate([rolled_px, found.rolled_px]),
         )
         keyframe.turned = turned
         self._settle(keyframe, grey)
@@ -311,14 +319,17 @@ class ActiveMap:
         self.collect_garbage()
         self.rebuild_window()
         self.triangulate()
-        self.window.adjust(self.camera, self.parameters)
-        self.remove_outliers()
-        self.window.update_statistics(self.camera)
+        self._adjust_window()
         self._inverse_distance = self.window.place_directions(self.camera, self._inverse_distance)
         if grey is not None:
             mapped = self.points.state[newest.rows] == MAPPED
             rows, points_px = newest.rows[mapped], newest.points_px[mapped]
             cut_patches(grey, points_px, rows, self.points.patches)
+
+    def _adjust_window(self) -> None:
+        self.window.adjust(self.camera, self.parameters)
+        self.remove_outliers()
+        self.window.update_statistics(self.camera)
 
     def _link_new_tracks(self, points_px: F32) -> I64:
         """Give candidate rows to tracks that have none.  Returns the indices of those tracks."""
@@ -335,7 +346,7 @@ class ActiveMap:
             self.points.colours[rows] = sample_colours(image, points_px)
 
     def _append_keyframe(
-        self, frame: int, T_world_camera: F64, rows: I32, points_px: F32
+        self, frame: int, T_world_camera: F64, rows: I32, points_px: F32, rolled_px: F32 | None
     ) -> Keyframe:
         rows, first = np.unique(rows, return_index=True)
         keyframe = Keyframe(
@@ -345,10 +356,41 @@ class ActiveMap:
             T_world_camera=T_world_camera.copy(),
             rows=rows,
             points_px=points_px[first],
+            rolled_px=np.zeros((len(first), 2), np.float32)
+            if rolled_px is None
+            else rolled_px[first],
         )
         self._next_keyframe_id += 1
         self.keyframes.append(keyframe)
         return keyframe
+
+    def rolled(self, readout: float, motion: F64) -> RolledFrame:
+        """What the readout does to a frame that moves so."""
+        return RolledFrame(self.camera, readout, motion, self._inverse_distance)
+
+    def inverse_depths(self, rows: I32, T_world_camera: F64) -> F64:
+        """(n,) of the rows (UNLINKED among them) in a camera; the map's where they are unknown."""
+        mapped = (rows != UNLINKED) & (self.points.state[rows] == MAPPED)
+        z = (self.points.xyz[rows] - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
+        known = mapped & (z > _MIN_DEPTH)
+        return np.divide(1.0, z, out=np.full(len(rows), self._inverse_distance), where=known)
+
+    def unroll(self, keyframes: list[Keyframe], path: Path, readout: float) -> None:
+        """Let keyframes see as if they had been taken at once, as is now known of readout, motion
+        and depths; those of which no motion is known any more stay."""
+        for keyframe, motion in zip(keyframes, path.motions(keyframes), strict=True):
+            if not motion.any():
+                continue
+            seen = keyframe.points_px + keyframe.rolled_px
+            depths = self.inverse_depths(keyframe.rows, keyframe.T_world_camera)
+            keyframe.rolled_px = self.rolled(readout, motion).shifts(seen, depths)
+            keyframe.points_px = seen - keyframe.rolled_px
+
+    def begin_to_unroll(self, path: Path, readout: float) -> None:
+        """The readout has become known: the map is bent until its window is adjusted with it."""
+        self.unroll(self.keyframes, path, readout)
+        self.window.see_anew()
+        self._adjust_window()
 
     def collect_garbage(self) -> None:
         """Give back the rows of dead candidates and of merged points."""
@@ -405,6 +447,7 @@ class ActiveMap:
         known, gone = adjust_keyframes(self.keyframes, self.points, known, self.parameters, motions)
         self._remove(gone)
         self.camera = known.view.camera
+        self.unroll(self.keyframes, path, known.readout)
         self.rebuild_window()
         return known
 

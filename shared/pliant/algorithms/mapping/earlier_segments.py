@@ -3,8 +3,6 @@ when each is adjusted as a whole."""
 
 from typing import NamedTuple
 
-import numpy as np
-
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.map_store import PointRows
 from pliant.algorithms.mapping.rolling_shutter import Path
@@ -32,9 +30,13 @@ class EarlierSegments:
         self._kept.append(_Earlier(active, path, calibration))
 
     def maps(self, calibration: SelfCalibration) -> list[ActiveMap]:
-        """Those whose keyframes have the pixels of a calibration, oldest first."""
-        known = calibration.correction
-        return [e.map for e in self._kept if np.array_equal(e.calibration.correction, known)]
+        """Those whose keyframes have the pixels of a calibration, whatever its readout was, oldest
+        first."""
+        view = calibration.view
+        known = view.camera, view.lens
+        views = [each.calibration.view for each in self._kept]
+        same = [(view.camera, view.lens) == known for view in views]
+        return [e.map for e, fits in zip(self._kept, same, strict=True) if fits]
 
     def take(self, segment: int) -> tuple[ActiveMap, Path]:
         """A segment goes on."""

@@ -18,6 +18,9 @@ from pliant.algorithms.mapping.rolling_shutter import readout_flow
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.triangulation import spread_of_rays
 
+_ROLLING = 1.0
+"""Standard deviation of the readout of a shutter that is known to roll."""
+
 _CHUNK = 4096
 """Points whose rays are compared at a time: bounds a dense table of keyframes x points."""
 
@@ -51,7 +54,8 @@ def adjust_keyframes(
     """Schur LM over all but the first keyframe, their points and the calibration.
 
     Observations that then miss their point are forgotten, and what is said of the points is
-    brought up to date.  The keyframes' pixels become those of the camera that is found.
+    brought up to date.  The keyframes' pixels become those of the camera that is found, but for the
+    readout.
     known: of the camera, whose pixels the keyframes have.    motions: (M, 6) of the keyframes, see
     ``Path``.    Returns what is known now, and the rows of points that too few keyframes see.
     """
@@ -79,7 +83,8 @@ def adjust_keyframes(
     count = np.bincount(seen.point[good], minlength=len(seen.rows))
     _update_statistics(seen, good, count, points, view.camera)
     for keyframe in keyframes:
-        keyframe.points_px = view.pixels(before.seen(keyframe.points_px))
+        keyframe.points_px = view.pixels(before.seen(keyframe.points_px + keyframe.rolled_px))
+        keyframe.rolled_px = np.zeros_like(keyframe.points_px)
     return known, seen.rows[count < 2]
 
 
@@ -95,11 +100,14 @@ def adjust_listed(
     """Schur LM over all but the first keyframe, all points that two see, and the calibration.
 
     ``seen`` is changed, but for its observations.  start: (6,) correction of the calibration to
-    begin from.
+    begin from; where that has a readout, nothing draws it to 0.
     """
     chosen = np.bincount(seen.point, minlength=len(seen.rows)) >= 2
     bundle = parameters.bundle.model_copy(update={"max_iterations": iterations})
     uncertainty = parameters.calibration if parameters.calibration.sigmas.any() else None
+    if start is not None and start[3] and parameters.calibration.readout > 0.0:
+        wide = max(parameters.calibration.readout, _ROLLING)
+        uncertainty = parameters.calibration.model_copy(update={"readout": wide})
     problem = _problem(seen, chosen, camera)
     found = solve_schur(
         problem, bundle, uncertainty=uncertainty, start=start, with_covariance=with_covariance
@@ -112,9 +120,11 @@ def adjust_listed(
 def list_map(
     keyframes: list[Keyframe], points: PointRows, camera: PinholeCamera, lens_radius: float
 ) -> ListedMap:
+    """px: as the rolling shutter saw them."""
     mapped = [points.state[keyframe.rows] == MAPPED for keyframe in keyframes]
-    listed = [k.rows[each] for k, each in zip(keyframes, mapped, strict=True)]
-    px = np.concatenate([k.points_px[each] for k, each in zip(keyframes, mapped, strict=True)])
+    pairs = list(zip(keyframes, mapped, strict=True))
+    listed = [k.rows[each] for k, each in pairs]
+    px = np.concatenate([(k.points_px + k.rolled_px)[each] for k, each in pairs])
     sizes = np.array([len(rows) for rows in listed])
     rows, point = np.unique(np.concatenate(listed), return_inverse=True)
     # Oldest first, which decides among points that are observed as often.

@@ -73,6 +73,7 @@ def close_loops(
     closed = replace(
         seen, T_world_camera=move_by_similarity(moves, S), xyz=xyz, camera=seen.camera[kept],
         point=point[kept], px=seen.px[kept], weights=seen.weights[kept],
+        flow=None if seen.flow is None else seen.flow[kept],
     )  # fmt: skip
     return closed, kept, accepted
 

@@ -114,6 +114,7 @@ class Keyframe:
     """A keyframe and what it observed.
 
     rows: (n,) rows of points or candidates, each at most once.    points_px: (n, 2).
+    rolled_px: (n, 2) by how much farther a rolling shutter had moved them, see ``RolledFrame``.
     published_pose: T_world_camera when last published.
     turned: it stands where the last one does: what turns on the spot tells nothing of depths, and
     its pose rests on all that it saw when it was made.
@@ -127,17 +128,22 @@ class Keyframe:
     T_world_camera: F64
     rows: I32
     points_px: F32
+    rolled_px: F32
     turned: bool = False
     published_pose: F64 | None = None
     focus: F64 | None = None
 
     def keep(self, mask: BoolArray) -> None:
         """Forget the observations that are not in the mask."""
-        self.rows, self.points_px = _kept(self.rows, self.points_px, mask)
+        rows = self.rows
+        _, self.rolled_px = _kept(rows, self.rolled_px, mask)
+        self.rows, self.points_px = _kept(rows, self.points_px, mask)
 
     def follow_aliases(self, points: PointRows) -> None:
         """Let observations of merged rows stand for the rows that took them in."""
-        self.rows, self.points_px = _follow_aliases(self.rows, self.points_px, points.alias)
+        rows, alias = self.rows, points.alias
+        _, self.rolled_px = _follow_aliases(rows, self.rolled_px, alias)
+        self.rows, self.points_px = _follow_aliases(rows, self.points_px, alias)
 
 
 @kernel
@@ -190,10 +196,11 @@ def _follow_aliases(rows: I32, points_px: F32, alias: I32) -> tuple[I32, F32]:
 
 @dataclass(frozen=True, kw_only=True)
 class Observations:
-    """What a frame sees of the map: rows (n,), each once, and points_px (n, 2)."""
+    """What a frame sees of the map: rows (n,), each once, points_px and rolled_px (n, 2)."""
 
     rows: I32
     points_px: F32
+    rolled_px: F32
 
 
 class TrackLinks:

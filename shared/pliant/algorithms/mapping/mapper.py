@@ -10,7 +10,7 @@ from itertools import islice
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, I64, U8
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
@@ -32,7 +32,7 @@ from pliant.algorithms.mapping.reacquisition import reacquire
 from pliant.algorithms.mapping.recovery import Motion, recover
 from pliant.algorithms.mapping.relocalisation import Place, relocalise
 from pliant.algorithms.mapping.revisits import Revisits
-from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, is_guess
 from pliant.algorithms.mapping.start import Start
 from pliant.algorithms.mapping.support import Support, doubt, support_of
@@ -109,15 +109,20 @@ class Mapper:
         if self._map is not None and self._motion is not None:
             with self._timer("whole map"):
                 if (answer := self.whole_map.take(frame)) is not None:
-                    self._motion = self._motion.moved(self._take(self._map, answer))
+                    self._take_over(self._map, self._motion, answer)
             self._map.links.follow(tracks.ids)
-        located = self._locate(stamp_ns, tracks, grey)
+        seen, rolled = tracks, None
+        located = self._locate(frame, stamp_ns, seen, grey)
         if self._map is None or self._motion is None:
             return self._wait(frame, stamp_ns, tracks, grey, colour)
         if located is None:
-            return self._lost(self._map, frame, stamp_ns, tracks)
+            return self._lost(self._map, frame, stamp_ns, seen)
         with self._timer("reacquisition"):
-            T_world_camera, found = self._reacquire(self._map, frame, located, tracks, grey)
+            if self.calibration.readout:
+                velocity = self._motion.velocity_at(frame, located)
+                tracks, rolled = self._at_once(self._map, located, velocity, seen)
+                grey = grey if grey is None else rolled.image(grey)
+            T_world_camera, found = self._reacquire(self._map, frame, located, tracks, grey, rolled)
         with self._timer("subspace adjustment"):
             T_world_camera, support = self._adjust(self._map, T_world_camera, found, tracks)
         with self._timer("triangulation"):
@@ -127,19 +132,23 @@ class Mapper:
         if self._keyframe_is_new:
             with self._timer("keyframe"):
                 T_world_camera, turned = self._stand(self._map, T_world_camera, found, tracks)
+                if rolled is not None:
+                    colour = colour if colour is None else rolled.image(colour)
+                    self._map.unroll(self._map.window.keyframes, self._path, rolled.readout)
                 hanging = self._map.insert_keyframe(
-                    frame, T_world_camera, tracks.points_px, found, grey, colour, turned
-                )
+                    frame, T_world_camera, tracks.points_px, seen.points_px - tracks.points_px,
+                    found, grey, colour, turned,
+                )  # fmt: skip
             self._motion = self._motion.moved(self._calibrate(self._map))
             T_world_camera = hanging.T_world_camera
             self._keyframe_ns = stamp_ns
             with self._timer("places"):
                 self._remember(self._map, hanging, grey)
         self._lost_frames, self._waiting = 0, Waiting()
-        self._motion = self._motion.then(stamp_ns, T_world_camera)
+        self._motion = self._motion.then(frame, stamp_ns, T_world_camera)
         self._add_pose(self._map, frame, hanging, T_world_camera, support.inliers)
         if hanging.frame == frame and self._finishes(self._map):
-            self.whole_map.ask(frame, self._map)
+            self.whole_map.ask(frame, self._map, self._path, self.calibration.readout)
         return self._publish(TRACKING, doubt(support, self._parameters.support), support.inliers)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
@@ -155,6 +164,41 @@ class Mapper:
     def _camera(self) -> PinholeCamera:
         """Whose pixels are worked on."""
         return self.calibration.view.camera
+
+    def _take_over(self, active: ActiveMap, motion: Motion, answer: Answer) -> None:
+        """Go on with what the adjustment of the whole map has found."""
+        if answer.moves is not None:
+            moves = held(answer.moves, self._spans, active.segment)
+            motion = motion.moved(move_map(active, moves, self._path))
+            for loop in answer.loops:
+                active.join(loop)
+            self._changes.move(moves)
+        before = self.calibration.readout
+        self.calibration = self.calibration.with_readout(answer.readout, answer.sigma)
+        if before:
+            active.unroll(active.keyframes, self._path, self.calibration.readout)
+        self._motion = motion if before else self._begin_to_unroll(active, motion)
+
+    def _begin_to_unroll(self, active: ActiveMap, motion: Motion) -> Motion:
+        """Map with the readout, where it is known, what was mapped without.  Returns the motion
+        with what that did to the end of the map."""
+        if not self.calibration.readout:
+            return motion
+        newest = active.keyframes[-1]
+        before = newest.T_world_camera
+        active.begin_to_unroll(self._path, self.calibration.readout)
+        return motion.moved(newest.T_world_camera @ inverse(before))
+
+    def _at_once(
+        self, active: ActiveMap, T_world_camera: F64, motion: F64, seen: FrameTracks
+    ) -> tuple[FrameTracks, RolledFrame]:
+        """The tracks of a frame with this pose and motion (6,), had it been taken at once."""
+        rolled = active.rolled(self.calibration.readout, motion)
+        depths = active.inverse_depths(active.links.rows, T_world_camera)
+        maxima = seen.maxima.copy()
+        maxima[:, :2] -= rolled.shifts(np.ascontiguousarray(maxima[:, :2]))
+        points_px = seen.points_px - rolled.shifts(seen.points_px, depths)
+        return dataclasses.replace(seen, points_px=points_px, maxima=maxima), rolled
 
     def _calibrate(self, active: ActiveMap) -> F64:
         """Adjust the whole map with its calibration where that is due: (4, 4) what its end made."""
@@ -173,25 +217,16 @@ class Mapper:
         """Points of the map now, of all segments."""
         return self._points.culled + int(np.count_nonzero(self._points.state == MAPPED))
 
-    def _take(self, active: ActiveMap, answer: Answer) -> F64:
-        """Move the map, and join what is one.  Returns the similarity (4, 4) of its end."""
-        moves = held(answer.moves, self._spans, active.segment)
-        S = move_map(active, moves, self._path)
-        for loop in answer.loops:
-            active.join(loop)
-        self._changes.move(moves)
-        return S
-
     def finish(self) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
         self._earlier.adjust()
-        if self._map is None:
+        if self._map is None or self._motion is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         self._whole = self._finishes(self._map)
         while self.whole_map.loops or self.whole_map.closing:
-            self.whole_map.ask(0, self._map)
+            self.whole_map.ask(0, self._map, self._path, self.calibration.readout)
             if (answer := self.whole_map.settle()) is not None:
-                self._take(self._map, answer)
+                self._take_over(self._map, self._motion, answer)
         if self._whole:
             self._map.collect_garbage()
             self.calibration = self._map.adjust_all(self._path, self.calibration)
@@ -269,9 +304,13 @@ class Mapper:
         self._spans.append((self._keyframes, self._map.segment))
         self._remember(self._map, self._map.keyframes[-1], grey)
         newest, before = placed[0], placed[min(1, len(placed) - 1)]
-        stamps = stamps_ns[before.frame], stamps_ns[newest.frame]
-        poses = before.T_world_camera, newest.T_world_camera
-        self._motion = Motion(stamps_ns=stamps, poses=poses)
+        frames = before.frame, newest.frame
+        self._motion = Motion(
+            frames=frames,
+            stamps_ns=(stamps_ns[frames[0]], stamps_ns[frames[1]]),
+            poses=(before.T_world_camera, newest.T_world_camera),
+        )
+        self._motion = self._begin_to_unroll(self._map, self._motion)
         self._keyframe_ns = self._waiting.frames[-1].stamp_ns
         self._keyframe_is_new = True
         self._waiting = Waiting()
@@ -285,26 +324,40 @@ class Mapper:
         last = active.keyframes[-1]
         return spread_of(self._points, rows, last) if len(directions) else None
 
-    def _locate(self, stamp_ns: int, tracks: FrameTracks, grey: U8 | None) -> F64 | None:
+    def _locate(
+        self, frame: int, stamp_ns: int, tracks: FrameTracks, grey: U8 | None
+    ) -> F64 | None:
         """T_world_camera of the frame where it goes on, or else where it was seen before."""
         if self._map is not None and self._motion is not None:
             with self._timer("places"):
                 earlier = self._earlier.maps(self.calibration) if self._keyframe_is_new else []
                 larger = [m for m in earlier if len(m.keyframes) > len(self._map.keyframes)]
-                located = self._recognise(larger, stamp_ns, tracks, grey)
+                located = self._recognise(larger, frame, stamp_ns, tracks, grey)
             if located is not None:
                 return located
             with self._timer("localisation"):
-                located = self._localise(self._map, self._motion, stamp_ns, tracks, grey)
+                at_once = tracks
+                if self.calibration.readout:
+                    predicted = self._motion.predictions(stamp_ns)[0]
+                    velocity = self._motion.velocity()
+                    at_once, _ = self._at_once(self._map, predicted, velocity, tracks)
+                located = self._localise(
+                    self._map, self._motion, stamp_ns, at_once, tracks.maxima, grey
+                )
             if located is not None:
                 return located
         with self._timer("places"):
             maps = [self._map] if self._map is not None else []
             maps += self._earlier.maps(self.calibration)
-            return self._recognise(maps, stamp_ns, tracks, grey)
+            return self._recognise(maps, frame, stamp_ns, tracks, grey)
 
     def _recognise(
-        self, maps: list[ActiveMap], stamp_ns: int, tracks: FrameTracks, grey: U8 | None
+        self,
+        maps: list[ActiveMap],
+        frame: int,
+        stamp_ns: int,
+        tracks: FrameTracks,
+        grey: U8 | None,
     ) -> F64 | None:
         """T_world_camera in the one of the maps that the image shows, which then goes on."""
         if grey is None or not maps:
@@ -319,7 +372,7 @@ class Mapper:
             return None
         self._go_on(found.keyframe, tracks)
         stamps, poses = (stamp_ns, stamp_ns), (found.T_world_camera, found.T_world_camera)
-        self._motion = Motion(stamps_ns=stamps, poses=poses)
+        self._motion = Motion(frames=(frame, frame), stamps_ns=stamps, poses=poses)
         return found.T_world_camera
 
     def _go_on(self, seen: Keyframe, tracks: FrameTracks) -> None:
@@ -359,10 +412,11 @@ class Mapper:
         motion: Motion,
         stamp_ns: int,
         tracks: FrameTracks,
+        maxima: F32,
         grey: U8 | None,
     ) -> F64 | None:
         """T_world_camera of the frame from the tracks of mapped points, or else from the map's
-        points in the image; None where both fail."""
+        points in the image, which has these maxima (M, 3); None where both fail."""
         directions = self._directions(active)
         linked = np.concatenate([active.linked(MAPPED), directions])
         limits = self._parameters.localisation
@@ -377,7 +431,7 @@ class Mapper:
         if grey is None:
             return None
         return recover(
-            motion, stamp_ns, active.nearby(), self._points, tracks.maxima, grey, self._camera,
+            motion, stamp_ns, active.nearby(), self._points, maxima, grey, self._camera,
             self._parameters, self._generator,
         )  # fmt: skip
 
@@ -407,10 +461,12 @@ class Mapper:
         T_world_camera: F64,
         tracks: FrameTracks,
         grey: U8 | None,
+        rolled: RolledFrame | None,
     ) -> tuple[F64, Observations]:
         """Find points without a track among the maxima, and refine the pose with them."""
         points = self._points
-        none = Observations(rows=np.zeros(0, np.int32), points_px=np.zeros((0, 2), np.float32))
+        no_px = np.zeros((0, 2), np.float32)
+        none = Observations(rows=np.zeros(0, np.int32), points_px=no_px, rolled_px=no_px)
         if not self._parameters.reacquisition.enabled:
             return T_world_camera, none
         reacquired = reacquire(
@@ -418,6 +474,10 @@ class Mapper:
             tracks.maxima, grey, self._camera, self._parameters.reacquisition,
         )  # fmt: skip
         found = active.take_over(reacquired, tracks)
+        if rolled is not None:
+            depths = active.inverse_depths(found.rows, T_world_camera)
+            points_px, rolled_px = rolled.found(found.points_px, depths)
+            found = Observations(rows=found.rows, points_px=points_px, rolled_px=rolled_px)
         directions = self._directions(active)
         rows, points_px = active.observed(tracks.points_px, found, directions)
         located = refine(

@@ -163,7 +163,7 @@ class KeyframeChanges:
             point_ids = self._points.ids[keyframe.rows[mapped]]
             order = np.argsort(point_ids)
             ids.append(point_ids[order])
-            pixels.append(keyframe.points_px[mapped[order]])
+            pixels.append((keyframe.points_px + keyframe.rolled_px)[mapped[order]])
         return KeyframeDelta(
             new=new,
             keyframe_ids=np.array([keyframe.id for keyframe, _ in changed], np.int64),

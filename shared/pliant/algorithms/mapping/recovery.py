@@ -20,6 +20,10 @@ from pliant.algorithms.mapping.parameters import (
     RecoveryParameters,
 )
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, match_widely, reacquire
+from pliant.algorithms.mapping.rolling_shutter import motion_between
+
+_SPEEDING_UP = 0.5
+"""Share of its last acceleration that a camera is taken to keep: all of it lets noise grow."""
 
 _NEAR = 0.3
 """Share of the radius that is searched first: mostly enough, and far less to confuse."""
@@ -29,19 +33,36 @@ _NEAR = 0.3
 class Motion:
     """How the camera moved last: T_world_camera (4, 4) of two frames, the newer one last."""
 
+    frames: tuple[int, int]
     stamps_ns: tuple[int, int]
     poses: tuple[F64, F64]
 
-    def then(self, stamp_ns: int, T_world_camera: F64) -> "Motion":
+    def then(self, frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
         """The motion after one more pose."""
         return Motion(
-            stamps_ns=(self.stamps_ns[1], stamp_ns), poses=(self.poses[1], T_world_camera)
+            frames=(self.frames[1], frame),
+            stamps_ns=(self.stamps_ns[1], stamp_ns),
+            poses=(self.poses[1], T_world_camera),
         )
 
     def moved(self, S: F64) -> "Motion":
         """The motion after the world has moved by a similarity (4, 4)."""
         before, last = (move_by_similarity(S, pose) for pose in self.poses)
-        return Motion(stamps_ns=self.stamps_ns, poses=(before, last))
+        return Motion(frames=self.frames, stamps_ns=self.stamps_ns, poses=(before, last))
+
+    def velocity(self) -> F64:
+        """(6,) between the two, as of ``Path.motions``."""
+        frames = max(1, self.frames[1] - self.frames[0])
+        return motion_between(*self.poses, self.poses[1], frames)
+
+    def velocity_at(self, frame: int, T_world_camera: F64) -> F64:
+        """(6,) at a frame that follows with this pose."""
+        between = self.then(frame, 0, T_world_camera).velocity()
+        if self.frames[0] == self.frames[1]:
+            return between
+        # The velocity that was between the frames has changed since.
+        share = (frame - self.frames[1]) / (frame - self.frames[0])
+        return between + _SPEEDING_UP * share * (between - self.velocity())
 
     def interval_s(self) -> float:
         """Seconds between the two."""

@@ -4,21 +4,40 @@ The pose of a frame is that of its middle row.  With the readout as a share of t
 row v is taken ``readout (v - middle) / height`` frame intervals later, when the camera has moved on
 by as much of its motion.  A map that is built without regard to this bends and drifts in scale, at
 residuals that hardly grow.
+
+Once the readout is known, everything is mapped as if each frame had been taken at once: what is
+seen at p was, when the middle row was taken, at the q with
+
+    p = q + readout (v_p - middle) / height flow(q),
+
+the flow that of the camera's motion and of the depth at q: that of its point, or a common one.
+Keyframes remember p - q, so that a better readout, motion or depth can take its place.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32
+from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.map_store import Keyframe
-from pliant.compiler.kernel import kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
-_SPAN = 2
-"""Frames before and after a keyframe over which its motion is measured: poses have noise."""
+_SPAN = 1
+"""Frames before and after a keyframe over which its motion is measured: hands shake faster than
+more of them would show."""
 
 _MIN_DEPTH = 1e-6
+
+_STEPS = 2
+"""Of the fixed point: a shift of a hundredth of the image changes itself by a hundredth."""
+
+_GRID_PX = 16
+"""Between these the shift of an image is interpolated: it is nearly quadratic."""
 
 
 class Path:
@@ -54,13 +73,77 @@ class Path:
             if len(known) < 2:
                 continue
             first, last = (
-                inverse(T_world_keyframe[hanging] @ T_keyframe_camera) @ keyframe.T_world_camera
+                T_world_keyframe[hanging] @ T_keyframe_camera
                 for hanging, T_keyframe_camera in (self._poses[known[0]], self._poses[known[-1]])
             )
-            turn = so3_log(last[:3, :3] @ first[:3, :3].T)
-            both = np.concatenate([turn, last[:3, 3] - first[:3, 3]])
-            motions[row] = both / (known[-1] - known[0])
+            frames = known[-1] - known[0]
+            motions[row] = motion_between(first, last, keyframe.T_world_camera, frames)
         return motions
+
+
+def motion_between(first: F64, last: F64, T_world_camera: F64, frames: int) -> F64:
+    """(6,) as of ``Path.motions``, in a camera near both of two poses (4, 4) so many frames
+    apart."""
+    first, last = inverse(first) @ T_world_camera, inverse(last) @ T_world_camera
+    turn = so3_log(last[:3, :3] @ first[:3, :3].T)
+    return np.concatenate([turn, last[:3, 3] - first[:3, 3]]) / frames
+
+
+@dataclass(frozen=True)
+class RolledFrame:
+    """What a rolling shutter did to a frame.
+
+    readout: share of the frame interval.   motion: (6,) as of ``Path.motions``.
+    inverse_depth: of what has no depth of its own.
+    """
+
+    camera: PinholeCamera
+    readout: float
+    motion: F64
+    inverse_depth: float
+
+    def shifts(self, points_px: F32, inverse_depths: F64 | None = None) -> F32:
+        """(N, 2) px by which that moved what is seen at points_px (N, 2)."""
+        return self._shifts(points_px, inverse_depths, seen=True)
+
+    def found(self, points_px: F32, inverse_depths: F64) -> tuple[F32, F32]:
+        """What is found at points_px (N, 2) of ``image`` where its own depth puts it, and its
+        shifts."""
+        seen = points_px + self._shifts(points_px, None, seen=False)
+        shifts = self.shifts(seen, inverse_depths)
+        return seen - shifts, shifts
+
+    def image(self, pixels: U8) -> U8:
+        """The image (H, W) or (H, W, 3), had it been taken at once: all of it at one depth."""
+        return np.asarray(
+            cv2.remap(pixels, *self._places, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE), np.uint8
+        )
+
+    @cached_property
+    def _places(self) -> tuple[F32, F32]:
+        """(H, W) columns and rows in which the pixels of the image taken at once are seen."""
+        width, height = self.camera.width, self.camera.height
+        columns, rows = -(-width // _GRID_PX) + 1, -(-height // _GRID_PX) + 1
+        v, u = np.mgrid[:rows, :columns].astype(np.float32) * _GRID_PX
+        nodes = np.stack([u.ravel(), v.ravel()], axis=1)
+        moved = self._shifts(nodes, None, seen=False).reshape(rows, columns, 2)
+        # Not cv2.resize, whose samples are the centres of cells.
+        to_nodes = np.array([[1.0 / _GRID_PX, 0.0, 0.0], [0.0, 1.0 / _GRID_PX, 0.0]])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        shift = cv2.warpAffine(moved, to_nodes, (width, height), None, flags)
+        return (
+            np.arange(width, dtype=np.float32) + shift[:, :, 0],
+            np.arange(height, dtype=np.float32)[:, None] + shift[:, :, 1],
+        )
+
+    def _shifts(self, points_px: F32, inverse_depths: F64 | None, *, seen: bool) -> F32:
+        camera = self.camera
+        K = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.height])
+        if inverse_depths is None:
+            inverse_depths = np.full(len(points_px), self.inverse_depth)
+        shifts = np.empty((len(points_px), 2), np.float32)
+        _shifts(points_px, inverse_depths, self.readout * self.motion, K, shifts, seen)
+        return shifts
 
 
 def readout_flow(
@@ -103,10 +186,35 @@ def _flow(
             continue
         x = (T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2] + T[0, 3]) / z
         y = (T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2] + T[1, 3]) / z
-        # The velocity of the point over its depth.
-        a = motion[1] - motion[2] * y + motion[3] / z
-        b = motion[2] * x - motion[0] + motion[4] / z
-        c = motion[0] * y - motion[1] * x + motion[5] / z
         share = (points_px[o, 1] - middle) / K[2]
-        flow[o, 0] = share * K[0] * (a - x * c)
-        flow[o, 1] = share * K[1] * (b - y * c)
+        a, b = _velocity(motion, x, y, 1.0 / z)
+        flow[o, 0], flow[o, 1] = share * K[0] * a, share * K[1] * b
+
+
+@fast_kernel
+def _velocity(motion: F64, x: float, y: float, inverse_depth: float) -> tuple[float, float]:
+    """Of a point on the plane z = 1, per frame interval."""
+    a = motion[1] - motion[2] * y + motion[3] * inverse_depth
+    b = motion[2] * x - motion[0] + motion[4] * inverse_depth
+    c = motion[0] * y - motion[1] * x + motion[5] * inverse_depth
+    return a - x * c, b - y * c
+
+
+@kernel
+def _shifts(
+    points_px: F32, inverse_depths: F64, motion: F64, K: F64, shifts: F32, seen: bool
+) -> None:
+    """Write p - q of the points p, where they are seen; or else of the points q."""
+    middle = 0.5 * (K[4] - 1.0)
+    for n in range(points_px.shape[0]):
+        u, v = float(points_px[n, 0]), float(points_px[n, 1])
+        du, dv = 0.0, 0.0
+        for _ in range(_STEPS):
+            if seen:
+                x, y, row = (u - du - K[2]) / K[0], (v - dv - K[3]) / K[1], v
+            else:
+                x, y, row = (u - K[2]) / K[0], (v - K[3]) / K[1], v + dv
+            share = (row - middle) / K[4]
+            a, b = _velocity(motion, x, y, inverse_depths[n])
+            du, dv = share * K[0] * a, share * K[1] * b
+        shifts[n, 0], shifts[n, 1] = du, dv

@@ -37,6 +37,12 @@ _PRINCIPAL_POINT = 0.03
 _HYPOTHESES = np.linspace(-2.0, 2.0, 7)
 """Focal lengths that a start is tried under, in standard deviations of the prior."""
 
+_CERTAIN = 4.0
+"""Standard deviations by which the readout of a rolling shutter differs from none."""
+
+_SLOWEST = 0.1
+"""Readout that a rolling shutter exceeds; less is what other errors look like."""
+
 _GROWTH = 1.4
 """The map is adjusted with its calibration whenever its keyframes are so many times more."""
 
@@ -64,6 +70,20 @@ class SelfCalibration:
     def sigmas(self) -> F64:
         """(6,) standard deviations of the correction."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def readout(self) -> float:
+        """Share of the frame interval that frames are read out in, as they are mapped: 0 where
+        nothing says that the shutter rolls."""
+        readout = float(self.correction[3])
+        return readout if is_certain(readout, self.sigmas[3]) else 0.0
+
+    def with_readout(self, readout: float, sigma: float) -> "SelfCalibration":
+        """With a readout that was found with its standard deviation, where that is certain."""
+        correction, covariance = self.correction.copy(), self.covariance.copy()
+        correction[3] = readout if is_certain(readout, sigma) else 0.0
+        covariance[3, 3] = sigma**2
+        return dataclasses.replace(self, correction=correction, covariance=covariance)
 
     @property
     def view(self) -> CorrectedView:
@@ -97,6 +117,11 @@ class SelfCalibration:
         """With what so many keyframes told of it."""
         following = max(keyframes + 1, int(np.ceil(_GROWTH * keyframes)))
         return SelfCalibration(self.given, correction, covariance, following)
+
+
+def is_certain(readout: float, sigma: float) -> bool:
+    """Whether a readout with this standard deviation is that of a rolling shutter."""
+    return abs(readout) > max(_CERTAIN * sigma, _SLOWEST)
 
 
 def widened(parameters: MappingParameters, focal_sigma: float) -> MappingParameters:

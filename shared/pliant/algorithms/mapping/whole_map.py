@@ -3,13 +3,13 @@
 The window corrects what is new; what drifts beyond it only all keyframes together can tell.  Their
 adjustment takes longer than a frame, so it works on a copy of the map and its result is taken over
 a fixed number of frames later.  How long it took decides nothing: who has not got it by then waits.
+Where the shutter may roll it begins with the first keyframes: they tell the readout.
 
 Meanwhile the map has grown and the window has moved.  So the result is not where the points are,
 but how the map around each keyframe moves: one similarity for each, as drift is small within what
 a keyframe sees.  The window and all that is new move rigidly with the last keyframe that has left
-the window.  The first keyframe stays, and with it place and scale of the beginning.  Lens and
-focal length are found anew each time; the readout of a rolling shutter is not, as frames are
-located without it.
+the window.  The first keyframe stays, and with it place and scale of the beginning.  Lens, focal
+length and readout are found anew each time; the readout alone is used for what comes next.
 
 A place that is recognised asks at once, and then the window moves as the rest does: what drifted
 since drifted in the window, too.
@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, matrix_to_pose, move_by_similarity
 from pliant.algorithms.map_delta import MapMoves
@@ -29,9 +30,13 @@ from pliant.algorithms.mapping.final_adjustment import ListedMap, adjust_listed,
 from pliant.algorithms.mapping.loops import Loop, close_loops
 from pliant.algorithms.mapping.map_store import FREE
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.rolling_shutter import Path, readout_flow
+from pliant.algorithms.mapping.self_calibration import is_certain
 
 _MIN_DEPTH = 1e-6
+
+_LEAST_TOLD = 0.2
+"""Share of what is known of the readout that the images must tell, and not the prior."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +44,8 @@ class Question:
     """A copy of the map of a frame, to be adjusted.
 
     keyframe_ids: (M,).   seen: what they see.   settled: how many of them, the oldest, move each
-    by itself.   loops: to be closed.   hosts, sigmas: (N,) of the points that are seen.
+    by itself.   readout: as it is known.   loops: to be closed.   hosts, sigmas: (N,) of the points
+    that are seen.
     """
 
     frame: int
@@ -48,16 +54,20 @@ class Question:
     seen: ListedMap
     camera: PinholeCamera
     parameters: MappingParameters
+    readout: float
     loops: list[Loop] = field(default_factory=list)
     hosts: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))
 
 
 class Answer(NamedTuple):
-    """How the map moves, and the loops that were closed: their points are to be joined."""
+    """How the map moves, None where it does not; the loops that were closed, whose points are to be
+    joined; the readout and its standard deviation."""
 
-    moves: MapMoves
+    moves: MapMoves | None
     loops: list[Loop]
+    readout: float
+    sigma: float
 
 
 @dataclass(kw_only=True)
@@ -80,13 +90,17 @@ class WholeMap:
         """Whether loops are being closed."""
         return self.question is not None and len(self.question.loops) > 0
 
-    def ask(self, frame: int, active: ActiveMap) -> None:
-        """Ask for the adjustment of the map as it is after a frame, where that is due."""
+    def ask(self, frame: int, active: ActiveMap, path: Path, readout: float) -> None:
+        """Ask for the adjustment of the map as it is after a frame, where that is due.
+
+        path: of the frames.   readout: as it is known.
+        """
         parameters = active.parameters
         window, growth = parameters.window.keyframes, parameters.whole_map.growth
         count = len(active.keyframes)
-        # While the window has half of the map it does well by itself.
-        early = growth == 0.0 or count < max(2 * window, self.due)
+        # While the window has half of the map it does well by itself, but for the readout.
+        least = parameters.start.keyframes if parameters.calibration.readout > 0.0 else 2 * window
+        early = growth == 0.0 or count < max(least, self.due)
         # The window would move with what was there before the camera was recognised.
         early = early or (active.since > 0 and count - active.since <= window)
         if self.question is not None or (early and not self.loops):
@@ -95,16 +109,22 @@ class WholeMap:
         loops, self.loops = self.loops, []
         points = active.points
         seen = list_map(active.keyframes, points, active.camera, parameters.window.lens_radius)
+        if parameters.calibration.readout > 0.0:
+            seen.flow = readout_flow(
+                seen.T_world_camera, path.motions(active.keyframes), seen.xyz, seen.camera,
+                seen.point, seen.px, active.camera,
+            )  # fmt: skip
         keyframe_ids = np.array([keyframe.id for keyframe in active.keyframes], np.int64)
         loops = [loop for loop in loops if np.isin((loop.old, loop.new), keyframe_ids).all()]
         hosts = np.searchsorted(keyframe_ids, points.first_keyframe[seen.rows], side="right") - 1
         self.question = Question(
             frame=frame,
             keyframe_ids=keyframe_ids,
-            settled=count if loops else count - window,
+            settled=count if loops or count < 2 * window else count - window,
             seen=seen,
             camera=active.camera,
             parameters=parameters,
+            readout=readout,
             loops=loops,
             hosts=np.maximum(hosts, 0),
             sigmas=points.sigmas[seen.rows].astype(np.float64),
@@ -121,10 +141,12 @@ class WholeMap:
         question = self.question
         if question is None:
             return False
-        return frame >= question.frame + question.parameters.whole_map.distance_frames
+        # Few keyframes take little time, and say what those that follow wait for.
+        distance = question.parameters.whole_map.distance_frames
+        return frame >= question.frame + min(distance, len(question.keyframe_ids))
 
     def take(self, frame: int) -> Answer | None:
-        """How the map moves before a frame is worked on; None where it does not."""
+        """What was found, where it is taken over before a frame is worked on."""
         return self.settle() if self.is_due(frame) else None
 
     def settle(self) -> Answer | None:
@@ -133,15 +155,16 @@ class WholeMap:
             return None
         answer = find_moves(self.question) if self.answer is None else self.answer
         self.question = self.answer = None
-        moves = answer.moves
         for n, loop in enumerate(self.loops):  # the worlds that they tell of have moved
-            old, new = moves.matrices(np.array([loop.old, loop.new]))
+            if answer.moves is None:
+                break
+            old, new = answer.moves.matrices(np.array([loop.old, loop.new]))
             self.loops[n] = loop._replace(S_old_new=old @ loop.S_old_new @ np.linalg.inv(new))
         return answer
 
 
 def find_moves(question: Question) -> Answer:
-    """How each settled keyframe moves with what hangs on it."""
+    """How each settled keyframe moves with what hangs on it, and the readout."""
     before, xyz = question.seen.T_world_camera, question.seen.xyz
     depths, loops = _depths(question.seen, before, xyz), question.loops
     seen = replace(question.seen, T_world_camera=before.copy(), xyz=xyz.copy())
@@ -150,12 +173,43 @@ def find_moves(question: Question) -> Answer:
             seen, question.keyframe_ids, question.hosts, question.sigmas, loops, question.camera.fx
         )
         depths = depths[kept]
-    adjust_listed(
+    parameters = question.parameters
+    found = adjust_listed(
         seen,
         question.camera,
-        question.parameters,
-        iterations=question.parameters.whole_map.iterations,
+        parameters,
+        iterations=parameters.whole_map.iterations,
+        start=np.array([0.0, 0.0, 0.0, question.readout, 0.0, 0.0]),
+        with_covariance=question.seen.flow is not None,
     )
+    readout, sigma = float(found.correction[3]), float(np.sqrt(found.covariance[3, 3]))
+    if question.readout == 0.0:
+        readout, sigma = _without_prior(readout, sigma, parameters.calibration)
+    # A window that is half of the map does as well, unless it did not know the readout.
+    bent = question.readout == 0.0 and is_certain(readout, sigma)
+    moving = bent or loops or len(question.keyframe_ids) >= 2 * parameters.window.keyframes
+    moves = _moves(question, seen, before, depths) if moving else None
+    return Answer(moves, loops, readout, sigma)
+
+
+def _without_prior(
+    readout: float, sigma: float, prior: CalibrationUncertainty
+) -> tuple[float, float]:
+    """The readout that the images alone tell, and its standard deviation.
+
+    A prior at 0 draws it there, and few keyframes are drawn far: of a Gaussian of precision p that
+    remains from one of precision p - p_0 and the prior's, the mean is (p - p_0) / p of the first.
+    """
+    if sigma == 0.0:
+        return 0.0, 0.0
+    share = 1.0 - (sigma * prior.prior_px / prior.readout) ** 2
+    if share < _LEAST_TOLD:
+        return 0.0, sigma
+    return readout / share, float(sigma / np.sqrt(share))
+
+
+def _moves(question: Question, seen: ListedMap, before: F64, depths: F64) -> MapMoves:
+    """before: (M, 4, 4) poses and depths: (O,) of the observations until now."""
     settled = slice(0, question.settled)
     scales = _scales(seen, depths, question.settled)
     T = seen.T_world_camera[settled].copy()
@@ -167,11 +221,10 @@ def find_moves(question: Question) -> Answer:
         T[:, :3, 3]
         - scales[:, None] * (moved[:, :3, :3] @ before[settled][:, :3, 3, None])[:, :, 0]
     )
-    moves = MapMoves(
+    return MapMoves(
         keyframe_ids=question.keyframe_ids[settled],
         moves=np.column_stack([matrix_to_pose(moved), scales]),
     )
-    return Answer(moves, loops)
 
 
 def held(moves: MapMoves, spans: list[tuple[int, int]], segment: int) -> MapMoves:

@@ -81,6 +81,12 @@ class Window:
             rows, points_px, weights, self.columns, slot, self.u, self.v, self.w, self.seen
         )  # fmt: skip
 
+    def see_anew(self) -> None:
+        """The keyframes have other pixels than when the window was made."""
+        for slot, keyframe in enumerate(self.keyframes):
+            self._observe(slot, keyframe.rows, keyframe.points_px)
+        self.seen[-1] = False
+
     def see(self, T_world_camera: F64, rows: I32, points_px: F32) -> None:
         """Put the current frame into the last slot."""
         self.seen[-1] = False
