@@ -43,6 +43,11 @@ class ListedMap:
     fixed: BoolArray
     flow: F32 | None = None
 
+    def depths(self) -> F64:
+        """(O,) of each observed point in the camera that observes it."""
+        T = self.T_world_camera[self.camera]
+        return np.einsum("oi,oi->o", self.xyz[self.point] - T[:, :3, 3], T[:, :3, 2])
+
 
 def adjust_keyframes(
     keyframes: list[Keyframe],

@@ -146,8 +146,7 @@ def _count_shared(camera: I32, starts: I64, shared: I32) -> None:
 
 def _medians(seen: ListedMap, sigmas: F64) -> tuple[F64, F64]:
     """(M,) depth and its sigma of what each keyframe sees."""
-    T = seen.T_world_camera[seen.camera]
-    depths = np.einsum("oi,oi->o", seen.xyz[seen.point] - T[:, :3, 3], T[:, :3, 2])
+    depths = seen.depths()
     M = len(seen.T_world_camera)
     ends = np.searchsorted(seen.camera, np.arange(M + 1))
     depth, sigma = np.ones(M), np.ones(M)

@@ -10,40 +10,35 @@ from itertools import islice
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, U8
+from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
-from pliant.algorithms.mapping.directions import (
-    Spread,
-    helping_candidates,
-    placed_candidates,
-    spread_of,
-)
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
+from pliant.algorithms.mapping.frame_pose import (
+    adjust,
+    directions_of,
+    find_again,
+    localise,
+    stand,
+)
 from pliant.algorithms.mapping.known_places import KnownPlaces
-from pliant.algorithms.mapping.localisation import locate, refine
-from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe, Observations, PointRows
-from pliant.algorithms.mapping.observation_table import reprojection_errors
+from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
-from pliant.algorithms.mapping.reacquisition import reacquire
-from pliant.algorithms.mapping.recovery import Motion, recover
+from pliant.algorithms.mapping.recovery import Motion
 from pliant.algorithms.mapping.relocalisation import Place, relocalise
 from pliant.algorithms.mapping.revisits import Revisits
 from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, is_guess
 from pliant.algorithms.mapping.start import Start
-from pliant.algorithms.mapping.support import Support, doubt, support_of
+from pliant.algorithms.mapping.support import doubt
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses
 from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held, move_map
 from pliant.algorithms.places.features import describe
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracks import FrameTracks
-
-_TELLING = 500
-"""Points at the least that tell whether a camera stands where it stood."""
 
 _LEAST_LOST = 3
 """Frames without a pose before a map is given up, however long that takes: of a time lapse."""
@@ -122,16 +117,16 @@ class Mapper:
                 velocity = self._motion.velocity_at(frame, located)
                 tracks, rolled = self._at_once(self._map, located, velocity, seen)
                 grey = grey if grey is None else rolled.image(grey)
-            T_world_camera, found = self._reacquire(self._map, frame, located, tracks, grey, rolled)
+            T_world_camera, found = find_again(self._map, frame, located, tracks, grey, rolled)
         with self._timer("subspace adjustment"):
-            T_world_camera, support = self._adjust(self._map, T_world_camera, found, tracks)
+            T_world_camera, support = adjust(self._map, self._motion, T_world_camera, found, tracks)
         with self._timer("triangulation"):
             self._map.triangulate()
         hanging = self._map.keyframes[-1]
         self._keyframe_is_new = self._keyframe_is_due(self._map, stamp_ns)
         if self._keyframe_is_new:
             with self._timer("keyframe"):
-                T_world_camera, turned = self._stand(self._map, T_world_camera, found, tracks)
+                T_world_camera, turned = stand(self._map, T_world_camera, found, tracks)
                 if rolled is not None:
                     colour = colour if colour is None else rolled.image(colour)
                     self._map.unroll(self._map.window.keyframes, self._path, rolled.readout)
@@ -316,14 +311,6 @@ class Mapper:
         self._waiting = Waiting()
         return newest.inliers
 
-    def _directions(self, active: ActiveMap) -> I64:
-        """Indices of the tracks of candidates that help to place the frame."""
-        return helping_candidates(self._points, active.links.rows)
-
-    def _spread(self, active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
-        last = active.keyframes[-1]
-        return spread_of(self._points, rows, last) if len(directions) else None
-
     def _locate(
         self, frame: int, stamp_ns: int, tracks: FrameTracks, grey: U8 | None
     ) -> F64 | None:
@@ -341,9 +328,10 @@ class Mapper:
                     predicted = self._motion.predictions(stamp_ns)[0]
                     velocity = self._motion.velocity()
                     at_once, _ = self._at_once(self._map, predicted, velocity, tracks)
-                located = self._localise(
-                    self._map, self._motion, stamp_ns, at_once, tracks.maxima, grey
-                )
+                located = localise(
+                    self._map, self._motion, stamp_ns, at_once, tracks.maxima, grey,
+                    self._generator,
+                )  # fmt: skip
             if located is not None:
                 return located
         with self._timer("places"):
@@ -379,8 +367,7 @@ class Mapper:
         """Go on in the segment of a keyframe, at the place that it saw."""
         active = self._map
         if active is not None:
-            self._keyframe_changes.settle(active.keyframes)
-            self._keyframes = active.next_keyframe_id
+            self._settle(active)
         if active is None or active.segment != seen.segment:
             if active is not None:
                 self._earlier.keep(active, self._path, self.calibration)
@@ -391,6 +378,11 @@ class Mapper:
         active.resume(seen, self._keyframes)
         active.links.follow(tracks.ids)
         self._spans.append((self._keyframes, active.segment))
+
+    def _settle(self, active: ActiveMap) -> None:
+        """What has been mapped so far is told of, and the next keyframe follows on it."""
+        self._keyframe_changes.settle(active.keyframes)
+        self._keyframes = active.next_keyframe_id
 
     def _remember(self, active: ActiveMap, keyframe: Keyframe, grey: U8 | None) -> None:
         """A keyframe is a place to come back to, and may be one that was seen before."""
@@ -406,35 +398,6 @@ class Mapper:
         maps = [active, *self._earlier.maps(self.calibration)]
         self._places.remember(keyframe, seen, maps, view)
 
-    def _localise(
-        self,
-        active: ActiveMap,
-        motion: Motion,
-        stamp_ns: int,
-        tracks: FrameTracks,
-        maxima: F32,
-        grey: U8 | None,
-    ) -> F64 | None:
-        """T_world_camera of the frame from the tracks of mapped points, or else from the map's
-        points in the image, which has these maxima (M, 3); None where both fail."""
-        directions = self._directions(active)
-        linked = np.concatenate([active.linked(MAPPED), directions])
-        limits = self._parameters.localisation
-        if len(linked) >= limits.min_inliers:
-            rows = active.links.rows[linked]
-            located = locate(
-                motion.predictions(stamp_ns), self._points.xyz[rows], tracks.points_px[linked],
-                self._camera, limits, self._generator, self._spread(active, rows, directions),
-            )  # fmt: skip
-            if located.inliers.sum() >= limits.min_inliers:
-                return located.T_world_camera
-        if grey is None:
-            return None
-        return recover(
-            motion, stamp_ns, active.nearby(), self._points, maxima, grey, self._camera,
-            self._parameters, self._generator,
-        )  # fmt: skip
-
     def _lost(self, active: ActiveMap, frame: int, stamp_ns: int, tracks: FrameTracks) -> MapDelta:
         """The frame has no pose.  After some time without one the segment is closed.
 
@@ -448,93 +411,16 @@ class Mapper:
         delta = self._publish(LOST, reason, 0)
         long = self._motion.lost_s(stamp_ns) > self._parameters.localisation.max_lost_s
         if long and self._lost_frames >= _LEAST_LOST:
+            self._settle(active)
             self._earlier.keep(active, self._path, self.calibration)
-            self._keyframe_changes.settle(active.keyframes)
-            self._keyframes = active.next_keyframe_id
             self._map, self._lost_frames = None, 0
         return delta
-
-    def _reacquire(
-        self,
-        active: ActiveMap,
-        frame: int,
-        T_world_camera: F64,
-        tracks: FrameTracks,
-        grey: U8 | None,
-        rolled: RolledFrame | None,
-    ) -> tuple[F64, Observations]:
-        """Find points without a track among the maxima, and refine the pose with them."""
-        points = self._points
-        no_px = np.zeros((0, 2), np.float32)
-        none = Observations(rows=np.zeros(0, np.int32), points_px=no_px, rolled_px=no_px)
-        if not self._parameters.reacquisition.enabled:
-            return T_world_camera, none
-        reacquired = reacquire(
-            T_world_camera, active.missing(frame), points.xyz, points.kappas, points.patches,
-            tracks.maxima, grey, self._camera, self._parameters.reacquisition,
-        )  # fmt: skip
-        found = active.take_over(reacquired, tracks)
-        if rolled is not None:
-            depths = active.inverse_depths(found.rows, T_world_camera)
-            points_px, rolled_px = rolled.found(found.points_px, depths)
-            found = Observations(rows=found.rows, points_px=points_px, rolled_px=rolled_px)
-        directions = self._directions(active)
-        rows, points_px = active.observed(tracks.points_px, found, directions)
-        located = refine(
-            T_world_camera, points.xyz[rows], points_px, self._camera,
-            self._parameters.localisation, near=True,
-            spread=self._spread(active, rows, directions),
-        )  # fmt: skip
-        linked = active.linked(MAPPED)
-        points.kappas[active.links.rows[linked]] = tracks.kappas[linked]
-        return located.T_world_camera, found
-
-    def _adjust(
-        self, active: ActiveMap, T_world_camera: F64, found: Observations, tracks: FrameTracks
-    ) -> tuple[F64, Support]:
-        """Eq. 6 over the window and this frame.  Returns its pose, and what there is for it."""
-        linked = active.linked(MAPPED)
-        xyz = self._points.xyz[active.links.rows[linked]]
-        errors = reprojection_errors(T_world_camera, xyz, tracks.points_px[linked], self._camera)
-        active.judge_tracks(linked, errors)
-        active.see(T_world_camera, tracks.points_px, found)
-        directions = self._directions(active)
-        if self._parameters.window.sweeps > 0 and not len(directions):
-            T_world_camera = active.window.sweep_current(self._camera, self._parameters)
-        rows, points_px = active.observed(tracks.points_px, found, directions)
-        xyz = self._points.xyz[rows]
-        errors = reprojection_errors(T_world_camera, xyz, points_px, self._camera)
-        interval_s = self._motion.interval_s() if self._motion is not None else 0.0
-        return T_world_camera, support_of(
-            tracks, interval_s, points_px, errors < self._parameters.localisation.inlier_px,
-            self._camera, self._parameters.support,
-        )  # fmt: skip
-
-    def _stand(
-        self, active: ActiveMap, T_world_camera: F64, found: Observations, tracks: FrameTracks
-    ) -> tuple[F64, bool]:
-        """Whether the frame stands where the last keyframe does, and its pose then."""
-        if active.since == len(active.keyframes):
-            return T_world_camera, False  # nobody knows where it was before
-        candidates = placed_candidates(self._points, active.links.rows)
-        rows, points_px = active.observed(tracks.points_px, found, candidates)
-        for every in (max(1, len(rows) // _TELLING), 1):  # a few tell of most that they moved
-            some = np.arange(0, len(rows), every)
-            located = refine(
-                T_world_camera, self._points.xyz[rows[some]], points_px[some], self._camera,
-                self._parameters.localisation, near=True,
-                spread=spread_of(self._points, rows[some], active.keyframes[-1]),
-            )  # fmt: skip
-            if not located.stands:
-                return T_world_camera, False
-            T_standing = located.T_world_camera
-        return T_standing, True
 
     def _keyframe_is_due(self, active: ActiveMap, stamp_ns: int) -> bool:
         if active.since == len(active.keyframes):
             return True  # the camera has been recognised
         limits = self._parameters.keyframe
-        least = CANDIDATE if len(self._directions(active)) else MAPPED
+        least = CANDIDATE if len(directions_of(active)) else MAPPED
         share, flow = active.window.flow_since_keyframe(least)
         unit = self._camera.width / 640.0
         if share < limits.min_shared_share or flow > limits.max_flow_px * unit:

@@ -130,7 +130,8 @@ def corners_in_map(
     T_camera_world = inverse(keyframe.T_world_camera)
     depth[known] = transform(T_camera_world, points.xyz[rows[nearest[known]]])[:, 2]
     known &= depth > 0.0
-    rays = np.column_stack([camera.normalise(features.points_px.astype(np.float64)), depth * 0 + 1])
+    seen_at = camera.normalise(features.points_px.astype(np.float64))
+    rays = np.column_stack([seen_at, np.ones(len(depth))])
     return transform(keyframe.T_world_camera, rays * depth[:, None]), known
 
 

@@ -166,7 +166,7 @@ class WholeMap:
 def find_moves(question: Question) -> Answer:
     """How each settled keyframe moves with what hangs on it, and the readout."""
     before, xyz = question.seen.T_world_camera, question.seen.xyz
-    depths, loops = _depths(question.seen, before, xyz), question.loops
+    depths, loops = question.seen.depths(), question.loops
     seen = replace(question.seen, T_world_camera=before.copy(), xyz=xyz.copy())
     if loops:
         seen, kept, loops = close_loops(
@@ -244,15 +244,9 @@ def held(moves: MapMoves, spans: list[tuple[int, int]], segment: int) -> MapMove
     return MapMoves(keyframe_ids=ids, moves=rows)
 
 
-def _depths(seen: ListedMap, T_world_camera: F64, xyz: F64) -> F64:
-    """(O,) of each observed point in the camera that observes it."""
-    T = T_world_camera[seen.camera]
-    return np.einsum("oi,oi->o", xyz[seen.point] - T[:, :3, 3], T[:, :3, 2])
-
-
 def _scales(seen: ListedMap, before: F64, count: int) -> F64:
     """(count,) by how much what each of the first keyframes sees has grown: the median."""
-    after = _depths(seen, seen.T_world_camera, seen.xyz)
+    after = seen.depths()
     usable = (before > _MIN_DEPTH) & (after > _MIN_DEPTH)
     cameras = seen.camera[usable]
     ratios = after[usable] / before[usable]

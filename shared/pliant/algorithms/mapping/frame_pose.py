@@ -1,0 +1,146 @@
+"""The pose of a frame in the map: from the tracks that it shares with it, then from points that are
+found again, then adjusted together with the window (VITAMIN-E section 3.2, Eq. 6)."""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8
+from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.directions import (
+    Spread,
+    helping_candidates,
+    placed_candidates,
+    spread_of,
+)
+from pliant.algorithms.mapping.localisation import locate, refine
+from pliant.algorithms.mapping.map_store import MAPPED, Observations
+from pliant.algorithms.mapping.observation_table import reprojection_errors
+from pliant.algorithms.mapping.reacquisition import reacquire
+from pliant.algorithms.mapping.recovery import Motion, recover
+from pliant.algorithms.mapping.rolling_shutter import RolledFrame
+from pliant.algorithms.mapping.support import Support, support_of
+from pliant.algorithms.tracks import FrameTracks
+
+_TELLING = 500
+"""Points at the least that tell whether a camera stands where it stood."""
+
+
+def directions_of(active: ActiveMap) -> I64:
+    """Indices of the tracks of candidates that help to place the frame."""
+    return helping_candidates(active.points, active.links.rows)
+
+
+def localise(
+    active: ActiveMap,
+    motion: Motion,
+    stamp_ns: int,
+    tracks: FrameTracks,
+    maxima: F32,
+    grey: U8 | None,
+    generator: np.random.Generator,
+) -> F64 | None:
+    """T_world_camera of the frame from the tracks of mapped points, or else from the map's points
+    in the image, which has these maxima (M, 3); None where both fail."""
+    points, parameters = active.points, active.parameters
+    directions = directions_of(active)
+    linked = np.concatenate([active.linked(MAPPED), directions])
+    limits = parameters.localisation
+    if len(linked) >= limits.min_inliers:
+        rows = active.links.rows[linked]
+        located = locate(
+            motion.predictions(stamp_ns), points.xyz[rows], tracks.points_px[linked],
+            active.camera, limits, generator, _spread(active, rows, directions),
+        )  # fmt: skip
+        if located.inliers.sum() >= limits.min_inliers:
+            return located.T_world_camera
+    if grey is None:
+        return None
+    return recover(
+        motion, stamp_ns, active.nearby(), points, maxima, grey, active.camera, parameters,
+        generator,
+    )  # fmt: skip
+
+
+def find_again(
+    active: ActiveMap,
+    frame: int,
+    T_world_camera: F64,
+    tracks: FrameTracks,
+    grey: U8 | None,
+    rolled: RolledFrame | None,
+) -> tuple[F64, Observations]:
+    """Find points without a track among the maxima, and refine the pose with them."""
+    points, parameters = active.points, active.parameters
+    no_px = np.zeros((0, 2), np.float32)
+    none = Observations(rows=np.zeros(0, np.int32), points_px=no_px, rolled_px=no_px)
+    if not parameters.reacquisition.enabled:
+        return T_world_camera, none
+    reacquired = reacquire(
+        T_world_camera, active.missing(frame), points.xyz, points.kappas, points.patches,
+        tracks.maxima, grey, active.camera, parameters.reacquisition,
+    )  # fmt: skip
+    found = active.take_over(reacquired, tracks)
+    if rolled is not None:
+        depths = active.inverse_depths(found.rows, T_world_camera)
+        points_px, rolled_px = rolled.found(found.points_px, depths)
+        found = Observations(rows=found.rows, points_px=points_px, rolled_px=rolled_px)
+    directions = directions_of(active)
+    rows, points_px = active.observed(tracks.points_px, found, directions)
+    located = refine(
+        T_world_camera, points.xyz[rows], points_px, active.camera, parameters.localisation,
+        near=True, spread=_spread(active, rows, directions),
+    )  # fmt: skip
+    linked = active.linked(MAPPED)
+    points.kappas[active.links.rows[linked]] = tracks.kappas[linked]
+    return located.T_world_camera, found
+
+
+def adjust(
+    active: ActiveMap,
+    motion: Motion,
+    T_world_camera: F64,
+    found: Observations,
+    tracks: FrameTracks,
+) -> tuple[F64, Support]:
+    """Eq. 6 over the window and this frame.  Returns its pose, and what there is for it."""
+    points, parameters, camera = active.points, active.parameters, active.camera
+    linked = active.linked(MAPPED)
+    xyz = points.xyz[active.links.rows[linked]]
+    errors = reprojection_errors(T_world_camera, xyz, tracks.points_px[linked], camera)
+    active.judge_tracks(linked, errors)
+    active.see(T_world_camera, tracks.points_px, found)
+    directions = directions_of(active)
+    if parameters.window.sweeps > 0 and not len(directions):
+        T_world_camera = active.window.sweep_current(camera, parameters)
+    rows, points_px = active.observed(tracks.points_px, found, directions)
+    errors = reprojection_errors(T_world_camera, points.xyz[rows], points_px, camera)
+    return T_world_camera, support_of(
+        tracks, motion.interval_s(), points_px, errors < parameters.localisation.inlier_px,
+        camera, parameters.support,
+    )  # fmt: skip
+
+
+def stand(
+    active: ActiveMap, T_world_camera: F64, found: Observations, tracks: FrameTracks
+) -> tuple[F64, bool]:
+    """Whether the frame stands where the last keyframe does, and its pose then."""
+    if active.since == len(active.keyframes):
+        return T_world_camera, False  # nobody knows where it was before
+    points, parameters = active.points, active.parameters
+    candidates = placed_candidates(points, active.links.rows)
+    rows, points_px = active.observed(tracks.points_px, found, candidates)
+    T_standing = T_world_camera
+    for every in (max(1, len(rows) // _TELLING), 1):  # a few tell of most that they moved
+        some = np.arange(0, len(rows), every)
+        located = refine(
+            T_world_camera, points.xyz[rows[some]], points_px[some], active.camera,
+            parameters.localisation, near=True,
+            spread=spread_of(points, rows[some], active.keyframes[-1]),
+        )  # fmt: skip
+        if not located.stands:
+            return T_world_camera, False
+        T_standing = located.T_world_camera
+    return T_standing, True
+
+
+def _spread(active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
+    return spread_of(active.points, rows, active.keyframes[-1]) if len(directions) else None
