@@ -37,7 +37,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "ingest",
         "pliant_services.nodes.ingest",
-        outputs=(topics.STREAM, topics.SOURCE, topics.IMAGE, topics.DEPTH),
+        outputs=(topics.STREAM, topics.MAP_KNOWN, topics.SOURCE, topics.IMAGE, topics.DEPTH),
     ),
     Process(
         "tracking",
@@ -50,7 +50,14 @@ PROCESSES: tuple[Process, ...] = (
         "pliant_services.nodes.bundle_adjustment",
         finishing="adjusting the whole map",
         inputs=(topics.STREAM, topics.IMAGE, topics.EXTREMA),
-        outputs=(topics.MAP_UPDATE, topics.MAP_FINAL, topics.KEYFRAME, topics.KEYFRAME_FINAL),
+        optional=(topics.MAP_KNOWN,),
+        outputs=(
+            topics.MAP_UPDATE,
+            topics.MAP_FINAL,
+            topics.KEYFRAME,
+            topics.KEYFRAME_FINAL,
+            topics.MAP_KEPT,
+        ),
         may_lag=True,
     ),
     Process(

@@ -39,6 +39,16 @@ class IngestParameters(Parameters):
         description="Images are worked on, and recorded, with no more pixels along their longer "
         "side; 0: as many as their details need, at most 1280.",
     )
+    start_s: float = Field(
+        default=0.0, ge=0.0, description="Frames are taken from so many seconds after the first on."
+    )
+    end_s: float = Field(
+        default=0.0, ge=0.0, description="And until so many seconds after it; 0: to the end."
+    )
+    every: int = Field(default=1, ge=1, description="One of so many frames is taken.")
+    sharpest: bool = Field(
+        default=False, description="Of these, that with the finest details, not the first."
+    )
     mapping_lag_s: float = Field(
         default=0.4,
         ge=0.0,
@@ -241,14 +251,15 @@ def recorded_config(metadata: Mapping[str, Mapping[str, str]], overrides: Sequen
     if not isinstance(content, dict):
         raise RecordingError("the configuration in the recording is damaged")
     known = {name for name, _, _ in describe()}
-    recorded = [setting for setting in _flat(content) if setting.partition("=")[0] in known]
+    recorded = [setting for setting in settings_of(content) if setting.partition("=")[0] in known]
     return load_config(None, [*recorded, *overrides])
 
 
-def _flat(content: Mapping[str, object], prefix: str = "") -> Iterator[str]:
+def settings_of(content: Mapping[str, object], prefix: str = "") -> Iterator[str]:
+    """``"bus.window=8"`` for ``{"bus": {"window": 8}}``, and for ``{"bus.window": 8}``."""
     for key, value in content.items():
         if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
+            yield from settings_of(value, f"{prefix}{key}.")
         else:
             flow = yaml.safe_dump(value, default_flow_style=True, width=10**9)
             yield f"{prefix}{key}={flow.removesuffix('...' + chr(10)).strip()}"

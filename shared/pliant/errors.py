@@ -37,6 +37,10 @@ class RecordingError(PliantError):
     """A recording cannot be written or read."""
 
 
+class MapError(PliantError):
+    """A map that was kept cannot be read, written or used."""
+
+
 class ResultError(PliantError):
     """A result folder or a trajectory file cannot be read, or would be overwritten."""
 

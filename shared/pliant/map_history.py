@@ -7,6 +7,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import matrix_to_pose, move_by_similarity, pose_to_matrix
+from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapDelta, MapMoves
 from pliant.trajectory import Trajectory
 
@@ -26,7 +27,7 @@ class FramePose:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A keyframe as last published."""
+    """A keyframe as last published.  frame: -1 where an earlier session made it."""
 
     frame: int
     segment: int
@@ -71,6 +72,12 @@ class _PointTable:
         ids = self.alive()
         xyz = self._columns["positions"]
         xyz[ids] = moves.points(xyz[ids], self._columns["hosts"][ids])
+
+    def join(self, gone: int, segment: int) -> None:
+        """The points of a segment belong to another one."""
+        if self._columns:
+            of = self._columns["segments"]
+            of[of == gone] = segment
 
     def alive(self) -> I64:
         """Ids of the points that exist."""
@@ -129,10 +136,31 @@ class CurrentMap:
         self.keyframes: dict[int, Keyframe] = {}
         self._points = _PointTable()
 
+    def know(self, kept: KeptKeyframe) -> None:
+        """Take in a keyframe of an earlier session, before all updates."""
+        pose = matrix_to_pose(kept.T_world_camera)
+        self.keyframes[kept.id] = Keyframe(-1, kept.segment, pose)
+        count = len(kept.point_ids)
+        columns = {
+            "segments": np.full(count, kept.segment, np.int32),
+            "positions": kept.points_world,
+            "colours": kept.point_colours,
+            "keyframes": kept.point_keyframes,
+            "parallax_rad": kept.point_parallax_rad,
+            "sigmas": kept.point_sigmas,
+            "hosts": np.full(count, kept.id, np.int64),
+        }
+        self._points.update(kept.point_ids, -1, columns)
+
     def take(self, delta: MapDelta, frame: int) -> None:
         """Take in the keyframes and points of one update."""
         if len(delta.moved_keyframes):
             self._move(delta.map_moves())
+        for gone, segment in delta.joined.tolist():
+            self._points.join(gone, segment)
+            for number, keyframe in self.keyframes.items():
+                if keyframe.segment == gone:
+                    self.keyframes[number] = replace(keyframe, segment=segment)
         for row in range(len(delta.keyframe_ids)):
             self.keyframes[int(delta.keyframe_ids[row])] = Keyframe(
                 int(delta.keyframe_frames[row]),
@@ -171,6 +199,11 @@ class CurrentMap:
         """Every point that exists now."""
         return self._points.of(self._points.alive())[1]
 
+    def points_in(self, segment: int) -> Points:
+        """Those of a segment: each is a world of its own."""
+        points = self.points()
+        return points.select(points.segments == segment)
+
 
 class MapHistory(CurrentMap):
     """Applies updates in order of frame; asks nothing of the mapper but its messages."""
@@ -179,7 +212,8 @@ class MapHistory(CurrentMap):
         super().__init__()
         self.stamps_ns: dict[int, int] = {}
         self.causal: dict[int, tuple[int, F64]] = {}
-        """Segment and T_world_camera of each frame as known when the frame was done."""
+        """Segment and T_world_camera of each frame as known when the frame was done: what became of
+        that segment later is not told."""
         self.frames: dict[int, FramePose] = {}
         self.states: dict[int, tuple[int, str]] = {}
 
@@ -188,6 +222,10 @@ class MapHistory(CurrentMap):
         self.take(delta, frame)
         if len(delta.moved_keyframes):
             self._scale(delta.map_moves())
+        for gone, segment in delta.joined.tolist():
+            for number, pose in self.frames.items():
+                if pose.segment == gone:
+                    self.frames[number] = replace(pose, segment=segment)
         for row in range(len(delta.pose_frames)):
             self.frames[int(delta.pose_frames[row])] = FramePose(
                 int(delta.pose_segments[row]),
@@ -226,6 +264,10 @@ class MapHistory(CurrentMap):
             counts[segment] = counts.get(segment, 0) + 1
         return max(counts, key=counts.__getitem__, default=-1)
 
+    def trajectory_in(self, segment: int, poses: dict[int, tuple[int, F64]]) -> Trajectory:
+        """Those of the poses that are in a segment, as ``trajectory``."""
+        return self.trajectory({f: pose for f, pose in poses.items() if pose[0] == segment})
+
     def trajectory(self, poses: dict[int, tuple[int, F64]]) -> Trajectory:
         """Poses by frame as a trajectory, in order of time."""
         frames = sorted(poses)
@@ -235,8 +277,9 @@ class MapHistory(CurrentMap):
         return Trajectory.from_poses(stamps, np.array([poses[frame][1] for frame in frames]))
 
     def keyframe_poses(self) -> dict[int, tuple[int, F64]]:
-        """Segment and T_world_camera of each keyframe, by frame."""
-        ordered = sorted(self.keyframes.values(), key=lambda keyframe: keyframe.frame)
+        """Segment and T_world_camera of each keyframe of this session, by frame."""
+        own = (keyframe for keyframe in self.keyframes.values() if keyframe.frame >= 0)
+        ordered = sorted(own, key=lambda keyframe: keyframe.frame)
         return {k.frame: (k.segment, k.pose_world_camera) for k in ordered}
 
     def _world(self, pose: FramePose) -> F64:

@@ -12,7 +12,8 @@ from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.algorithms.tracks import FrameTracks
 from pliant.config import Config
-from pliant.datasets.base import Dataset
+from pliant.datasets.base import Dataset, SourceFrame
+from pliant.datasets.calibration import Calibration
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.map_history import MapHistory
 from pliant.messages.types import Image
@@ -35,6 +36,50 @@ class Timers:
     bundle_adjustment: StageTimer = no_stages
 
 
+class Pipeline:
+    """Tracker and mapper of one camera; ``history`` is complete after ``finish``."""
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        config: Config,
+        history: MapHistory,
+        timers: Timers = Timers(),
+    ) -> None:
+        self.history = history
+        self._timers = timers
+        self._rectifier = Rectifier(calibration)
+        camera = self._rectifier.camera
+        self._tracker = ExtremaTracker(camera.width, camera.height, config.tracking, config.seed)
+        self._mapper = mapper_for(
+            camera, config.bundle_adjustment, config.seed, calibration.focal_sigma
+        )
+        self._last = 0
+
+    def take(self, source: SourceFrame) -> Frame:
+        """Track and map the next frame."""
+        image = rectified(source, self._rectifier)
+        if image.missing:
+            tracks = FrameTracks.empty()
+            delta = self._mapper.skip(image.frame)
+        else:
+            tracks = self._tracker.track(image.grey, self._timers.tracking)
+            colour = image.colour if image.colour.size else None
+            delta = self._mapper.process(
+                image.frame, image.stamp_ns, tracks, image.grey, colour,
+                self._timers.bundle_adjustment,
+            )  # fmt: skip
+        self.history.apply(delta, frame=image.frame, stamp_ns=image.stamp_ns)
+        self._last = image.frame
+        return Frame(image, tracks, delta)
+
+    def finish(self) -> MapDelta:
+        """What is still to be corrected at the end of the stream."""
+        delta = self._mapper.finish()
+        self.history.apply(delta, frame=self._last, stamp_ns=0, final=True)
+        return delta
+
+
 def process(
     dataset: Dataset,
     config: Config,
@@ -43,24 +88,7 @@ def process(
     timers: Timers = Timers(),
 ) -> Iterator[Frame]:
     """Track and map every frame of a source; ``history`` is complete once the iterator ends."""
-    rectifier = Rectifier(dataset.calibration)
-    camera = rectifier.camera
-    tracker = ExtremaTracker(camera.width, camera.height, config.tracking, config.seed)
-    focal_sigma = dataset.calibration.focal_sigma
-    mapper = mapper_for(camera, config.bundle_adjustment, config.seed, focal_sigma)
-    last = 0
+    pipeline = Pipeline(dataset.calibration, config, history, timers)
     for source in dataset:
-        image = rectified(source, rectifier)
-        if image.missing:
-            tracks = FrameTracks.empty()
-            delta = mapper.skip(image.frame)
-        else:
-            tracks = tracker.track(image.grey, timers.tracking)
-            colour = image.colour if image.colour.size else None
-            delta = mapper.process(
-                image.frame, image.stamp_ns, tracks, image.grey, colour, timers.bundle_adjustment
-            )
-        history.apply(delta, frame=image.frame, stamp_ns=image.stamp_ns)
-        yield Frame(image, tracks, delta)
-        last = image.frame
-    history.apply(mapper.finish(), frame=last, stamp_ns=0, final=True)
+        yield pipeline.take(source)
+    pipeline.finish()

@@ -32,7 +32,7 @@ _ROOMS = (
 _CLASSES = {
     *("ExtremaTracker", "BriefExtractor"),
     *("Mapper", "ActiveMap", "PointRows", "Window", "Path", "TrackLinks", "TrialMapper"),
-    *("EarlierSegments", "MapChanges", "KeyframeChanges"),
+    *("EarlierSegments", "Localiser", "MapChanges", "KeyframeChanges"),
     *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
 }
 """Those that are no records: neither dataclasses, nor named tuples, nor parameters."""

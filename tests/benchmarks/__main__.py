@@ -48,6 +48,30 @@ def places(sources: Sources, overrides: Overrides = None) -> None:
     _print(measure(sources, load_config(None, overrides or [])))
 
 
+@app.command("kept-maps")
+def kept_maps(sources: Sources, overrides: Overrides = None) -> None:
+    """Sources cut in two: the second half localised in the map of the first, and going on in it.
+
+    scripts/bench kept-maps path/to/7scenes_redkitchen400 built-in:room
+    """
+    from benchmarks.kept_maps import measure
+    from pliant.config import load_config
+
+    _print(measure(sources, load_config(None, overrides or [])))
+
+
+@app.command()
+def sessions(sources: Sources, overrides: Overrides = None) -> None:
+    """Sources forth and back, whole and as two sessions with the dark between them.
+
+    scripts/bench sessions path/to/7scenes_redkitchen400 built-in:corridor
+    """
+    from benchmarks.sessions import measure
+    from pliant.config import load_config
+
+    _print(measure(sources, load_config(None, overrides or [])))
+
+
 @app.command("surfel-speed")
 def surfel_speed(
     source: Annotated[

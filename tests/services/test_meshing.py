@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import matrix_to_pose
+from pliant.algorithms.geometry import inverse, matrix_to_pose, move_by_similarity, transform
 from pliant.algorithms.meshing.mesh_blocks import BlockMesh
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import load_config
@@ -370,3 +370,76 @@ def test_the_spool_gives_back_what_it_got() -> None:
         np.testing.assert_array_equal(found[0], ids[:7])
         np.testing.assert_array_equal(found[1], pixels[:7])
         assert spool.size_bytes > 0
+
+
+MET, JOINED = 2, 4
+"""Frames: from MET on the camera is in another segment, until it is known where that lies."""
+
+
+def two_segments() -> Inputs:
+    """The same keyframes; those of a second segment at twice the size, with points of its own."""
+    given = inputs()
+    T = looking_aside()
+    larger = T @ np.diag([2.0, 2.0, 2.0, 1.0])
+    first = map_update(0)
+    own = {
+        "point_ids": first.point_ids + POINTS, "point_segments": np.ones(POINTS, np.int32),
+        "points_world": transform(larger, first.points_world),
+        "point_hosts": np.full(POINTS, MET),
+    }  # fmt: skip
+    for frame in range(MET, FRAMES):
+        update = map_update(frame)
+        if frame < JOINED:
+            there = matrix_to_pose(move_by_similarity(larger, pose(frame))[None])
+            one = np.ones(1, np.int32)
+            update = replace(update, segment=1, keyframe_segments=one, keyframe_poses=there)
+        if frame == MET:
+            points = {name: getattr(first, name) for name in vars(first) if "point" in name}
+            update = replace(update, **points | own)
+        if frame == JOINED:
+            back = inverse(T)
+            back[:3, 3] *= 0.5
+            update = replace(
+                update, joined=np.array([[1, 0]], np.int32), moved_keyframes=np.array([MET]),
+                moves=np.append(matrix_to_pose(back), 0.5)[None],
+            )  # fmt: skip
+        given[topics.MAP_UPDATE][frame] = update
+    for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
+        given[topic] = [seeing_its_own(message) for message in given[topic]]
+    return given
+
+
+def looking_aside() -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], (1.0, 2.0, 3.0)
+    return T
+
+
+def seeing_its_own(message: Header) -> Keyframe:
+    """Keyframes of the second segment, and later ones, see the points of that one."""
+    assert isinstance(message, Keyframe)
+    own = np.repeat(message.keyframe_ids >= MET, message.counts)
+    return replace(message, point_ids=message.point_ids + POINTS * own)
+
+
+def live_triangles(made: dict[Topic, list[Header]], segment: int) -> int:
+    """Of the last mesh that a viewer has of a segment."""
+    held = BlockMesh()
+    for message in made[topics.MESH_BLOCKS]:
+        assert isinstance(message, MeshUpdate)
+        if message.segment == segment:
+            held.apply(message)
+        else:
+            held = BlockMesh()
+    return int(held.blocks(held.packed_keys()).triangle_counts.sum())
+
+
+def test_segments_that_were_joined_are_one_mesh(outputs: dict[Topic, list[Header]]) -> None:
+    made = run(two_segments())
+    for level in ("fine", "coarse"):
+        one, alone = final(made, level), final(outputs, level)
+        assert (one.segment, one.keyframes) == (0, FRAMES)
+        assert len(one.triangles) == pytest.approx(len(alone.triangles), rel=0.05)
+        assert one.positions[:, 2].max() < 4.1
+    # Its voxels are those of the first keyframe that was fused, which is another one.
+    assert live_triangles(made, 0) == pytest.approx(live_triangles(outputs, 0), rel=0.2)

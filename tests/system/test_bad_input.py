@@ -24,6 +24,7 @@ from running import (
 )
 
 from pliant.bus.session import free_endpoint, open_router
+from pliant.datasets.builtin import builtin_folder
 from pliant.messages import topics
 from pliant.recording.reader import Recording
 from pliant_services import cli
@@ -42,6 +43,7 @@ IMAGES = [IMAGE] * 3
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with some bad input, as the working folder."""
+    builtin_folder(TINY)  # on a new machine it would be rendered, and say so
     (tmp_path / "file").write_text("hello\n")
     (tmp_path / "empty").mkdir()
     (tmp_path / "misspelt.yaml").write_text("tracking:\n  min_curvatur: 8\n")

@@ -110,7 +110,7 @@ def test_the_demo_sets_itself_up_and_leaves_what_it_names(machine_with_venv: Mac
     assert done.returncode == 0, done.stdout + done.stderr
     _, list_of_files = done.stdout.split("Look at:")
     named = [word for word in list_of_files.split() if word.startswith("results/demo/")]
-    assert len(named) == 6  # the mesh is among them
+    assert len(named) == 7  # the mesh is among them
     for name in named:
         assert machine_with_venv.shell(f"test -s ~/pliant/{name}").returncode == 0, name
 

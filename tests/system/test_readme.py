@@ -12,7 +12,6 @@ import cv2
 import pytest
 
 from pliant.datasets.builtin import builtin_folder
-from pliant.datasets.calibration_files import read_calibration
 
 pytestmark = pytest.mark.system
 
@@ -99,22 +98,21 @@ def test_a_camera_that_is_not_there_is_one_line(clean_folder: Path) -> None:
     assert "camera" in line
 
 
-def test_the_python_example_maps_a_sequence(
-    sequence: Path, capsys: pytest.CaptureFixture[str]
+def test_the_python_example_maps_a_video(
+    sequence: Path,
+    clean_folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (example,) = blocks("python")
-    code = [line for line in example.splitlines() if line and "import" not in line]
-    assert len(code) <= 10
-    own = read_calibration(sequence / "calib.yaml")
-    keys = ("width", "height", "fx", "fy", "cx", "cy")
-    values = ", ".join(f"{key}={getattr(own, key)}" for key in keys)
-    example, count = re.subn(r"PinholeCamera\([^)]*\)", f"PinholeCamera({values})", example)
-    assert count == 1
+    monkeypatch.chdir(clean_folder)
     images = [str(path) for path in sorted((sequence / "images").iterdir())]
     exec(compile(example, "README.md", "exec"), {"image_paths": images})
-    rows = re.findall(r"^(\d+) (\d+) ", capsys.readouterr().out, re.MULTILINE)
+    said = capsys.readouterr().out
+    rows = re.findall(r"^(\d+) (\d+) (?:None|\[\[)", said, re.MULTILINE)
     assert [int(frame) for frame, _ in rows] == list(range(len(images)))
-    assert sum(int(inliers) >= 30 for _, inliers in rows) > len(images) // 2
+    (poses,) = re.findall(r"^(\d+) poses$", said, re.MULTILINE)
+    assert int(poses) > len(images) // 2
 
 
 def test_the_files_that_the_readme_points_to_are_there() -> None:

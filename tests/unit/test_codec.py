@@ -15,7 +15,7 @@ from pliant.algorithms.tracks import FrameTracks
 from pliant.errors import MessageError
 from pliant.messages import codec
 from pliant.messages.topics import TOPICS, status
-from pliant.messages.types import Extrema, Header, Image, Surfels
+from pliant.messages.types import Extrema, Header, Image, MapUpdate, Surfels
 
 MESSAGES = sorted({t.message for t in (*TOPICS, status("ingest"))}, key=lambda m: m.__name__)
 _SCALARS = {
@@ -118,6 +118,18 @@ def test_a_missing_field_is_named_and_an_unknown_one_passed_over() -> None:
     del content["ids"]
     with pytest.raises(MessageError, match="ids"):
         codec.decode(Extrema, msgpack.packb(content))
+
+
+def test_a_map_of_a_recording_from_before_segments_were_joined() -> None:
+    fields = array_fields(MapUpdate)
+    sides = {f.name: [side if isinstance(side, int) else 0 for side in f.shape] for f in fields}
+    update = MapUpdate(
+        frame=1, stamp_ns=2, frame_id="", state=0, reason="", segment=-1, inliers=0,
+        **{f.name: np.zeros(sides[f.name], f.dtype) for f in fields},
+    )  # fmt: skip
+    content = msgpack.unpackb(codec.encode(update))
+    del content["joined"]
+    assert codec.decode(MapUpdate, msgpack.packb(content)).joined.shape == (0, 2)
 
 
 def test_surfels_of_a_recording_that_does_not_tell_where_they_were_tried() -> None:

@@ -274,10 +274,10 @@ def keyframe_at(number, x):
 def test_points_are_looked_for_near_the_newest_keyframe_only():
     keyframes = [keyframe_at(k, 10.0 * k) for k in range(40)]
     newest = keyframe_at(40, 12.0)
-    near = near_keyframes(keyframes, newest, 3)
+    near = near_keyframes(keyframes, newest.T_world_camera, 3)
     assert [keyframe.id for keyframe in near] == [0, 1, 2]
     assert rows_of(near, np.array([7], np.int32), 50).tolist() == [0, 1, 2, 7]
-    assert near_keyframes(keyframes[:2], newest, 3) == keyframes[:2]
+    assert near_keyframes(keyframes[:2], newest.T_world_camera, 3) == keyframes[:2]
 
 
 def test_missing_points_are_mapped_have_no_track_and_wait_after_many_misses():

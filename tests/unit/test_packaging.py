@@ -62,7 +62,9 @@ def test_the_wheel_holds_the_two_packages_whole_and_nothing_else(wheel: Path) ->
     }
     assert packed == sources
     assert {"pliant/py.typed", "pliant_services/py.typed"} <= packed
-    assert all(Path(name).suffix in {".py", ".typed", ".yaml", ".json"} for name in packed)
+    assert all(
+        Path(name).suffix in {".py", ".typed", ".yaml", ".json", ".html", ".js"} for name in packed
+    )
 
 
 def test_the_wheel_is_any_python_3_and_carries_its_licence(wheel: Path) -> None:

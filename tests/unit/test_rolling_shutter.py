@@ -8,6 +8,7 @@ from mapping_scene import INTERVAL_NS, Scene, looking
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import align_umeyama, inverse, so3_exp
+from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -34,6 +35,16 @@ def keyframe(number, T_world_camera):
         id=number, frame=10 * number, segment=0, T_world_camera=T_world_camera, rows=none,
         points_px=np.zeros((0, 2), np.float32), rolled_px=np.zeros((0, 2), np.float32),
     )  # fmt: skip
+
+
+def test_the_motion_of_an_earlier_session_is_known_and_scales_with_the_map():
+    path = Path({3: np.concatenate([OMEGA, NU])})
+    known, unknown = keyframe(3, np.eye(4)), keyframe(4, np.eye(4))
+    np.testing.assert_array_equal(path.motions([known])[0], [*OMEGA, *NU])
+    assert not path.motions([unknown]).any()
+    moves = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0]])
+    path.scale(MapMoves(keyframe_ids=np.array([0], np.int64), moves=moves))
+    np.testing.assert_allclose(path.motions([known])[0], [*OMEGA, *2.0 * NU])
 
 
 def test_the_motion_is_that_of_the_frames_around():

@@ -19,6 +19,7 @@ from pliant_services.cli import (
     view,
 )
 from pliant_services.cli import evaluate as evaluate_command
+from pliant_services.cli import map as map_commands
 
 app.command("run")(run.run)
 app.command("service")(service.service)
@@ -31,6 +32,7 @@ app.command("export")(export.export)
 app.command("view")(view.view)
 app.command("mesh")(mesh.mesh)
 app.command("info")(info.info)
+app.add_typer(map_commands.app, name="map")
 app.command("recover")(recover.recover)
 app.command("replay")(replay.replay)
 app.command("render")(render.render)

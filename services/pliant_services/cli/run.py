@@ -49,9 +49,32 @@ def run(
     fov: Annotated[
         float | None, typer.Option(help="Horizontal field of view in degrees, for a first try.")
     ] = None,
+    known: Annotated[
+        Path | None,
+        typer.Option("--map", help="Go on in the map of an earlier run: its folder or map.pliant."),
+    ] = None,
+    localise: Annotated[
+        bool, typer.Option("--localise", help="Find each frame in that map, and map nothing.")
+    ] = False,
     topic: Annotated[
         str, typer.Option(help="The images of an MCAP file or ROS bag that has several.")
     ] = "",
+    start: Annotated[
+        float | None, typer.Option(min=0.0, help="Begin so many seconds after the first frame.")
+    ] = None,
+    end: Annotated[
+        float | None, typer.Option(min=0.0, help="End so many seconds after the first frame.")
+    ] = None,
+    every: Annotated[
+        int | None, typer.Option(min=1, help="Take one of so many frames [1].")
+    ] = None,
+    sharpest: Annotated[
+        bool, typer.Option("--sharpest", help="With --every: the sharpest of them, not the first.")
+    ] = False,
+    max_size: Annotated[
+        int | None,
+        typer.Option(min=1, help="Pixels along the longer side [what the details need]."),
+    ] = None,
     view: Annotated[
         Literal["window", "web"] | None, typer.Option(help="Look on in Rerun (pliant view).")
     ] = None,
@@ -88,6 +111,12 @@ def run(
 
     pliant run video.mp4 --fov 70 --set tracking.max_tracks=5000
 
+    pliant run video.mp4 --start 10 --end 40 --every 5 --sharpest
+
+    pliant run today.mp4 --calibration calib.yaml --map results/yesterday
+
+    pliant run camera:0 --calibration calib.yaml --map results/office --localise
+
     pliant run path/to/cloth --profile deformable --camera static
 
     pliant run path/to/tissue --profile deformable --camera moving --depth map
@@ -97,9 +126,21 @@ def run(
     sets = [*(overrides or []), *([f"ingest.mode={mode}"] if mode else [])]
     if profile == "rigid" and (camera or depth_frames or depth):
         raise typer.BadParameter("--camera, --depth and --depth-frames need --profile deformable")
+    if sharpest and not every:
+        raise typer.BadParameter("--sharpest needs --every: of how many frames?")
+    part = {"start_s": start, "end_s": end, "every": every, "longest_side_px": max_size}
+    sets += [f"ingest.{name}={value}" for name, value in part.items() if value is not None]
+    sets += ["ingest.sharpest=true"] if sharpest else []
     sets += [f"surfels.camera={camera}"] if camera else []
     sets += [f"surfels.depth_from={depth}"] if depth else []
     sets += [f"ingest.depth={depth_frames}"] if depth_frames else []
+    if localise and known is None:
+        raise typer.BadParameter("--localise needs --map: a result folder or its map.pliant")
+    if known is not None and profile != "rigid":
+        raise typer.BadParameter("--map needs --profile rigid: surfels keep no map")
+    # A map that does not grow has no new surface.
+    localising = ["bundle_adjustment.only_localise=true", "meshing.enabled=false"]
+    sets += localising if localise else []
     sets += [] if images else ["recorder.images=false"]
     request = RunRequest(
         source=source,
@@ -111,6 +152,7 @@ def run(
         seed=seed,
         calibration=calibration,
         fov_deg=fov,
+        known=known,
         topic=topic,
         view=view,
         save=save,

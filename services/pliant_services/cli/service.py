@@ -34,6 +34,9 @@ def service(
     fov: Annotated[
         float | None, typer.Option(help="ingest: horizontal field of view in degrees.")
     ] = None,
+    known: Annotated[
+        Path | None, typer.Option("--map", help="ingest: a map of earlier sessions to go on in.")
+    ] = None,
     topic: Annotated[str, typer.Option(help="ingest: the images of a file with several.")] = "",
     output: Annotated[Path | None, typer.Option(help="recorder: the MCAP file to write.")] = None,
     metadata: Annotated[
@@ -87,6 +90,7 @@ def service(
     arguments: dict[str, Any] = {}
     if name == "ingest":
         from pliant.datasets import open_source
+        from pliant.recording.map_file import MapFile
 
         if not source:
             raise PliantError("ingest needs --source: a folder, a video, camera:0 or built-in:room")
@@ -97,7 +101,9 @@ def service(
             topic=topic,
             depth=config.ingest.depth if reads_depth(names, config) else "none",
             longest_side_px=config.ingest.longest_side_px,
+            part=config.ingest,
         )
+        arguments["known"] = None if known is None else MapFile(known)
     elif name == "recorder":
         if output is None:
             raise PliantError("recorder needs --output: the MCAP file to write")

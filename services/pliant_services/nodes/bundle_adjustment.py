@@ -1,6 +1,7 @@
 """Bundle adjustment: where the camera is and what it sees, from tracks alone.
 
 in   camera/stream    once
+     map/known        before the first frame: a map of earlier sessions, to go on in
      camera/image     every frame: colours, and patches for re-acquisition; in live mode, whether
                       to pass over the frame
      tracks/extrema   every frame
@@ -9,6 +10,8 @@ out  map/update       one per frame: pose, points, keyframes, corrections of ear
      map/keyframe     one per frame: a new keyframe with its image, observations of those that leave
                       (as a map starts: the images of all keyframes that it starts from)
      map/keyframe_final   one, after the last frame: observations of those still in the window
+     map/kept         after that: each keyframe of the map with all that was known, for sessions to
+                      come
 
 The whole map is adjusted in a thread beside the frames, see ``whole_map.py``.
 """
@@ -18,6 +21,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import cv2
 
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
 from pliant.algorithms.mapping.whole_map import Answer, Question, WholeMap, find_moves
@@ -32,6 +36,7 @@ from pliant.messages.types import (
     Header,
     Image,
     Keyframe,
+    MapKeyframe,
     MapUpdate,
 )
 from pliant_services.runtime.link_images import receive_images
@@ -44,10 +49,13 @@ _JPEG_QUALITY = 95
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     """Map until the tracks end."""
 
-    def start() -> tuple[Header, Mapper | TrialMapper, dict[int, bytes]]:
+    def start() -> tuple[Header, Mapper | TrialMapper | Localiser, dict[int, bytes]]:
         stream = receive_one(bus, topics.STREAM, CameraStream)
+        known: list[MapKeyframe] = []
+        if bus.reads(topics.MAP_KNOWN):
+            known += receive(bus, topics.MAP_KNOWN, MapKeyframe)
         parameters, sigma = config.bundle_adjustment, stream.focal_sigma
-        return stream, mapper_for(stream.camera, parameters, config.seed, sigma), {}
+        return stream, mapper_for(stream.camera, parameters, config.seed, sigma, known), {}
 
     # waiting: images of the frames from which a map may yet start, by frame number.
     last, mapper, waiting = resume(bus, start)
@@ -88,6 +96,9 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     bus.publish(topics.MAP_FINAL, _update(last, final))
     keyframes = _keyframe(last, mapper.publish_keyframes(), final, waiting)
     bus.publish(topics.KEYFRAME_FINAL, keyframes)
+    for number, kept in enumerate(mapper.kept()):
+        header = Header(frame=number, stamp_ns=0, frame_id=WORLD_FRAME_ID)
+        bus.publish(topics.MAP_KEPT, MapKeyframe.of(header, kept))
     monitor.report(last, points=mapper.point_count)
 
 

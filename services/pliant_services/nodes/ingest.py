@@ -2,6 +2,7 @@
 
 in   an image folder, a video, a camera, a built-in sequence
 out  camera/stream   once: the camera
+     map/known       before the first frame: the keyframes of a map of earlier sessions
      camera/source   every frame: its bytes as they came
      camera/image    every frame: rectified; empty where it was dropped or does not decode; over a
                      link as ``link_images`` says; who passes over it, as ``keeping_up`` says
@@ -25,6 +26,7 @@ from pliant.datasets.working_size import SmallerImages
 from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import topics
 from pliant.messages.types import CAMERA_FRAME_ID, CameraStream, Depth, Image, SourceImage
+from pliant.recording.map_file import MapFile
 from pliant_services.runtime.keeping_up import (
     Drops,
     MappingPace,
@@ -36,10 +38,16 @@ from pliant_services.runtime.monitor import Monitor
 
 
 def run(
-    bus: Bus, config: Config, monitor: Monitor, dataset: Dataset, stopping: Callable[[], bool]
+    bus: Bus,
+    config: Config,
+    monitor: Monitor,
+    dataset: Dataset,
+    stopping: Callable[[], bool],
+    known: MapFile | None = None,
 ) -> None:
     """Publish until the source ends or ``stopping()``.
 
+    known: a map of earlier sessions.
     Raises SourceLostError where the source fails after its first frame; what came before is sent.
     """
     live = plays_live(dataset, config)
@@ -49,6 +57,9 @@ def run(
     def start() -> tuple[Any, ...]:
         bus.publish(topics.STREAM, _stream(dataset, rectifier, live=live))
         bus.end(topics.STREAM)  # its readers wait for its end before the first frame
+        for keyframe in known.keyframes() if known is not None else ():
+            bus.publish(topics.MAP_KNOWN, keyframe)
+        bus.end(topics.MAP_KNOWN)
         # One less than there is credit for: the tracks of a frame are taken after its image.
         return 0, 0, 0, (deque[int](maxlen=config.bus.window - 1),), ({},)
 

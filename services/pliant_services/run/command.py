@@ -2,7 +2,6 @@
 
 import math
 import os
-import re
 import shutil
 import sys
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from pliant.datasets.working_size import SmallerImages
 from pliant.errors import CalibrationError, PliantError, ResultError
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.recording import parts
+from pliant.recording.map_file import MapFile
 from pliant.recording.recover import mend
 from pliant.results.folder import (
     CONFIG_NAME,
@@ -28,6 +28,7 @@ from pliant.results.folder import (
     STATE_FOLDER,
     files_of,
     files_read,
+    folder_name,
     keep_apart,
     prepare,
     written,
@@ -56,6 +57,7 @@ class RunRequest:
     seed: int | None = None
     calibration: Path | None = None
     fov_deg: float | None = None
+    known: Path | None = None
     topic: str = ""
     port: int | None = None
     view: Literal["window", "web"] | None = None
@@ -69,14 +71,20 @@ def run_pipeline(request: RunRequest) -> int:
 
     Everything is checked before an earlier result is touched.
     """
-    output = request.output or Path("results") / _folder_name(request.source)
+    output = request.output or Path("results") / folder_name(request.source)
     source = Path(request.source)
     read = [source, *parts.parts_of(source)] if os.path.exists(request.source) else []
+    known = None if request.known is None else MapFile(request.known)
+    if known is not None:
+        read.append(known.path)
     keep_apart(output, read)
     if request.save is not None:
         keep_apart(request.save, [*read, *files_read(output)], option="--save")
     web, looked_on = request.view == "web", bool(request.view or request.save)
     with Viewer(web=web, save=request.save) if looked_on else nullcontext() as viewer:
+        if known is not None:
+            for _ in known.keyframes():  # said before anything is touched
+                pass
         with written(output, force=request.force or request.resume):
             code = _run_into(output, request, viewer)
         if viewer is not None and code != INTERRUPTED:
@@ -104,6 +112,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
         topic=request.topic,
         depth=config.ingest.depth if reads_depth(PROFILES[profile], config) else "none",
         longest_side_px=config.ingest.longest_side_px,
+        part=config.ingest,
     )
     progress = Progress(dataset.frame_count)
     if isinstance(dataset, SmallerImages):
@@ -223,6 +232,7 @@ def service_arguments(name: str, request: RunRequest, output: Path) -> list[str]
         extra += ["--calibration", str(request.calibration)] if request.calibration else []
         extra += ["--fov", str(request.fov_deg)] if request.fov_deg is not None else []
         extra += ["--topic", request.topic] if request.topic else []
+        extra += ["--map", str(request.known)] if request.known is not None else []
     if name == "recorder":
         extra += ["--output", str(output / RECORDING_NAME)]
         extra += ["--metadata", str(output / "logs" / "metadata.json")]
@@ -283,10 +293,3 @@ def _say_guess(calibration: Calibration, profile: str, progress: Progress) -> No
 def _say_rendering(what: str, done: int, total: int) -> None:
     if done == 0:
         print(f"built-in sequence, {what} (once) ...", file=sys.stderr)
-
-
-def _folder_name(source: str) -> str:
-    name = source.rstrip("/").rsplit("/", 1)[-1]
-    if name in ("", ".", ".."):
-        name = Path(source).resolve().name
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name) or "run"

@@ -61,13 +61,14 @@ class MapDelta:
     state: WAITING, TRACKING or LOST.
     reason: why the map cannot start or was lost; when TRACKING why the pose is doubtful, mostly "".
     segment: id of the map segment that the camera is in, or was in last; an earlier one goes on
-        where its place is recognised.  Segments are never joined.   -1 before the first.
+        where its place is recognised.   -1 before the first.
     inliers: points that support this frame's pose (reprojection error < 1.5 px).
     pose_frames: frames whose pose is new or changed; includes this frame when it is localised.
     pose_segments, pose_keyframes: the segment and the keyframe id on which each of them hangs.
     poses_keyframe_camera: T_keyframe_camera for each.
     pose_inliers: points that support each.
-    keyframe_ids, keyframe_frames, keyframe_segments: keyframes that are new or have moved.
+    keyframe_ids, keyframe_frames, keyframe_segments: keyframes that are new or have moved; frame -1
+        for those that an earlier session made.
     keyframe_poses: T_world_camera for each.
     point_ids: points that are new or have changed.      point_segments: theirs.
     points_world: positions.      point_colours: RGB (grey is repeated).
@@ -78,6 +79,8 @@ class MapDelta:
     removed_point_ids: points that no longer exist (wrong, or merged into another).
     moved_keyframes, moves: how the whole map moved before all else of this update: ``MapMoves``.
         Keyframes and points move; of poses that hang on a keyframe, the distance to it scales.
+    joined: segments that have become one, after ``moves`` and before all else: what belongs to the
+        first of each row belongs to the second from now on, where ``moves`` has brought it.
     calibration_correction: (s, k1, k2, readout, a, b), what the last adjustment found wrong with
         the calibration: a point of the map at (x, y) on the plane z = 1 is seen in the rectified
         image at ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx``, likewise v with b, and a rolling
@@ -114,6 +117,9 @@ class MapDelta:
     point_hosts: Annotated[I64, Shape("P")] = field(default_factory=_no_ids)
     moved_keyframes: Annotated[I64, Shape("C")] = field(default_factory=_no_ids)
     moves: Annotated[F64, Shape("C", 8)] = field(default_factory=lambda: np.zeros((0, 8)))
+    joined: Annotated[I32, Shape("J", 2)] = field(
+        default_factory=lambda: np.zeros((0, 2), np.int32)
+    )
 
     def hosts(self) -> I64:
         """(P,) ``point_hosts``; -1 in recordings from before maps moved."""

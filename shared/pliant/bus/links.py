@@ -132,7 +132,7 @@ class OutLink:
             readers,
             window=window.messages,
             window_bytes=window.size,
-            windows=windows,
+            windows={} if topic.kept_whole else windows,
             lags=lags,
         )
         self.ended = False

@@ -14,6 +14,7 @@ from pliant.datasets.calibration import Calibration, calibration_from_yaml, cali
 from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.camera_device import CameraDevice, camera_index
 from pliant.datasets.euroc import is_euroc, open_euroc
+from pliant.datasets.excerpt import Excerpt, Part, is_all
 from pliant.datasets.folder import (
     is_bare_folder,
     is_listed_folder,
@@ -37,6 +38,7 @@ __all__ = [
     "Calibration",
     "CameraDevice",
     "Dataset",
+    "Part",
     "Rectifier",
     "SourceFormat",
     "SourceFrame",
@@ -126,6 +128,7 @@ def open_source(
     topic: str = "",
     depth: Literal["none", "first", "all"] = "none",
     longest_side_px: int = 0,
+    part: Part | None = None,
 ) -> Dataset:
     """Open a source of frames of any of the ``FORMATS``, and check it as far as can be seen.
 
@@ -134,11 +137,14 @@ def open_source(
     topic: which images of a file that holds several; "" where there is one.
     depth: which depth maps the frames bring along; a source without any is refused then.
     longest_side_px: to which larger images are made smaller; 0: as large as their details need.
+    part: which frames are taken; None: all.
 
     Raises DatasetError or CalibrationError: one line with what is wrong, where, and what to do.
     """
     if not source or "\0" in source:
         raise DatasetError(f"source {source!r}: is empty; understood are {understood()}")
+    first_depth = depth == "first"
+    depth = "all" if first_depth and not is_all(part) else depth  # that of its first is elsewhere
     options = SourceOptions(calibration=calibration, fov_deg=fov_deg, topic=topic, depth=depth)
     path = Path(source)
     try:
@@ -152,6 +158,8 @@ def open_source(
                         "a folder with rgb.txt and depth.txt"
                     )
                 opened = kind.open(source, options)
+                if part is not None and not is_all(part):
+                    opened = Excerpt(opened, part, first_depth_only=first_depth)
                 if kind.sized and not longest_side_px:
                     return opened
                 return at_working_size(opened, longest_side_px)

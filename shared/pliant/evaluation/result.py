@@ -40,9 +40,9 @@ CAUSAL_NAME = "trajectory_causal.txt"
 class TrajectoryEvaluation:
     """One trajectory against the truth.
 
-    Map segments are never joined, and aligning each by itself would flatter a run that was lost:
-    only the longest segment is evaluated (it is what trajectory.txt holds), and the frames of all
-    others count as not localised.
+    To align each map segment by itself would flatter a run that was lost: only the longest is
+    evaluated (it is what trajectory.txt holds), and the frames of those that were never joined to
+    it count as not localised.  Causal poses stay in the segment of their time.
 
     kind: "final" (after all corrections) or "causal" (each pose as known when its frame was done).
     frames: of the whole sequence; None where nobody said, and then there is no success rate.

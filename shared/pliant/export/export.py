@@ -158,9 +158,9 @@ def _overview(recording: Recording, path: Path, folder: Path | None) -> None:
 
 def _longest_segment(history: MapHistory) -> tuple[Points, F64]:
     """Points and (N, 4, 4) poses of one map segment: those of others lie in worlds of their own."""
-    longest, points = history.longest_segment(), history.points()
-    poses = {frame: known for frame, known in history.final().items() if known[0] == longest}
-    return points.select(points.segments == longest), history.trajectory(poses).T_world_camera
+    longest = history.longest_segment()
+    path = history.trajectory_in(longest, history.final())
+    return history.points_in(longest), path.T_world_camera
 
 
 def _overlay_frame(frame: RecordedFrame, stream: CameraStream) -> OverlayFrame:

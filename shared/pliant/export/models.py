@@ -110,8 +110,7 @@ def images(recording: Recording, path: Path, folder: Path | None) -> None:
 def ply(recording: Recording, path: Path, folder: Path | None) -> None:
     """The points of the longest segment."""
     history = read_run(recording.path).history
-    points = history.points()
-    points = points.select(points.segments == history.longest_segment())
+    points = history.points_in(history.longest_segment())
     if not len(points):
         raise ResultError(f"{recording.path}: the run has no map to export")
     colours = np.asarray(points.colours, np.uint8).reshape(-1, 3)

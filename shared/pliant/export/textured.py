@@ -23,10 +23,9 @@ from pliant.export.models import make_folder
 from pliant.export.open3d_import import require_open3d
 from pliant.formats.textured import TexturedMesh, write_glb, write_obj
 from pliant.messages import topics
-from pliant.messages.mesh_pieces import joined
 from pliant.messages.types import Keyframe, MeshPiece
 from pliant.recording.reader import Recording
-from pliant.results.mesh import meshes_of
+from pliant.results.mesh import mesh_of
 from pliant.results.run import Run, read_run
 
 TRIANGLES = 40_000
@@ -59,10 +58,10 @@ def textured_mesh(recording: Recording, triangles: int) -> TexturedMesh:
     run = read_run(recording.path)
     segment = run.history.longest_segment()
     pieces = [p for p in recording.decoded(topics.MESH_FINAL) if isinstance(p, MeshPiece)]
-    fine = meshes_of(pieces).get((segment, "fine"))
-    if run.stream is None or fine is None or not sum(len(piece.triangles) for piece in fine):
+    fine = mesh_of(pieces, segment)
+    if run.stream is None or fine is None or not len(fine.triangles):
         raise ResultError(f"{recording.path}: there is no mesh in it: run its source again")
-    points, faces, colours = _decimated(open3d, joined(fine), triangles)
+    points, faces, colours = _decimated(open3d, fine, triangles)
     cut, _ = cut_apart(faces, patches(points[faces]))
     uvs = make_atlas(points[faces], cut, _TEXELS)
     texels = find_texels(uvs, _TEXELS)

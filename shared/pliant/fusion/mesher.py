@@ -109,6 +109,9 @@ class Mesher:
         self._frozen = parts_of(())
         self._segment = -1
         self._pending: list[tuple[int, bool]] = []
+        self._told: dict[int, bool] = {}  # keyframes, and whether they were settled
+        self._fused: set[int] = set()
+        self._again: list[int] = []
         self.note = ""
         self.counts: dict[str, float] = dict.fromkeys(
             ("fused", "settled", "passed_over", "without_surface"), 0.0
@@ -132,7 +135,21 @@ class Mesher:
             self._spool.put_observations(
                 keyframe, keyframes.point_ids[told], keyframes.points_px[told]
             )
-            self._pending.append((keyframe, bool(keyframes.settled[row])))
+            self._told[keyframe] = bool(keyframes.settled[row])
+            self._pending.append((keyframe, self._told[keyframe]))
+        for gone, segment in update.joined.tolist():
+            self._join(gone, segment)
+
+    def _join(self, gone: int, segment: int) -> None:
+        """Two segments are one: what the live mesh lacks of it is fused one by one."""
+        if self._segment == gone:
+            self._begin_live(segment)
+        if self._segment == segment:
+            joined = (k for k in self._told if self._map.keyframes[k].segment == segment)
+            self._again = sorted(k for k in joined if k not in self._fused)
+
+    def _begin_live(self, segment: int) -> None:
+        self._segment, self._live, self._fused, self._again = segment, None, set(), []
 
     def _see(self, segment: int, correction: tuple[float, ...]) -> None:
         """A segment is made with a corrected calibration."""
@@ -172,8 +189,12 @@ class Mesher:
             segment = self._map.keyframes[keyframe].segment
             if segment != self._segment:
                 changed += self._changes(timer)
-                self._segment, self._live = segment, None
+                self._begin_live(segment)
             self._fuse_one(keyframe, settled=settled, timer=timer)
+        self._again = [keyframe for keyframe in self._again if keyframe not in self._fused]
+        if self._again:  # of a segment that was joined: one by one, so that nobody waits for all
+            keyframe = self._again[0]
+            self._fuse_one(keyframe, settled=self._told[keyframe], timer=timer)
         return changed + self._changes(timer)
 
     @property
@@ -197,6 +218,7 @@ class Mesher:
             yield from self._finish_segment(segment, keyframes, timer)
 
     def _fuse_one(self, keyframe: int, *, settled: bool, timer: StageTimer) -> None:
+        self._fused.add(keyframe)
         colour = self._colour(keyframe)
         surface = self._surface(keyframe, timer)
         if surface.depth_map is None or colour is None:

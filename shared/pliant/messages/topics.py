@@ -9,6 +9,7 @@ from pliant.messages.types import (
     Header,
     Image,
     Keyframe,
+    MapKeyframe,
     MapUpdate,
     MeshPiece,
     MeshUpdate,
@@ -37,6 +38,8 @@ class Topic:
     """In live mode the next is not chosen before the last was taken, which readers tell at once."""
     max_bytes: int = 16 * _MIB
     """A larger message is refused before memory is taken for it."""
+    kept_whole: bool = False
+    """Its readers take in all of it before they come to a checkpoint, so that senders keep all."""
     compression: str = "zstd"
     """How its chunks of a recording are stored: "" as they are, or "zstd"."""
 
@@ -50,6 +53,8 @@ IMAGE = Topic(
 )
 # Empty where nobody but the recorder would read it.
 DEPTH = Topic("camera/depth", Depth, per_frame=True, max_bytes=128 * _MIB, compression="")
+# The map of earlier sessions, before the first frame: nothing where a run begins without one.
+MAP_KNOWN = Topic("map/known", MapKeyframe, per_frame=False, max_bytes=64 * _MIB, kept_whole=True)
 EXTREMA = Topic("tracks/extrema", Extrema, per_frame=True)
 MAP_UPDATE = Topic("map/update", MapUpdate, per_frame=True, max_bytes=64 * _MIB)
 # One message, after the last frame: what is only known once nothing more can come.
@@ -57,6 +62,8 @@ MAP_FINAL = Topic("map/final", MapUpdate, per_frame=False, max_bytes=512 * _MIB)
 KEYFRAME = Topic("map/keyframe", Keyframe, per_frame=True, max_bytes=64 * _MIB)
 # One message, after the last frame: the keyframes that were still in the window.
 KEYFRAME_FINAL = Topic("map/keyframe_final", Keyframe, per_frame=False, max_bytes=64 * _MIB)
+# After the last frame: the map with all that was known, for sessions to come.
+MAP_KEPT = Topic("map/kept", MapKeyframe, per_frame=False, max_bytes=64 * _MIB)
 # In live mode, what of the live mesh is told depends on what there was time for.
 MESH_BLOCKS = Topic("mesh/blocks", MeshUpdate, per_frame=False, max_bytes=256 * _MIB)
 MESH_FINAL = Topic("mesh/final", MeshPiece, per_frame=False)
@@ -70,8 +77,8 @@ def status(service: str) -> Topic:
 
 
 TOPICS = (
-    STREAM, SOURCE, IMAGE, DEPTH, EXTREMA, MAP_UPDATE, MAP_FINAL, KEYFRAME, KEYFRAME_FINAL,
-    MESH_BLOCKS, MESH_FINAL, SURFELS, STREAM_END,
+    STREAM, SOURCE, IMAGE, DEPTH, MAP_KNOWN, EXTREMA, MAP_UPDATE, MAP_FINAL, KEYFRAME,
+    KEYFRAME_FINAL, MAP_KEPT, MESH_BLOCKS, MESH_FINAL, SURFELS, STREAM_END,
 )  # fmt: skip
 WITH_PIXELS = (IMAGE, SOURCE)
 """Those that are made smaller for a link between machines."""

@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.mesh_blocks import MeshBlocks
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame
@@ -166,6 +167,11 @@ class Keyframe(Header, KeyframeDelta):
         """All images of this message by the id of the keyframe."""
         found = dict(zip(self.earlier_ids, self.earlier_jpegs, strict=False))
         return {**found, self.new: self.jpeg} if self.new >= 0 else found
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapKeyframe(Header, KeptKeyframe):
+    """A keyframe of a map that is kept over sessions.  frame: its number in the map, from 0."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,11 +23,12 @@ _SHIFT = 4
 class MapView:
     """Where to look at a map from.  T_world_view: (4, 4), x right, y down, z forward.
 
-    reach: distance at which points fade half into the background.
+    centre: (3,) what it looks at.    reach: distance at which points fade half into the background.
     ceiling: points farther than this along ``up`` are not drawn, so that one can look into a room.
     """
 
     T_world_view: F64
+    centre: F64
     up: F64
     ceiling: float
     reach: float
@@ -63,7 +64,7 @@ def choose_view(
     right = _unit(np.asarray(np.cross(direction, up), np.float64), _any_normal(up))
     T = np.eye(4)
     T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = right, np.cross(direction, right), direction, eye
-    return MapView(T_world_view=T, up=up, ceiling=ceiling, reach=5.0 * radius)
+    return MapView(T_world_view=T, centre=centre, up=up, ceiling=ceiling, reach=5.0 * radius)
 
 
 def _body(points: F64, positions: F64) -> tuple[F64, float]:

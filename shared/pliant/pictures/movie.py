@@ -72,10 +72,19 @@ def write_animation(
     Raises ResultError for a suffix other than .webp, .gif and .avif, no pictures, an OpenCV older
     than 4.11, and a file that cannot be written.
     """
-    if path.suffix.lower() not in _ANIMATIONS:
+    suffix = path.suffix.lower()
+    if suffix not in _ANIMATIONS:
         raise ResultError(f"{path}: unknown kind of animation; use {', '.join(_ANIMATIONS)}")
     if not pictures:
         raise ResultError(f"{path}: there are no frames to write")
+    data = encode_animation(pictures, fps=fps, suffix=suffix, width=width, quality=quality)
+    write_bytes(path, data)
+
+
+def encode_animation(
+    pictures: Sequence[U8], *, fps: float, suffix: str, width: int | None = None, quality: int = 55
+) -> bytes:
+    """The bytes of an animation; see ``write_animation``.  Raises ResultError."""
     module: Any = cv2
     if not hasattr(module, "imencodeanimation"):
         raise ResultError("animations need OpenCV 4.11: pip install 'opencv-python-headless>=4.11'")
@@ -88,11 +97,10 @@ def write_animation(
         ".avif": [cv2.IMWRITE_AVIF_QUALITY, quality],
         ".gif": [],
     }
-    suffix = path.suffix.lower()
     good, data = module.imencodeanimation(suffix, animation, options[suffix])
     if not good:
-        raise ResultError(f"{path}: this OpenCV cannot encode {suffix}")
-    write_bytes(path, data.tobytes())
+        raise ResultError(f"this OpenCV cannot encode {suffix}")
+    return data.tobytes()
 
 
 def _bgr(picture: U8, width: int | None) -> U8:

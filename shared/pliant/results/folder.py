@@ -5,6 +5,7 @@ import fcntl
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -18,10 +19,12 @@ from pliant import __version__, arithmetic
 from pliant.errors import ResultError
 from pliant.files import make_folder, write_whole
 from pliant.recording import parts
+from pliant.recording.map_file import MAP_NAME
 
 RECORDING_NAME = "recording.mcap"
 CONFIG_NAME = "config.yaml"
 REPORT_NAME = "report.json"
+PAGE_NAME = "report.html"
 STATE_FOLDER = "state"
 """Checkpoints of the services, while a run goes on that may be started again."""
 SESSION_NAME = "session.json"
@@ -36,11 +39,22 @@ _RIGID_FILES = (
     "points.ply",
     CALIBRATION_NAME,
     REPORT_NAME,
+    PAGE_NAME,
 )
 SURFEL_FILES = (TRAJECTORY_NAME, SURFELS_NAME, REPORT_NAME)
+SOMETIMES = (MAP_NAME,)
+"""Of a map that came to its end."""
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
 _LOCK_NAME = ".lock"
 _VERSIONS = ("eclipse-zenoh", "mcap", "msgpack", "numba", "numpy", "opencv-python-headless")
+
+
+def folder_name(source: str) -> str:
+    """What the result folder of a source is called."""
+    name = source.rstrip("/").rsplit("/", 1)[-1]
+    if name in ("", ".", ".."):
+        name = Path(source).resolve().name
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name) or "run"
 
 
 def keep_apart(output: Path, read: Iterable[Path], *, option: str = "--output") -> None:
@@ -60,7 +74,7 @@ def keep_apart(output: Path, read: Iterable[Path], *, option: str = "--output") 
 
 def files_read(result: Path) -> list[Path]:
     """What a command may read of a result folder or a recording, or will write to one."""
-    names = (RECORDING_NAME, CONFIG_NAME, *_RIGID_FILES, *MESH_FILES, SURFELS_NAME)
+    names = (RECORDING_NAME, CONFIG_NAME, *_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME)
     return [*parts.parts_of(result), *(result / name for name in names)]
 
 
@@ -150,7 +164,7 @@ def prepare(output: Path, config: str) -> None:
         make_folder(output / "logs")
         parts.remove(output / RECORDING_NAME)
         shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
-        for name in (*_RIGID_FILES, *MESH_FILES, SURFELS_NAME):
+        for name in (*_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME):
             (output / name).unlink(missing_ok=True)
         for path in output.glob("*_segment_*"):
             path.unlink()
@@ -209,4 +223,4 @@ def commit_of(package: Path) -> str:
 def files_of(output: Path, report: dict[str, Any]) -> list[str]:
     """Names of the files that a run with this report has left, but for its recording."""
     always = SURFEL_FILES if report.get("profile") == "deformable" else _RIGID_FILES
-    return [*always, *(name for name in MESH_FILES if (output / name).exists())]
+    return [*always, *(name for name in (*SOMETIMES, *MESH_FILES) if (output / name).exists())]

@@ -23,6 +23,12 @@ def meshes_of(pieces: Sequence[MeshPiece]) -> dict[tuple[int, str], list[MeshPie
     return {key: some for key, some in found.items() if len(some) == some[0].pieces}
 
 
+def mesh_of(pieces: Sequence[MeshPiece], segment: int, level: str = "fine") -> TriangleMesh | None:
+    """One of them, None where it is not there."""
+    found = meshes_of(pieces).get((segment, level))
+    return None if found is None else joined(found)
+
+
 def write_meshes(
     folder: Path, pieces: Sequence[MeshPiece], segment: int, suffix: str, T_world_camera: F64
 ) -> None:

@@ -55,7 +55,8 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "last_reason": telling[-1] if telling else "",
         "frames_without_pixels": {str(f): why for f, why in sorted(run.missing.items())},
         "frames_passed_over": run.passed_over,
-        "keyframes": len(history.keyframes),
+        "keyframes": len(history.keyframe_poses()),
+        "known_map": _known_map(run, final),
         "points": len(history.points()),
         "points_well_observed": _well_observed(run, final),
         "calibration_correction": _correction(run),
@@ -116,6 +117,21 @@ def _well_observed(run: Run, final: dict[int, Any]) -> int:
     return count_distinct(
         points.positions, points.frames, camera=run.stream.camera, T_world_camera=poses
     )
+
+
+def _known_map(run: Run, final: dict[int, Any]) -> dict[str, Any] | None:
+    """How the run found its way in the map of earlier sessions; None where it had none.
+
+    looked: frames before the first that was recognised in it.
+    """
+    known = {k.segment for k in run.history.keyframes.values() if k.frame < 0}
+    if not known:
+        return None
+    inside = sorted(frame for frame, (segment, _) in final.items() if segment in known)
+    came = sorted(run.history.states)
+    looked = came.index(inside[0]) if inside else len(came)
+    count = sum(k.frame < 0 for k in run.history.keyframes.values())
+    return {"keyframes": count, "frames_in_it": len(inside), "looked": looked}
 
 
 def _correction(run: Run) -> dict[str, float] | None:

@@ -1,9 +1,13 @@
 """A recording read as one run: what it says of frames, map, mesh and services."""
 
 from collections import defaultdict
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from pliant.algorithms.arrays import F32, I64
 from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.topics import by_key
@@ -11,6 +15,8 @@ from pliant.messages.types import (
     PASSED_OVER,
     CameraStream,
     Extrema,
+    Keyframe,
+    MapKeyframe,
     MapUpdate,
     MeshPiece,
     Status,
@@ -21,6 +27,8 @@ from pliant.recording.summary import Summary
 
 _LEFT_ALONE = (
     *(topics.SOURCE, topics.DEPTH, topics.KEYFRAME, topics.KEYFRAME_FINAL, topics.MESH_BLOCKS),
+    topics.MAP_KEPT,  # it becomes a file of its own
+    topics.MAP_KNOWN,  # see known_keyframes
     topics.SURFELS,  # see surfels.py
 )
 """Topics that results do not need; most bytes are theirs."""
@@ -80,6 +88,8 @@ class Run:
 def read_run(path: Path) -> Run:
     """Fold a recording.  Raises RecordingError for a file that is none."""
     run = Run()
+    for keyframe in known_keyframes(path):
+        run.history.know(keyframe)
     for recorded in Recording(path).messages():
         run.recorded.count(recorded)
         if recorded.topic in _LEFT_ALONE:
@@ -94,6 +104,8 @@ def read_run(path: Path) -> Run:
         elif isinstance(message, MapUpdate):
             final = recorded.topic.key == topics.MAP_FINAL.key
             run.history.apply(message, frame=message.frame, stamp_ns=message.stamp_ns, final=final)
+            for gone, _ in message.joined.tolist():
+                run.corrections.pop(gone, None)
             if message.calibration_correction:
                 run.corrections[message.segment] = message.calibration_correction
                 run.calibration_sigmas = message.calibration_sigmas
@@ -109,6 +121,44 @@ def read_run(path: Path) -> Run:
         elif isinstance(message, StreamEnd):
             run.ends[message.topic] = message
     return run
+
+
+def known_keyframes(path: Path) -> Iterator[MapKeyframe]:
+    """The map of earlier sessions that a run began with: before all else, as only the messages of
+    one topic are in order."""
+    for keyframe in Recording(path).decoded(topics.MAP_KNOWN):
+        assert isinstance(keyframe, MapKeyframe)
+        yield keyframe
+
+
+@dataclass(kw_only=True)
+class SeenKeyframe:
+    """What was told of a keyframe's image and of what it sees, last.
+
+    jpeg: b"" where none was recorded.   point_ids: (N,).   points_px: (N, 2).
+    """
+
+    jpeg: bytes = b""
+    point_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    points_px: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+
+
+def seen_by_keyframes(recording: Recording, wanted: Container[int]) -> dict[int, SeenKeyframe]:
+    """Of each of the wanted keyframes that a recording tells of, by id."""
+    seen: dict[int, SeenKeyframe] = defaultdict(SeenKeyframe)
+    for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
+        for message in recording.decoded(topic):
+            assert isinstance(message, Keyframe)
+            for number, jpeg in message.images().items():
+                if number in wanted:
+                    seen[number].jpeg = jpeg
+            ends = np.cumsum(message.counts)
+            for row, number in enumerate(message.keyframe_ids.tolist()):
+                if number in wanted:
+                    told = slice(int(ends[row] - message.counts[row]), int(ends[row]))
+                    seen[number].point_ids = message.point_ids[told]
+                    seen[number].points_px = message.points_px[told]
+    return dict(seen)
 
 
 def _take_status(run: Run, status: Status) -> None:
@@ -127,6 +177,8 @@ def _take_status(run: Run, status: Status) -> None:
 def folded_map(path: Path) -> MapHistory:
     """The map of a recording alone."""
     history = MapHistory()
+    for keyframe in known_keyframes(path):
+        history.know(keyframe)
     for topic in (topics.MAP_UPDATE, topics.MAP_FINAL):
         for update in Recording(path).decoded(topic):
             assert isinstance(update, MapUpdate)

@@ -87,6 +87,17 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
     return report
 
 
+def surfel_report(recording: Path) -> dict[str, Any]:
+    """What report.json says of a run of the deformable profile."""
+    counts, followed = _Counts(), 0
+    for recorded in Recording(recording).messages(topics.SURFELS):
+        surfels = recorded.decode()
+        assert isinstance(surfels, Surfels)
+        _count(counts, surfels, recorded.log_time_ns)
+        followed += len(_followed(surfels))
+    return _report(read_run(recording), counts, followed)
+
+
 def surfel_trajectory(recording: Path) -> Trajectory:
     """The camera's pose of every frame whose surfels were followed."""
     return _trajectory([f for surfels in recorded_surfels(recording) for f in _followed(surfels)])

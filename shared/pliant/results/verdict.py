@@ -32,6 +32,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         f"median per frame: {report['median_tracks_per_frame']:.0f} tracks, "
         f"{report['median_inliers_per_frame']:.0f} mapped inliers",
     ]
+    lines += _told_of_map(report.get("known_map"), report["frames"])
     lines += [
         f"{mesh['level']} mesh: {mesh['triangles']} triangles "
         f"from {counted(mesh['keyframes'], 'keyframe')}"
@@ -45,6 +46,23 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
     elif len(report["segments"]) > 1:
         lines.append(f"the map was lost and restarted: {len(report['segments'])} segments")
     return [*lines, f"{report['verdict']}: {report['verdict_reason']}"]
+
+
+def _told_of_map(known: dict[str, Any] | None, frames: int) -> list[str]:
+    """How the run found its way in the map of earlier sessions."""
+    if known is None:
+        return []
+    if known["frames_in_it"] == 0:
+        return [
+            f"the known map of {counted(known['keyframes'], 'keyframe')} was recognised in none of "
+            f"{counted(frames, 'frame')}"
+        ]
+    share = known["frames_in_it"] / max(frames, 1)
+    return [
+        f"{counted(known['frames_in_it'], 'frame')} ({share:.1%}) in the known map of "
+        f"{counted(known['keyframes'], 'keyframe')}, recognised after "
+        f"{counted(known['looked'], 'frame')}"
+    ]
 
 
 def _broken(report: dict[str, Any]) -> dict[str, str]:

@@ -12,9 +12,14 @@ from pliant.errors import ResultError
 from pliant.files import move_all
 from pliant.formats.ply import write_ply
 from pliant.formats.tum import write_tum
+from pliant.messages import topics
+from pliant.messages.types import MapKeyframe
+from pliant.recording.map_file import MAP_NAME, MapHeader, write_map
+from pliant.recording.reader import Recording
 from pliant.results.calibration import found_calibration
-from pliant.results.folder import CALIBRATION_NAME, RECORDING_NAME, REPORT_NAME
+from pliant.results.folder import CALIBRATION_NAME, PAGE_NAME, RECORDING_NAME, REPORT_NAME
 from pliant.results.mesh import write_meshes
+from pliant.results.page.page import write_page
 from pliant.results.report import rigid_report
 from pliant.results.run import Run, read_run
 from pliant.results.surfels import has_surfels, write_surfel_results
@@ -31,12 +36,14 @@ def _write_rigid_results(output: Path) -> dict[str, Any]:
 
     All of them, or none where the disk is full.  Raises RecordingError and ResultError.
     """
-    run = read_run(output / RECORDING_NAME)
+    recording = Recording(output / RECORDING_NAME)
+    run = read_run(recording.path)
     final = run.history.final()
     report = rigid_report(run, final)
     try:
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=output) as folder:
-            _write_files(Path(folder), run, final, report)
+            _write_files(Path(folder), run, recording, final, report)
+            _write_map(Path(folder), recording, run)
             move_all(Path(folder), output)
     except OSError as error:
         raise ResultError(
@@ -45,25 +52,34 @@ def _write_rigid_results(output: Path) -> dict[str, Any]:
     return report
 
 
-def _write_files(folder: Path, run: Run, final: dict[int, Any], report: dict[str, Any]) -> None:
+def _write_map(folder: Path, recording: Recording, run: Run) -> None:
+    """Keep the map, where the run came to its end with one."""
+    stream = run.stream
+    if stream is None:
+        return
+    header = MapHeader(source=stream.source, calibration=stream.calibration)
+    kept = (k for k in recording.decoded(topics.MAP_KEPT) if isinstance(k, MapKeyframe))
+    write_map(folder / MAP_NAME, header, kept)
+
+
+def _write_files(
+    folder: Path, run: Run, recording: Recording, final: dict[int, Any], report: dict[str, Any]
+) -> None:
     history = run.history
     trajectories = {
         "trajectory": final,
         "trajectory_causal": history.causal,
         "keyframes": history.keyframe_poses(),
     }
-    points = history.points()
     longest = history.longest_segment()
     for segment in sorted({longest, *(s["id"] for s in report["segments"])}):
         # Each segment is a world of its own, at a scale of its own: a file of its own.
         suffix = "" if segment == longest else f"_segment_{segment}"
-        path = {f: pose for f, pose in final.items() if pose[0] == segment}
-        T_world_camera = history.trajectory(path).T_world_camera
+        T_world_camera = history.trajectory_in(segment, final).T_world_camera
         write_meshes(folder, run.mesh, segment, suffix, T_world_camera)
         for name, poses in trajectories.items():
-            chosen = {frame: pose for frame, pose in poses.items() if pose[0] == segment}
-            write_tum(folder / f"{name}{suffix}.txt", history.trajectory(chosen))
-        here = points.select(points.segments == segment) if len(points) else points
+            write_tum(folder / f"{name}{suffix}.txt", history.trajectory_in(segment, poses))
+        here = history.points_in(segment)
         write_ply(
             folder / f"points{suffix}.ply",
             np.asarray(here.positions, np.float32),
@@ -75,3 +91,5 @@ def _write_files(folder: Path, run: Run, final: dict[int, Any], report: dict[str
         (folder / CALIBRATION_NAME).write_text(text, encoding="utf-8")
     text = json.dumps(report, indent=1) + "\n"
     (folder / REPORT_NAME).write_text(text, encoding="utf-8")
+    names = {path.name for path in folder.iterdir()} | {RECORDING_NAME}
+    write_page(folder / PAGE_NAME, run, recording, final, report, names)

@@ -59,6 +59,17 @@ class PointBlocks:
         self._xyz[ids] = moved.astype(np.float32)
         self._touch(ids)
 
+    def take_in(self, other: "PointBlocks") -> None:
+        """The points of another world belong to this one."""
+        ids = np.flatnonzero(other._alive)
+        self._reserve(int(ids.max(initial=-1)) + 1)
+        self._xyz[ids], self._rgb[ids], self._hosts[ids] = (
+            other._xyz[ids], other._rgb[ids], other._hosts[ids],
+        )  # fmt: skip
+        self._alive[ids] = True
+        self._recent[ids], self._doubtful[ids] = other._recent[ids], other._doubtful[ids]
+        self._touch(ids)
+
     def miss(self) -> None:
         """Updates were missed here."""
         self._doubtful |= self._recent & self._alive

@@ -134,11 +134,15 @@ class Scene:
         if not final:
             self._notice_gap(at, sequence)
         self._last = at
+        if len(update.moved_keyframes):
+            for segment in {self._world.segment: 0} | dict(update.joined.tolist()):
+                if segment in self._worlds:
+                    self._move(self._worlds[segment], update.map_moves())
+        for gone, segment in update.joined.tolist():
+            self._join(at, gone, segment)
         world = self._world
         if update.segment not in (-1, world.segment):
             world = self._enter(at, update.segment)
-        if len(update.moved_keyframes):
-            self._move_map(update.map_moves())
         mine = update.keyframe_segments == world.segment
         for row in np.flatnonzero(mine):
             frame, pose = int(update.keyframe_frames[row]), update.keyframe_poses[row]
@@ -174,9 +178,21 @@ class Scene:
         self._drawn = at.frame - REDRAW_FRAMES
         return world
 
-    def _move_map(self, moves: MapMoves) -> None:
-        """The whole map moves: keyframes, and points with those on which they hang."""
-        world = self._world
+    def _join(self, at: Moment, gone: int, segment: int) -> None:
+        """What belongs to a world that is gone lies in another one."""
+        old = self._worlds.pop(gone, _World())
+        world = self._worlds.setdefault(segment, _World(segment=segment))
+        world.keyframes |= old.keyframes
+        world.points.take_in(old.points)
+        world.moved = True
+        if self._world is old:
+            self.mesh.begin(at, segment)
+            self._canvas.forget(at, gone)
+            self._world = world
+            world.points.draw_again()
+
+    def _move(self, world: _World, moves: MapMoves) -> None:
+        """A world moves: keyframes, and points with those on which they hang."""
         ids = np.array(list(world.keyframes), np.int64)
         poses = np.array([pose for _, pose in world.keyframes.values()]).reshape(-1, 7)
         moved = matrix_to_pose(move_by_similarity(moves.matrices(ids), pose_to_matrix(poses)))

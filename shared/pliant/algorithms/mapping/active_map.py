@@ -139,6 +139,13 @@ class ActiveMap:
             )
         self._settle(self.keyframes[-1], grey)
 
+    def know(self, keyframes: list[Keyframe]) -> None:
+        """Take over what an earlier session has mapped, oldest first."""
+        self.keyframes = keyframes
+        self.since = len(keyframes)
+        for keyframe in keyframes:
+            keyframe.focus = focus_of(keyframe, self.points)
+
     def linked(self, state: int) -> I64:
         """Indices of the living tracks whose row has the given state."""
         return self.links.in_state(self.points.state, state)
@@ -410,7 +417,7 @@ class ActiveMap:
             self._cull(self.keyframes.pop(redundant))
             self.since -= redundant < self.since
             outside = self.keyframes[: -len(moving)]
-        older = near_keyframes(outside, moving[-1], _NEAR_KEYFRAMES)
+        older = near_keyframes(outside, moving[-1].T_world_camera, _NEAR_KEYFRAMES)
         # What was there before the camera was recognised takes the place of what will be.
         count = max(sizes.fixed, sizes.keyframes - len(moving))
         fixed = most_shared(older, moving, self.points)[:count] if older else []
@@ -436,6 +443,34 @@ class ActiveMap:
         self.since, self._next_keyframe_id = len(self.keyframes), next_keyframe_id
         older = most_shared(self.keyframes, [seen], self.points)[:_NEAR_KEYFRAMES]
         self._look_at(older, older[: self.parameters.window.keyframes], [])
+
+    def look_around(self, T_world_camera: F64) -> None:
+        """What keyframes see that look where a camera does is looked for from now on."""
+        self._look_at(near_keyframes(self.keyframes, T_world_camera, _NEAR_KEYFRAMES), [], [])
+
+    def take_in(self, earlier: "ActiveMap", segment: int) -> None:
+        """Become one with a segment that lost its camera before, in whose world this one lies by
+        now, or the other way round.
+
+        segment: of both, from now on.  What was mapped there does not move with the window.
+        """
+        for keyframe in earlier.keyframes[earlier._first_of_window() :]:
+            earlier._leave_window(keyframe)
+        older = [*earlier.keyframes, *self.keyframes[: self.since]]
+        older.sort(key=lambda keyframe: keyframe.id)
+        self.keyframes = [*older, *self.keyframes[self.since :]]
+        self.since = len(older)
+        self.culled += earlier.culled
+        self._removed += earlier._removed
+        both = np.isin(self.points.segment, (self.segment, earlier.segment))
+        self.points.segment[both] = segment
+        for keyframe in self.keyframes:
+            keyframe.segment = segment
+        self.segment = segment
+
+    def scaled(self, scale: float) -> None:
+        """The world has become larger."""
+        self._inverse_distance /= scale
 
     def _first_of_window(self) -> int:
         """Index of the first keyframe that may move."""

@@ -36,19 +36,19 @@ def focus_of(keyframe: Keyframe, points: PointRows) -> F64:
     return centre + axis * float(np.median((points.xyz[rows] - centre) @ axis))
 
 
-def near_keyframes(keyframes: list[Keyframe], newest: Keyframe, count: int) -> list[Keyframe]:
-    """At most ``count`` of the keyframes, those that look where the newest does, in their order.
+def near_keyframes(keyframes: list[Keyframe], T_world_camera: F64, count: int) -> list[Keyframe]:
+    """At most ``count`` of the keyframes, those that look where a camera does, in their order.
 
     Nearness: how far the places looked at lie apart, added to half of how far the cameras do.
     """
     if len(keyframes) <= count:
         return keyframes
     last = keyframes[-1]
-    centre = newest.T_world_camera[:3, 3]
+    centre = T_world_camera[:3, 3]
     depth = 0.0
     if last.focus is not None:
         depth = float(np.linalg.norm(last.focus - last.T_world_camera[:3, 3]))
-    focus = centre + newest.T_world_camera[:3, 2] * depth
+    focus = centre + T_world_camera[:3, 2] * depth
     places = np.array([np.zeros(3) if k.focus is None else k.focus for k in keyframes])
     centres = np.array([k.T_world_camera[:3, 3] for k in keyframes])
     apart = np.linalg.norm(places - focus, axis=1) + 0.5 * np.linalg.norm(centres - centre, axis=1)

@@ -10,11 +10,15 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 
 
 class _Earlier(NamedTuple):
-    """A segment, the poses of its frames, and the calibration whose pixels its keyframes have."""
+    """A segment, the poses of its frames, and the calibration whose pixels its keyframes have.
+
+    known: it is as an earlier session left it.
+    """
 
     map: ActiveMap
     path: Path
     calibration: SelfCalibration
+    known: bool = False
 
 
 class EarlierSegments:
@@ -28,6 +32,14 @@ class EarlierSegments:
         """A segment has lost its camera."""
         active.close()
         self._kept.append(_Earlier(active, path, calibration))
+
+    def know(self, known: ActiveMap, path: Path, calibration: SelfCalibration) -> None:
+        """A segment of an earlier session, in which the camera may be recognised."""
+        self._kept.append(_Earlier(known, path, calibration, known=True))
+
+    def everything(self) -> list[tuple[ActiveMap, Path, SelfCalibration]]:
+        """All of them, oldest first."""
+        return [(each.map, each.path, each.calibration) for each in self._kept]
 
     def maps(self, calibration: SelfCalibration) -> list[ActiveMap]:
         """Those whose keyframes have the pixels of a calibration, whatever its readout was, oldest
@@ -44,14 +56,25 @@ class EarlierSegments:
         self._kept = [each for each in self._kept if each is not taken]
         return taken.map, taken.path
 
+    def segment_of(self, keyframe: int) -> int:
+        """That of a keyframe of one of them."""
+        known = (k for each in self._kept for k in each.map.keyframes)
+        return next(k.segment for k in known if k.id == keyframe)
+
     def make_room(self, points: PointRows, max_keyframes: int) -> None:
         """Give back the oldest segments, which have been published, beyond so many keyframes of
         all together."""
-        while sum(len(each.map.keyframes) + each.map.culled for each in self._kept) > max_keyframes:
-            points.cull(self._kept.pop(0).map.mapped_rows())
+        own = [each for each in self._kept if not each.known]
+        while sum(len(each.map.keyframes) + each.map.culled for each in own) > max_keyframes:
+            oldest = own.pop(0)
+            points.cull(oldest.map.mapped_rows())
+            self._kept = [each for each in self._kept if each is not oldest]
 
     def adjust(self) -> None:
-        """Adjust each of them, no earlier than the end of the stream."""
-        for earlier in self._kept:
-            earlier.map.adjust_all(earlier.path, earlier.calibration)
-        self.adjusted = [earlier.map for earlier in self._kept]
+        """Adjust each of them, no earlier than the end of the stream; what nobody has gone on in
+        is as an earlier session left it."""
+        for n, earlier in enumerate(self._kept):
+            if not earlier.known:
+                found = earlier.map.adjust_all(earlier.path, earlier.calibration)
+                self._kept[n] = earlier._replace(calibration=found)
+        self.adjusted = [earlier.map for earlier in self._kept if not earlier.known]

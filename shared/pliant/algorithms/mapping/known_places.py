@@ -1,29 +1,88 @@
-"""The keyframes of all segments as places: which of them look like an image."""
+"""The keyframes of all segments as places: which of them an image shows, or a keyframe comes to."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
+import numpy as np
+
+from pliant.algorithms.arrays import F32, U8
 from pliant.algorithms.corrected_view import CorrectedView
+from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.mapping.active_map import ActiveMap
-from pliant.algorithms.mapping.map_store import Keyframe
-from pliant.algorithms.mapping.relocalisation import Place
-from pliant.algorithms.places.features import Features
+from pliant.algorithms.mapping.kept_map import features_for
+from pliant.algorithms.mapping.loops import Loop
+from pliant.algorithms.mapping.map_store import Keyframe, PointRows
+from pliant.algorithms.mapping.meetings import Meetings
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.relocalisation import Place, Recognised, relocalise
+from pliant.algorithms.mapping.revisits import Revisits
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.places.features import Features, describe
 from pliant.algorithms.places.index import PlaceIndex
+
+_PLACES = 5
+"""That look most like a frame are looked at more closely."""
 
 
 @dataclass(kw_only=True)
 class KnownPlaces:
-    """index: of their corners, at the pixels of the rectified image."""
+    """index: of their corners, at the pixels of the rectified image.   revisits: of the segment
+    that the camera is in with itself.   meetings: with earlier ones.
+    """
 
     index: PlaceIndex = field(default_factory=PlaceIndex)
+    revisits: Revisits = field(default_factory=Revisits)
+    meetings: Meetings = field(default_factory=Meetings)
 
-    def like(self, seen: Features, maps: list[ActiveMap], view: CorrectedView) -> Iterator[Place]:
-        """Keyframes of the maps that look like an image, the most alike first."""
-        segments = {k.id: (k, active.keyframes) for active in maps for k in active.keyframes}
-        for keyframe, segment in (segments[i] for i in self.index.query(seen) if i in segments):
-            features = self.index.features[keyframe.id]
-            there = replace(features, points_px=view.pixels(features.points_px))
-            yield Place(keyframe=keyframe, features=there, segment=segment)
+    def know(self, kept: Iterable[KeptKeyframe], calibration: SelfCalibration) -> None:
+        """Take in the places of a map that was kept.   calibration: of the camera that has come."""
+        for each in kept:
+            if len(each.descriptors):
+                self.index.add(each.id, features_for(each, calibration))
+
+    def enter(self) -> None:
+        """The camera is in a segment that it was not in before."""
+        self.revisits, self.meetings = Revisits(), Meetings()
+
+    def recognise(
+        self,
+        grey: U8,
+        maxima: F32,
+        maps: list[ActiveMap],
+        points: PointRows,
+        calibration: SelfCalibration,
+        parameters: MappingParameters,
+        generator: np.random.Generator,
+    ) -> Recognised | None:
+        """Which keyframe of the maps saw what an image shows, and where that was taken; None where
+        no single one is proved.   grey: (H, W).   maxima: (M, 3) of its curvature.
+        """
+        seen, view = describe(grey), calibration.view
+        return relocalise(
+            seen, list(islice(self._like(seen, maps, view), _PLACES)), points, maxima, grey,
+            view.camera, parameters, generator,
+        )  # fmt: skip
+
+    def compare(
+        self,
+        keyframe: Keyframe,
+        seen: Features,
+        active: ActiveMap,
+        earlier: list[ActiveMap],
+        view: CorrectedView,
+        *,
+        loops: bool,
+    ) -> list[Loop]:
+        """What a new keyframe, which sees these corners, shows again: returns the loops that it
+        proves in its own segment, where these are asked for; what it has in common with earlier
+        ones waits in ``meetings``."""
+        new = Place(keyframe=keyframe, features=seen, segment=active.keyframes)
+        rest = active.points, view.camera, active.parameters
+        found = self.revisits.look(new, self._like(seen, [active], view), *rest) if loops else []
+        if earlier:
+            self.meetings.look(new, islice(self._like(seen, earlier, view), _PLACES), *rest)
+        return found
 
     def remember(
         self, keyframe: Keyframe, seen: Features, maps: list[ActiveMap], view: CorrectedView
@@ -32,3 +91,11 @@ class KnownPlaces:
         self.index.add(keyframe.id, replace(seen, points_px=view.seen(seen.points_px)))
         known = {k.id for active in maps for k in active.keyframes}
         self.index.forget(self.index.features.keys() - known)
+
+    def _like(self, seen: Features, maps: list[ActiveMap], view: CorrectedView) -> Iterator[Place]:
+        """Keyframes of the maps that look like an image, the most alike first."""
+        segments = {k.id: (k, active.keyframes) for active in maps for k in active.keyframes}
+        for keyframe, segment in (segments[i] for i in self.index.query(seen) if i in segments):
+            features = self.index.features[keyframe.id]
+            there = replace(features, points_px=view.pixels(features.points_px))
+            yield Place(keyframe=keyframe, features=there, segment=segment)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, I64
+from pliant.algorithms.arrays import F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.pose_graph import Edges, optimise_pose_graph
 from pliant.algorithms.geometry import inverse, move_by_similarity
 from pliant.algorithms.mapping.final_adjustment import ListedMap
@@ -19,6 +19,9 @@ from pliant.compiler.kernel import kernel
 
 _COVISIBLE_SHARE = 0.3
 """Share of the points of the lesser keyframe that two share which have an edge."""
+
+_FOLLOWING_SHARE = 0.02
+"""The same of one that follows another in time: with fewer the camera was elsewhere meanwhile."""
 
 _DEPTHS = 10.0
 """Square root of how many depths of a keyframe have errors that nothing shares."""
@@ -100,6 +103,9 @@ def _joined(seen: ListedMap, loops: list[Loop]) -> I32:
 def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px: float) -> Edges:
     """Between keyframes that follow each other or meet again, then the loops.
 
+    Where the camera was lost between two that follow each other, where the second one lies is known
+    by what it sees of earlier ones, or by the loops: the step itself tells nothing.
+
     How well two keyframes lie to each other is what one point tells, at 1 px: the errors that add
     up to drift are those that all their points share.  But of depths, and so of scale, each point
     has an error of its own, as little as its parallax tells.
@@ -115,7 +121,12 @@ def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px:
     since = np.arange(M)[:, None] - np.arange(M)
     nearest = np.where(enough | (since < 0), np.iinfo(np.int64).max, since).min(axis=1)
     enough &= since >= nearest[:, None]
-    enough[np.arange(1, M), np.arange(M - 1)] = True
+    following = np.arange(1, M)
+    told = shared[following, following - 1] >= _FOLLOWING_SHARE * np.minimum(own[1:], own[:-1])
+    enough[following, following - 1] = told
+    jumps = following[~told]
+    if len(jumps):
+        enough[jumps, jumps - 1] = _apart(np.tril(enough, -1), ends, jumps)
     j, i = np.nonzero(np.tril(enough, -1))
     S = seen.T_world_camera
     Z = inverse(S[i]) @ S[j]
@@ -131,6 +142,23 @@ def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px:
         sigmas=np.column_stack([bearing] * 3 + [bearing * depth[j]] * 3 + [sigma[j] / _DEPTHS]),
         doubtful=np.arange(len(i)) >= len(i) - len(loops),
     )  # fmt: skip
+
+
+def _apart(edges: BoolArray, ends: I32, jumps: I64) -> BoolArray:
+    """Which of the jumps to a keyframe from the one before alone keep the graph together.
+
+    edges: (M, M).   ends: (L, 2) of the loops.
+    """
+    group = np.arange(len(edges))
+
+    def meet(a: int, b: int) -> bool:
+        apart = bool(group[a] != group[b])
+        group[group == group[a]] = group[b]
+        return apart
+
+    for a, b in [*np.argwhere(edges).tolist(), *ends.tolist()]:
+        meet(a, b)
+    return np.array([meet(jump - 1, jump) for jump in jumps.tolist()])
 
 
 @kernel

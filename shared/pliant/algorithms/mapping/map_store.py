@@ -102,6 +102,10 @@ class PointRows:
         self.ids[rows] = np.arange(self._next_id, self._next_id + len(rows))
         self._next_id += len(rows)
 
+    def go_on_after(self, last_id: int) -> None:
+        """Points up to this id come from elsewhere."""
+        self._next_id = max(self._next_id, last_id + 1)
+
     def mapped(self, segment: int) -> I32:
         """Rows of all points of a segment."""
         used = slice(0, self.count)

@@ -6,13 +6,15 @@ over the window at keyframes and re-acquisition of points that lost their track.
 """
 
 import dataclasses
-from itertools import islice
+import heapq
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
+from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
@@ -23,18 +25,18 @@ from pliant.algorithms.mapping.frame_pose import (
     localise,
     stand,
 )
+from pliant.algorithms.mapping.kept_map import Origin, keep, known_camera, take_in
 from pliant.algorithms.mapping.known_places import KnownPlaces
 from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.meetings import Meetings, join
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.recovery import Motion
-from pliant.algorithms.mapping.relocalisation import Place, relocalise
-from pliant.algorithms.mapping.revisits import Revisits
 from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, is_guess
 from pliant.algorithms.mapping.start import Start
 from pliant.algorithms.mapping.support import doubt
-from pliant.algorithms.mapping.waiting import Waiting, earlier_poses
+from pliant.algorithms.mapping.waiting import Waiting, earlier_poses, returned_poses
 from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held, move_map
 from pliant.algorithms.places.features import describe
 from pliant.algorithms.stages import StageTimer, no_stages
@@ -42,9 +44,6 @@ from pliant.algorithms.tracks import FrameTracks
 
 _LEAST_LOST = 3
 """Frames without a pose before a map is given up, however long that takes: of a time lapse."""
-
-_PLACES = 5
-"""That look most like a frame are looked at more closely."""
 
 
 class Mapper:
@@ -59,10 +58,17 @@ class Mapper:
         parameters: MappingParameters,
         seed: int,
         calibration: SelfCalibration | None = None,
+        known: Sequence[KeptKeyframe] = (),
     ) -> None:
-        """calibration: what is known of the camera already; None: what the parameters say."""
+        """calibration: what is known of the camera already; None: what the map or else the
+        parameters say.   known: a map of earlier sessions, in which the camera may be recognised.
+        """
         self._parameters = parameters
-        self.calibration = calibration or SelfCalibration.of(camera, parameters.calibration)
+        self.calibration = (
+            calibration
+            or known_camera(known, camera)
+            or SelfCalibration.of(camera, parameters.calibration)
+        )
         self._generator = np.random.default_rng(seed)
         self._timer: StageTimer = no_stages
         self._points = PointRows()
@@ -74,7 +80,6 @@ class Mapper:
         self._map: ActiveMap | None = None
         self._earlier = EarlierSegments()
         self._places = KnownPlaces()
-        self._revisits = Revisits()
         self._spans: list[tuple[int, int]] = []
         self._segments = 0
         self._segment = -1  # that the camera is in, or was in last
@@ -85,6 +90,33 @@ class Mapper:
         self._keyframe_is_new = False
         self._published_frames = 0
         self._whole = False
+        self._origins = {each.id: Origin(each.session, each.source_frame) for each in known}
+        if known:
+            self._know(list(known))
+
+    def _know(self, known: list[KeptKeyframe]) -> None:
+        """Begin with a map of earlier sessions: what is new is numbered on."""
+        for each in take_in(known, self._points, self.calibration, self._parameters):
+            self._earlier.know(each.map, each.path, self.calibration)
+        for each in known:
+            if not self._spans or self._spans[-1][1] != each.segment:
+                self._spans.append((each.id, each.segment))
+        self._places.know(known, self.calibration)
+        self._segments = max(each.segment for each in known) + 1
+        self._keyframes = known[-1].id + 1
+        self._keyframe_changes = KeyframeChanges(self._points, after=known[-1].id)
+
+    def kept(self) -> Iterator[KeptKeyframe]:
+        """The map as it is to be kept, oldest keyframe first.  Once the stream has ended."""
+        segments = self._earlier.everything()
+        if self._map is not None:
+            segments = [*segments, (self._map, self._path, self.calibration)]
+        session = 1 + max((origin.session for origin in self._origins.values()), default=-1)
+        made = (keyframe for active, _, _ in segments for keyframe in active.keyframes)
+        origins = {k.id: Origin(session, k.frame) for k in made} | self._origins
+        features = self._places.index.features
+        each = [keep(*segment, features, origins) for segment in segments]
+        yield from heapq.merge(*each, key=lambda keyframe: keyframe.id)
 
     def process(
         self,
@@ -103,6 +135,7 @@ class Mapper:
         tracks, grey, colour = self.calibration.ideal(tracks, grey, colour)
         if self._map is not None and self._motion is not None:
             with self._timer("whole map"):
+                self._join_met(self._map, self._motion, frame)
                 if (answer := self.whole_map.take(frame)) is not None:
                     self._take_over(self._map, self._motion, answer)
             self._map.links.follow(tracks.ids)
@@ -139,6 +172,7 @@ class Mapper:
             self._keyframe_ns = stamp_ns
             with self._timer("places"):
                 self._remember(self._map, hanging, grey)
+        self._place_waiting(self._map, hanging, T_world_camera)
         self._lost_frames, self._waiting = 0, Waiting()
         self._motion = self._motion.then(frame, stamp_ns, T_world_camera)
         self._add_pose(self._map, frame, hanging, T_world_camera, support.inliers)
@@ -155,10 +189,34 @@ class Mapper:
         state = LOST if self._lost_frames else TRACKING
         return self._publish(WAITING if self._map is None else state, reason, 0)
 
+    def stay(self) -> None:
+        """Forget what is about to move the map: nobody has it yet."""
+        self.whole_map, self._places.meetings = WholeMap(), Meetings()
+
     @property
     def _camera(self) -> PinholeCamera:
         """Whose pixels are worked on."""
         return self.calibration.view.camera
+
+    def _join_met(self, active: ActiveMap, motion: Motion, frame: int) -> None:
+        """Become one with an earlier segment that has been met."""
+        proved = self._places.meetings.proved
+        if not proved:
+            return
+        segments = [self._earlier.segment_of(loop.old) for loop in proved]
+        met = [loop for loop, of in zip(proved, segments, strict=True) if of == segments[0]]
+        earlier, path = self._earlier.take(segments[0])
+        self.whole_map.withdraw()
+        self.whole_map.loops += met
+        joined = join(active, self._path, earlier, path, met, self._spans, self.calibration.readout)
+        self._changes.move(joined.moves)
+        self._changes.join(joined.gone, active.segment)
+        self._motion = motion.moved(joined.S)
+        self._segment = active.segment
+        self._spans = [(k, active.segment if of == joined.gone else of) for k, of in self._spans]
+        self._places.enter()
+        self.whole_map.move(joined.moves)
+        self.whole_map.ask(frame, active, self._path, self.calibration.readout)
 
     def _take_over(self, active: ActiveMap, motion: Motion, answer: Answer) -> None:
         """Go on with what the adjustment of the whole map has found."""
@@ -214,6 +272,8 @@ class Mapper:
 
     def finish(self) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
+        if self._map is not None and self._motion is not None:
+            self._join_met(self._map, self._motion, 0)
         self._earlier.adjust()
         if self._map is None or self._motion is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
@@ -228,9 +288,9 @@ class Mapper:
         self._keyframe_changes.settle(self._map.keyframes)
         return self._publish(TRACKING, "", 0, snapshot=True)
 
-    def _finishes(self, active: ActiveMap) -> bool:
+    def _finishes(self, *maps: ActiveMap) -> bool:
         limits = self._parameters.window
-        few = len(active.keyframes) + active.culled <= limits.final_max_keyframes
+        few = sum(len(m.keyframes) + m.culled for m in maps) <= limits.final_max_keyframes
         return limits.final_adjustment and few
 
     def _add_pose(
@@ -285,6 +345,7 @@ class Mapper:
         self._segment, self._segments = self._segments, self._segments + 1
         self._path = Path()
         self.whole_map = WholeMap()
+        self._places.enter()
         self._map.begin(start, self._waiting.frames, grey, colour)
         self._calibrate(self._map)
         placed = list(
@@ -316,12 +377,6 @@ class Mapper:
     ) -> F64 | None:
         """T_world_camera of the frame where it goes on, or else where it was seen before."""
         if self._map is not None and self._motion is not None:
-            with self._timer("places"):
-                earlier = self._earlier.maps(self.calibration) if self._keyframe_is_new else []
-                larger = [m for m in earlier if len(m.keyframes) > len(self._map.keyframes)]
-                located = self._recognise(larger, frame, stamp_ns, tracks, grey)
-            if located is not None:
-                return located
             with self._timer("localisation"):
                 at_once = tracks
                 if self.calibration.readout:
@@ -350,11 +405,9 @@ class Mapper:
         """T_world_camera in the one of the maps that the image shows, which then goes on."""
         if grey is None or not maps:
             return None
-        seen = describe(grey)
-        like = islice(self._places.like(seen, maps, self.calibration.view), _PLACES)
-        found = relocalise(
-            seen, list(like), self._points, tracks.maxima, grey, self._camera,
-            self._parameters, self._generator,
+        found = self._places.recognise(
+            grey, tracks.maxima, maps, self._points, self.calibration, self._parameters,
+            self._generator,
         )  # fmt: skip
         if found is None:
             return None
@@ -373,6 +426,7 @@ class Mapper:
                 self._earlier.keep(active, self._path, self.calibration)
             active, self._path = self._earlier.take(seen.segment)
             self._map, self.whole_map = active, WholeMap()
+            self._places.enter()
         self.whole_map.withdraw()  # nobody knows how what is new would move
         self._segment = active.segment
         active.resume(seen, self._keyframes)
@@ -389,14 +443,26 @@ class Mapper:
         if grey is None:
             return
         seen, view = describe(grey), self.calibration.view
-        if self._finishes(active) and not self.whole_map.closing:
-            self.whole_map.loops += self._revisits.look(
-                Place(keyframe=keyframe, features=seen, segment=active.keyframes),
-                self._places.like(seen, [active], view), self._points, self._camera,
-                self._parameters,
-            )  # fmt: skip
-        maps = [active, *self._earlier.maps(self.calibration)]
-        self._places.remember(keyframe, seen, maps, view)
+        earlier = self._earlier.maps(self.calibration)
+        self.whole_map.loops += self._places.compare(
+            keyframe, seen, active, [each for each in earlier if self._finishes(active, each)],
+            view, loops=self._finishes(active) and not self.whole_map.closing,
+        )  # fmt: skip
+        self._places.remember(keyframe, seen, [active, *earlier], view)
+
+    def _place_waiting(self, active: ActiveMap, keyframe: Keyframe, T_world_camera: F64) -> None:
+        """The camera was lost, and has been found: so are the frames between that follow what it
+        sees now."""
+        if not self._waiting.frames:
+            return
+        linked = active.linked(MAPPED)
+        placed = returned_poses(
+            T_world_camera, active.links.ids[linked],
+            self._points.xyz[active.links.rows[linked]], self._waiting, keyframe, self._camera,
+            self._parameters.localisation,
+        )  # fmt: skip
+        for each in placed:
+            self._add_pose(active, each.frame, keyframe, each.T_world_camera, each.inliers)
 
     def _lost(self, active: ActiveMap, frame: int, stamp_ns: int, tracks: FrameTracks) -> MapDelta:
         """The frame has no pose.  After some time without one the segment is closed.

@@ -248,6 +248,10 @@ class MappingParameters(Parameters):
     point: PointParameters = PointParameters()
     bundle: BundleParameters = BundleParameters(kernel_sigma_px=1.0)
     calibration: CalibrationUncertainty = CalibrationUncertainty()
+    only_localise: bool = Field(
+        default=False,
+        description="Find frames in a map of earlier sessions, and map nothing (run --localise)",
+    )
     snapshot_frames: int = Field(
         default=100,
         ge=1,

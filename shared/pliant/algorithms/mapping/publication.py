@@ -22,10 +22,15 @@ class MapChanges:
         self._poses: list[tuple[int, int, int, F64, int]] = []
         self._removed: list[I64] = []
         self._moves: MapMoves | None = None
+        self._joined: list[tuple[int, int]] = []
 
     def move(self, moves: MapMoves) -> None:
         """The whole map moves, before anything else of the frame."""
         self._moves = moves if self._moves is None else self._moves.then(moves)
+
+    def join(self, gone: int, segment: int) -> None:
+        """What belongs to a segment that is gone belongs to another one, after all moves."""
+        self._joined.append((gone, segment))
 
     def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
         """The pose of a frame is new, and hangs on a keyframe."""
@@ -57,6 +62,7 @@ class MapChanges:
         poses, self._poses = sorted(self._poses, key=lambda pose: pose[0]), []
         removed, self._removed = self._removed, []
         moves, self._moves = self._moves, None
+        joined, self._joined = self._joined, []
         moved = [k for k in keyframes if snapshot or _differs(k)]
         for keyframe in moved:
             keyframe.published_pose = keyframe.T_world_camera.copy()
@@ -90,6 +96,7 @@ class MapChanges:
             point_hosts=points.first_keyframe[rows].astype(np.int64),
             snapshot=snapshot,
             removed_point_ids=np.sort(np.concatenate([*removed, np.zeros(0, np.int64)])),
+            joined=np.array(joined, np.int32).reshape(-1, 2),
         )
         if moves is None:
             return delta
@@ -138,10 +145,11 @@ def _differs(keyframe: Keyframe) -> bool:
 class KeyframeChanges:
     """Remembers what has been published, and makes each KeyframeDelta."""
 
-    def __init__(self, points: PointRows) -> None:
+    def __init__(self, points: PointRows, after: int = -1) -> None:
+        """after: id of the last keyframe of earlier sessions, of which nothing is told."""
         self._points = points
-        self._newest = -1
-        self._settled = -1
+        self._newest = after
+        self._settled = after
         self._final: list[Keyframe] = []
 
     def settle(self, keyframes: Sequence[Keyframe]) -> None:

@@ -41,10 +41,12 @@ class Revisits:
         points: PointRows,
         camera: PinholeCamera,
         parameters: MappingParameters,
+        tries: int = 1,
     ) -> list[Loop]:
-        """The loops that a new keyframe proves: with the place that looks most like it, if any.
+        """The loops that a new keyframe proves: with a place that looks like it, if any.
 
-        places: of the segment that look like it, the most alike first.
+        places: of one segment that look like it, the most alike first.   tries: how many of them
+        are asked; if they contradict each other, what is alike in both proves neither.
         """
         keyframe = new.keyframe
         mine = np.zeros(len(points.state), np.bool_)
@@ -54,28 +56,34 @@ class Revisits:
         window = {k.id for k in new.segment[-parameters.window.keyframes :]}
         # Its own, so that no frame is located otherwise because something was looked at here.
         generator = np.random.default_rng(keyframe.id)
+        told: list[Loop] = []
         for old in places:
             shares = int(mine[old.keyframe.rows].sum())
             if old.keyframe.id in window or shares >= parameters.localisation.min_inliers:
                 continue
             found = same_place(old, new, points, camera, parameters, generator)
-            if isinstance(found, str):
-                return []
-            rows = found.rows[found.rows[:, 0] != found.rows[:, 1]]
-            loop = Loop(
-                old=old.keyframe.id, new=keyframe.id, S_old_new=found.S_old_new, rows=rows,
-                ids=points.ids[rows],
-            )  # fmt: skip
-            agreeing = [each for each in self.waiting if _agree(each, loop, new, points)]
-            self.waiting = [] if agreeing else [*self.waiting, loop]
-            return [*agreeing, loop] if agreeing else []
-        return []
+            if not isinstance(found, str):
+                rows = found.rows[found.rows[:, 0] != found.rows[:, 1]]
+                told.append(
+                    Loop(
+                        old=old.keyframe.id, new=keyframe.id, S_old_new=found.S_old_new, rows=rows,
+                        ids=points.ids[rows],
+                    )
+                )  # fmt: skip
+            tries -= 1
+            if tries == 0:
+                break
+        loop = max(told, key=lambda each: len(each.rows), default=None)
+        if loop is None or not all(_agree(each, loop, new, points) for each in told):
+            return []
+        others = [each for each in self.waiting if each.new != keyframe.id]
+        agreeing = [each for each in others if _agree(each, loop, new, points)]
+        self.waiting = [] if agreeing else [*self.waiting, loop]
+        return [*agreeing, loop] if agreeing else []
 
 
 def _agree(one: Loop, other: Loop, new: Place, points: PointRows) -> bool:
-    """Whether loops of two keyframes take what the newer one sees to the same place."""
-    if one.new == other.new:
-        return False
+    """Whether two loops take what the new keyframe sees to the same place."""
     keyframe = new.keyframe
     between: F64 = np.linalg.inv(other.S_old_new) @ one.S_old_new
     scale = float(np.cbrt(np.linalg.det(between[:3, :3])))

@@ -43,12 +43,19 @@ _GRID_PX = 16
 class Path:
     """Poses of the frames of a segment, each relative to its keyframe, which may still move."""
 
-    def __init__(self) -> None:
+    def __init__(self, known: dict[int, F64] | None = None) -> None:
+        """known: motions (6,) of keyframes by their ids, whose frames nobody has any more."""
         self._poses: dict[int, tuple[int, F64]] = {}
+        self._known = known or {}
 
     def add(self, frame: int, keyframe: Keyframe, T_world_camera: F64) -> None:
         """A frame whose pose hangs on a keyframe."""
         self._poses[frame] = (keyframe.id, inverse(keyframe.T_world_camera) @ T_world_camera)
+
+    def take_in(self, other: "Path") -> None:
+        """The frames of another segment are of this one, too."""
+        self._poses |= other._poses
+        self._known |= other._known
 
     def scale(self, moves: MapMoves) -> None:
         """The whole map moves: distances to a keyframe scale with it."""
@@ -56,6 +63,10 @@ class Path:
         scales = np.cbrt(np.linalg.det(moves.matrices(hanging)[:, :3, :3]))
         for frame, scale in zip(self._poses, scales, strict=True):
             self._poses[frame][1][:3, 3] *= scale
+        known = np.array(list(self._known), np.int64)
+        scales = np.cbrt(np.linalg.det(moves.matrices(known)[:, :3, :3]))
+        for keyframe, scale in zip(self._known, scales, strict=True):
+            self._known[keyframe] = self._known[keyframe] * np.repeat([1.0, scale], 3)
 
     def forget(self) -> None:
         """Nobody will ask any more."""
@@ -68,6 +79,9 @@ class Path:
         T_world_keyframe = {keyframe.id: keyframe.T_world_camera for keyframe in keyframes}
         motions = np.zeros((len(keyframes), 6))
         for row, keyframe in enumerate(keyframes):
+            if keyframe.id in self._known:
+                motions[row] = self._known[keyframe.id]
+                continue
             near = range(keyframe.frame - _SPAN, keyframe.frame + _SPAN + 1)
             known = [f for f in near if self._poses.get(f, (-1,))[0] in T_world_keyframe]
             if len(known) < 2:

@@ -7,13 +7,17 @@ frames can wait, the map begins anew with all of them and with the camera that w
 """
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDelta
+from pliant.algorithms.mapping.kept_map import known_camera
+from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import is_guess, widened
@@ -43,8 +47,16 @@ class TrialMapper:
     first: of those that the trial gave a pose.
     """
 
-    def __init__(self, camera: PinholeCamera, parameters: MappingParameters, seed: int) -> None:
+    def __init__(
+        self,
+        camera: PinholeCamera,
+        parameters: MappingParameters,
+        seed: int,
+        known: Sequence[KeptKeyframe] = (),
+    ) -> None:
+        """known: as of ``Mapper``; the trial does without."""
         self._anew = (camera, parameters, seed)
+        self._known = list(known)
         self._mapper = Mapper(camera, parameters, seed)
         self._taken: list[_Taken] = []
         self._on_trial = True
@@ -104,6 +116,10 @@ class TrialMapper:
         final = self._mapper.finish()
         return final if begun is None else _joined([begun, final])
 
+    def kept(self) -> Iterator[KeptKeyframe]:
+        """As ``Mapper.kept``; what was known, where nothing came of the trial."""
+        return iter(self._known) if self._on_trial else self._mapper.kept()
+
     def publish_keyframes(self) -> KeyframeDelta:
         """As ``Mapper.publish_keyframes``."""
         if self._on_trial:
@@ -112,23 +128,34 @@ class TrialMapper:
 
     def _begin(self, timer: StageTimer) -> MapDelta:
         """Map all that was taken with the camera that the trial has found."""
-        self._mapper = Mapper(*self._anew, calibration=self._mapper.calibration)
+        self._mapper = Mapper(*self._anew, calibration=self._mapper.calibration, known=self._known)
         self._on_trial = False
         deltas: list[MapDelta] = []
         for taken in self._taken:
             deltas.append(self._mapper.process(*taken, timer))
-            self._mapper.whole_map = WholeMap()  # nobody has the map yet that it would move
+            self._mapper.stay()
         self._taken = []
         return _joined(deltas)
 
 
 def mapper_for(
-    camera: PinholeCamera, parameters: MappingParameters, seed: int, focal_sigma: float = 0.0
-) -> Mapper | TrialMapper:
-    """The mapper of a camera, as well as its calibration is known: see ``widened``."""
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    seed: int,
+    focal_sigma: float = 0.0,
+    known: Sequence[KeptKeyframe] = (),
+) -> Mapper | TrialMapper | Localiser:
+    """The mapper of a camera, as well as its calibration is known: see ``widened``.
+
+    known: a map of earlier sessions; where it is of this very camera it tells the calibration, too.
+    """
     parameters = widened(parameters, focal_sigma)
-    kind = TrialMapper if is_guess(parameters.calibration) else Mapper
-    return kind(camera, parameters, seed)
+    if parameters.only_localise:
+        return Localiser(camera, parameters, seed, known=known)
+    found = known_camera(known, camera)
+    if is_guess(parameters.calibration) and (found is None or found.sigmas[0] > _KNOWN):
+        return TrialMapper(camera, parameters, seed, known)
+    return Mapper(camera, parameters, seed, known=known)
 
 
 _ARRAYS = [field.name for field in dataclasses.fields(MapDelta) if "Annotated" in str(field.type)]

@@ -1,4 +1,4 @@
-"""Poses of the frames that waited for a map: backwards from where it starts.
+"""Poses of the frames that waited for a map: backwards from where it starts, or goes on.
 
 They are placed by the points of the start.  Those before, which see too few of them, have but
 turned, or the map would have started there: they stand where the first one that is placed does,
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64
+from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.epipolar import rotation_between
 from pliant.algorithms.mapping.localisation import refine
@@ -114,7 +114,9 @@ def earlier_poses(
     for frame in sorted(frames.keys() | turned.keys(), reverse=True):
         here, inliers = T_world_camera, 0
         if frame in frames:
-            here, inliers = _place(T_world_camera, start, frames[frame], camera, parameters)
+            here, inliers = _place(
+                T_world_camera, start.ids, start.points_world, frames[frame], camera, parameters
+            )
         if frame in keyframe_at:
             hanging = keyframe_at[frame]
             here = hanging.T_world_camera
@@ -131,15 +133,40 @@ def earlier_poses(
         )
 
 
+def returned_poses(
+    T_world_camera: F64,
+    ids: I64,
+    points_world: F64,
+    waiting: Waiting,
+    keyframe: Keyframe,
+    camera: PinholeCamera,
+    parameters: LocalisationParameters,
+) -> Iterator[EarlierPose]:
+    """Of the frames that waited until a lost camera was found in its map, the newest first: those
+    that follow enough of what it sees there.
+
+    T_world_camera: where it was found.   ids, points_world: (n,) and (n, 3) of the tracks of points
+    that it sees.   keyframe: on which they hang.
+    """
+    for frame in reversed(waiting.frames):
+        here, inliers = _place(T_world_camera, ids, points_world, frame, camera, parameters)
+        if inliers >= parameters.min_inliers:
+            T_world_camera = here
+            yield EarlierPose(
+                frame=frame.frame, keyframe=keyframe, T_world_camera=here, inliers=inliers
+            )
+
+
 def _place(
     T_world_camera: F64,
-    start: Start,
+    ids: I64,
+    points_world: F64,
     frame: WaitingFrame,
     camera: PinholeCamera,
     parameters: LocalisationParameters,
 ) -> tuple[F64, int]:
-    _, i, j = np.intersect1d(frame.ids, start.ids, assume_unique=True, return_indices=True)
+    _, i, j = np.intersect1d(frame.ids, ids, assume_unique=True, return_indices=True)
     if len(i) < parameters.min_inliers:
         return T_world_camera, 0
-    located = refine(T_world_camera, start.points_world[j], frame.points_px[i], camera, parameters)
+    located = refine(T_world_camera, points_world[j], frame.points_px[i], camera, parameters)
     return located.T_world_camera, int(located.inliers.sum())

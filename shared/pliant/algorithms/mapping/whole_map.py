@@ -155,12 +155,15 @@ class WholeMap:
             return None
         answer = find_moves(self.question) if self.answer is None else self.answer
         self.question = self.answer = None
-        for n, loop in enumerate(self.loops):  # the worlds that they tell of have moved
-            if answer.moves is None:
-                break
-            old, new = answer.moves.matrices(np.array([loop.old, loop.new]))
-            self.loops[n] = loop._replace(S_old_new=old @ loop.S_old_new @ np.linalg.inv(new))
+        if answer.moves is not None:
+            self.move(answer.moves)
         return answer
+
+    def move(self, moves: MapMoves) -> None:
+        """The worlds that loops tell of have moved."""
+        for n, loop in enumerate(self.loops):
+            old, new = moves.matrices(np.array([loop.old, loop.new]))
+            self.loops[n] = loop._replace(S_old_new=old @ loop.S_old_new @ np.linalg.inv(new))
 
 
 def find_moves(question: Question) -> Answer:

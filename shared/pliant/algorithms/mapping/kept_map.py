@@ -1,0 +1,223 @@
+"""A map that is kept: its keyframes as places, each with the points that hang on it, and back.
+
+What is kept is what a camera may come back to: poses, what they saw, corners, points with the
+patches by which they are found again.  Pixels are those of the ideal camera of the calibration that
+is kept with them, so that another camera, with a calibration of its own, can use the map.  Each
+keyframe stands for itself: no part grows with the map.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import F32, I32, I64, U8, check_arrays
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import CorrectedView, corrected_view
+from pliant.algorithms.kept_keyframe import KeptKeyframe
+from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.map_store import MAPPED, PATCH_SIDE, Keyframe, PointRows
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.places.features import Features
+
+
+class Origin(NamedTuple):
+    """Where a keyframe comes from: the number of the run, and the frame there."""
+
+    session: int
+    frame: int
+
+
+class KnownSegment(NamedTuple):
+    """A segment of an earlier session: its map, and what is known of the motion in it."""
+
+    map: ActiveMap
+    path: Path
+
+
+def view_of(kept: KeptKeyframe) -> CorrectedView:
+    """Whose pixels a keyframe has."""
+    return corrected_view(kept.given_camera, tuple(kept.correction.tolist()))
+
+
+def check(kept: KeptKeyframe) -> None:
+    """Raise ValueError where a keyframe is none that this module has made."""
+    check_arrays(kept)
+    if kept.point_patches.shape[1:] != (PATCH_SIDE, PATCH_SIDE):
+        raise ValueError(f"patches of {kept.point_patches.shape[1]} pixels")
+    if kept.id < 0 or kept.segment < 0 or kept.given[:4].min() <= 0.0:
+        raise ValueError("numbers or a camera that cannot be")
+    real = (kept.given, kept.correction, kept.T_world_camera, kept.motion, kept.points_world)
+    if not all(np.isfinite(each).all() for each in (*real, kept.seen_px, kept.corners_px)):
+        raise ValueError("values that are not finite")
+    R, last = kept.T_world_camera[:3, :3], kept.T_world_camera[3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or last.tolist() != [0.0, 0.0, 0.0, 1.0]:
+        raise ValueError("a pose that is none")
+    for ids in (kept.seen_ids, kept.point_ids):
+        if len(ids) and (ids[0] < 0 or (np.diff(ids) <= 0).any()):
+            raise ValueError("points that are not in order")
+
+
+def keep(
+    segment: ActiveMap,
+    path: Path,
+    calibration: SelfCalibration,
+    features: dict[int, Features],
+    origins: dict[int, Origin],
+) -> Iterator[KeptKeyframe]:
+    """The keyframes of a segment, oldest first.
+
+    features: of keyframes by their ids, at the pixels of the rectified image.   origins: of all.
+    """
+    points, given, view = segment.points, calibration.given, calibration.view
+    ids = np.array([keyframe.id for keyframe in segment.keyframes], np.int64)
+    rows = points.mapped(segment.segment)
+    # What hung on a keyframe that the map has forgotten moves with the one before it.
+    hosts = np.maximum(np.searchsorted(ids, points.first_keyframe[rows], side="right") - 1, 0)
+    rows = rows[np.lexsort([points.ids[rows], hosts])]
+    ends = np.cumsum(np.bincount(hosts, minlength=len(ids)))
+    motions = path.motions(segment.keyframes)
+    for slot, keyframe in enumerate(segment.keyframes):
+        mine = rows[ends[slot - 1] if slot else 0 : ends[slot]]
+        mapped = np.flatnonzero(points.state[keyframe.rows] == MAPPED)
+        mapped = mapped[np.argsort(points.ids[keyframe.rows[mapped]])]
+        corners = features.get(keyframe.id)
+        none = Features(points_px=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), "u1"))
+        corners = none if corners is None else corners
+        origin = origins[keyframe.id]
+        size = given.width, given.height
+        yield KeptKeyframe(
+            id=keyframe.id,
+            segment=keyframe.segment,
+            session=origin.session,
+            source_frame=origin.frame,
+            turned=keyframe.turned,
+            given=np.array([*size, given.fx, given.fy, given.cx, given.cy], np.float64),
+            correction=calibration.correction.copy(),
+            sigmas=calibration.sigmas,
+            T_world_camera=keyframe.T_world_camera.copy(),
+            motion=motions[slot],
+            seen_ids=points.ids[keyframe.rows[mapped]],
+            seen_px=keyframe.points_px[mapped],
+            rolled_px=keyframe.rolled_px[mapped],
+            corners_px=view.pixels(corners.points_px),
+            descriptors=corners.descriptors,
+            point_ids=points.ids[mine],
+            points_world=points.xyz[mine],
+            point_colours=points.colours[mine],
+            point_keyframes=points.keyframes[mine],
+            point_parallax_rad=points.parallax_rad[mine],
+            point_sigmas=points.sigmas[mine],
+            point_kappas=points.kappas[mine],
+            point_patches=points.patches[mine],
+        )
+
+
+def take_in(
+    kept: list[KeptKeyframe],
+    points: PointRows,
+    calibration: SelfCalibration,
+    parameters: MappingParameters,
+) -> list[KnownSegment]:
+    """The segments of a kept map, their points in rows that are new; those without a point are
+    left out.
+
+    calibration: of the camera that goes on in it.   Raises ValueError where a point is told twice.
+    """
+    rows = points.allocate(sum(len(each.point_ids) for each in kept))
+    first = 0
+    for each in kept:
+        mine = rows[first : first + len(each.point_ids)]
+        first += len(mine)
+        _put(points, mine, each, calibration)
+    order = np.argsort(points.ids[rows], kind="stable").astype(np.int32)
+    ids, rows = points.ids[rows][order], rows[order]
+    if (np.diff(ids) == 0).any():
+        raise ValueError("a point that is told twice")
+    points.go_on_after(int(ids[-1]) if len(ids) else -1)
+    segments: list[KnownSegment] = []
+    for segment in sorted({each.segment for each in kept}):
+        mine = [each for each in kept if each.segment == segment]
+        known = ActiveMap(segment, points, 0, calibration.view.camera, parameters)
+        known.know([_keyframe(each, ids, rows, calibration) for each in mine])
+        path = Path({each.id: each.motion for each in mine if each.motion.any()})
+        if any(len(each.point_ids) for each in mine):
+            segments.append(KnownSegment(known, path))
+    return segments
+
+
+def features_for(kept: KeptKeyframe, calibration: SelfCalibration) -> Features:
+    """Its corners at the pixels of the rectified image of a camera."""
+    moved = _moved(kept.corners_px, view_of(kept).camera, calibration.view.camera)
+    return Features(points_px=calibration.view.seen(moved), descriptors=kept.descriptors)
+
+
+def known_camera(kept: Sequence[KeptKeyframe], camera: PinholeCamera) -> SelfCalibration | None:
+    """What the last session of a map knew of a camera that was given in the same words; None where
+    it is another one."""
+    for each in reversed(kept):
+        if each.given_camera == camera:
+            found = SelfCalibration(camera, each.correction.copy(), np.diag(each.sigmas**2))
+            return replace(found, next_keyframes=np.iinfo(np.int32).max)
+    return None
+
+
+def _put(points: PointRows, rows: I32, kept: KeptKeyframe, calibration: SelfCalibration) -> None:
+    points.state[rows] = MAPPED
+    points.ids[rows] = kept.point_ids
+    points.segment[rows] = kept.segment
+    points.first_keyframe[rows] = kept.id
+    points.xyz[rows] = points.published_xyz[rows] = kept.points_world
+    points.spread[rows] = 0.0
+    points.published_keyframes[rows] = -1  # told again where this session sees them
+    points.colours[rows] = kept.point_colours
+    points.keyframes[rows] = points.base_keyframes[rows] = kept.point_keyframes
+    points.parallax_rad[rows] = points.base_parallax_rad[rows] = kept.point_parallax_rad
+    points.sigmas[rows] = kept.point_sigmas
+    points.kappas[rows] = kept.point_kappas
+    zoom = calibration.view.camera.fx / view_of(kept).camera.fx
+    points.patches[rows] = _zoomed(kept.point_patches, zoom)
+
+
+def _keyframe(kept: KeptKeyframe, ids: I64, rows: I32, calibration: SelfCalibration) -> Keyframe:
+    at = np.minimum(np.searchsorted(ids, kept.seen_ids), max(len(ids) - 1, 0))
+    there = np.flatnonzero(ids[at] == kept.seen_ids) if len(ids) else np.zeros(0, np.int64)
+    seen = rows[at[there]] if len(ids) else np.zeros(0, np.int32)
+    there = there[np.argsort(seen)]
+    old, new = view_of(kept).camera, calibration.view.camera
+    points_px = _moved(kept.seen_px[there], old, new)
+    return Keyframe(
+        id=kept.id,
+        frame=-1,
+        segment=kept.segment,
+        T_world_camera=kept.T_world_camera.copy(),
+        rows=np.sort(seen),
+        points_px=points_px,
+        rolled_px=_moved(kept.seen_px[there] + kept.rolled_px[there], old, new) - points_px
+        if old != new
+        else kept.rolled_px[there],
+        turned=kept.turned,
+    )
+
+
+def _moved(points_px: F32, old: PinholeCamera, new: PinholeCamera) -> F32:
+    """Pixels of one pinhole camera in another one that stands where it stood."""
+    if old == new:
+        return points_px
+    seen = old.normalise(points_px)
+    return (seen * (new.fx, new.fy) + (new.cx, new.cy)).astype(np.float32)
+
+
+def _zoomed(patches: U8, zoom: float) -> U8:
+    """Patches as a camera with so many times the focal length sees them, their border repeated."""
+    if zoom == 1.0 or not len(patches):
+        return patches
+    middle = 0.5 * (PATCH_SIDE - 1)
+    side = ((np.arange(PATCH_SIDE) - middle) / zoom + middle).astype(np.float32)
+    u, v = np.meshgrid(side, side)
+    moved = [cv2.remap(p, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE) for p in patches]
+    return np.array(moved, np.uint8)

@@ -1,0 +1,213 @@
+"""Finds frames in a map of earlier sessions, which stays as it is.
+
+A frame is recognised by what it looks like; those that follow are found by the points of the map:
+those that tracks lead to, and those found again at the maxima of curvature, as when a map grows.
+Nothing is triangulated or adjusted.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse, so3_log, transform
+from pliant.algorithms.kept_keyframe import KeptKeyframe
+from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
+from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.frame_pose import find_again, localise
+from pliant.algorithms.mapping.kept_map import known_camera, take_in
+from pliant.algorithms.mapping.known_places import KnownPlaces
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.observation_table import reprojection_errors
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
+from pliant.algorithms.mapping.recovery import Motion
+from pliant.algorithms.mapping.relocalisation import Recognised
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.mapping.support import Support, doubt, support_of
+from pliant.algorithms.mapping.whole_map import WholeMap
+from pliant.algorithms.stages import StageTimer, no_stages
+from pliant.algorithms.tracks import FrameTracks
+
+_LOOK_TURN_RAD = np.radians(5.0)
+_LOOK_SHIFT = 0.05
+"""Of the depth: a camera that has moved or turned by more may see what others saw."""
+
+
+class Localiser:
+    """What it is told and tells is a ``Mapper``'s.
+
+    A pure function of camera, map, parameters, seed and the frames given, one after the other.
+    """
+
+    def __init__(
+        self,
+        camera: PinholeCamera,
+        parameters: MappingParameters,
+        seed: int,
+        known: Sequence[KeptKeyframe] = (),
+    ) -> None:
+        """known: the map; where it is of this very camera, it tells the calibration, too."""
+        self._parameters = parameters
+        self.calibration = known_camera(known, camera) or SelfCalibration.of(
+            camera, parameters.calibration
+        )
+        self.whole_map = WholeMap()
+        self._generator = np.random.default_rng(seed)
+        self._points = PointRows()
+        self._changes = MapChanges()
+        self._places = KnownPlaces()
+        kept = list(known)
+        segments = take_in(kept, self._points, self.calibration, parameters)
+        self._maps = [each.map for each in segments]
+        self._places.know(kept, self.calibration)
+        self._map: ActiveMap | None = None
+        self._hanging: Keyframe | None = None
+        self._motion: Motion | None = None
+        self._looked_from: F64 = np.eye(4)
+
+    def process(
+        self,
+        frame: int,
+        stamp_ns: int,
+        tracks: FrameTracks,
+        grey: U8 | None,
+        colour: U8 | None,
+        timer: StageTimer = no_stages,
+    ) -> MapDelta:
+        """Find a frame in the map.  stamp_ns, grey, colour: as of ``Mapper.process``."""
+        tracks, grey, _ = self.calibration.ideal(tracks, grey, None)
+        if self._map is not None:
+            self._map.links.follow(tracks.ids)
+        located = self._locate(stamp_ns, tracks, grey, timer)
+        if located is None or self._map is None or self._hanging is None:
+            return self._publish(LOST if self._map else WAITING, "not recognised in the map", 0)
+        with timer("reacquisition"):
+            looks_anew = self._look_from(self._map, located)
+            located, support = self._find(self._map, frame, located, tracks, grey)
+        if support.inliers < self._parameters.localisation.min_inliers:
+            return self._publish(LOST, f"lost: {support.inliers} points of the map are seen", 0)
+        frames, stamps, poses = (frame, frame), (stamp_ns, stamp_ns), (located, located)
+        if self._motion is None:
+            self._motion = Motion(frames=frames, stamps_ns=stamps, poses=poses)
+        else:
+            self._motion = self._motion.then(frame, stamp_ns, located)
+        self._changes.add_pose(frame, self._hanging, located, support.inliers)
+        why = doubt(support, self._parameters.support)
+        return self._publish(TRACKING, why, support.inliers, looks_anew=looks_anew)
+
+    def recognise(self, maxima: F32, grey: U8) -> Recognised | None:
+        """Where an image (H, W) of the ideal camera, with its maxima (M, 3) of curvature, is seen
+        from, by what it looks like alone."""
+        return self._places.recognise(
+            grey, maxima, self._maps, self._points, self.calibration, self._parameters,
+            self._generator,
+        )  # fmt: skip
+
+    def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
+        """As ``Mapper.skip``."""
+        return self._publish(WAITING if self._map is None else TRACKING, reason, 0)
+
+    @property
+    def waiting_frames(self) -> list[int]:
+        """None: no map will start."""
+        return []
+
+    @property
+    def point_count(self) -> int:
+        """Points of the map."""
+        return int(np.count_nonzero(self._points.state == MAPPED))
+
+    def kept(self) -> list[KeptKeyframe]:
+        """Nothing: the map is as it was."""
+        return []
+
+    def finish(self) -> MapDelta:
+        """As ``Mapper.finish``."""
+        return self._publish(WAITING if self._map is None else TRACKING, "", 0)
+
+    def publish_keyframes(self) -> KeyframeDelta:
+        """None are made."""
+        return KeyframeChanges(self._points).publish(None)
+
+    def _locate(
+        self, stamp_ns: int, tracks: FrameTracks, grey: U8 | None, timer: StageTimer
+    ) -> F64 | None:
+        if self._map is not None and self._motion is not None:
+            with timer("localisation"):
+                located = localise(
+                    self._map, self._motion, stamp_ns, tracks, tracks.maxima, grey,
+                    self._generator,
+                )  # fmt: skip
+            if located is not None:
+                return located
+        if grey is None:
+            return None
+        with timer("places"):
+            found = self.recognise(tracks.maxima, grey)
+        if found is None:
+            return None
+        self._hanging, self._motion = found.keyframe, None
+        self._map = next(m for m in self._maps if m.segment == found.keyframe.segment)
+        self._map.links.follow(np.zeros(0, np.int64))
+        self._map.links.follow(tracks.ids)
+        self._map.look_around(found.T_world_camera)
+        self._looked_from = found.T_world_camera
+        return found.T_world_camera
+
+    def _look_from(self, active: ActiveMap, T_world_camera: F64) -> bool:
+        """Whether the camera has moved so far that it may see what others saw."""
+        rows = active.links.rows[active.linked(MAPPED)]
+        moved = inverse(self._looked_from) @ T_world_camera
+        turn = float(np.linalg.norm(so3_log(moved[:3, :3])))
+        shift, depth = float(np.linalg.norm(moved[:3, 3])), 0.0
+        if len(rows):
+            seen = transform(inverse(T_world_camera), self._points.xyz[rows])
+            depth = float(np.median(seen[:, 2]))
+        if turn < _LOOK_TURN_RAD and shift < _LOOK_SHIFT * depth:
+            return False
+        active.look_around(T_world_camera)
+        self._looked_from = T_world_camera
+        return True
+
+    def _find(
+        self,
+        active: ActiveMap,
+        frame: int,
+        T_world_camera: F64,
+        tracks: FrameTracks,
+        grey: U8 | None,
+    ) -> tuple[F64, Support]:
+        """The pose by all points that are found again, and what there is for it."""
+        parameters, camera = self._parameters, active.camera
+        T_world_camera, found = find_again(active, frame, T_world_camera, tracks, grey, None)
+        linked = active.linked(MAPPED)
+        rows, points_px = active.observed(tracks.points_px, found, np.zeros(0, np.int64))
+        errors = reprojection_errors(T_world_camera, self._points.xyz[rows], points_px, camera)
+        active.judge_tracks(linked, errors[: len(linked)])
+        interval_s = 0.0 if self._motion is None else self._motion.interval_s()
+        return T_world_camera, support_of(
+            tracks, interval_s, points_px, errors < parameters.localisation.inlier_px, camera,
+            parameters.support,
+        )  # fmt: skip
+
+    def _publish(
+        self, state: int, reason: str, inliers: int, *, looks_anew: bool = False
+    ) -> MapDelta:
+        active, hanging = self._map, self._hanging
+        rows = np.zeros(0, np.int32)
+        if active is not None and looks_anew:
+            rows = active.nearby()
+        delta = self._changes.publish(
+            state=state,
+            reason=reason,
+            segment=-1 if active is None else active.segment,
+            inliers=inliers,
+            keyframes=[] if hanging is None else [hanging],
+            points=self._points,
+            rows=rows,
+            centre=self._looked_from[:3, 3].copy(),
+            snapshot=False,
+        )
+        return self.calibration.told_with(delta)

@@ -1,0 +1,1 @@
+"""What ``import pliant`` gives: runs, their results, and mapping image by image."""

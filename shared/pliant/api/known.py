@@ -1,0 +1,102 @@
+"""A kept map in Python: where an image was taken."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.mapping.localiser import Localiser
+from pliant.algorithms.tracking.maxima import curvature_and_maxima
+from pliant.api.images import calibration_of, source_frame
+from pliant.config import load_config
+from pliant.datasets.calibration import Calibration, calibration_from_yaml
+from pliant.datasets.rectifier import Rectifier
+from pliant.messages.types import MapKeyframe
+from pliant.recording.map_file import MapFile
+
+
+@dataclass(frozen=True, kw_only=True)
+class Located:
+    """Where an image was taken.
+
+    T_world_camera: (4, 4), in the world of the segment of the map.   inliers: points of the map
+    that prove it.
+    """
+
+    T_world_camera: F64
+    segment: int
+    inliers: int
+
+
+class KnownMap:
+    """A map that is kept.
+
+    calibration: of the camera of its last session.   keyframes: (N, 4, 4) T_world_camera of them.
+    points: (P, 3).   colours: (P, 3) RGB.   segments: (P,) of the points: each is a world of its
+    own.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """path: a result folder or its ``map.pliant``.  Raises MapError."""
+        file = MapFile(Path(path))
+        self._kept: list[MapKeyframe] = list(file.keyframes())
+        self.calibration = calibration_from_yaml(file.header.calibration)
+        self.keyframes = np.array([each.T_world_camera for each in self._kept])
+        self.points = np.concatenate([each.points_world for each in self._kept])
+        self.colours = np.concatenate([each.point_colours for each in self._kept])
+        counts = [len(each.point_ids) for each in self._kept]
+        self.segments = np.repeat([each.segment for each in self._kept], counts)
+        self._tracking = load_config().tracking
+        self._finder: tuple[Calibration, Rectifier, Localiser] | None = None
+
+    def localise(
+        self, image: U8, camera: Calibration | PinholeCamera | None = None
+    ) -> Located | None:
+        """Where an image was taken; None where the map is not recognised in it.
+
+        image: (H, W) grey or (H, W, 3) RGB, uint8, as the camera took it.    camera: its own, where
+        it is not that of the map's last session.  Raises DatasetError for an image that is none of
+        the camera's.
+        """
+        calibration, rectifier, localiser = self._finder_for(camera)
+        grey, _ = rectifier.rectify(source_frame(image, calibration))
+        ideal = localiser.calibration.view.image(grey)
+        parameters = self._tracking
+        *_, maxima = curvature_and_maxima(
+            ideal, parameters.blur_sigma_px, parameters.min_curvature,
+            both_signs=parameters.both_signs,
+        )  # fmt: skip
+        found = localiser.recognise(maxima, ideal)
+        if found is None:
+            return None
+        return Located(
+            T_world_camera=found.T_world_camera,
+            segment=found.keyframe.segment,
+            inliers=found.inliers,
+        )
+
+    def _finder_for(
+        self, camera: Calibration | PinholeCamera | None
+    ) -> tuple[Calibration, Rectifier, Localiser]:
+        """What finds images of a camera: kept for the next one."""
+        calibration = self.calibration if camera is None else calibration_of(camera)
+        if self._finder is None or self._finder[0] != calibration:
+            rectifier, config = Rectifier(calibration), load_config()
+            parameters = config.bundle_adjustment
+            localiser = Localiser(rectifier.camera, parameters, config.seed, known=self._kept)
+            self._finder = calibration, rectifier, localiser
+        return self._finder
+
+
+def load_map(path: str | Path) -> KnownMap:
+    """The map that a run has left::
+
+        office = pliant.load_map("results/office")
+        found = office.localise(image)  # None where it is not recognised
+        found.T_world_camera
+
+    path: a result folder or its ``map.pliant``.  Raises MapError.
+    """
+    return KnownMap(path)

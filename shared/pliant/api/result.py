@@ -1,0 +1,210 @@
+"""What a run has left, as arrays: read from its recording when it is asked for."""
+
+import base64
+import html
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I64, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import corrected_view
+from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.api.mapped import Mapped
+from pliant.datasets.calibration import Calibration, calibration_from_yaml
+from pliant.datasets.own_recording import recorded_frame
+from pliant.datasets.rectifier import Rectifier
+from pliant.errors import ResultError
+from pliant.map_history import MapHistory
+from pliant.messages import topics
+from pliant.messages.topics import Topic
+from pliant.messages.types import CameraStream, Extrema, Header, SourceImage, Surfels
+from pliant.pictures.map import choose_view, render_map
+from pliant.recording import parts
+from pliant.recording.reader import Recording
+from pliant.results.calibration import found_calibration
+from pliant.results.folder import RECORDING_NAME
+from pliant.results.mesh import mesh_of
+from pliant.results.report import rigid_report
+from pliant.results.run import Run, read_run, seen_by_keyframes
+from pliant.results.surfels import has_surfels, recorded_surfels, surfel_report, surfel_trajectory
+from pliant.results.verdict import summary
+from pliant.trajectory import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keyframe:
+    """A keyframe of the longest segment.
+
+    id: of the run.    frame: that it is.    T_world_camera: (4, 4).    point_ids (N,),
+    points_px (N, 2): points of the map and where it sees them, rectified.
+    """
+
+    id: int
+    frame: int
+    T_world_camera: F64
+    point_ids: I64
+    points_px: F32
+    _jpeg: bytes = field(repr=False)
+
+    @property
+    def image(self) -> U8:
+        """(H, W, 3) RGB, without distortion; (0, 0, 3) where it was not recorded."""
+        if not self._jpeg:
+            return np.zeros((0, 0, 3), np.uint8)
+        data = np.frombuffer(self._jpeg, np.uint8)
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)
+
+
+class Result(Mapped):
+    """A result folder, or a recording alone::
+
+        result = pliant.open("results/clip")
+        result.trajectory.positions, result.points, result.mesh.positions
+        result.keyframes[3].image, result.tracks(120).points_px
+
+    Everything is read when it is first asked for, and kept.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Raises RecordingError where there is none."""
+        self.path = Path(path)
+        inside = self.path / RECORDING_NAME
+        self._recording = Recording(inside if parts.exists(inside) else self.path)
+
+    @cached_property
+    def _run(self) -> Run:
+        return read_run(self._recording.path)
+
+    @property
+    def history(self) -> MapHistory:
+        """All segments of the map, with what it knew when."""
+        return self._run.history
+
+    @cached_property
+    def is_deformable(self) -> bool:
+        """Whether surfels follow a scene that moves."""
+        return has_surfels(self._recording.path)
+
+    @cached_property
+    def report(self) -> dict[str, Any]:
+        """As in report.json: the verdict, frames, times."""
+        if self.is_deformable:
+            return surfel_report(self._recording.path)
+        return rigid_report(self._run, self.history.final())
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses after all corrections; of surfels, the camera's."""
+        if self.is_deformable:
+            return surfel_trajectory(self._recording.path)
+        return super().trajectory
+
+    @cached_property
+    def mesh(self) -> TriangleMesh | None:
+        """The fine mesh of the longest segment; None where there is none."""
+        return mesh_of(self._run.mesh, self.history.longest_segment())
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """Of the source, with what the images told of it: what calibration.yaml holds."""
+        return found_calibration(self._run)
+
+    @cached_property
+    def camera(self) -> PinholeCamera:
+        """Of the map: points project into its pixels where ``keyframes`` and ``tracks`` have them,
+        but for what the images told of the lens."""
+        stream, longest = self._stream, self.history.longest_segment()
+        return corrected_view(stream.camera, self._run.correction_of(longest)).camera
+
+    @cached_property
+    def keyframes(self) -> list[Keyframe]:
+        """Of the longest segment, in order of time."""
+        longest = self.history.longest_segment()
+        here = {n: k for n, k in self.history.keyframes.items() if k.segment == longest}
+        own = {number: keyframe for number, keyframe in here.items() if keyframe.frame >= 0}
+        seen = seen_by_keyframes(self._recording, own)
+        found = [
+            Keyframe(
+                id=number,
+                frame=keyframe.frame,
+                T_world_camera=pose_to_matrix(keyframe.pose_world_camera),
+                point_ids=seen[number].point_ids,
+                points_px=seen[number].points_px,
+                _jpeg=seen[number].jpeg,
+            )
+            for number, keyframe in own.items()
+            if number in seen
+        ]
+        return sorted(found, key=lambda keyframe: keyframe.frame)
+
+    def tracks(self, frame: int) -> Extrema:
+        """The tracks of a frame: ``ids``, ``points_px``, ``ages``, ``maxima``."""
+        message = self._message(topics.EXTREMA, frame)
+        assert isinstance(message, Extrema)
+        return message
+
+    def image(self, frame: int) -> U8:
+        """(H, W) or (H, W, 3) RGB of a frame, without distortion.
+
+        Raises ResultError where images were not recorded, BrokenFrame where it has no pixels.
+        """
+        message = self._message(topics.SOURCE, frame)
+        assert isinstance(message, SourceImage)
+        grey, colour = self._rectifier.rectify(recorded_frame(message))
+        return grey if colour is None else colour
+
+    def surfels(self) -> Iterator[Surfels]:
+        """Of a scene that deforms: its surfels in every frame."""
+        return recorded_surfels(self._recording.path)
+
+    def picture(self, width: int = 960, height: int = 720) -> U8:
+        """(height, width, 3) RGB of the points and the camera's path."""
+        poses = self.trajectory.T_world_camera
+        if not len(poses):
+            raise ResultError(f"{self.path}: the run has no map to draw")
+        view = choose_view(self.points, poses)
+        return render_map(self.points, self.colours, poses, view=view, size=(width, height))
+
+    def __repr__(self) -> str:
+        return f"<pliant.Result {str(self.path)!r}: {len(self.trajectory)} poses>"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the verdict and a picture."""
+        lines = summary(self.report, has_map=not self.is_deformable)
+        text = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
+        if self.is_deformable or not len(self.trajectory):
+            return text
+        _, data = cv2.imencode(".png", np.ascontiguousarray(self.picture(640, 480)[..., ::-1]))
+        encoded = base64.b64encode(data.tobytes()).decode()
+        return f'{text}<img alt="the map" src="data:image/png;base64,{encoded}">'
+
+    @cached_property
+    def _stream(self) -> CameraStream:
+        for message in self._recording.decoded(topics.STREAM):
+            assert isinstance(message, CameraStream)
+            return message
+        raise ResultError(f"{self.path}: no camera: the run stopped before its first frame")
+
+    @cached_property
+    def _rectifier(self) -> Rectifier:
+        return Rectifier(calibration_from_yaml(self._stream.calibration))
+
+    def _message(self, topic: Topic, frame: int) -> Header:
+        """The message of a frame; there is one for each."""
+        found = next(islice(self._recording.messages(topic), max(frame, 0), None), None)
+        if found is None or frame < 0:
+            raise ResultError(f"{self.path}: {topic.key} of frame {frame} was not recorded")
+        return found.decode()
+
+
+def open(path: str | Path) -> Result:
+    """The result of a run, from its folder or from a recording.  Raises RecordingError."""
+    return Result(path)

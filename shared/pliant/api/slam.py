@@ -1,0 +1,178 @@
+"""Mapping image by image in this process: no bus, no files, the same numbers."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pliant.algorithms.arrays import F32, F64, I64, U8
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import pose_to_matrix
+from pliant.api.images import calibration_of, source_frame
+from pliant.api.mapped import Mapped
+from pliant.config import load_config, settings_of
+from pliant.datasets import open_source
+from pliant.datasets.base import SourceFrame
+from pliant.datasets.calibration import (
+    SAID_SIGMA,
+    UNSAID_FOV_DEG,
+    UNSAID_SIGMA,
+    Calibration,
+    calibration_from_fov,
+)
+from pliant.errors import CalibrationError, DatasetError
+from pliant.map_history import MapHistory
+from pliant.offline import Pipeline
+
+_FPS = 30.0
+"""Of images that come without a time."""
+
+
+class Slam(Mapped):
+    """Localises images in a map that it makes of them::
+
+    slam = pliant.Slam(fov=70)
+    for image, stamp in ...:
+        T_world_camera = slam.track(image, stamp)
+    slam.finish()
+    slam.trajectory.positions, slam.points
+    """
+
+    def __init__(
+        self,
+        camera: Calibration | PinholeCamera | None = None,
+        *,
+        fov: float | None = None,
+        settings: Mapping[str, Any] | None = None,
+        seed: int | None = None,
+    ) -> None:
+        """camera: of the images; without one it is found from them, beginning with a horizontal
+        field of view of ``fov`` degrees.    settings: as ``{"tracking.max_tracks": 5000}``.
+
+        Raises ConfigError for a setting that there is not, CalibrationError.
+        """
+        if camera is not None and fov is not None:
+            raise CalibrationError("camera and fov contradict each other: give one of them")
+        self._camera = None if camera is None else calibration_of(camera)
+        self._fov = fov
+        self._config = load_config(None, list(settings_of(settings or {})), seed=seed)
+        self._history = MapHistory()
+        self._pipeline: Pipeline | None = None
+        self._next = SourceFrame(index=0, stamp_ns=-1, encoding="", data=b"")
+        self._finished = False
+
+    @property
+    def history(self) -> MapHistory:
+        """Of all images until now."""
+        return self._history
+
+    def track(self, image: U8, stamp: float | None = None) -> F64 | None:
+        """T_world_camera (4, 4) of the next image; None where it has none, or none yet.
+
+        image: (H, W) grey or (H, W, 3) RGB, of one size.    stamp: when it was taken, in seconds,
+        increasing; without any, 30 images are a second.
+
+        A map begins once the camera has moved: the images until then get their poses later, see
+        ``trajectory``.  Raises DatasetError for an image or a time that cannot be.
+        """
+        return self.take(image, stamp).T_world_camera
+
+    def take(self, image: U8, stamp: float | None = None) -> "Tracked":
+        """As ``track``, with all that is known of the image."""
+        number, last_ns = self._next.index, self._next.stamp_ns
+        stamp_ns = round(1e9 * (number / _FPS if stamp is None else stamp))
+        if stamp_ns <= last_ns:
+            raise DatasetError(
+                f"image {number}: its time, {1e-9 * stamp_ns:.6f} s, is not after that of the one "
+                f"before, {1e-9 * last_ns:.6f} s"
+            )
+        source = source_frame(image, self._camera, number=number, stamp_ns=stamp_ns)
+        if self._camera is None:
+            known = (UNSAID_FOV_DEG, UNSAID_SIGMA) if self._fov is None else (self._fov, SAID_SIGMA)
+            self._camera = calibration_from_fov(source.width, source.height, *known)
+        return self._step(source)
+
+    def finish(self) -> "Slam":
+        """Adjust the whole map, when no more images come.  Returns this object."""
+        if self._pipeline is not None and not self._finished:
+            self._pipeline.finish()
+        self._finished = True
+        return self
+
+    def _step(self, source: SourceFrame) -> "Tracked":
+        if self._finished:
+            raise DatasetError("the map is finished, and takes no more images: begin another Slam")
+        if self._pipeline is None:
+            assert self._camera is not None
+            self._pipeline = Pipeline(self._camera, self._config, self._history)
+        frame = self._pipeline.take(source)
+        self._next = SourceFrame(
+            index=source.index + 1, stamp_ns=source.stamp_ns, encoding="", data=b""
+        )
+        known = self._history.causal.get(source.index)
+        image = frame.image
+        return Tracked(
+            number=image.frame,
+            stamp_ns=image.stamp_ns,
+            image=image.colour if image.colour.size else image.grey,
+            T_world_camera=None if known is None else pose_to_matrix(known[1]),
+            segment=frame.delta.segment,
+            inliers=frame.delta.inliers,
+            reason=image.missing or frame.delta.reason,
+            track_ids=frame.tracks.ids,
+            points_px=frame.tracks.points_px,
+            slam=self,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracked:
+    """What became of a frame.
+
+    number: from 0.    stamp_ns: when it was taken.    image: (H, W) or (H, W, 3), rectified; of
+    size 0 where it was broken.    T_world_camera: (4, 4), None without a pose.    segment: of the
+    map.    inliers: points that support the pose.    reason: why there is none, or why it is
+    doubtful; "".    track_ids (N,), points_px (N, 2): the tracks and where the image has them.
+    slam: that took it.
+    """
+
+    number: int
+    stamp_ns: int
+    image: U8
+    T_world_camera: F64 | None
+    segment: int
+    inliers: int
+    reason: str
+    track_ids: I64
+    points_px: F32
+    slam: Slam
+
+
+def follow(
+    source: str | Path,
+    *,
+    calibration: str | Path | None = None,
+    fov: float | None = None,
+    settings: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+) -> Iterator[Tracked]:
+    """Map a source that ``pliant run`` opens, frame by frame, in this process::
+
+        for frame in pliant.follow("clip.mp4", fov=70):
+            print(frame.number, frame.T_world_camera)
+        frame.slam.trajectory
+
+    Raises DatasetError, CalibrationError, ConfigError.
+    """
+    config = load_config(None, list(settings_of(settings or {})), seed=seed)
+    dataset = open_source(
+        str(source),
+        calibration=None if calibration is None else Path(calibration),
+        fov_deg=fov,
+        longest_side_px=config.ingest.longest_side_px,
+        part=config.ingest,
+    )
+    slam = Slam(dataset.calibration, settings=settings, seed=seed)
+    for frame in dataset:
+        yield slam._step(frame)  # pyright: ignore[reportPrivateUsage]
+    slam.finish()

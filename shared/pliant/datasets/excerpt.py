@@ -1,0 +1,106 @@
+"""A part of a source: between two times, each n-th frame or the sharpest of each n."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol, cast
+
+import cv2
+
+from pliant.algorithms.arrays import U8
+from pliant.algorithms.image.sharpness import LONGEST_SIDE_PX, resized, sharpness
+from pliant.datasets.base import BrokenFrame, Dataset, SourceFrame
+from pliant.datasets.rectifier import decode
+from pliant.errors import DatasetError
+
+
+class Part(Protocol):
+    """Which frames of a source are taken: what ``ingest`` of the configuration says.
+
+    start_s, end_s: seconds after its first frame, the end not included; end 0: to its end.
+    every: one of so many frames: the first, or ``sharpest``, that with the finest details.
+    """
+
+    @property
+    def start_s(self) -> float: ...
+    @property
+    def end_s(self) -> float: ...
+    @property
+    def every(self) -> int: ...
+    @property
+    def sharpest(self) -> bool: ...
+
+
+class Excerpt:
+    """Those frames of a source, counted from 0.  Times stay those of the source."""
+
+    def __init__(self, source: Dataset, part: Part, *, first_depth_only: bool = False) -> None:
+        """first_depth_only: of depth maps that come along, only the first is handed on.
+
+        Raises DatasetError where the end is not after the start.
+        """
+        if 0.0 < part.end_s <= part.start_s:
+            raise DatasetError(
+                f"--end {part.end_s:g}: is not after --start {part.start_s:g}: nothing is left"
+            )
+        self._source = source
+        self._part = part
+        self._first_depth_only = first_depth_only
+        self.calibration = source.calibration
+        self.name = source.name
+        self.is_live = source.is_live
+        count, cut = source.frame_count, part.start_s > 0.0 or part.end_s > 0.0
+        self.frame_count = None if count is None or cut else -(-count // part.every)
+        self.ground_truth_path: Path | None = source.ground_truth_path
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        index = 0
+        for group in _groups(self._within(), self._part.every):
+            chosen = max(group, key=_sharpness) if self._part.sharpest else group[0]
+            # Of equals max takes the first, so that frames without pixels are as without it.
+            depth = b"" if index and self._first_depth_only else chosen.depth
+            yield replace(chosen, index=index, depth=depth)
+            index += 1
+        if index == 0:
+            raise DatasetError(
+                f"{self.name}: no frame lies between --start {self._part.start_s:g} s and its end"
+            )
+
+    def _within(self) -> Iterator[SourceFrame]:
+        part, first_ns = self._part, 0
+        for frame in self._source:
+            first_ns = first_ns if frame.index else frame.stamp_ns
+            time_s = 1e-9 * (frame.stamp_ns - first_ns)
+            if part.end_s and time_s >= part.end_s:
+                return
+            if time_s >= part.start_s:
+                yield frame
+
+
+def is_all(part: Part | None) -> bool:
+    """Whether it is the whole source."""
+    return part is None or (part.start_s == part.end_s == 0.0 and part.every == 1)
+
+
+def _groups(frames: Iterable[SourceFrame], size: int) -> Iterator[list[SourceFrame]]:
+    """So many frames that follow each other; the last may be fewer."""
+    group: list[SourceFrame] = []
+    for frame in frames:
+        group.append(frame)
+        if len(group) == size:
+            yield group
+            group = []
+    if group:
+        yield group
+
+
+def _sharpness(frame: SourceFrame) -> float:
+    if frame.dropped:
+        return -1.0
+    try:
+        pixels = decode(frame)
+    except BrokenFrame:
+        return -1.0
+    if pixels.ndim == 3:
+        pixels = cast(U8, cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+    return sharpness(resized(pixels, LONGEST_SIDE_PX))

@@ -1,0 +1,66 @@
+"""What would make the next run of such a video better, in words."""
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+from pliant.messages.types import DROPPED
+
+_FEW_TRACKS = 600
+_FEW_MAPPED = 0.25
+_LONG = 0.02
+"""Share of the frames from which on those without a pose are worth a word."""
+
+
+def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
+    """Sentences, the most important first; none where nothing is wrong."""
+    told: list[str] = []
+    segments = report["segments"]
+    if not segments:
+        told.append(
+            "No map could start. Move the camera sideways by a tenth of the distance to the scene "
+            f"or more, not only turn it. It said: {report['last_reason'] or 'no frames'}."
+        )
+    first_ns = min(stamps_ns.values(), default=0)
+    for before, after in itertools.pairwise(segments):
+        when_s = 1e-9 * (stamps_ns.get(after["first_frame"], first_ns) - first_ns)
+        told.append(
+            f"Before {when_s:.1f} s the camera was lost for good, and another map began "
+            f"({before['frames']} and {after['frames']} frames): move more slowly there, and let "
+            "half of what is in view stay in view; or come back to what was seen before."
+        )
+    frames, posed = report["frames"], report["frames_with_pose"]
+    missing = frames - posed - len(report["frames_without_pixels"])
+    if segments and missing > _LONG * frames:
+        told.append(
+            f"{missing} frames have no pose: dark, blurred or covered images, or a camera that was "
+            "carried off. More light makes exposures shorter and images sharper."
+        )
+    tracks, mapped = report["median_tracks_per_frame"], report["median_inliers_per_frame"]
+    if segments and tracks < _FEW_TRACKS:
+        told.append(
+            f"Only {tracks:.0f} tracks a frame: blank walls, little light or defocus. Keep "
+            "something with detail in view, and the focus fixed."
+        )
+    elif segments and mapped < _FEW_MAPPED * tracks:
+        told.append(
+            "Few of the tracks became points of the map: the camera turned more than it moved, or "
+            "much of what it sees moves by itself. Walk round things instead of turning to them."
+        )
+    if report["doubtful_frames"] and report["verdict"] == "doubtful":
+        told.append(
+            f"{len(report['doubtful_frames'])} poses rest on a small part of the image: something "
+            "large moves in front of the camera, or most of what it sees is blank."
+        )
+    if report["calibration_verdict"]:
+        told.append(
+            f"{report['calibration_verdict'][:1].upper()}{report['calibration_verdict'][1:]}."
+        )
+    if report["frames_passed_over"] or any(
+        why == DROPPED for why in report["frames_without_pixels"].values()
+    ):
+        told.append(
+            "The machine did not keep up with the camera: record first and run the recording, or "
+            "use smaller images (--max-size)."
+        )
+    return told

@@ -1,0 +1,131 @@
+"""The map of a run as one block of bytes that a browser draws."""
+
+import base64
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.pictures.map import PATH_COLOUR, choose_view
+
+MAX_POINTS = 40_000
+MAX_TRIANGLES = 60_000
+_LEVELS = 65535
+_BACK = 1.4
+"""Farther away than a picture is taken from: who wants to see more closely comes closer."""
+_RIM = 0.005
+"""Share of the points that may lie outside of the box that is drawn, at each side."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """header: JSON for viewer.js.    bytes: base64."""
+
+    header: str
+    bytes: str
+
+
+def make_scene(points: F64, colours: U8, T_world_camera: F64, mesh: TriangleMesh | None) -> Scene:
+    """Points (P, 3), the camera's path (N, 4, 4), N >= 1, and the mesh, as many as a page carries.
+
+    Places are 16-bit shares of the box that holds all but stray points.
+    """
+    path = T_world_camera[:, :3, 3]
+    cloud = points if len(points) else path
+    low, high = np.quantile(cloud, (_RIM, 1.0 - _RIM), axis=0)
+    low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
+    size = np.maximum(high - low, 1e-9)
+    block = _Block(low, size)
+    if mesh is not None and len(mesh.triangles):
+        vertices, tints, triangles = simplified(*_outwards(mesh), MAX_TRIANGLES)
+        inside = ((vertices >= low - size) & (vertices <= high + size)).all(axis=1)
+        triangles = triangles[inside[triangles].all(axis=1)]
+        block.add("mesh", vertices, tints, triangles)
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    step = max(1, -(-int(inside.sum()) // MAX_POINTS))
+    block.add("points", points[inside][::step], colours[inside][::step])
+    block.add("path", path, np.tile(np.array(PATH_COLOUR, np.uint8), (len(path), 1)), line=True)
+    view = choose_view(points, T_world_camera)
+    direction = view.T_world_view[:3, 2]
+    up = view.up / np.linalg.norm(view.up)
+    level = direction - (direction @ up) * up
+    level /= max(float(np.linalg.norm(level)), 1e-9)
+    header = {
+        "low": low.tolist(),
+        "size": size.tolist(),
+        "target": view.centre.tolist(),
+        "distance": _BACK * float(np.linalg.norm(view.T_world_view[:3, 3] - view.centre)),
+        "height": float(np.arcsin(np.clip(-direction @ up, -1.0, 1.0))),
+        "axes": [np.cross(level, up).tolist(), up.tolist(), level.tolist()],
+        "layers": block.layers,
+    }
+    return Scene(json.dumps(header), base64.b64encode(b"".join(block.parts)).decode())
+
+
+class _Block:
+    """Arrays one after the other, each at a multiple of four bytes."""
+
+    def __init__(self, low: F64, size: F64) -> None:
+        self.parts: list[bytes] = []
+        self.layers: list[dict[str, Any]] = []
+        self._low, self._size = low, size
+        self._length = 0
+
+    def add(
+        self, name: str, places: F64 | F32, colours: U8, triangles: I32 | None = None,
+        line: bool = False,
+    ) -> None:  # fmt: skip
+        shares = np.clip((places - self._low) / self._size, 0.0, 1.0)
+        layer: dict[str, Any] = {"name": name, "count": len(places), "line": line}
+        layer["places"] = self._put(np.round(_LEVELS * shares).astype("<u2").tobytes())
+        layer["colours"] = self._put(np.ascontiguousarray(colours, np.uint8).tobytes())
+        if triangles is not None:
+            layer["triangles"] = len(triangles)
+            layer["indices"] = self._put(triangles.astype("<u4").tobytes())
+        self.layers.append(layer)
+
+    def _put(self, data: bytes) -> int:
+        at = self._length
+        data += bytes(-len(data) % 4)
+        self.parts.append(data)
+        self._length += len(data)
+        return at
+
+
+def _outwards(mesh: TriangleMesh) -> tuple[F32, U8, I32]:
+    """Vertices, colours and triangles whose corners run anticlockwise seen from outside."""
+    corners = mesh.positions[mesh.triangles].astype(np.float64)
+    turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inwards = (turned * mesh.normals[mesh.triangles[:, 0]]).sum(axis=1) < 0.0
+    triangles = mesh.triangles.copy()
+    triangles[inwards] = triangles[inwards][:, ::-1]
+    return mesh.positions, mesh.colours, triangles
+
+
+def simplified(vertices: F32, colours: U8, triangles: I32, most: int) -> tuple[F32, U8, I32]:
+    """A mesh of at most so many triangles: vertices within cells of a grid become their mean
+    (Rossignac and Borrel 1993); the cells grow until it is small enough."""
+    if len(triangles) <= most:
+        return vertices, colours, triangles
+    corners = vertices[triangles].astype(np.float64)
+    edges = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+    cell = float(np.median(edges))
+    while True:
+        cell *= 1.25
+        keys = np.floor(vertices / cell).astype(np.int64)
+        _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+        cells = cells.reshape(-1)
+        merged = cells[triangles].astype(np.int32)
+        a, b, c = merged.T
+        merged = merged[(a != b) & (b != c) & (c != a)]
+        if len(merged) <= most:
+            break
+    together = np.column_stack([vertices, colours]).astype(np.float64)
+    sums = np.zeros((len(counts), 6))
+    np.add.at(sums, cells, together)
+    means = sums / counts[:, None]
+    tints = np.round(means[:, 3:]).astype(np.uint8)
+    return means[:, :3].astype(np.float32), tints, merged

@@ -1,0 +1,144 @@
+"use strict";
+// A cloud of points, a mesh and a path that can be turned.  The data is one block of bytes:
+// positions are 16-bit shares of a box, as many as the header says.
+const header = JSON.parse(document.getElementById("scene").textContent);
+const text = atob(document.getElementById("bytes").textContent.trim());
+const bytes = Uint8Array.from(text, (letter) => letter.charCodeAt(0)).buffer;
+const canvas = document.getElementById("view");
+const gl = canvas.getContext("webgl2", { antialias: true });
+
+const VERTEX = `#version 300 es
+in vec3 place; in vec3 colour; uniform mat4 seen; uniform vec3 low; uniform vec3 size; uniform float dot_px;
+out vec3 tint; out vec3 world;
+void main() { world = low + place * size; tint = colour; gl_Position = seen * vec4(world, 1.0);
+  gl_PointSize = clamp(dot_px / gl_Position.w, 1.5, 12.0); }`;
+const FRAGMENT = `#version 300 es
+precision highp float; in vec3 tint; in vec3 world; uniform vec3 eye; uniform float lit; out vec4 shown;
+void main() { vec3 normal = normalize(cross(dFdx(world), dFdy(world)));
+  float light = mix(1.0, 0.45 + 0.55 * abs(dot(normal, normalize(eye - world))), lit);
+  shown = vec4(tint * light, 1.0); }`;
+
+function compiled(kind, source) {
+  const shader = gl.createShader(kind);
+  gl.shaderSource(shader, source);
+  gl.compileShader(shader);
+  return shader;
+}
+
+function begin() {
+  const program = gl.createProgram();
+  gl.attachShader(program, compiled(gl.VERTEX_SHADER, VERTEX));
+  gl.attachShader(program, compiled(gl.FRAGMENT_SHADER, FRAGMENT));
+  gl.linkProgram(program);
+  gl.useProgram(program);
+  const at = (name) => gl.getUniformLocation(program, name);
+  const places = { seen: at("seen"), low: at("low"), size: at("size"), eye: at("eye"), lit: at("lit"), dot: at("dot_px") };
+
+  function parts(layer) {
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    const fill = (name, offset, count, kind) => {
+      const place = gl.getAttribLocation(program, name);
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, new DataView(bytes, offset, count), gl.STATIC_DRAW);
+      gl.enableVertexAttribArray(place);
+      gl.vertexAttribPointer(place, 3, kind, true, 0, 0);
+    };
+    fill("place", layer.places, 6 * layer.count, gl.UNSIGNED_SHORT);
+    fill("colour", layer.colours, 3 * layer.count, gl.UNSIGNED_BYTE);
+    if (layer.triangles) {
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new DataView(bytes, layer.indices, 12 * layer.triangles), gl.STATIC_DRAW);
+    }
+    return array;
+  }
+
+  const layers = header.layers.map((layer) => ({ ...layer, array: parts(layer), shown: true }));
+  if (layers.some((layer) => layer.name === "mesh")) layers.forEach((layer) => (layer.shown = layer.name !== "points"));
+  const box = document.getElementById("layers");
+  for (const layer of layers) {
+    const label = document.createElement("label");
+    const tick = document.createElement("input");
+    tick.type = "checkbox";
+    tick.checked = layer.shown;
+    tick.onchange = () => { layer.shown = tick.checked; draw(); };
+    label.append(tick, " " + layer.name);
+    box.append(label);
+  }
+
+  // The eye goes round a point: turn about the world's up, height over it, and distance.
+  const view = { turn: 0, height: header.height, distance: header.distance, target: [...header.target] };
+  const [right0, up, forward0] = header.axes;
+  const sum = (...terms) => [0, 1, 2].map((k) => terms.reduce((all, [share, vector]) => all + share * vector[k], 0));
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
+  function axes() {
+    const [c, s] = [Math.cos(view.turn), Math.sin(view.turn)];
+    const right = sum([c, right0], [s, forward0]);
+    const level = sum([-s, right0], [c, forward0]);
+    const [ch, sh] = [Math.cos(view.height), Math.sin(view.height)];
+    return { right, forward: sum([ch, level], [-sh, up]), above: sum([sh, level], [ch, up]) };
+  }
+
+  function draw() {
+    const { right, forward, above } = axes();
+    const eye = sum([1, view.target], [-view.distance, forward]);
+    canvas.width = canvas.clientWidth * devicePixelRatio;
+    canvas.height = canvas.clientHeight * devicePixelRatio;
+    gl.viewport(0, 0, canvas.width, canvas.height);
+    gl.clearColor(16 / 255, 19 / 255, 24 / 255, 1);
+    gl.enable(gl.DEPTH_TEST);
+    gl.enable(gl.CULL_FACE);  // one looks into a room through its walls
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const f = 2.4, [near, far] = [0.01 * view.distance, 50 * header.distance];
+    const rows = [
+      [f * canvas.height / canvas.width, right], [f, above], [(far + near) / (far - near), forward], [1, forward],
+    ].map(([scale, axis]) => [...axis.map((value) => scale * value), -scale * dot(axis, eye)]);
+    rows[2][3] -= 2 * far * near / (far - near);
+    gl.uniformMatrix4fv(places.seen, false, [0, 1, 2, 3].flatMap((k) => rows.map((row) => row[k])));
+    gl.uniform3fv(places.low, header.low);
+    gl.uniform3fv(places.size, header.size);
+    gl.uniform3fv(places.eye, eye);
+    gl.uniform1f(places.dot, 0.004 * canvas.height * header.distance);
+    for (const layer of layers.filter((each) => each.shown)) {
+      gl.bindVertexArray(layer.array);
+      gl.uniform1f(places.lit, layer.triangles ? 1 : 0);
+      if (layer.triangles) gl.drawElements(gl.TRIANGLES, 3 * layer.triangles, gl.UNSIGNED_INT, 0);
+      else gl.drawArrays(layer.line ? gl.LINE_STRIP : gl.POINTS, 0, layer.count);
+    }
+  }
+
+  const fingers = new Map();
+  canvas.onpointerdown = (event) => { canvas.setPointerCapture(event.pointerId); fingers.set(event.pointerId, event); };
+  canvas.onpointerup = canvas.onpointercancel = (event) => fingers.delete(event.pointerId);
+  canvas.onpointermove = (event) => {
+    const before = fingers.get(event.pointerId);
+    if (!before) return;
+    const [dx, dy] = [event.clientX - before.clientX, event.clientY - before.clientY];
+    const other = [...fingers.values()].find((each) => each.pointerId !== event.pointerId);
+    if (other) {
+      const apart = (each) => Math.hypot(each.clientX - other.clientX, each.clientY - other.clientY);
+      view.distance *= apart(before) / Math.max(apart(event), 1);
+    } else if (event.buttons & 2 || event.shiftKey) {
+      const { right, above } = axes(), step = view.distance / (1.2 * canvas.clientHeight);
+      view.target = sum([1, view.target], [-step * dx, right], [step * dy, above]);
+    } else {
+      view.turn -= 0.006 * dx;
+      view.height = Math.min(1.55, Math.max(-1.55, view.height + 0.006 * dy));
+    }
+    fingers.set(event.pointerId, event);
+    draw();
+  };
+  canvas.oncontextmenu = (event) => event.preventDefault();
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    view.distance *= Math.exp(0.001 * event.deltaY);
+    draw();
+  }, { passive: false });
+  new ResizeObserver(draw).observe(canvas);
+  draw();
+  canvas.dataset.drawn = "yes";
+}
+
+if (gl) begin();
+else document.getElementById("layers").textContent = "This browser shows no 3D (WebGL 2 is off): open points.ply or mesh.ply.";

@@ -1,0 +1,245 @@
+"""report.html: what a browser shows of it, and what it says of runs that went wrong."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import pliant
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.messages import topics
+from pliant.recording.reader import Recording
+from pliant.recording.writer import RecordingWriter
+from pliant.results.folder import RECORDING_NAME
+from pliant.results.page.advice import advice
+from pliant.results.page.scene import MAX_TRIANGLES, make_scene, simplified
+from pliant.results.write import write_results
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> pliant.Result:
+    folder = tmp_path_factory.mktemp("page") / "result"
+    return pliant.run("built-in:tiny", output=folder, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def page(result: pliant.Result) -> str:
+    return (result.path / "report.html").read_text(encoding="utf-8")
+
+
+def test_it_says_what_the_report_says(result: pliant.Result, page: str) -> None:
+    report = json.loads((result.path / "report.json").read_text())
+    for said in ("built-in:tiny", report["verdict_reason"], f"{report['points']:,} points"):
+        assert said in page
+    (listed,) = re.findall(r"<h2>Files</h2><table>(.*?)</table>", page, re.DOTALL)
+    for name in re.findall(r"<th>(.*?)</th>", listed):
+        assert (result.path / name).exists(), name
+
+
+def test_nothing_in_it_points_elsewhere(page: str) -> None:
+    assert not re.findall(r"(?:src|href)=[\"'](?!data:)", page)
+    assert "://" not in page
+    assert "default-src 'none'" in page
+
+
+def test_the_clip_has_a_picture_for_each_keyframe(result: pliant.Result, page: str) -> None:
+    (data,) = re.findall(r'src="data:image/webp;base64,([^"]+)"', page)
+    read, clip = cv2.imdecodeanimation(np.frombuffer(base64.b64decode(data), np.uint8))
+    assert read
+    assert len(clip.frames) == min(24, len(result.keyframes))
+    assert np.asarray(clip.frames[0]).std() > 10.0
+
+
+def test_the_scene_has_the_points_the_path_and_the_mesh(result: pliant.Result, page: str) -> None:
+    header, data = scene_of(page)
+    mesh, points, path = (layer_of(header, data, name) for name in ("mesh", "points", "path"))
+    step = np.array(header["size"]) / 65535
+    assert np.abs(path - result.trajectory.positions).max() < step.max()
+    assert result.mesh is not None
+    near = lambda some: np.quantile(some, (0.05, 0.5, 0.95), axis=0)  # noqa: E731
+    np.testing.assert_allclose(near(mesh), near(result.mesh.positions), atol=0.15)
+    low, high = np.array(header["low"]), np.add(header["low"], header["size"])
+    inside = ((result.points >= low) & (result.points <= high)).all(axis=1)
+    assert inside.mean() > 0.95
+    assert len(points) == inside.sum()
+    assert np.abs(points - result.points[inside]).max() < step.max()
+
+
+def test_a_browser_draws_it(result: pliant.Result, tmp_path: Path) -> None:
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("chromium is not installed")
+    picture = tmp_path / "page.png"
+    done = subprocess.run(
+        [
+            *(browser, "--headless", "--no-sandbox", "--window-size=1000,900"),
+            *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+            *(f"--user-data-dir={tmp_path / 'browser'}", "--virtual-time-budget=20000"),
+            *(f"--screenshot={picture}", (result.path / "report.html").as_uri()),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert picture.exists(), done.stderr
+    shown = cv2.imread(str(picture))
+    view = shown[120:740, 20:960].astype(int)
+    ground = np.array([24, 19, 16])
+    drawn = np.abs(view - ground).max(axis=2) > 8
+    assert 0.03 < drawn.mean() < 0.99  # a map on its ground, not a blank canvas
+    orange = (view[..., 2] > 180) & (view[..., 0] < 120)
+    assert orange.sum() > 20  # the camera's path
+
+
+def test_a_page_without_a_map_says_why(tmp_path: Path) -> None:
+    sequence = tmp_path / "still"
+    (sequence / "images").mkdir(parents=True)
+    squares = np.random.default_rng(0).integers(0, 255, (12, 16), dtype=np.uint8)
+    image = cv2.imencode(".png", np.kron(squares, np.ones((10, 10), np.uint8)))[1].tobytes()
+    for n in range(6):
+        (sequence / "images" / f"{n}.png").write_bytes(image)
+    listed = "".join(f"{0.1 * n:.1f} images/{n}.png\n" for n in range(6))
+    (sequence / "rgb.txt").write_text(listed)
+    (sequence / "calib.yaml").write_text(
+        "width: 160\nheight: 120\nfx: 150\nfy: 150\ncx: 80\ncy: 60\n"
+    )
+    folder = pliant.run(sequence, output=tmp_path / "result", quiet=True).path
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "No map could start" in page
+    assert "canvas id" not in page
+
+
+@pytest.mark.parametrize("updates", [0, 1, 5, 40])
+@pytest.mark.parametrize("keyframes", [0, 1, 2, 40])
+def test_a_run_that_was_cut_off_has_a_page_too(
+    result: pliant.Result, tmp_path: Path, updates: int, keyframes: int
+) -> None:
+    """What keyframes saw reaches a disk before or after the map that they belong to."""
+    whole = Recording(result.path / RECORDING_NAME)
+    kept = {topics.STREAM: 1, topics.MAP_UPDATE: updates, topics.KEYFRAME: keyframes}
+    with RecordingWriter(tmp_path / RECORDING_NAME, whole.metadata()) as part:
+        for topic, count in kept.items():
+            for message in islice(whole.messages(topic), count):
+                part.write(topic, message.data, sequence=0, log_time_ns=0, publish_time_ns=0)
+    write_results(tmp_path)
+    poses = (tmp_path / "trajectory.txt").read_text(encoding="utf-8").strip()
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert ("canvas id" in page) == bool(poses)
+
+
+def scene_of(page: str) -> tuple[dict[str, Any], bytes]:
+    (header,) = re.findall(r'id="scene">(.*?)</script>', page, re.DOTALL)
+    (data,) = re.findall(r'id="bytes">(.*?)</script>', page, re.DOTALL)
+    return json.loads(header), base64.b64decode(data)
+
+
+def layer_of(header: dict[str, Any], data: bytes, name: str) -> np.ndarray:
+    (layer,) = (each for each in header["layers"] if each["name"] == name)
+    shares = np.frombuffer(data, "<u2", 3 * layer["count"], layer["places"]).reshape(-1, 3)
+    return np.array(header["low"]) + shares / 65535 * np.array(header["size"])
+
+
+def sheet(side: int) -> TriangleMesh:
+    """A wavy sheet of 2 (side - 1)^2 triangles, normals up, every second triangle turned over."""
+    x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
+    z = np.sin(x / 10.0)
+    positions = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    a = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    triangles = np.concatenate(
+        [np.stack([a, a + side, a + 1], 1), np.stack([a + 1, a + side + 1, a + side], 1)]
+    )
+    return TriangleMesh(
+        positions=positions,
+        normals=np.tile(np.array([0, 0, 1], np.float32), (len(positions), 1)),
+        colours=np.full((len(positions), 3), 100, np.uint8),
+        triangles=triangles.astype(np.int32),
+    )
+
+
+def test_all_triangles_turn_outwards() -> None:
+    mesh = sheet(20)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 1.0
+    scene = make_scene(mesh.positions.astype(np.float64), mesh.colours, poses, mesh)
+    header, data = json.loads(scene.header), base64.b64decode(scene.bytes)
+    (layer,) = (each for each in header["layers"] if each["name"] == "mesh")
+    places = layer_of(header, data, "mesh")
+    corners = places[
+        np.frombuffer(data, "<u4", 3 * layer["triangles"], layer["indices"]).reshape(-1, 3)
+    ]
+    out = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert layer["triangles"] > 500
+    assert (out[:, 2] > 0.0).all()
+
+
+def test_a_large_mesh_becomes_small_and_keeps_its_shape() -> None:
+    mesh = sheet(300)
+    assert len(mesh.triangles) > 2 * MAX_TRIANGLES
+    vertices, colours, triangles = simplified(
+        mesh.positions, mesh.colours, mesh.triangles, MAX_TRIANGLES
+    )
+    assert MAX_TRIANGLES / 3 < len(triangles) <= MAX_TRIANGLES
+    assert len(vertices) == len(colours)
+    assert (colours == 100).all()
+    assert np.abs(vertices[:, 2] - np.sin(vertices[:, 0] / 10.0)).max() < 0.1
+    same = simplified(vertices, colours, triangles, MAX_TRIANGLES)
+    np.testing.assert_array_equal(same[2], triangles)
+
+
+def report(**changes: Any) -> dict[str, Any]:
+    return {
+        "segments": [{"id": 0, "first_frame": 0, "frames": 100}],
+        "frames": 100,
+        "frames_with_pose": 100,
+        "frames_without_pixels": {},
+        "frames_passed_over": [],
+        "median_tracks_per_frame": 9000.0,
+        "median_inliers_per_frame": 6000.0,
+        "doubtful_frames": [],
+        "verdict": "good",
+        "calibration_verdict": "",
+        "last_reason": "",
+        **changes,
+    }
+
+
+STAMPS = {frame: 10**9 + frame * 33_000_000 for frame in range(100)}
+
+
+def test_of_a_good_run_there_is_nothing_to_say() -> None:
+    assert advice(report(), STAMPS) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"segments": [], "frames_with_pose": 0, "last_reason": "too little parallax"}, "parallax"),
+        (
+            {
+                "segments": [
+                    {"id": 0, "first_frame": 0, "frames": 50},
+                    {"id": 1, "first_frame": 60, "frames": 40},
+                ]
+            },
+            "Before 2.0 s",
+        ),
+        ({"frames_with_pose": 80}, "20 frames have no pose"),
+        ({"median_tracks_per_frame": 100.0}, "100 tracks"),
+        ({"median_inliers_per_frame": 100.0}, "turned more than it moved"),
+        ({"doubtful_frames": [1, 2, 3], "verdict": "doubtful"}, "3 poses rest on"),
+        ({"calibration_verdict": "the focal length is wrong"}, "The focal length is wrong."),
+        ({"frames_passed_over": [5]}, "did not keep up"),
+        ({"frames_without_pixels": {"5": "dropped"}}, "did not keep up"),
+    ],
+)
+def test_what_went_wrong_is_told(changes: dict[str, Any], said: str) -> None:
+    (line,) = advice(report(**changes), STAMPS)
+    assert said in line

@@ -1,0 +1,87 @@
+"""``pliant run --map``: another session in the map that the first one has left."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from running import TINY, assert_one_line, digests, pliant
+
+import pliant as library
+from pliant.datasets import open_source
+from pliant.datasets.rectifier import decode
+from pliant.formats.tum import read_tum
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope="module")
+def office(tiny_run: Path) -> Path:
+    assert (tiny_run / "map.pliant").is_file()
+    return tiny_run
+
+
+def test_a_run_goes_on_in_a_map_and_replays(office: Path, tmp_path: Path) -> None:
+    before = (office / "map.pliant").read_bytes()
+    done = pliant("run", TINY, "--map", office, "--output", tmp_path / "today")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "today" / "report.json").read_text())
+    assert report["known_map"]["frames_in_it"] == report["frames_with_pose"] == report["frames"]
+    assert report["known_map"]["looked"] == 0
+    assert [segment["id"] for segment in report["segments"]] == [0]
+    assert "in the known map" in done.stdout
+    first = read_tum(office / "trajectory.txt").positions
+    second = read_tum(tmp_path / "today" / "trajectory.txt").positions
+    assert np.linalg.norm(first - second, axis=1).max() < 0.01  # one world, at one scale
+    assert (office / "map.pliant").read_bytes() == before
+    told = pliant("map", "info", tmp_path / "today")
+    assert "sessions: 2" in told.stdout
+
+    again = pliant("replay", tmp_path / "today", "--check", "--output", tmp_path / "again")
+    assert again.returncode == 0, again.stdout
+    assert "map/kept" in again.stdout
+    kept = [tmp_path / name / "map.pliant" for name in ("today", "again")]
+    assert kept[0].read_bytes() == kept[1].read_bytes()
+    assert digests(tmp_path / "today") == digests(tmp_path / "again")
+
+
+def test_a_run_only_localises(office: Path, tmp_path: Path) -> None:
+    done = pliant("run", TINY, "--map", office, "--localise", "--output", tmp_path / "robot")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "robot" / "report.json").read_text())
+    assert report["frames_with_pose"] == report["frames"]
+    assert report["keyframes"] == 0
+    first = read_tum(office / "trajectory.txt").positions
+    second = read_tum(tmp_path / "robot" / "trajectory.txt").positions
+    assert np.linalg.norm(first - second, axis=1).max() < 0.01
+    assert not (tmp_path / "robot" / "map.pliant").exists()
+
+
+def test_a_map_tells_python_where_an_image_was_taken(office: Path) -> None:
+    known = library.load_map(office)
+    frames = list(open_source(TINY))
+    found = known.localise(decode(frames[10]))
+    assert found is not None
+    position = read_tum(office / "trajectory.txt").positions[10]
+    assert np.linalg.norm(found.T_world_camera[:3, 3] - position) < 0.01
+    assert known.localise(np.zeros_like(decode(frames[10]))) is None
+    assert known.localise(decode(frames[10]), known.calibration) is not None
+    assert len(known.points) == len(known.colours) == len(known.segments) > 100
+
+
+def test_what_is_no_map_of_use_is_said_before_anything_is_touched(
+    office: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / "there"
+    for arguments, why in (
+        (("--map", tmp_path / "nowhere"), "no map there"),
+        (("--map", office / "recording.mcap"), "no map"),
+        (("--map", office, "--output", office, "--force"), "is read from there"),
+    ):
+        output = () if "--output" in arguments else ("--output", target)
+        done = pliant("run", TINY, *arguments, *output)
+        assert_one_line(done, why)
+        assert not target.exists()
+    for arguments in (("--localise",), ("--map", office, "--profile", "deformable")):
+        assert pliant("run", TINY, *arguments, "--output", target).returncode == 2
+    assert (office / "map.pliant").is_file()

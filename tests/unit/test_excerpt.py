@@ -1,0 +1,91 @@
+"""A part of a source: which frames it has, and that their times stay."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pliant.config import IngestParameters
+from pliant.datasets import open_source
+from pliant.datasets.base import SourceFrame
+from pliant.datasets.calibration import Calibration, calibration_from_fov
+from pliant.datasets.excerpt import Excerpt
+from pliant.errors import DatasetError
+
+START_NS = 5_000_000_000
+
+
+@dataclass
+class Frames:
+    """Ten frames a second; each third is sharp, but for one without pixels."""
+
+    count: int = 30
+    frame_count: int | None = 30
+    name: str = "frames"
+    is_live: bool = False
+    ground_truth_path: Path | None = None
+
+    @property
+    def calibration(self) -> Calibration:
+        return calibration_from_fov(512, 192, 60.0)
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        squares = np.random.default_rng(0).integers(0, 255, (12, 16), dtype=np.uint8)
+        scene = np.pad(np.kron(squares, np.ones((16, 16), np.uint8)), ((0, 0), (0, 256)))
+        for index in range(self.count):
+            blurred = cv2.GaussianBlur(scene, (0, 0), 0.5 if index % 3 == 2 else 2.0)
+            frame = SourceFrame(
+                index=index, stamp_ns=START_NS + index * 100_000_000, encoding="mono8",
+                data=blurred.tobytes(), width=512, height=192, depth=b"%d" % index,
+            )  # fmt: skip
+            yield frame.without_data() if index == 5 else frame
+
+
+def taken(**part: object) -> list[int]:
+    """Numbers, in the source, of the frames that are taken."""
+    frames = list(Excerpt(Frames(), IngestParameters.model_validate(part)))
+    assert [frame.index for frame in frames] == list(range(len(frames)))
+    return [(frame.stamp_ns - START_NS) // 100_000_000 for frame in frames]
+
+
+def test_times_are_seconds_after_the_first_frame() -> None:
+    assert taken(start_s=0.5, end_s=0.9) == [5, 6, 7, 8]
+    assert taken(start_s=2.75) == [28, 29]
+    assert taken(end_s=0.05) == [0]
+
+
+def test_one_of_several_is_the_first_or_the_sharpest() -> None:
+    assert taken(every=7) == [0, 7, 14, 21, 28]
+    assert taken(every=3, sharpest=True, end_s=1.0) == [2, 3, 8, 9]  # 5 has no pixels
+    assert taken(every=3, start_s=0.1, end_s=0.8) == [1, 4, 7]
+
+
+def test_how_many_come_is_said_where_it_is_known() -> None:
+    assert Excerpt(Frames(), IngestParameters(every=7)).frame_count == 5
+    assert Excerpt(Frames(), IngestParameters(end_s=1.0)).frame_count is None
+    assert Excerpt(Frames(frame_count=None), IngestParameters(every=2)).frame_count is None
+
+
+def test_a_first_depth_map_is_that_of_the_first_frame_taken() -> None:
+    part = IngestParameters(start_s=0.6, end_s=0.9)
+    frames = list(Excerpt(Frames(), part, first_depth_only=True))
+    assert [frame.depth for frame in frames] == [b"6", b"", b""]
+    assert [frame.depth for frame in Excerpt(Frames(), part)] == [b"6", b"7", b"8"]
+
+
+def test_nothing_left_is_one_line() -> None:
+    with pytest.raises(DatasetError, match="--end 1: is not after --start 2"):
+        Excerpt(Frames(), IngestParameters(start_s=2.0, end_s=1.0))
+    with pytest.raises(DatasetError, match="no frame lies between"):
+        list(Excerpt(Frames(), IngestParameters(start_s=99.0)))
+
+
+def test_a_source_is_opened_in_part() -> None:
+    whole = list(open_source("built-in:tiny"))
+    part = IngestParameters(every=4)
+    some = list(open_source("built-in:tiny", part=part))
+    assert [replace(f, index=0) for f in some] == [replace(f, index=0) for f in whole[::4]]
+    assert open_source("built-in:tiny", part=IngestParameters()).frame_count == len(whole)

@@ -1,0 +1,195 @@
+"""Two segments that see the same place become one, for the map and for all who read of it."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
+from test_mapper import Published, trajectory_error
+from test_recovery import dark, picture, textures
+
+from pliant.algorithms.geometry import matrix_to_pose
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import (
+    MappingParameters,
+    WholeMapParameters,
+    WindowParameters,
+)
+from pliant.algorithms.tracks import FrameTracks
+from pliant.map_history import MapHistory
+from pliant.messages import topics
+from pliant.messages.types import Header, MapUpdate
+from pliant.state import load_state, save_state
+from pliant.viewers.canvas import Canvas
+from pliant.viewers.scene import Scene as Viewed
+
+_DARK, _COUNT = 40, 1150
+PARAMETERS = MappingParameters(
+    window=WindowParameters(keyframes=5),
+    whole_map=WholeMapParameters(growth=0.0, distance_frames=3),
+)
+
+
+def wall(seed=0):
+    generator = np.random.default_rng(seed)
+    points = generator.uniform((-4.0, -3.0, 3.0), (16.5, 3.0, 7.0), (_COUNT, 3))
+    return Scene(points, generator.uniform(5.0, 500.0, len(points)).astype(np.float32))
+
+
+def along(first, last, step=0.15):
+    """Positions along the wall."""
+    count = round(abs(last - first) / step)
+    return [looking((x, 0.02 * np.sin(2.0 * x), 0.0)) for x in np.linspace(first, last, count + 1)]
+
+
+def film(scene, squares, poses, cut):
+    tracks = [replace(f, ids=f.ids + 1_000_000 * cut) for f in scene.frames(poses)]
+    return [(f, picture(scene, squares, T)) for f, T in zip(tracks, poses, strict=True)]
+
+
+def run(shots, restored=()):
+    """Frame by frame; what is published is checked against the map.  restored: frames before which
+    the mapper is a restarted one."""
+    mapper, published, history = Mapper(CAMERA, PARAMETERS, 0), Published(), MapHistory()
+    joined, deltas = {}, []
+    for k, (tracks, grey) in enumerate(shots):
+        if k in restored:
+            mapper = load_state(save_state(mapper))
+        delta = mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
+        mapper.publish_keyframes()
+        deltas.append(delta)
+        published.apply(delta)
+        history.apply(delta, frame=k, stamp_ns=k)
+        if len(delta.joined):
+            joined[k] = delta.joined.tolist()
+            agree(mapper, history)
+    delta = mapper.finish()
+    deltas.append(delta)
+    published.apply(delta)
+    history.apply(delta, frame=len(shots) - 1, stamp_ns=0, final=True)
+    agree(mapper, history)
+    return SimpleNamespace(
+        mapper=mapper, published=published, history=history, joined=joined, deltas=deltas
+    )
+
+
+def agree(mapper, history):
+    """What readers have is what the map is, of all segments."""
+    active, points = mapper._map, mapper._points
+    for keyframe in active.keyframes:
+        told = history.keyframes[keyframe.id]
+        assert told.segment == keyframe.segment == active.segment
+        np.testing.assert_allclose(
+            told.pose_world_camera, matrix_to_pose(keyframe.published_pose), atol=1e-9
+        )
+    rows = active.mapped_rows()
+    known = np.isfinite(points.published_xyz[rows, 0])
+    at, told = history.points_of(points.ids[rows[known]])
+    assert len(at) == known.sum()
+    assert (told.segments == active.segment).all()
+    np.testing.assert_allclose(told.positions, points.published_xyz[rows[known]], atol=1e-9)
+    ids = [keyframe.id for keyframe in active.keyframes]
+    assert ids == sorted(set(ids))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    scene = wall()
+    return scene, textures(len(scene.points))
+
+
+@pytest.fixture(scope="module", params=["a long one first", "a short one first"])
+def two(request, scene):
+    """A camera at one end of a wall, and after a while in the dark on its way from the other."""
+    long = request.param == "a long one first"
+    there, back = (
+        ([*along(4, 0), *along(0, 4)], along(12, 4)) if long else (along(0, 2), along(11, 0.5))
+    )
+    shots = film(*scene, there, 0) + [dark(FrameTracks.empty())] * _DARK + film(*scene, back, 1)
+    return shots, [*there, *[np.eye(4)] * _DARK, *back], run(shots)
+
+
+def test_segments_that_meet_become_one(two):
+    shots, poses, made = two
+    assert list(made.joined.values()) == [[[1, 0]]]
+    final = made.history.final()
+    assert {segment for segment, _ in final.values()} == {0}
+    assert sorted(final) == [k for k, (tracks, _) in enumerate(shots) if len(tracks.ids)]
+    assert trajectory_error(made.published, poses)[0] < 2e-3
+    points = made.history.points()
+    assert set(points.segments.tolist()) == {0}
+
+
+def test_what_both_have_seen_is_mapped_once(two):
+    shots, _, made = two
+    active = made.mapper._map
+    before = [k for k in active.keyframes if k.frame < len(shots) // 2 - _DARK // 2]
+    shared = [len(np.intersect1d(k.rows, active.keyframes[-1].rows)) for k in before]
+    assert max(shared) >= 30
+    assert len(made.history.points()) < 1.25 * _COUNT
+
+
+def test_causal_poses_stay_as_they_were_known(two):
+    shots, _, made = two
+    (at,) = made.joined
+    dark_at = next(k for k, (tracks, _) in enumerate(shots) if not len(tracks.ids))
+    for frame, (segment, _) in made.history.causal.items():
+        assert segment == (1 if dark_at < frame < at else 0)
+
+
+def test_a_restart_while_segments_are_joined_changes_nothing(two):
+    shots, _, made = two
+    (at,) = made.joined
+    again = run(shots, restored=(at - 1, at, at + 2))
+    for one, other in zip(made.history.final().items(), again.history.final().items(), strict=True):
+        assert one[0] == other[0]
+        np.testing.assert_array_equal(one[1][1], other[1][1])
+
+
+def test_another_wall_is_not_joined(scene):
+    other = wall(seed=3)
+    shots = film(*scene, along(0, 3), 0) + [dark(FrameTracks.empty())] * _DARK
+    shots += film(other, textures(len(other.points))[::-1], along(4, 0), 1)
+    made = run(shots)
+    assert made.joined == {}
+    assert {segment for segment, _ in made.history.final().values()} == {0, 1}
+
+
+class Drawn:
+    """A canvas that holds the worlds that are on it."""
+
+    def __init__(self):
+        self.clouds, self.paths = {}, {}
+
+    def points(self, at, segment, points, changed):
+        self.clouds[segment] = points
+
+    def path(self, at, segment, positions):
+        self.paths[segment] = positions
+
+    def forget(self, at, segment):
+        self.clouds.pop(segment, None)
+        self.paths.pop(segment, None)
+
+    def __getattr__(self, name):
+        return lambda *_: None
+
+
+def test_a_viewer_draws_one_world(two):
+    shots, _, made = two
+    canvas = Drawn()
+    scene = Viewed(cast(Canvas, canvas))
+    for k, delta in enumerate(made.deltas):
+        topic = topics.MAP_UPDATE if k < len(shots) else topics.MAP_FINAL
+        header = Header(frame=min(k, len(shots) - 1), stamp_ns=k, frame_id="world")
+        scene.take(topic, MapUpdate.of(header, delta), k, k)
+    scene.close()
+    segment = made.mapper._map.segment
+    assert list(canvas.clouds) == list(canvas.paths) == [segment]
+    keyframes = made.history.keyframe_poses()
+    path = np.array([keyframes[frame][1][:3] for frame in sorted(keyframes)])
+    np.testing.assert_allclose(canvas.paths[segment], path, atol=1e-9)
+    xyz, told = canvas.clouds[segment].everything()[0], made.history.points().positions
+    np.testing.assert_allclose(xyz, told, atol=1e-3)
