@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Sequence
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,10 @@ from hostile import attack, samples
 from running import TINY, assert_one_line, digests, pliant
 
 from pliant.config import config_yaml, load_config
+from pliant.messages import topics
 from pliant.messages.types import Status
+from pliant.recording.reader import Recording
+from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import STATE_FOLDER, prepare
 from pliant.results.write import write_results
 from pliant_services.processes import PROFILES
@@ -122,9 +126,13 @@ def test_a_live_run_is_not_resumed_but_its_recording_is_a_source(
     tmp_path: Path, tiny_run: Path
 ) -> None:
     """Other frames would be passed over, which some services saw already and others did not."""
-    whole = (tiny_run / "recording.mcap").read_bytes()
+    whole = Recording(tiny_run / "recording.mcap")
     (tmp_path / "state").mkdir()
-    (tmp_path / "recording.mcap").write_bytes(whole[: len(whole) // 2])
+    with RecordingWriter(tmp_path / "recording.mcap", whole.metadata()) as half:  # of its frames
+        half.attach("calibration.yaml", "text/yaml", whole.attachments()["calibration.yaml"])
+        for topic in (topics.STREAM, topics.SOURCE):
+            for n, each in enumerate(islice(whole.messages(topic), 20)):
+                half.write(topic, each.data, sequence=n, log_time_ns=n, publish_time_ns=n)
     (tmp_path / "config.yaml").write_text(config_yaml(load_config(overrides=["ingest.mode=live"])))
     refused = pliant("run", TINY, "--resume", "--output", tmp_path)
     assert_one_line(refused, "was recorded live")
