@@ -29,9 +29,10 @@ class Published:
         moves = delta.map_moves()
         for i, T in self.keyframes.items():
             self.keyframes[i] = move_by_similarity(moves.matrices(np.array(i)), T)
-        for point, (xyz, seen, host) in self.points.items():
-            moved = moves.points(xyz[None], np.array([host]))[0]
-            self.points[point] = (moved, seen, host)
+        if self.points:
+            xyz, seen, hosts = zip(*self.points.values(), strict=True)
+            moved = moves.points(np.array(xyz), np.array(hosts))
+            self.points = dict(zip(self.points, zip(moved, seen, hosts, strict=True), strict=True))
         for i, pose in zip(delta.keyframe_ids.tolist(), delta.keyframe_poses, strict=True):
             self.keyframes[i] = pose_to_matrix(pose)
         for k, frame in enumerate(delta.pose_frames.tolist()):
