@@ -89,6 +89,19 @@ def surfel_speed(
     _print(measure(source, frames, surfels))
 
 
+@app.command("exported-models")
+def exported_models(
+    results: Annotated[list[Path], typer.Argument(help="Result folders of runs.")],
+) -> None:
+    """COLMAP models of runs beside COLMAP's own of the same images: held-out reprojection.
+
+    scripts/bench exported-models results/room
+    """
+    from benchmarks.exported_models import measure
+
+    _print(measure(results))
+
+
 @app.command("drone-flights")
 def drone_flights(
     motions: Annotated[Path, typer.Argument(help="Folder of TUM files: EuRoC's true motions.")],

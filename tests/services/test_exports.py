@@ -1,6 +1,7 @@
 """What `pliant export` writes, read by programs that are not ours."""
 
 import dataclasses
+import json
 import shutil
 import subprocess
 import sys
@@ -27,7 +28,7 @@ from pliant.export.textured import keyframe_images, textured_mesh
 from pliant.formats.ply import read_ply
 from pliant.formats.tum import read_tum
 from pliant.messages import topics
-from pliant.messages.types import CameraStream, Extrema, MapUpdate, SourceImage
+from pliant.messages.types import CameraStream, Extrema, Keyframe, MapUpdate, SourceImage
 from pliant.recording.reader import Recording
 from pliant.results.run import read_run
 from pliant.viewers.point_blocks import BLOCK_POINTS, PointBlocks
@@ -113,18 +114,83 @@ def test_rerun_reads_both_its_file_and_foxgloves(result: Path, tmp_path: Path) -
         assert f"/map/{entity}" in done.stdout
 
 
+def reprojection_errors(reconstruction: Any) -> F64:
+    """(N,) px of every observation of a pycolmap.Reconstruction, both ways consistent."""
+    errors = list[float]()
+    for image in reconstruction.images.values():
+        for row, seen in enumerate(image.points2D):
+            assert seen.has_point3D()
+            point = reconstruction.points3D[seen.point3D_id]
+            assert any(
+                (each.image_id, each.point2D_idx) == (image.image_id, row)
+                for each in point.track.elements
+            )
+            errors.append(float(np.linalg.norm(image.project_point(point.xyz) - seen.xy)))
+    return np.array(errors)
+
+
 def test_colmap_reads_a_model_whose_points_are_where_its_images_see_them(model: Path) -> None:
     pycolmap: Any = import_module("pycolmap")
     read = pycolmap.Reconstruction(str(model / "sparse" / "0"))
     assert read.num_images() >= 4
     assert read.num_points3D() > 1000
+    errors = reprojection_errors(read)
+    assert len(errors) == sum(len(p.track.elements) for p in read.points3D.values())
+    assert np.median(errors) < 0.3
     said = read.compute_mean_reprojection_error()
     read.update_point_3d_errors()
     assert read.compute_mean_reprojection_error() == pytest.approx(said, abs=1e-3)
-    assert said < 0.5
     assert read.compute_mean_track_length() > 3.0
+    camera = read.cameras[1]
     for image in read.images.values():
-        assert (model / "images" / image.name).is_file()
+        pixels = cv2.imread(str(model / "images" / image.name))
+        assert pixels.shape[:2] == (camera.height, camera.width)
+
+
+def test_nerfstudio_gets_the_images_points_and_poses_of_the_colmap_model(
+    result: Path, model: Path, tmp_path: Path
+) -> None:
+    pycolmap: Any = import_module("pycolmap")
+    read = pycolmap.Reconstruction(str(model / "sparse" / "0"))
+    by_name = {image.name: image for image in read.images.values()}
+    folder = export_result(result, "nerfstudio", tmp_path / "nerfstudio")
+    said = json.loads((folder / "transforms.json").read_text())
+    fx, fy, cx, cy = (said[key] for key in ("fl_x", "fl_y", "cx", "cy"))
+    assert (said["camera_model"], fx, fy, cx, cy) == ("OPENCV", *read.cameras[1].params)
+    assert [said[key] for key in ("k1", "k2", "p1", "p2")] == [0.0] * 4
+    points = read_ply(folder / said["ply_file_path"])
+    assert points.colours is not None
+    homogeneous = np.concatenate([points.points, np.ones((len(points.points), 1))], axis=1)
+    assert len(said["frames"]) == len(by_name)
+    for frame in said["frames"]:
+        image = folder / frame["file_path"]
+        assert image.read_bytes() == (model / frame["file_path"]).read_bytes()
+        assert cv2.imread(str(image)).shape[:2] == (said["h"], said["w"])
+        T_world_camera = np.array(frame["transform_matrix"])
+        np.testing.assert_allclose(T_world_camera[3], (0.0, 0.0, 0.0, 1.0))
+        np.testing.assert_allclose(np.linalg.det(T_world_camera[:3, :3]), 1.0)
+        x, y, z, _ = np.linalg.inv(T_world_camera) @ homogeneous.T  # right, up, back
+        ahead = z < 0.0
+        pixels = np.stack([fx * x / -z + cx, fy * -y / -z + cy], axis=1)
+        theirs = by_name[image.name]
+        for row in np.flatnonzero(ahead)[::500]:
+            seen = theirs.project_point(points.points[row].astype(np.float64))
+            np.testing.assert_allclose(pixels[row], seen, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["colmap", "nerfstudio", "images"])
+def test_images_that_were_not_recorded_are_one_line(
+    kind: str, corrected_run: Path, tmp_path: Path
+) -> None:
+    told = {t: list(Recording(corrected_run / "recording.mcap").decoded(t)) for t in topics.TOPICS}
+    told.pop(topics.SOURCE)
+    recorder.run(ReplayBus(told), Config(), tmp_path / "recording.mcap", {})
+    command = [*(sys.executable, "-m", "pliant_services.cli", "export"), tmp_path, "--to", kind]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "has no images (--no-images)" in done.stderr
+    assert not (tmp_path / kind).exists()
 
 
 CORRECTION = (0.05, 0.04, -0.01, 0.0)
@@ -164,7 +230,7 @@ def corrected_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         removed_point_ids=np.zeros(0, np.int64), calibration_correction=CORRECTION,
         point_hosts=np.zeros(400, np.int64),
     )  # fmt: skip
-    tracks, images = list[Extrema](), list[SourceImage]()
+    tracks, images, keyframes = list[Extrema](), list[SourceImage](), list[Keyframe]()
     v, u = np.mgrid[:120, :160]
     pixels = cv2.imencode(".png", np.stack([u, v, 0 * u], axis=2).astype(np.uint8))[1].tobytes()
     for frame in range(3):
@@ -176,12 +242,18 @@ def corrected_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             states=np.zeros(400, np.uint8),
         )  # fmt: skip
         tracks.append(Extrema.of(dataclasses.replace(stream, frame=frame), here))
+        seen_by = {"point_ids": ids, "points_px": seen_px.astype(np.float32)}
+        told_of_it = Keyframe(
+            frame=frame, **header, new=frame, keyframe_ids=frames[frame : frame + 1],
+            settled=np.ones(1, np.bool_), counts=np.array([400], np.int32), **seen_by,
+        )  # fmt: skip
+        keyframes.append(told_of_it)
         image = {"encoding": "png", "width": 160, "height": 120, "data": pixels}
         images.append(SourceImage(frame=frame, stamp_ns=frame * 10**8, frame_id="", **image))
     folder = tmp_path_factory.mktemp("corrected")
     told = {
         topics.STREAM: [stream], topics.SOURCE: images, topics.EXTREMA: tracks,
-        topics.MAP_FINAL: [final],
+        topics.KEYFRAME: keyframes, topics.MAP_FINAL: [final],
     }  # fmt: skip
     recorder.run(ReplayBus(told), Config(), folder / "recording.mcap", {})
     return folder
@@ -202,8 +274,10 @@ def test_exported_images_are_those_of_the_corrected_camera(corrected_run: Path) 
     lens = open_source(str(folder)).calibration.lens
     assert lens.fx == lens.fy == pytest.approx(100.0 * np.exp(0.05))
     pixels = cv2.imread(str(folder / "images" / "000001.png"))  # says where a pixel was taken from
-    v, u = (x.ravel() for x in np.mgrid[20:100, 25:135])
-    pinhole = np.stack([u - 79.5, v - 59.5], axis=1) / lens.fx
+    assert 110 < pixels.shape[0] < 120  # of the image what the lens has shown
+    assert np.ptp(pixels[:, 0, 0]) > 0
+    v, u = (x.ravel() for x in np.mgrid[15:95, 20:130])
+    pinhole = np.stack([u - lens.cx, v - lens.cy], axis=1) / lens.fx
     taken_from = pixels[v, u, :2].astype(float)
     np.testing.assert_allclose(taken_from, seen_through_a_wrong_calibration(pinhole), atol=1.0)
 

@@ -12,8 +12,8 @@ def export(
         str,
         typer.Option(
             "--to",
-            help="foxglove, rerun, tum, kitti, euroc, ply, colmap, images, glb, obj, surface, "
-            "overlay, picture or overview.",
+            help="foxglove, rerun, tum, kitti, euroc, ply, colmap, nerfstudio, images, glb, "
+            "obj, surface, overlay, picture or overview.",
         ),
     ],
     output: Annotated[
@@ -36,14 +36,21 @@ def export(
 
     pliant export results/room --to colmap --output models/room
 
+    pliant export results/room --to nerfstudio
+
     pliant export results/room --to glb
 
     pliant export results/cloth --to surface --every 10
 
     pliant export recording.mcap --to kitti --output poses.txt
     """
-    from pliant.export.export import export_result
+    from functools import partial
 
-    typer.echo(
-        str(export_result(result, to, output, force=force, every=every, triangles=triangles))
-    )
+    from pliant.export.export import export_result
+    from pliant_services.cli.progress import tell_progress
+
+    written = export_result(
+        result, to, output, force=force, every=every, triangles=triangles,
+        progress=partial(tell_progress, f"{to}: image"),
+    )  # fmt: skip
+    typer.echo(str(written))

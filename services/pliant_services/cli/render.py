@@ -20,21 +20,16 @@ def render(
     pliant render "built-in:corridor?frames=100"
     """
     import shutil
-    import sys
 
     from pliant.datasets.builtin import builtin_folder
     from pliant.errors import ResultError
     from pliant.results.folder import keep_apart
+    from pliant_services.cli.progress import tell_progress
 
     if output is not None and output.exists() and not force:
         raise ResultError(f"{output} exists: choose another --output, or --force to replace it")
 
-    def progress(what: str, done: int, total: int) -> None:
-        if sys.stderr.isatty():
-            end = "\n" if done == total else ""
-            print(f"\r{what} {done} of {total} ", end=end, file=sys.stderr, flush=True)
-
-    folder = builtin_folder(name, progress=progress)
+    folder = builtin_folder(name, progress=tell_progress)
     if output is not None:
         keep_apart(output, [folder])
         shutil.copytree(folder, output, dirs_exist_ok=force)

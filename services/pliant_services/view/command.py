@@ -14,7 +14,8 @@ import zenoh
 
 from pliant.bus.session import Identity, open_session
 from pliant.errors import MessageError, PliantError, ResultError
-from pliant.export.models import MESH_NAME, camera_of, draw
+from pliant.export.images import camera_of
+from pliant.export.models import MESH_NAME, draw
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic, by_key
 from pliant.messages.types import StreamEnd

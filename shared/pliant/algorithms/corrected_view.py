@@ -6,7 +6,7 @@ from functools import cached_property, lru_cache
 import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.bundle.calibration import ideal_pixels
 from pliant.algorithms.camera import PinholeCamera
 
@@ -52,6 +52,14 @@ class CorrectedView:
             return pixels
         moved = cv2.remap(pixels, *self._places, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
         return np.asarray(moved, np.uint8)
+
+    @property
+    def shows(self) -> BoolArray:
+        """(H, W) which pixels of the ideal image the rectified one shows; the others are made up of
+        its border."""
+        u, v = self._places
+        across = (u >= 0.0) & (u <= self.camera.width - 1.0)
+        return across & (v >= 0.0) & (v <= self.camera.height - 1.0)
 
     @cached_property
     def _places(self) -> tuple[F32, F32]:

@@ -1,123 +1,120 @@
-"""A recording as a COLMAP model: which points the keyframes see, and the images that go with them.
+"""A run as a COLMAP model: its posed images, their camera, and points with where they are seen.
 
-Map updates tell where points are, not by which tracks they were seen.  So observations are found
-again: a track belongs to the point that it meets, within the mapper's own limit, in the most
-keyframes; a track that meets none twice, or a point that fewer than two keyframes see, is left out.
-The camera is the one that the map was made with; observations lie where it would have seen them.
+Keyframes see what the mapper had them see.  The other frames see what their tracks lead to: a track
+is that of the point which the most keyframes see on it, where it lies no farther off than an inlier
+of the mapper.  A point that fewer than two images see is left out.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
-from pliant.algorithms.corrected_view import CorrectedView
-from pliant.algorithms.geometry import inverse, pose_to_matrix
+from pliant.algorithms.geometry import inverse
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
-from pliant.errors import ResultError
+from pliant.export.images import camera_of, make_folder
+from pliant.export.posed_images import IdealCamera, PosedImage, write_posed_images
 from pliant.formats.colmap import ColmapImage, write_colmap
-from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.types import Extrema
 from pliant.recording.reader import Recording
+from pliant.results.run import SeenKeyframe, read_run, seen_by_keyframes
 
 _NEAR_PX = 1.5  # an inlier of the mapper
+_SAME_PX = 0.1  # of a track that was observed, but for rounding
 
 
-@dataclass(frozen=True)
-class _View:
-    """A keyframe: its pose, and which track (row) meets which point (row) at what distance."""
-
-    frame: int
-    T_world_camera: F64
-    points_px: F64
-    tracks: I64
-    points: I64
-    errors: F64
-
-
-def write_colmap_model(
-    recording: Recording, view: CorrectedView, history: MapHistory, folder: Path
-) -> list[int]:
-    """Write the model of the longest segment; returns the frames whose images belong to it.
-
-    view: that of the camera with which this segment was made.
-    Raises ResultError where there is no map.
-    """
-    segment = history.longest_segment()
-    poses = {f: pose for f, (s, pose) in history.keyframe_poses().items() if s == segment}
-    if not poses:
-        raise ResultError("the run has no map to export")
-    points = history.points()
-    points = points.select(points.segments == segment)
-    keyframes = [
-        _meet(tracks, pose_to_matrix(poses[tracks.frame]), points.positions, view)
-        for tracks in recording.decoded(topics.EXTREMA)
-        if isinstance(tracks, Extrema) and tracks.frame in poses and not tracks.missing
-    ]
-    owner = _owners(keyframes)
-    seen = [_observations(keyframe, owner) for keyframe in keyframes]
-    counts = np.bincount(np.concatenate([p for _, p in seen]), minlength=len(points))
+def colmap(recording: Recording, path: Path, folder: Path | None) -> None:
+    """``sparse/0`` with the text model, ``images`` as its camera sees them."""
+    run = read_run(recording.path)
+    ideal = IdealCamera(run)
+    images = write_posed_images(recording, camera_of(recording), ideal, path / "images")
+    points = run.history.points_in(ideal.segment)
+    seen = seen_by_keyframes(recording, set(ideal.keyframes.values()))
+    sights = _sights(recording, ideal, images, seen, points.ids, points.positions)
+    counts = np.bincount(np.concatenate([rows for _, rows in sights]), minlength=len(points))
     kept = np.flatnonzero(counts >= 2)
-    row = np.full(len(points), -1, np.int64)
-    row[kept] = np.arange(len(kept))
-    images = [
+    number = np.full(len(points), -1, np.int64)
+    number[kept] = np.arange(len(kept))
+    model = [
         ColmapImage(
-            image_name(keyframe.frame),
-            keyframe.T_world_camera,
-            pixels[row[p] >= 0],
-            row[p][row[p] >= 0],
+            image.name,
+            image.T_world_camera,
+            pixels[number[rows] >= 0],
+            number[rows][number[rows] >= 0],
         )
-        for keyframe, (pixels, p) in zip(keyframes, seen, strict=True)
+        for image, (pixels, rows) in zip(images, sights, strict=True)
     ]
+    make_folder(path / "sparse" / "0")
     colours = np.asarray(points.colours[kept], np.uint8)
-    write_colmap(folder, view.camera, images, points.positions[kept], colours)
-    return [keyframe.frame for keyframe in keyframes]
+    write_colmap(path / "sparse" / "0", ideal.camera, model, points.positions[kept], colours)
 
 
-def image_name(frame: int) -> str:
-    """The file of a frame."""
-    return f"{frame:06d}.png"
+def _sights(
+    recording: Recording,
+    ideal: IdealCamera,
+    images: list[PosedImage],
+    seen: dict[int, SeenKeyframe],
+    ids: I64,
+    positions: F64,
+) -> list[tuple[F64, I64]]:
+    """For each image the (N, 2) pixels at which it sees points and the (N,) rows of those.
+
+    seen: by the id of the keyframe.    ids: (P,) of the points, ascending.    positions: (P, 3).
+    """
+    owner = _owners(recording, ideal, seen)
+    wanted = {image.frame: image for image in images}
+    found: dict[int, tuple[F64, I64]] = {}
+    for tracks in recording.decoded(topics.EXTREMA):
+        assert isinstance(tracks, Extrema)
+        image = wanted.get(tracks.frame)
+        if image is None:
+            continue
+        keyframe = seen.get(ideal.keyframes.get(tracks.frame, -1))
+        if keyframe is not None:
+            points, points_px = keyframe.point_ids, keyframe.points_px
+        else:
+            points = np.array([owner.get(track, -1) for track in tracks.ids.tolist()], np.int64)
+            points_px = tracks.points_px
+        rows = np.minimum(np.searchsorted(ids, points), len(ids) - 1)
+        known = np.flatnonzero(ids[rows] == points)
+        pixels = ideal.pixels(tracks.frame, points_px[known]).astype(np.float64)
+        found[tracks.frame] = _inliers(ideal, image, pixels, rows[known], positions)
+    nothing = np.zeros((0, 2)), np.zeros(0, np.int64)
+    return [found.get(image.frame, nothing) for image in images]
 
 
-def _meet(tracks: Extrema, T_world_camera: F64, positions: F64, view: CorrectedView) -> _View:
-    """For every point in view the track that is nearest to it, where one is near."""
-    camera, tracks_px = view.camera, view.pixels(tracks.points_px)
-    T_camera_world = inverse(T_world_camera)
-    space = positions @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    front = np.flatnonzero(space[:, 2] > 0.0)
-    pixels = camera.project(space[front])
-    inside = np.all((pixels > -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5)), axis=1)
-    front, pixels = front[inside], pixels[inside]
-    places = np.zeros((len(tracks.ids), 3), np.float32)
-    places[:, :2] = tracks_px
-    grid = MaximaGrid.build(places, camera.width, camera.height, _NEAR_PX)
-    nearest = grid.nearest(pixels.astype(np.float32), _NEAR_PX)
-    met = nearest >= 0
-    rows = nearest[met]
-    points_px = tracks_px[rows].astype(np.float64)
-    errors = np.linalg.norm(pixels[met] - points_px, axis=1)
-    return _View(tracks.frame, T_world_camera, points_px, tracks.ids[rows], front[met], errors)
+def _owners(
+    recording: Recording, ideal: IdealCamera, seen: dict[int, SeenKeyframe]
+) -> dict[int, int]:
+    """The point (by id) of each track that is seen on one: in the most keyframes."""
+    camera = camera_of(recording)
+    pairs = [np.zeros((0, 2), np.int64)]
+    for tracks in recording.decoded(topics.EXTREMA):
+        assert isinstance(tracks, Extrema)
+        keyframe = seen.get(ideal.keyframes.get(tracks.frame, -1))
+        if keyframe is None:
+            continue
+        places = np.zeros((len(tracks.ids), 3), np.float32)
+        places[:, :2] = tracks.points_px
+        grid = MaximaGrid.build(places, camera.width, camera.height, 1.0)
+        rows = grid.nearest(keyframe.points_px, _SAME_PX)
+        on = rows >= 0
+        pairs.append(np.stack([tracks.ids[rows[on]], keyframe.point_ids[on]], axis=1))
+    unique, counts = np.unique(np.concatenate(pairs), axis=0, return_counts=True)
+    order = np.lexsort((counts, unique[:, 0]))  # the last of a track stays
+    return dict(unique[order].tolist())
 
 
-def _owners(views: list[_View]) -> dict[int, int]:
-    """The point of each track that met one at least twice: most often, then nearest."""
-    pairs = np.concatenate([np.stack([v.tracks, v.points], axis=1) for v in views])
-    errors = np.concatenate([view.errors for view in views])
-    unique, inverse_rows, counts = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
-    mean = np.bincount(inverse_rows.ravel(), errors, len(unique)) / counts
-    often = counts >= 2
-    unique, counts, mean = unique[often], counts[often], mean[often]
-    order = np.lexsort((unique[:, 1], mean, -counts, unique[:, 0]))
-    tracks, first = np.unique(unique[order, 0], return_index=True)
-    return dict(zip(tracks.tolist(), unique[order][first, 1].tolist(), strict=True))
-
-
-def _observations(view: _View, owner: dict[int, int]) -> tuple[F64, I64]:
-    """(N, 2) pixels and (N,) points that the view sees, each point at most once."""
-    owned = np.array([owner.get(track, -1) for track in view.tracks.tolist()], np.int64)
-    good = np.flatnonzero(owned == view.points)
-    good = good[np.lexsort((view.errors[good], view.points[good]))]
-    points, first = np.unique(view.points[good], return_index=True)
-    return view.points_px[good][first], points
+def _inliers(
+    ideal: IdealCamera, image: PosedImage, pixels: F64, rows: I64, positions: F64
+) -> tuple[F64, I64]:
+    """Those of the pixels (N, 2) in the image that are where it sees the point, each point once."""
+    T = inverse(image.T_world_camera)
+    local = positions[rows] @ T[:3, :3].T + T[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = np.linalg.norm(ideal.camera.project(local) - pixels, axis=1)
+    good = np.flatnonzero((local[:, 2] > 0.0) & (errors < _NEAR_PX) & ideal.shows(pixels))
+    good = good[np.lexsort((errors[good], rows[good]))]
+    points, first = np.unique(rows[good], return_index=True)
+    return pixels[good[first]], points

@@ -1,7 +1,7 @@
 """Behind ``pliant export``: what a result folder becomes for other programs and for the eye."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +11,10 @@ import numpy as np
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.errors import ResultError
-from pliant.export import models as export_models
-from pliant.export.models import camera_of, rectified_images
+from pliant.export.colmap import colmap
+from pliant.export.images import camera_of, images, rectified_images
+from pliant.export.models import foxglove, ply, rerun
+from pliant.export.nerfstudio import nerfstudio
 from pliant.export.surface import overlay_pictures, surfaces
 from pliant.export.textured import glb, obj
 from pliant.formats.euroc import write_euroc
@@ -26,7 +28,7 @@ from pliant.pictures.map import choose_view, render_map, write_map_picture
 from pliant.pictures.movie import beside, write_animation, write_movie
 from pliant.pictures.overlay import OverlayFrame, TrackPainter, write_overlay_video
 from pliant.recording.parts import parts_in
-from pliant.recording.reader import Recording
+from pliant.recording.reader import Recorded, Recording
 from pliant.results.folder import RECORDING_NAME, files_read, keep_apart
 from pliant.results.run import read_run
 from pliant.results.surfels import has_surfels, surfel_trajectory
@@ -41,23 +43,27 @@ Export = Callable[..., None]
 """Writes to a path what a recording holds: the recording, the path, the folder if it is that of a
 result, and options of its own."""
 
+Progress = Callable[[int, int], None]
+"""Is told how much is done, of how much; less than 1: nobody knows."""
+
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """One frame of a recording with what became of it."""
+    """One frame of a recording with what became of it.  image: None where it has no pixels."""
 
-    image: U8
+    image: U8 | None
     tracks: Extrema
     update: MapUpdate
 
 
 def export_result(
     result: Path, to: str, output: Path | None, *, force: bool = False,
-    every: int | None = None, triangles: int | None = None,
+    every: int | None = None, triangles: int | None = None, progress: Progress | None = None,
 ) -> Path:  # fmt: skip
     """Write one export of a result folder or a recording and return where.
 
     every: of surfaces, which frames.    triangles: most of a textured mesh.
+    progress: is told how many images have been read, and of how many.
 
     Raises ResultError for an unknown kind, and for what is there already unless ``force``.
     """
@@ -72,7 +78,7 @@ def export_result(
     if not result.exists():
         raise ResultError(f"{result}: no such result folder or recording")
     folder = result if result.is_dir() and not parts_in(result) else None
-    recording = Recording(result / RECORDING_NAME if folder is not None else result)
+    recording = _Followed(result / RECORDING_NAME if folder is not None else result, progress)
     name, write = EXPORTS[to]
     path = output or (result / name if folder is not None else _beside(result, name))
     keep_apart(path, files_read(result))
@@ -88,6 +94,23 @@ def export_result(
     return path
 
 
+class _Followed(Recording):
+    """A recording that tells how many of its images have been read: they take the time."""
+
+    def __init__(self, path: Path, progress: Progress | None) -> None:
+        super().__init__(path)
+        self._progress = progress
+
+    def messages(self, *topics_: Topic) -> Iterator[Recorded]:
+        """As of a recording."""
+        with_images = not topics_ or topics.SOURCE in topics_
+        frames = camera_of(self).frames if with_images else 0
+        for recorded in super().messages(*topics_):
+            if self._progress is not None and recorded.topic == topics.SOURCE:
+                self._progress(recorded.sequence + 1, frames)
+            yield recorded
+
+
 def _remove(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
@@ -101,21 +124,26 @@ def _beside(recording: Path, name: str) -> Path:
     return recording.with_name(f"{recording.stem}_{name}")
 
 
-def recorded_frames(recording: Recording) -> Iterator[RecordedFrame]:
-    """The frames of a recording that have pixels, rectified again from their source bytes."""
-    images = rectified_images(recording, camera_of(recording))
+def recorded_frames(
+    recording: Recording, wanted: Container[int] | None = None
+) -> Iterator[RecordedFrame]:
+    """The frames of a recording, their images rectified again from their source bytes.
+
+    wanted: numbers of those whose image is; None: all.
+    """
+    images = rectified_images(recording, camera_of(recording), wanted)
     others = zip(
         recording.decoded(topics.EXTREMA),
         recording.decoded(topics.MAP_UPDATE),
         strict=False,  # a recording that was cut off ends where its shortest topic ends
     )
-    for frame, _, pixels in images:
-        for tracks, update in others:
-            assert isinstance(tracks, Extrema)
-            assert isinstance(update, MapUpdate)
-            if tracks.frame == frame:
-                yield RecordedFrame(pixels, tracks, update)
-                break
+    at, pixels = -1, None
+    for tracks, update in others:
+        assert isinstance(tracks, Extrema)
+        assert isinstance(update, MapUpdate)
+        while at < tracks.frame:
+            at, _, pixels = next(images, (tracks.frame, 0, None))
+        yield RecordedFrame(pixels if at == tracks.frame else None, tracks, update)
 
 
 def _overlay(recording: Recording, path: Path, folder: Path | None) -> None:
@@ -124,7 +152,8 @@ def _overlay(recording: Recording, path: Path, folder: Path | None) -> None:
         write_movie(path, overlay_pictures(recording), fps=fps)
         return
     stream = camera_of(recording)
-    frames = (_overlay_frame(frame, stream) for frame in recorded_frames(recording))
+    drawn = (_overlay_frame(frame, stream) for frame in recorded_frames(recording))
+    frames = (frame for frame in drawn if frame is not None)
     write_overlay_video(path, frames, fps=_frames_per_second(recording), scale=1)
 
 
@@ -145,14 +174,16 @@ def _overview(recording: Recording, path: Path, folder: Path | None) -> None:
     view = choose_view(last.positions, final)
     every = max(1, len(run.tracks) // _OVERVIEW_FRAMES)
     painter, history, pictures = TrackPainter(scale=2), MapHistory(), list[U8]()
-    for frame in recorded_frames(recording):
-        number = frame.update.frame
-        history.apply(frame.update, frame=number, stamp_ns=frame.update.stamp_ns)
-        left = painter.draw(_overlay_frame(frame, stream))
-        if number % every == 0:
-            points, poses = _longest_segment(history)
-            right = render_map(points.positions, points.colours, poses, view=view)
-            pictures.append(beside(left, right))
+    for frame in recorded_frames(recording, range(0, len(run.tracks), every)):
+        update = frame.update
+        history.apply(update, frame=update.frame, stamp_ns=update.stamp_ns)
+        shown = _overlay_frame(frame, stream)
+        if shown is None:
+            painter.follow(frame.tracks)
+            continue
+        points, poses = _longest_segment(history)
+        right = render_map(points.positions, points.colours, poses, view=view)
+        pictures.append(beside(painter.draw(shown), right))
     write_animation(path, pictures, fps=_OVERVIEW_FPS, width=_OVERVIEW_WIDTH)
 
 
@@ -163,7 +194,9 @@ def _longest_segment(history: MapHistory) -> tuple[Points, F64]:
     return history.points_in(longest), path.T_world_camera
 
 
-def _overlay_frame(frame: RecordedFrame, stream: CameraStream) -> OverlayFrame:
+def _overlay_frame(frame: RecordedFrame, stream: CameraStream) -> OverlayFrame | None:
+    if frame.image is None:
+        return None
     update = frame.update
     words = {WAITING: "starting", TRACKING: "tracking", LOST: "lost"}[update.state]
     detail = f"{update.inliers} mapped" if update.state == TRACKING else update.reason
@@ -202,14 +235,15 @@ def _frames_per_second(recording: Recording, topic: Topic = topics.EXTREMA) -> f
 
 
 EXPORTS: dict[str, tuple[str, Export]] = {
-    "foxglove": ("foxglove.mcap", export_models.foxglove),
-    "rerun": ("rerun.rrd", export_models.rerun),
+    "foxglove": ("foxglove.mcap", foxglove),
+    "rerun": ("rerun.rrd", rerun),
     "tum": ("trajectory_tum.txt", _poses(write_tum)),
     "kitti": ("trajectory_kitti.txt", _poses(write_kitti)),
     "euroc": ("trajectory_euroc.csv", _poses(write_euroc)),
-    "ply": ("points_longest.ply", export_models.ply),
-    "colmap": ("colmap", export_models.colmap),
-    "images": ("images", export_models.images),
+    "ply": ("points_longest.ply", ply),
+    "colmap": ("colmap", colmap),
+    "nerfstudio": ("nerfstudio", nerfstudio),
+    "images": ("images", images),
     "glb": ("mesh.glb", glb),
     "obj": ("obj", obj),
     "surface": ("surface", surfaces),

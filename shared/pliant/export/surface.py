@@ -9,7 +9,7 @@ from pliant.algorithms.arrays import U8
 from pliant.algorithms.surfels.surface import surface_of
 from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.errors import ResultError
-from pliant.export.models import camera_of, make_folder, rectified_images
+from pliant.export.images import camera_of, make_folder, rectified_images
 from pliant.formats.ply import write_ply
 from pliant.messages import topics
 from pliant.messages.types import Surfels

@@ -19,7 +19,7 @@ from pliant.algorithms.meshing.texturing import (
     patches,
 )
 from pliant.errors import ResultError
-from pliant.export.models import make_folder
+from pliant.export.images import make_folder
 from pliant.export.open3d_import import require_open3d
 from pliant.formats.textured import TexturedMesh, write_glb, write_obj
 from pliant.messages import topics

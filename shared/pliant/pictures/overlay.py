@@ -55,7 +55,7 @@ class TrackPainter:
         hollow: carried by its patch.  Tracks that are not in the map (where that is known) are
         drawn small.
         """
-        self._remember(frame.tracks)
+        self.follow(frame.tracks)
         scale = self._scale or (2 if frame.image.shape[1] < 1000 else 1)
         canvas = _enlarge(frame.image, scale)
         mapped = None
@@ -65,7 +65,8 @@ class TrackPainter:
         self._draw_points(canvas, frame.tracks, mapped, scale)
         return self._with_bar(canvas, frame, mapped)
 
-    def _remember(self, tracks: FrameTracks) -> None:
+    def follow(self, tracks: FrameTracks) -> None:
+        """Take in the tracks of a frame that is not drawn."""
         tails = np.repeat(tracks.points_px[:, None], TAIL + 1, axis=1)
         if len(self._ids) and len(tracks.ids):
             row = np.minimum(np.searchsorted(self._ids, tracks.ids), len(self._ids) - 1)

@@ -1,0 +1,11 @@
+"""How far a command is, where somebody looks on."""
+
+import sys
+
+
+def tell_progress(what: str, done: int, total: int) -> None:
+    """One line of a terminal that counts; total below 1: nobody knows."""
+    if sys.stderr.isatty():
+        end = "\n" if done == total else ""
+        of = f" of {total}" if total > 0 else ""
+        print(f"\r{what} {done}{of} ", end=end, file=sys.stderr, flush=True)
