@@ -31,7 +31,7 @@ _ROOMS = (
 )
 _CLASSES = {
     *("ExtremaTracker", "BriefExtractor"),
-    *("Mapper", "ActiveMap", "PointRows", "Window", "Path", "TrackLinks", "TrialMapper"),
+    *("Mapper", "Atlas", "ActiveMap", "PointRows", "Window", "Path", "TrackLinks", "TrialMapper"),
     *("EarlierSegments", "Localiser", "MapChanges", "KeyframeChanges"),
     *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
 }

@@ -59,14 +59,14 @@ class _Run:
     @property
     def keyframes(self) -> list[Keyframe]:
         """Of the last segment."""
-        active = self.mapper._map  # pyright: ignore[reportPrivateUsage]
+        active = self.mapper.atlas.active
         return [] if active is None else active.keyframes
 
     def ask(self, grey: U8, maxima: F32, stamp_ns: int | None) -> tuple[Recognised | None, float]:
         """What the map says to an image, and in how many ms the index.
 
         stamp_ns: of one of its own frames."""
-        index: PlaceIndex = self.mapper._places.index  # pyright: ignore[reportPrivateUsage]
+        index: PlaceIndex = self.mapper.atlas.places.index
         known = {k.id: k for k in self.keyframes if self.is_apart(k, stamp_ns)}
         begin = time.process_time()
         seen = describe(grey)
@@ -75,7 +75,7 @@ class _Run:
         places = [
             Place(keyframe=k, features=index.features[k.id], segment=self.keyframes) for k in chosen
         ]
-        points = self.mapper._points  # pyright: ignore[reportPrivateUsage]
+        points = self.mapper.atlas.points
         found = relocalise(
             seen, places, points, maxima, grey, self.camera, self.config.bundle_adjustment,
             np.random.default_rng(0),
@@ -88,7 +88,7 @@ class _Run:
 
     def is_in_view(self, T_world_camera: F64, stamp_ns: int) -> bool:
         """Whether some keyframe of another time shows half of the surface, from not far aside."""
-        points = self.mapper._points  # pyright: ignore[reportPrivateUsage]
+        points = self.mapper.atlas.points
         for keyframe in self.keyframes:
             turn = so3_log(keyframe.T_world_camera[:3, :3].T @ T_world_camera[:3, :3])
             aside = np.degrees(np.linalg.norm(turn)) > _TURN_DEG
@@ -106,7 +106,7 @@ class _Run:
 
     def is_right(self, found: Recognised, T_world_camera: F64) -> bool:
         """Whether a pose is that of the frame."""
-        points = self.mapper._points  # pyright: ignore[reportPrivateUsage]
+        points = self.mapper.atlas.points
         between = inverse(found.T_world_camera) @ T_world_camera
         rows = found.keyframe.rows[points.state[found.keyframe.rows] == MAPPED]
         depth = np.median(transform(inverse(T_world_camera), points.xyz[rows])[:, 2])

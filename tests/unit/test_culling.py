@@ -73,13 +73,13 @@ def test_the_active_map_stays_as_it_is_where_the_camera_comes_back() -> None:
         published.apply(delta)
         mapper.publish_keyframes()
         keyframes = len(published.keyframes)
-        active = mapper._map
+        active = mapper.atlas.active
         assert active is None or len(active.keyframes) <= 30
-        rows.append(mapper._points.count)
+        rows.append(mapper.atlas.points.count)
     published.apply(mapper.finish())
     assert keyframes > 45  # of which 30 are kept: else nothing had to leave
     assert max(rows[len(rows) // 2 :]) <= 1.05 * max(rows[: len(rows) // 2])
     assert mapper.point_count == len(published.points)
-    assert len(load_state(save_state(mapper))._map.keyframes) <= 30
+    assert len(load_state(save_state(mapper)).atlas.active.keyframes) <= 30
     assert trajectory_error(published, poses)[0] < 1e-3
     assert set(published.states[10:]) == {TRACKING}

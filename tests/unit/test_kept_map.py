@@ -165,8 +165,8 @@ def test_another_camera_sees_the_map_with_its_own_calibration(kept: list[MapKeyf
     other = PinholeCamera(width=800, height=600, fx=700.0, fy=690.0, cx=390.0, cy=310.0)
     points = PointRows()
     known = SelfCalibration.of(other, PARAMETERS.calibration)
-    (segment,) = take_in(list(kept), points, known, PARAMETERS)
-    for keyframe in segment.map.keyframes:
+    (segment,) = take_in(kept, points, known)
+    for keyframe in segment.keyframes:
         assert (points.state[keyframe.rows] == MAPPED).all()
         seen = transform(inverse(keyframe.T_world_camera), points.xyz[keyframe.rows])
         errors = np.linalg.norm(other.project(seen) - keyframe.points_px, axis=1)

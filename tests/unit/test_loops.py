@@ -19,7 +19,6 @@ from pliant.algorithms.mapping.parameters import (
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.whole_map import move_map
 from pliant.state import load_state, save_state
 
 AWAY = 80
@@ -53,14 +52,12 @@ def drifted_once(world):
     mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
     for k, tracks in enumerate(frames[: 2 * AWAY]):
         published.apply(mapper.process(k, k * INTERVAL_NS, tracks, None, None))
-    active = mapper._map
+    active = mapper.atlas.active
     ids = np.array([keyframe.id for keyframe in active.keyframes])
     drift = np.array([similarity(1.005**k, (0, 1e-3 * k, 0), (0, 0, 0)) for k in range(len(ids))])
-    mapper._motion = mapper._motion.moved(
-        drifting := move_map(active, moves := MapMoves(keyframe_ids=ids, moves=drift), mapper._path)
-    )
-    mapper._changes.move(moves)
-    assert drifting[0, 0] > 1.1
+    moved = mapper.atlas.move(MapMoves(keyframe_ids=ids, moves=drift))
+    mapper.follow([moved])
+    assert moved.S[0, 0] > 1.1
     return scene, frames, mapper, published
 
 
@@ -73,7 +70,7 @@ def drifted(drifted_once):
 
 def recognised(scene, mapper, *, wrong=False):
     """The loop between the first keyframe and the last, by what they see of the scene."""
-    active, points = mapper._map, mapper._points
+    active, points = mapper.atlas.active, mapper.atlas.points
     old, new = active.keyframes[0], active.keyframes[-1]
     seen = []
     for keyframe in (old, new):
@@ -100,15 +97,15 @@ def error(active):
 
 
 def close(mapper):
-    mapper.whole_map.ask(2 * AWAY, mapper._map, mapper._path, 0.0)
+    mapper.atlas.ask(2 * AWAY)
     answer = mapper.whole_map.settle()
-    mapper._take_over(mapper._map, mapper._motion, answer)
+    mapper.follow(mapper.atlas.take_over(answer))
     return answer
 
 
 def test_a_loop_takes_out_the_drift_and_joins_the_points(drifted):
     scene, _, mapper, _ = drifted
-    loop, active = recognised(scene, mapper), mapper._map
+    loop, active = recognised(scene, mapper), mapper.atlas.active
     assert len(loop.rows) > 100
     before, count = error(active), mapper.point_count
     mapper.whole_map.loops.append(loop)
@@ -125,13 +122,13 @@ def test_a_loop_takes_out_the_drift_and_joins_the_points(drifted):
 def test_the_map_goes_on_and_readers_have_it(drifted):
     scene, frames, mapper, published = drifted
     mapper.whole_map.loops.append(recognised(scene, mapper))
-    mapper.whole_map.ask(2 * AWAY - 1, mapper._map, mapper._path, 0.0)
+    mapper.atlas.ask(2 * AWAY - 1)
     for k in range(2 * AWAY, 2 * AWAY + 10):
         mapper = load_state(save_state(mapper))
         published.apply(mapper.process(k, k * INTERVAL_NS, frames[k], None, None))
         mapper.publish_keyframes()
     assert published.states[-1] == TRACKING
-    active = mapper._map
+    active = mapper.atlas.active
     for keyframe in active.keyframes:
         np.testing.assert_allclose(
             published.keyframes[keyframe.id], keyframe.T_world_camera, atol=1e-9
@@ -153,7 +150,7 @@ def test_a_loop_that_waits_moves_with_the_map(drifted):
     scene, _, mapper, _ = drifted
     loop = recognised(scene, mapper)
     mapper.whole_map.loops.append(loop)
-    mapper.whole_map.ask(0, mapper._map, mapper._path, 0.0)
+    mapper.atlas.ask(0)
     mapper.whole_map.loops.append(loop)
     close(mapper)
     (waiting,) = mapper.whole_map.loops
@@ -164,20 +161,20 @@ def test_a_loop_that_waits_moves_with_the_map(drifted):
 def test_a_loop_that_others_contradict_is_left_out(drifted):
     scene, _, mapper, _ = drifted
     good, bad = recognised(scene, mapper), recognised(scene, mapper, wrong=True)
-    ids = [keyframe.id for keyframe in mapper._map.keyframes]
+    ids = [keyframe.id for keyframe in mapper.atlas.active.keyframes]
     others = [good._replace(old=ids[0], new=ids[-1]) for _ in range(2)]
     mapper.whole_map.loops += [bad, *others]
     answer = close(mapper)
     assert answer.loops == others
-    assert error(mapper._map) < 0.03
+    assert error(mapper.atlas.active) < 0.03
 
 
 def test_points_that_have_gone_are_not_joined(drifted):
     scene, _, mapper, _ = drifted
     loop = recognised(scene, mapper)
     count = mapper.point_count
-    mapper._map._remove(loop.rows[:5, 0])
-    mapper._map.join(loop)
+    mapper.atlas.points.remove(loop.rows[:5, 0])
+    mapper.atlas.active.join(loop)
     assert mapper.point_count == count - 5 - (len(loop.rows) - 5)
 
 
@@ -199,7 +196,7 @@ def test_a_place_that_looks_alike_is_too_far_for_drift(world):
     mapper = Mapper(CAMERA, PARAMETERS, 0)
     for k, tracks in enumerate(frames[:AWAY]):
         mapper.process(k, k * INTERVAL_NS, tracks, None, None)
-    active, points = mapper._map, mapper._points
+    active, points = mapper.atlas.active, mapper.atlas.points
     first, last = active.keyframes[0], active.keyframes[-1]
     S = first.T_world_camera @ inverse(last.T_world_camera)
     rows = np.column_stack([k.rows[points.state[k.rows] == MAPPED][:200] for k in (first, last)])

@@ -77,18 +77,18 @@ def run(shots, restored=()):
 
 def agree(mapper, history):
     """What readers have is what the map is, of all segments."""
-    active, points = mapper._map, mapper._points
+    active, points = mapper.atlas.active, mapper.atlas.points
     for keyframe in active.keyframes:
         told = history.keyframes[keyframe.id]
-        assert told.segment == keyframe.segment == active.segment
+        assert told.segment == keyframe.segment == active.segment.id
         np.testing.assert_allclose(
             told.pose_world_camera, matrix_to_pose(keyframe.published_pose), atol=1e-9
         )
-    rows = active.mapped_rows()
+    rows = active.segment.mapped_rows()
     known = np.isfinite(points.published_xyz[rows, 0])
     at, told = history.points_of(points.ids[rows[known]])
     assert len(at) == known.sum()
-    assert (told.segments == active.segment).all()
+    assert (told.segments == active.segment.id).all()
     np.testing.assert_allclose(told.positions, points.published_xyz[rows[known]], atol=1e-9)
     ids = [keyframe.id for keyframe in active.keyframes]
     assert ids == sorted(set(ids))
@@ -124,7 +124,7 @@ def test_segments_that_meet_become_one(two):
 
 def test_what_both_have_seen_is_mapped_once(two):
     shots, _, made = two
-    active = made.mapper._map
+    active = made.mapper.atlas.active
     before = [k for k in active.keyframes if k.frame < len(shots) // 2 - _DARK // 2]
     shared = [len(np.intersect1d(k.rows, active.keyframes[-1].rows)) for k in before]
     assert max(shared) >= 30
@@ -186,7 +186,7 @@ def test_a_viewer_draws_one_world(two):
         header = Header(frame=min(k, len(shots) - 1), stamp_ns=k, frame_id="world")
         scene.take(topic, MapUpdate.of(header, delta), k, k)
     scene.close()
-    segment = made.mapper._map.segment
+    segment = made.mapper.atlas.active.segment.id
     assert list(canvas.clouds) == list(canvas.paths) == [segment]
     keyframes = made.history.keyframe_poses()
     path = np.array([keyframes[frame][1][:3] for frame in sorted(keyframes)])

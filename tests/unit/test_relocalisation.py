@@ -113,11 +113,11 @@ def test_what_is_mapped_elsewhere_stays_where_one_segment_moves():
 
 
 def place_of(mapper: Mapper, number: int) -> Place:
-    active = mapper._map
+    active = mapper.atlas.active
     assert active is not None
-    keyframe = next(k for k in active.keyframes[number:] if k.id in mapper._places.index.features)
-    features = mapper._places.index.features[keyframe.id]
-    return Place(keyframe=keyframe, features=features, segment=active.keyframes)
+    known = mapper.atlas.places.index.features
+    keyframe = next(k for k in active.keyframes[number:] if k.id in known)
+    return Place(keyframe=keyframe, features=known[keyframe.id], segment=active.keyframes)
 
 
 def test_two_maps_of_one_place_tell_how_they_lie_to_each_other(known):
@@ -127,13 +127,13 @@ def test_two_maps_of_one_place_tell_how_they_lie_to_each_other(known):
     there = sideways(36, step=0.04)
     run(film(scene, there, squares), mapper)
     old = place_of(mapper, 5)
-    assert mapper._map is not None
+    assert mapper.atlas.active is not None
     # The same map again, as a world of its own.
     other = load_state(save_state(mapper))
     S = np.eye(4)
     S[:3, :3], S[:3, 3] = 0.6 * looking((0, 0, 0), (0.3, 0.2, -0.1))[:3, :3], (1.0, -2.0, 0.5)
     new = place_of(other, 6)
-    points = mapper._points
+    points = mapper.atlas.points
     shifted = points.allocate(len(new.keyframe.rows))
     for name in ("state", "kappas", "ids"):
         getattr(points, name)[shifted] = getattr(points, name)[new.keyframe.rows]
@@ -161,7 +161,7 @@ def test_two_places_are_not_one(known):
     run(film(scene, there, squares), a)
     run(film(elsewhere, there, squares[::-1]), b)
     why = same_place(
-        place_of(a, 3), place_of(b, 3), a._points, CAMERA, parameters, np.random.default_rng(0)
+        place_of(a, 3), place_of(b, 3), a.atlas.points, CAMERA, parameters, np.random.default_rng(0)
     )
     assert isinstance(why, str)
     assert "agree" in why

@@ -139,7 +139,7 @@ def test_the_mapper_closes_a_loop_that_it_sees(killed):
         published.apply(delta)
         moved.append(len(delta.moved_keyframes))
     assert sum(count > 0 for count in moved) >= 1
-    keyframes = mapper._map.keyframes
+    keyframes = mapper.atlas.active.keyframes
     assert len(np.intersect1d(keyframes[0].rows, keyframes[-1].rows)) >= 30
     assert mapper.point_count < 1.3 * len(points)
     published.apply(mapper.finish())

@@ -213,7 +213,7 @@ def test_frames_with_a_known_readout_are_as_good_as_if_taken_at_once():
 
 def test_published_is_what_was_seen():
     mapper, _, tracks, keyframes = Shaken(0.6, frames=60).mapped(known=0.6)
-    newest = mapper._map.keyframes[-1]
+    newest = mapper.atlas.active.keyframes[-1]
     assert np.abs(newest.rolled_px).max() > 0.5
     told = next(delta for delta in reversed(keyframes) if delta.new >= 0)
     seen = tracks[newest.frame].points_px
@@ -226,4 +226,4 @@ def test_published_is_what_was_seen():
 def test_a_global_shutter_stays_one():
     mapper, _, _, _ = Shaken(0.0, frames=60).mapped()
     assert mapper.calibration.readout == 0.0
-    assert not any(keyframe.rolled_px.any() for keyframe in mapper._map.keyframes)
+    assert not any(keyframe.rolled_px.any() for keyframe in mapper.atlas.active.keyframes)

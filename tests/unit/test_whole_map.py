@@ -23,7 +23,7 @@ from pliant.algorithms.mapping.parameters import (
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.whole_map import find_moves, move_map
+from pliant.algorithms.mapping.whole_map import find_moves
 from pliant.map_history import MapHistory
 from pliant.state import load_state, save_state
 from pliant_services.nodes.bundle_adjustment import Beside
@@ -109,11 +109,11 @@ def test_where_the_answer_was_found_changes_nothing(grown, how):
 
 def test_readers_have_the_map_that_the_mapper_has(grown):
     mapper, _, history = grown
-    active = mapper._map
+    active = mapper.atlas.active
     for keyframe in active.keyframes:
         known = history.keyframes[keyframe.id].pose_world_camera
         np.testing.assert_allclose(known, matrix_to_pose(keyframe.T_world_camera), atol=1e-9)
-    rows = active.mapped_rows()
+    rows = active.segment.mapped_rows()
     told = rows[np.isfinite(active.points.published_xyz[rows, 0])]
     points = history.points()
     order = np.argsort(active.points.ids[told])
@@ -126,18 +126,18 @@ def test_readers_have_the_map_that_the_mapper_has(grown):
 def test_a_drifted_map_comes_back():
     """Scale that drifts along the keyframes, and what hangs on them with it, is taken out."""
     mapper, _, _ = fold(AT_THE_END, frames=120)
-    active = mapper._map
+    active = mapper.atlas.active
     ids = np.array([keyframe.id for keyframe in active.keyframes])
     usual = error(active)
     drift = np.array([similarity(1.002**k, (0, 0, 0), (0, 0, 0)) for k in range(len(ids))])
-    move_map(active, MapMoves(keyframe_ids=ids, moves=drift), mapper._path)
+    active.move(MapMoves(keyframe_ids=ids, moves=drift))
     drifted = error(active)
     assert drifted > 10.0 * usual
-    active.parameters = GROWING.model_copy(update={"window": WindowParameters(keyframes=3)})
-    mapper.whole_map.ask(120, active, mapper._path, 0.0)
+    parameters = GROWING.model_copy(update={"window": WindowParameters(keyframes=3)})
+    mapper.whole_map.ask(120, active.segment, mapper.calibration, parameters)
     moves = find_moves(mapper.whole_map.question).moves
     assert len(moves.keyframe_ids) == len(ids) - 3
-    move_map(active, moves, mapper._path)
+    active.move(moves)
     assert error(active) < 0.7 * drifted  # the kernel takes the rest for outliers
 
 
@@ -155,13 +155,13 @@ def error_of(active, true_path):
 
 def test_a_common_move_changes_nothing_that_a_camera_sees(grown):
     mapper, _, _ = fold(GROWING, frames=40)
-    active = mapper._map
-    rows = active.mapped_rows()
+    active = mapper.atlas.active
+    rows = active.segment.mapped_rows()
     last = active.keyframes[-1]
     before = transform(inverse(last.T_world_camera), active.points.xyz[rows])
     one = similarity(1.7, (0.1, -0.2, 0.3), (4, 5, 6))
     first = np.array([active.keyframes[0].id])
-    S = move_map(active, MapMoves(keyframe_ids=first, moves=one[None]), mapper._path)
+    S = active.move(MapMoves(keyframe_ids=first, moves=one[None]))
     after = transform(inverse(last.T_world_camera), active.points.xyz[rows])
     np.testing.assert_allclose(after, 1.7 * before, atol=1e-9)
     np.testing.assert_allclose(S, similarity_to_matrix(one))

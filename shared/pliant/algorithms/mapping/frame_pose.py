@@ -1,6 +1,8 @@
 """The pose of a frame in the map: from the tracks that it shares with it, then from points that are
 found again, then adjusted together with the window (VITAMIN-E section 3.2, Eq. 6)."""
 
+import dataclasses
+
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8
@@ -17,6 +19,7 @@ from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.reacquisition import reacquire
 from pliant.algorithms.mapping.recovery import Motion, recover
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.support import Support, support_of
 from pliant.algorithms.tracks import FrameTracks
 
@@ -60,6 +63,22 @@ def localise(
     )  # fmt: skip
 
 
+def at_once(
+    active: ActiveMap,
+    calibration: SelfCalibration,
+    T_world_camera: F64,
+    motion: F64,
+    seen: FrameTracks,
+) -> tuple[FrameTracks, RolledFrame]:
+    """The tracks of a frame with this pose and motion (6,), had it been taken at once."""
+    rolled = active.segment.rolled(calibration, motion)
+    depths = active.segment.inverse_depths(active.links.rows, T_world_camera)
+    maxima = seen.maxima.copy()
+    maxima[:, :2] -= rolled.shifts(np.ascontiguousarray(maxima[:, :2]))
+    points_px = seen.points_px - rolled.shifts(seen.points_px, depths)
+    return dataclasses.replace(seen, points_px=points_px, maxima=maxima), rolled
+
+
 def find_again(
     active: ActiveMap,
     frame: int,
@@ -80,7 +99,7 @@ def find_again(
     )  # fmt: skip
     found = active.take_over(reacquired, tracks)
     if rolled is not None:
-        depths = active.inverse_depths(found.rows, T_world_camera)
+        depths = active.segment.inverse_depths(found.rows, T_world_camera)
         points_px, rolled_px = rolled.found(found.points_px, depths)
         found = Observations(rows=found.rows, points_px=points_px, rolled_px=rolled_px)
     directions = directions_of(active)
@@ -110,7 +129,7 @@ def adjust(
     active.see(T_world_camera, tracks.points_px, found)
     directions = directions_of(active)
     if parameters.window.sweeps > 0 and not len(directions):
-        T_world_camera = active.window.sweep_current(camera, parameters)
+        T_world_camera = active.window.sweep_current(parameters)
     rows, points_px = active.observed(tracks.points_px, found, directions)
     errors = reprojection_errors(T_world_camera, points.xyz[rows], points_px, camera)
     return T_world_camera, support_of(
@@ -123,7 +142,7 @@ def stand(
     active: ActiveMap, T_world_camera: F64, found: Observations, tracks: FrameTracks
 ) -> tuple[F64, bool]:
     """Whether the frame stands where the last keyframe does, and its pose then."""
-    if active.since == len(active.keyframes):
+    if active.segment.resumes:
         return T_world_camera, False  # nobody knows where it was before
     points, parameters = active.points, active.parameters
     candidates = placed_candidates(points, active.links.rows)

@@ -17,10 +17,10 @@ from pliant.algorithms.arrays import F32, I32, I64, U8, check_arrays
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.kept_keyframe import KeptKeyframe
-from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.covisibility import focus_of
 from pliant.algorithms.mapping.map_store import MAPPED, PATCH_SIDE, Keyframe, PointRows
-from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.places.features import Features
 
@@ -30,13 +30,6 @@ class Origin(NamedTuple):
 
     session: int
     frame: int
-
-
-class KnownSegment(NamedTuple):
-    """A segment of an earlier session: its map, and what is known of the motion in it."""
-
-    map: ActiveMap
-    path: Path
 
 
 def view_of(kept: KeptKeyframe) -> CorrectedView:
@@ -63,8 +56,7 @@ def check(kept: KeptKeyframe) -> None:
 
 
 def keep(
-    segment: ActiveMap,
-    path: Path,
+    segment: Segment,
     calibration: SelfCalibration,
     features: dict[int, Features],
     origins: dict[int, Origin],
@@ -75,12 +67,12 @@ def keep(
     """
     points, given, view = segment.points, calibration.given, calibration.view
     ids = np.array([keyframe.id for keyframe in segment.keyframes], np.int64)
-    rows = points.mapped(segment.segment)
+    rows = points.mapped(segment.id)
     # What hung on a keyframe that the map has forgotten moves with the one before it.
     hosts = np.maximum(np.searchsorted(ids, points.first_keyframe[rows], side="right") - 1, 0)
     rows = rows[np.lexsort([points.ids[rows], hosts])]
     ends = np.cumsum(np.bincount(hosts, minlength=len(ids)))
-    motions = path.motions(segment.keyframes)
+    motions = segment.path.motions(segment.keyframes)
     for slot, keyframe in enumerate(segment.keyframes):
         mine = rows[ends[slot - 1] if slot else 0 : ends[slot]]
         mapped = np.flatnonzero(points.state[keyframe.rows] == MAPPED)
@@ -118,11 +110,8 @@ def keep(
 
 
 def take_in(
-    kept: list[KeptKeyframe],
-    points: PointRows,
-    calibration: SelfCalibration,
-    parameters: MappingParameters,
-) -> list[KnownSegment]:
+    kept: Sequence[KeptKeyframe], points: PointRows, calibration: SelfCalibration
+) -> list[Segment]:
     """The segments of a kept map, their points in rows that are new; those without a point are
     left out.
 
@@ -139,14 +128,18 @@ def take_in(
     if (np.diff(ids) == 0).any():
         raise ValueError("a point that is told twice")
     points.go_on_after(int(ids[-1]) if len(ids) else -1)
-    segments: list[KnownSegment] = []
-    for segment in sorted({each.segment for each in kept}):
-        mine = [each for each in kept if each.segment == segment]
-        known = ActiveMap(segment, points, 0, calibration.view.camera, parameters)
-        known.know([_keyframe(each, ids, rows, calibration) for each in mine])
+    segments: list[Segment] = []
+    for number in sorted({each.segment for each in kept}):
+        mine = [each for each in kept if each.segment == number]
+        if not any(len(each.point_ids) for each in mine):
+            continue
+        keyframes = [_keyframe(each, ids, rows, calibration) for each in mine]
+        for keyframe in keyframes:
+            keyframe.focus = focus_of(keyframe, points)
         path = Path({each.id: each.motion for each in mine if each.motion.any()})
-        if any(len(each.point_ids) for each in mine):
-            segments.append(KnownSegment(known, path))
+        segments.append(
+            Segment(id=number, points=points, keyframes=keyframes, path=path, since=len(keyframes))
+        )
     return segments
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from pliant.algorithms.arrays import F32, U8
 from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.kept_keyframe import KeptKeyframe
-from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.kept_map import features_for
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.map_store import Keyframe, PointRows
@@ -17,6 +16,7 @@ from pliant.algorithms.mapping.meetings import Meetings
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import Place, Recognised, relocalise
 from pliant.algorithms.mapping.revisits import Revisits
+from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.places.features import Features, describe
 from pliant.algorithms.places.index import PlaceIndex
@@ -49,18 +49,18 @@ class KnownPlaces:
         self,
         grey: U8,
         maxima: F32,
-        maps: list[ActiveMap],
+        segments: list[Segment],
         points: PointRows,
         calibration: SelfCalibration,
         parameters: MappingParameters,
         generator: np.random.Generator,
     ) -> Recognised | None:
-        """Which keyframe of the maps saw what an image shows, and where that was taken; None where
-        no single one is proved.   grey: (H, W).   maxima: (M, 3) of its curvature.
+        """Which keyframe of the segments saw what an image shows, and where that was taken; None
+        where no single one is proved.   grey: (H, W).   maxima: (M, 3) of its curvature.
         """
         seen, view = describe(grey), calibration.view
         return relocalise(
-            seen, list(islice(self._like(seen, maps, view), _PLACES)), points, maxima, grey,
+            seen, list(islice(self._like(seen, segments, view), _PLACES)), points, maxima, grey,
             view.camera, parameters, generator,
         )  # fmt: skip
 
@@ -68,34 +68,37 @@ class KnownPlaces:
         self,
         keyframe: Keyframe,
         seen: Features,
-        active: ActiveMap,
-        earlier: list[ActiveMap],
+        segment: Segment,
+        earlier: list[Segment],
         view: CorrectedView,
+        parameters: MappingParameters,
         *,
         loops: bool,
     ) -> list[Loop]:
         """What a new keyframe, which sees these corners, shows again: returns the loops that it
         proves in its own segment, where these are asked for; what it has in common with earlier
         ones waits in ``meetings``."""
-        new = Place(keyframe=keyframe, features=seen, segment=active.keyframes)
-        rest = active.points, view.camera, active.parameters
-        found = self.revisits.look(new, self._like(seen, [active], view), *rest) if loops else []
+        new = Place(keyframe=keyframe, features=seen, segment=segment.keyframes)
+        rest = segment.points, view.camera, parameters
+        found = self.revisits.look(new, self._like(seen, [segment], view), *rest) if loops else []
         if earlier:
             self.meetings.look(new, islice(self._like(seen, earlier, view), _PLACES), *rest)
         return found
 
     def remember(
-        self, keyframe: Keyframe, seen: Features, maps: list[ActiveMap], view: CorrectedView
+        self, keyframe: Keyframe, seen: Features, segments: list[Segment], view: CorrectedView
     ) -> None:
-        """A keyframe is a place to come back to; those that the maps have forgotten are not."""
+        """A keyframe is a place to come back to; those that the segments have forgotten are not."""
         self.index.add(keyframe.id, replace(seen, points_px=view.seen(seen.points_px)))
-        known = {k.id for active in maps for k in active.keyframes}
+        known = {k.id for segment in segments for k in segment.keyframes}
         self.index.forget(self.index.features.keys() - known)
 
-    def _like(self, seen: Features, maps: list[ActiveMap], view: CorrectedView) -> Iterator[Place]:
-        """Keyframes of the maps that look like an image, the most alike first."""
-        segments = {k.id: (k, active.keyframes) for active in maps for k in active.keyframes}
-        for keyframe, segment in (segments[i] for i in self.index.query(seen) if i in segments):
+    def _like(
+        self, seen: Features, segments: list[Segment], view: CorrectedView
+    ) -> Iterator[Place]:
+        """Keyframes of the segments that look like an image, the most alike first."""
+        known = {k.id: (k, each.keyframes) for each in segments for k in each.keyframes}
+        for keyframe, segment in (known[i] for i in self.index.query(seen) if i in known):
             features = self.index.features[keyframe.id]
             there = replace(features, points_px=view.pixels(features.points_px))
             yield Place(keyframe=keyframe, features=there, segment=segment)

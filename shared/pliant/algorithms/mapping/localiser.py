@@ -58,10 +58,8 @@ class Localiser:
         self._points = PointRows()
         self._changes = MapChanges()
         self._places = KnownPlaces()
-        kept = list(known)
-        segments = take_in(kept, self._points, self.calibration, parameters)
-        self._maps = [each.map for each in segments]
-        self._places.know(kept, self.calibration)
+        self._segments = take_in(known, self._points, self.calibration)
+        self._places.know(known, self.calibration)
         self._map: ActiveMap | None = None
         self._hanging: Keyframe | None = None
         self._motion: Motion | None = None
@@ -88,9 +86,8 @@ class Localiser:
             located, support = self._find(self._map, frame, located, tracks, grey)
         if support.inliers < self._parameters.localisation.min_inliers:
             return self._publish(LOST, f"lost: {support.inliers} points of the map are seen", 0)
-        frames, stamps, poses = (frame, frame), (stamp_ns, stamp_ns), (located, located)
         if self._motion is None:
-            self._motion = Motion(frames=frames, stamps_ns=stamps, poses=poses)
+            self._motion = Motion.at(frame, stamp_ns, located)
         else:
             self._motion = self._motion.then(frame, stamp_ns, located)
         self._changes.add_pose(frame, self._hanging, located, support.inliers)
@@ -101,7 +98,7 @@ class Localiser:
         """Where an image (H, W) of the ideal camera, with its maxima (M, 3) of curvature, is seen
         from, by what it looks like alone."""
         return self._places.recognise(
-            grey, maxima, self._maps, self._points, self.calibration, self._parameters,
+            grey, maxima, self._segments, self._points, self.calibration, self._parameters,
             self._generator,
         )  # fmt: skip
 
@@ -149,8 +146,8 @@ class Localiser:
         if found is None:
             return None
         self._hanging, self._motion = found.keyframe, None
-        self._map = next(m for m in self._maps if m.segment == found.keyframe.segment)
-        self._map.links.follow(np.zeros(0, np.int64))
+        segment = next(each for each in self._segments if each.id == found.keyframe.segment)
+        self._map = ActiveMap(segment, 0, self.calibration.view.camera, self._parameters)
         self._map.links.follow(tracks.ids)
         self._map.look_around(found.T_world_camera)
         self._looked_from = found.T_world_camera
@@ -202,7 +199,7 @@ class Localiser:
         delta = self._changes.publish(
             state=state,
             reason=reason,
-            segment=-1 if active is None else active.segment,
+            segment=-1 if active is None else active.segment.id,
             inliers=inliers,
             keyframes=[] if hanging is None else [hanging],
             points=self._points,

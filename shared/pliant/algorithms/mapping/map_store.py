@@ -62,6 +62,7 @@ class PointRows:
         """Points of the map that were published and are not kept any more."""
         self._free: I32 = np.zeros(0, np.int32)
         self._next_id = 0
+        self._removed: list[I64] = []
 
     def allocate(self, count: int) -> I32:
         """Rows of ``count`` new candidates, cleared."""
@@ -101,6 +102,31 @@ class PointRows:
         self.spread[rows] = 0.0
         self.ids[rows] = np.arange(self._next_id, self._next_id + len(rows))
         self._next_id += len(rows)
+
+    def merge(self, old: int, new: int) -> None:
+        """Let a row stand for another one."""
+        if self.state[old] == MAPPED:
+            self._note_removed(np.array([old], np.int32))
+        self.state[old] = MERGED
+        self.alias[old] = new
+        self.first_keyframe[new] = min(self.first_keyframe[old], self.first_keyframe[new])
+        self.published_keyframes[new] = -1  # others are told on what it hangs
+
+    def remove(self, rows: I32) -> None:
+        """Points go.  As candidates they may come back while their track lives."""
+        self._note_removed(rows)
+        self.state[rows] = CANDIDATE
+        self.ids[rows] = -1
+        self.published_xyz[rows] = np.nan
+
+    def _note_removed(self, rows: I32) -> None:
+        """Points go that have been published; nobody knows of the others."""
+        self._removed.append(self.ids[rows[np.isfinite(self.published_xyz[rows, 0])]])
+
+    def take_removed(self) -> I64:
+        """Ids of the points that were removed since the last call."""
+        removed, self._removed = self._removed, []
+        return np.concatenate([*removed, np.zeros(0, np.int64)])
 
     def go_on_after(self, last_id: int) -> None:
         """Points up to this id come from elsewhere."""

@@ -7,11 +7,9 @@ between them the loops take out that told so.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
@@ -21,8 +19,9 @@ from pliant.algorithms.mapping.map_store import PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import Place
 from pliant.algorithms.mapping.revisits import Revisits
-from pliant.algorithms.mapping.rolling_shutter import Path
-from pliant.algorithms.mapping.whole_map import held, move_map
+from pliant.algorithms.mapping.segment import Moved, Segment
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.mapping.whole_map import held
 
 _TRIES = 3
 """Places of a segment that are compared with a keyframe: none of them may contradict."""
@@ -56,33 +55,23 @@ class Meetings:
             self.proved += told.look(new, some, points, camera, parameters, tries=_TRIES)
 
 
-class Joined(NamedTuple):
-    """How the map has moved, the segment that is gone, and what that did (4, 4) to the segment that
-    the camera is in."""
-
-    moves: MapMoves
-    gone: int
-    S: F64
-
-
 def join(
     active: ActiveMap,
-    path: Path,
-    earlier: ActiveMap,
-    earlier_path: Path,
+    earlier: Segment,
     loops: list[Loop],
     spans: list[tuple[int, int]],
-    readout: float,
-) -> Joined:
+    calibration: SelfCalibration,
+) -> Moved:
     """Make two segments one, in the world of the older one: its first keyframe goes on holding it.
 
-    loops: from the earlier one to the one that goes on.   spans: as of ``held``.   readout: that of
+    loops: from the earlier one to the one that goes on.   spans: as of ``held``.   calibration: of
     the segment that goes on.
     """
+    goes_on = active.segment
     to_earlier = max(loops, key=lambda loop: len(loop.rows)).S_old_new
-    active_moves = active.segment > earlier.segment
-    moving, staying = (active, earlier) if active_moves else (earlier, active)
-    gone, segment = moving.segment, staying.segment
+    active_moves = goes_on.id > earlier.id
+    moving, staying = (goes_on, earlier) if active_moves else (earlier, goes_on)
+    gone, id = moving.id, staying.id
     S = to_earlier if active_moves else np.asarray(np.linalg.inv(to_earlier), np.float64)
     scale = float(np.cbrt(np.linalg.det(S[:3, :3])))
     turned = S.copy()
@@ -93,11 +82,9 @@ def join(
         moves=np.concatenate([matrix_to_pose(turned), [scale]])[None],
     )
     moves = held(move, spans, gone)
-    move_map(moving, moves, path if active_moves else earlier_path)
-    if active_moves:
-        active.scaled(scale)
-    active.take_in(earlier, segment)
-    path.take_in(earlier_path)
-    if readout:
-        active.unroll(earlier.keyframes, path, readout)
-    return Joined(moves, gone, S if active_moves else np.eye(4))
+    (active if active_moves else earlier).move(moves)
+    moving.inverse_distance /= scale
+    goes_on.take_in(earlier, id)
+    if calibration.readout:
+        goes_on.unroll(earlier.keyframes, calibration)
+    return Moved(S if active_moves else np.eye(4), moves, gone)

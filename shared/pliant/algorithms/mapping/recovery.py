@@ -37,6 +37,12 @@ class Motion:
     stamps_ns: tuple[int, int]
     poses: tuple[F64, F64]
 
+    @staticmethod
+    def at(frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
+        """Of a camera of which one pose is known."""
+        twice = (T_world_camera, T_world_camera)
+        return Motion(frames=(frame, frame), stamps_ns=(stamp_ns, stamp_ns), poses=twice)
+
     def then(self, frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
         """The motion after one more pose."""
         return Motion(

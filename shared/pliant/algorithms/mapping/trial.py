@@ -133,7 +133,7 @@ class TrialMapper:
         deltas: list[MapDelta] = []
         for taken in self._taken:
             deltas.append(self._mapper.process(*taken, timer))
-            self._mapper.stay()
+            self._mapper.atlas.stay()
         self._taken = []
         return _joined(deltas)
 

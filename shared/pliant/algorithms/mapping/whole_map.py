@@ -23,15 +23,14 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse, matrix_to_pose, move_by_similarity
+from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.final_adjustment import ListedMap, adjust_listed, list_map
 from pliant.algorithms.mapping.loops import Loop, close_loops
-from pliant.algorithms.mapping.map_store import FREE
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.rolling_shutter import Path, readout_flow
-from pliant.algorithms.mapping.self_calibration import is_certain
+from pliant.algorithms.mapping.rolling_shutter import readout_flow
+from pliant.algorithms.mapping.segment import Segment
+from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_certain
 
 _MIN_DEPTH = 1e-6
 
@@ -90,31 +89,34 @@ class WholeMap:
         """Whether loops are being closed."""
         return self.question is not None and len(self.question.loops) > 0
 
-    def ask(self, frame: int, active: ActiveMap, path: Path, readout: float) -> None:
-        """Ask for the adjustment of the map as it is after a frame, where that is due.
-
-        path: of the frames.   readout: as it is known.
-        """
-        parameters = active.parameters
+    def ask(
+        self,
+        frame: int,
+        segment: Segment,
+        calibration: SelfCalibration,
+        parameters: MappingParameters,
+    ) -> None:
+        """Ask for the adjustment of the map as it is after a frame, where that is due."""
+        camera = calibration.view.camera
         window, growth = parameters.window.keyframes, parameters.whole_map.growth
-        count = len(active.keyframes)
+        count = len(segment.keyframes)
         # While the window has half of the map it does well by itself, but for the readout.
         least = parameters.start.keyframes if parameters.calibration.readout > 0.0 else 2 * window
         early = growth == 0.0 or count < max(least, self.due)
         # The window would move with what was there before the camera was recognised.
-        early = early or (active.since > 0 and count - active.since <= window)
+        early = early or (segment.since > 0 and count - segment.since <= window)
         if self.question is not None or (early and not self.loops):
             return
         self.due = (1.0 + growth) * count
         loops, self.loops = self.loops, []
-        points = active.points
-        seen = list_map(active.keyframes, points, active.camera, parameters.window.lens_radius)
+        points = segment.points
+        seen = list_map(segment.keyframes, points, camera, parameters.window.lens_radius)
         if parameters.calibration.readout > 0.0:
             seen.flow = readout_flow(
-                seen.T_world_camera, path.motions(active.keyframes), seen.xyz, seen.camera,
-                seen.point, seen.px, active.camera,
+                seen.T_world_camera, segment.path.motions(segment.keyframes), seen.xyz, seen.camera,
+                seen.point, seen.px, camera,
             )  # fmt: skip
-        keyframe_ids = np.array([keyframe.id for keyframe in active.keyframes], np.int64)
+        keyframe_ids = np.array([keyframe.id for keyframe in segment.keyframes], np.int64)
         loops = [loop for loop in loops if np.isin((loop.old, loop.new), keyframe_ids).all()]
         hosts = np.searchsorted(keyframe_ids, points.first_keyframe[seen.rows], side="right") - 1
         self.question = Question(
@@ -122,9 +124,9 @@ class WholeMap:
             keyframe_ids=keyframe_ids,
             settled=count if loops or count < 2 * window else count - window,
             seen=seen,
-            camera=active.camera,
+            camera=camera,
             parameters=parameters,
-            readout=readout,
+            readout=calibration.readout,
             loops=loops,
             hosts=np.maximum(hosts, 0),
             sigmas=points.sigmas[seen.rows].astype(np.float64),
@@ -260,30 +262,3 @@ def _scales(seen: ListedMap, before: F64, count: int) -> F64:
         if len(some):
             scales[slot] = np.median(some)
     return scales
-
-
-def move_map(active: ActiveMap, moves: MapMoves, path: Path) -> F64:
-    """Move the map and its frames.  Returns the similarity (4, 4) of its newest keyframe."""
-    keyframes, points, window = active.keyframes, active.points, active.window
-    S = moves.matrices(np.array([keyframe.id for keyframe in keyframes], np.int64))
-    poses = move_by_similarity(S, np.array([keyframe.T_world_camera for keyframe in keyframes]))
-    for keyframe, move, T_world_camera in zip(keyframes, S, poses, strict=True):
-        still = keyframe.published_pose is not None and np.array_equal(
-            keyframe.published_pose, keyframe.T_world_camera
-        )
-        keyframe.T_world_camera = T_world_camera
-        if still:  # who reads of the move finds the pose
-            keyframe.published_pose = T_world_camera.copy()
-        if keyframe.focus is not None:
-            keyframe.focus = move[:3, :3] @ keyframe.focus + move[:3, 3]
-    used = slice(0, points.count)  # candidates have a provisional place, too
-    here = (points.state[used] != FREE) & (points.segment[used] == active.segment)
-    rows = np.flatnonzero(here)
-    hosts = points.first_keyframe[rows].astype(np.int64)
-    points.xyz[rows] = moves.points(points.xyz[rows], hosts)
-    points.published_xyz[rows] = moves.points(points.published_xyz[rows], hosts)
-    turned = moves.matrices(hosts)[:, :3, :3] @ points.spread[rows][:, :, None]
-    points.spread[rows] = turned[:, :, 0]
-    window.move(S[-1])
-    path.scale(moves)
-    return S[-1]

@@ -15,15 +15,19 @@ from pliant.algorithms.mapping.observation_table import (
     count_cameras,
     flows,
     gather,
+    has_parallax,
     observe,
     seen_in_state,
     weigh,
     window_errors,
 )
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.triangulation import spread_of_rays
+from pliant.algorithms.mapping.parameters import MappingParameters, PointParameters
+from pliant.algorithms.triangulation import spread_of_rays, triangulate
 
 OUTSIDE = -1
+
+_CLEAR_SHARE = 0.7
+"""Share of the least parallax under which noise does not make rays differ enough."""
 
 _SETTLED = 0.01
 """Share of the cost that the last iteration may still take off: the next keyframe goes on."""
@@ -99,7 +103,7 @@ class Window:
         # Not in place: keyframes and others may have rows of it.
         self.T_world_camera = np.array([*(k.T_world_camera for k in self.keyframes), frame])
 
-    def sweep_current(self, camera: PinholeCamera, parameters: MappingParameters) -> F64:
+    def sweep_current(self, parameters: MappingParameters) -> F64:
         """A few subspace Gauss-Newton sweeps (Eq. 11-12) with the current frame.
 
         The frame and the points that it sees move; the paper lets the keyframes move as well.
@@ -108,13 +112,13 @@ class Window:
         columns = seen_in_state(
             self.rows, self.points.state, MAPPED, self.seen, len(self.keyframes), 1
         )
-        problem = self._problem(columns, camera)
+        problem = self._problem(columns)
         problem.fixed_cameras[:-1] = True
         bundle = parameters.bundle.model_copy(update={"max_sweeps": parameters.window.sweeps})
         self._take(columns, solve_subspace(problem, bundle))
         return self.T_world_camera[-1].copy()
 
-    def adjust(self, camera: PinholeCamera, parameters: MappingParameters) -> None:
+    def adjust(self, parameters: MappingParameters) -> None:
         """Schur LM over the keyframes and all points that two of them see, until it settles.
 
         The points seen longest alone are quicker, but they are those that the camera's motion moves
@@ -128,11 +132,11 @@ class Window:
                 "min_relative_decrease": _SETTLED,
             }
         )
-        problem = self._problem(columns, camera)
+        problem = self._problem(columns)
         problem.fixed_cameras[:-1] |= [keyframe.turned for keyframe in self.keyframes]
         self._take(columns, solve_schur(problem, bundle))
 
-    def place_directions(self, camera: PinholeCamera, inverse_distance: float) -> float:
+    def place_directions(self, inverse_distance: float) -> float:
         """Give the candidates their provisional places, about as far as the map is.
 
         inverse_distance: median of the map as the last keyframe found it.  Returns it of this one.
@@ -145,7 +149,7 @@ class Window:
         columns = columns_in_state(self.rows, self.points.state, CANDIDATE)
         rows = self.rows[columns]
         self.points.xyz[rows], self.points.spread[rows] = place(
-            self.T_world_camera, self.u, self.v, self.seen, columns, camera, inverse_distance
+            self.T_world_camera, self.u, self.v, self.seen, columns, self._camera, inverse_distance
         )
         return inverse_distance
 
@@ -163,6 +167,34 @@ class Window:
             return 0.0, 0.0
         return len(moved) / before, float(np.median(moved))
 
+    def triangulate(self, limits: PointParameters) -> None:
+        """Make points of the candidates whose rays now meet under enough parallax."""
+        points = self.points
+        if self.seen[-1].any():
+            candidates = seen_in_state(
+                self.rows, points.state, CANDIDATE, self.seen, len(self.keyframes),
+                limits.min_observations,
+            )  # fmt: skip
+            # Rays that hardly differ need no triangulation to be turned down.
+            columns = has_parallax(
+                candidates, len(self.keyframes), self.T_world_camera[:, :3, :3], self.u, self.v,
+                self.seen, self.lens,
+                float(np.cos(_CLEAR_SHARE * np.radians(limits.min_parallax_deg))),
+            )  # fmt: skip
+        else:
+            candidates = columns_in_state(self.rows, points.state, CANDIDATE)
+            seen = count_cameras(candidates, self.seen, 0, len(self.seen))
+            columns = candidates[seen >= limits.min_observations].astype(np.int64)
+        xyz, errors, parallax, sigmas = triangulate(
+            self.T_world_camera, self.u, self.v, self.seen, columns, self._camera
+        )
+        good = (parallax >= np.radians(limits.min_parallax_deg)) & (errors < limits.max_error_px)
+        rows = self.rows[columns[good]]
+        points.xyz[rows] = xyz[good]
+        points.parallax_rad[rows] = parallax[good]
+        points.sigmas[rows] = sigmas[good]
+        points.promote(rows)
+
     def current_rows(self) -> I32:
         """Rows that the current frame sees."""
         return self.rows[self.seen[-1]]
@@ -171,7 +203,7 @@ class Window:
         """Columns of the points of the map."""
         return columns_in_state(self.rows, self.points.state, MAPPED)
 
-    def _problem(self, columns: I32, camera: PinholeCamera) -> BundleWindow:
+    def _problem(self, columns: I32) -> BundleWindow:
         fixed = np.zeros(len(self.keyframes) + 1, np.bool_)
         fixed[: self.fixed] = True
         fixed[-1] = not self.seen[-1].any()
@@ -183,7 +215,7 @@ class Window:
             u=table[0],
             v=table[1],
             weights=table[2],
-            intrinsics=shared_intrinsics(camera, len(fixed)),
+            intrinsics=shared_intrinsics(self._camera, len(fixed)),
             fixed_cameras=fixed,
         )
 
@@ -193,33 +225,31 @@ class Window:
         for slot, keyframe in enumerate(self.keyframes):
             keyframe.T_world_camera = self.T_world_camera[slot]
 
-    def errors(self, columns: I32, camera: PinholeCamera) -> F32:
-        """(M, C) reprojection errors of the keyframes in px, 0 where they do not see a point."""
-        return window_errors(
-            self.T_world_camera[:-1],
-            self.points.xyz[self.rows[columns]],
-            self.u,
-            self.v,
-            self.seen,
-            columns,
-            camera,
-        )
-
-    def forget(self, columns: I32, bad: BoolArray) -> None:
-        """Forget observations of the keyframes: (M, C) mask over ``columns``."""
+    def remove_outliers(self, outlier_px: float) -> None:
+        """Forget observations that miss their point, and points with too few observations."""
+        columns = self.mapped_columns()
+        rows = self.rows[columns]
+        errors = window_errors(
+            self.T_world_camera[:-1], self.points.xyz[rows], self.u, self.v, self.seen, columns,
+            self._camera,
+        )  # fmt: skip
+        bad = errors > outlier_px
         for slot, keyframe in enumerate(self.keyframes):
             self.seen[slot, columns[bad[slot]]] = False
             keyframe.keep(self.seen[slot, self.columns[keyframe.rows]])
+        remaining = count_cameras(columns, self.seen, 0, len(self.seen))
+        remaining += self.points.base_keyframes[rows]
+        self.points.remove(rows[remaining < 2])
 
-    def update_statistics(self, camera: PinholeCamera) -> None:
-        """Keyframes, parallax and uncertainty of the points of the self."""
+    def update_statistics(self) -> None:
+        """Keyframes, parallax and uncertainty of the points of the window."""
         points = self.points
         mapped = self.mapped_columns()
         columns, rows = mapped.astype(np.int64), self.rows[mapped]
         moving = count_cameras(mapped, self.seen, self.outside, len(self.keyframes))
         points.keyframes[rows] = points.base_keyframes[rows] + moving
         parallax, sigmas = spread_of_rays(
-            self.T_world_camera, self.seen, columns, points.xyz[rows], focal_px=camera.fx
+            self.T_world_camera, self.seen, columns, points.xyz[rows], focal_px=self._camera.fx
         )
         points.parallax_rad[rows] = np.maximum(parallax, points.base_parallax_rad[rows])
         known = np.isfinite(sigmas)

@@ -1,0 +1,300 @@
+"""The atlas: all segments of the map, that which the camera is in and earlier ones.
+
+A segment begins where a map starts.  It becomes an earlier one where the camera is lost for long or
+is recognised in another, goes on where the camera is recognised in it, and two become one where
+they see the same place.  What drifts in the one that the camera is in is adjusted as a whole beside
+the frames; what else moves it is told by how its end has moved, for what follows from there.
+"""
+
+import heapq
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8
+from pliant.algorithms.geometry import inverse
+from pliant.algorithms.kept_keyframe import KeptKeyframe
+from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.earlier_segments import EarlierSegments
+from pliant.algorithms.mapping.kept_map import Origin, keep, take_in
+from pliant.algorithms.mapping.known_places import KnownPlaces
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.meetings import Meetings, join
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.relocalisation import Recognised
+from pliant.algorithms.mapping.segment import Moved, Segment
+from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_guess
+from pliant.algorithms.mapping.start import Start, WaitingFrame
+from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held
+from pliant.algorithms.places.features import describe
+
+
+class Atlas:
+    """points: of all segments.   calibration: of the camera.   active: the segment that it is in;
+    None: in none.   segment: number of that, or of the last one; -1 before the first.
+    whole_map: the adjustment beside the frames.   places: where the camera may be recognised.
+    """
+
+    def __init__(
+        self,
+        calibration: SelfCalibration,
+        parameters: MappingParameters,
+        known: Sequence[KeptKeyframe] = (),
+    ) -> None:
+        """known: a map of earlier sessions; what is new is numbered on."""
+        self.points = PointRows()
+        self.calibration = calibration
+        self.active: ActiveMap | None = None
+        self.segment = -1
+        self.whole_map = WholeMap()
+        self.places = KnownPlaces()
+        self._parameters = parameters
+        self._earlier = EarlierSegments()
+        self._origins = {each.id: Origin(each.session, each.source_frame) for each in known}
+        self._spans: list[tuple[int, int]] = []  # as of ``held``
+        for each in known:
+            if not self._spans or self._spans[-1][1] != each.segment:
+                self._spans.append((each.id, each.segment))
+        self._next_segment = 1 + max((each.segment for each in known), default=-1)
+        self._next_keyframe = known[-1].id + 1 if known else 0
+        self._adjusted = False  # all of the active segment, and nobody has been told
+        for segment in take_in(known, self.points, calibration):
+            self._earlier.keep(segment, calibration, known=True)
+        self.places.know(known, calibration)
+
+    def kept(self) -> Iterator[KeptKeyframe]:
+        """The map as it is to be kept, oldest keyframe first.  Once the stream has ended."""
+        segments = self._earlier.everything()
+        if self.active is not None:
+            segments.append((self.active.segment, self.calibration))
+        session = 1 + max((origin.session for origin in self._origins.values()), default=-1)
+        made = (keyframe for segment, _ in segments for keyframe in segment.keyframes)
+        origins = {k.id: Origin(session, k.frame) for k in made} | self._origins
+        features = self.places.index.features
+        each = [keep(*segment, features, origins) for segment in segments]
+        yield from heapq.merge(*each, key=lambda keyframe: keyframe.id)
+
+    @property
+    def point_count(self) -> int:
+        """Points of the map now, of all segments."""
+        return self.points.culled + int(np.count_nonzero(self.points.state == MAPPED))
+
+    def begin(
+        self,
+        start: Start,
+        calibration: SelfCalibration,
+        waiting: list[WaitingFrame],
+        grey: U8 | None,
+        colour: U8 | None,
+    ) -> ActiveMap:
+        """A segment begins.  calibration: as the start tells it.   The images are those of the
+        newest of the frames that waited."""
+        limits = self._parameters.window
+        kept = limits.final_max_keyframes if limits.final_adjustment else 0
+        self._earlier.make_room(self.points, kept)
+        self.calibration = calibration
+        active = self._enter(Segment(id=self._next_segment, points=self.points))
+        self._next_segment += 1
+        self._forget_questions()
+        active.begin(start, waiting, grey, colour)
+        self.calibrate()
+        self.remember(active.keyframes[-1], grey)
+        return active
+
+    def _enter(self, segment: Segment) -> ActiveMap:
+        """The camera is in a segment."""
+        camera = self.calibration.view.camera
+        self.active = ActiveMap(segment, self._next_keyframe, camera, self._parameters)
+        self.segment = segment.id
+        self._spans.append((self._next_keyframe, segment.id))
+        return self.active
+
+    def _forget_questions(self) -> None:
+        """They were asked of the segment that the camera was in before."""
+        self.whole_map = WholeMap()
+        self.places.enter()
+
+    def recognise(self, grey: U8, maxima: F32, generator: np.random.Generator) -> Recognised | None:
+        """What an image (H, W) with its maxima (M, 3) of curvature shows of any segment."""
+        segments = self._earlier.like(self.calibration)
+        if self.active is not None:
+            segments = [self.active.segment, *segments]
+        if not segments:
+            return None
+        return self.places.recognise(
+            grey, maxima, segments, self.points, self.calibration, self._parameters, generator
+        )
+
+    def go_on(self, seen: Keyframe, ids: I64) -> None:
+        """The camera has been recognised: its segment goes on at the place that a keyframe saw.
+
+        ids: of the tracks.
+        """
+        stays = self.active is not None and self.active.segment.id == seen.segment
+        self.leave()
+        active = self._enter(self._earlier.take(seen.segment))
+        if stays:
+            self.whole_map.withdraw()  # nobody knows how what is new would move
+        else:
+            self._forget_questions()
+        active.look_with(seen)
+        active.links.follow(ids)
+
+    def leave(self) -> None:
+        """The camera is not in its segment any more, which becomes an earlier one."""
+        if self.active is None:
+            return
+        self.active.close()
+        self._next_keyframe = self.active.next_keyframe_id
+        self._earlier.keep(self.active.segment, self.calibration)
+        self.active = None
+
+    def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64) -> None:
+        """A frame has a pose, which hangs on a keyframe of the segment that the camera is in."""
+        assert self.active is not None
+        segment = self.active.segment
+        if self._is_adjusted_whole(segment):
+            segment.path.add(frame, keyframe, T_world_camera)
+        else:
+            segment.path.forget()
+
+    def remember(self, keyframe: Keyframe, grey: U8 | None) -> None:
+        """A new keyframe is a place to come back to, and may be one that was seen before."""
+        if grey is None or self.active is None:
+            return
+        segment, view = self.active.segment, self.calibration.view
+        seen, earlier = describe(grey), self._earlier.like(self.calibration)
+        self.whole_map.loops += self.places.compare(
+            keyframe, seen, segment,
+            [each for each in earlier if self._is_adjusted_whole(segment, each)],
+            view, self._parameters,
+            loops=self._is_adjusted_whole(segment) and not self.whole_map.closing,
+        )  # fmt: skip
+        self.places.remember(keyframe, seen, [segment, *earlier], view)
+
+    def ask(self, frame: int) -> None:
+        """Ask for the adjustment of the map as it is after a frame, where that is due."""
+        if self.active is not None and self._is_adjusted_whole(self.active.segment):
+            self._ask(frame, self.active)
+
+    def _ask(self, frame: int, active: ActiveMap) -> None:
+        self.whole_map.ask(frame, active.segment, self.calibration, self._parameters)
+
+    def catch_up(self, frame: int) -> list[Moved]:
+        """Take over, before a frame, what the keyframes and the adjustment have found."""
+        moved = self._join_met(frame)
+        answer = self.whole_map.take(frame)
+        return moved if answer is None else [*moved, *self.take_over(answer)]
+
+    def _join_met(self, frame: int) -> list[Moved]:
+        """Become one with an earlier segment that has been met."""
+        proved = self.places.meetings.proved
+        if self.active is None or not proved:
+            return []
+        segments = [self._earlier.segment_of(loop.old) for loop in proved]
+        met = [loop for loop, of in zip(proved, segments, strict=True) if of == segments[0]]
+        earlier = self._earlier.take(segments[0])
+        self.whole_map.withdraw()
+        self.whole_map.loops += met
+        moved = join(self.active, earlier, met, self._spans, self.calibration)
+        self.segment = self.active.segment.id
+        spans = [(k, self.segment if of == moved.gone else of) for k, of in self._spans]
+        self._spans = spans
+        self.places.enter()
+        assert moved.moves is not None
+        self.whole_map.move(moved.moves)
+        self._ask(frame, self.active)
+        return [moved]
+
+    def take_over(self, answer: Answer) -> list[Moved]:
+        """Go on with what the adjustment of the whole map has found."""
+        assert self.active is not None
+        moved: list[Moved] = []
+        if answer.moves is not None:
+            moved = [self.move(held(answer.moves, self._spans, self.segment))]
+            for loop in answer.loops:
+                self.active.join(loop)
+        before = self.calibration.readout
+        self.calibration = self.calibration.with_readout(answer.readout, answer.sigma)
+        if not before:
+            return [*moved, *self.begin_to_unroll()]
+        self.active.segment.unroll(self.active.keyframes, self.calibration)
+        return moved
+
+    def move(self, moves: MapMoves) -> Moved:
+        """Move the segment that the camera is in."""
+        assert self.active is not None
+        return Moved(self.active.move(moves), moves)
+
+    def begin_to_unroll(self) -> list[Moved]:
+        """Map with the readout, where it is known, what was mapped without."""
+        if self.active is None or not self.calibration.readout:
+            return []
+        newest = self.active.keyframes[-1]
+        before = newest.T_world_camera
+        self.active.begin_to_unroll(self.calibration)
+        return [Moved(newest.T_world_camera @ inverse(before))]
+
+    def calibrate(self) -> list[Moved]:
+        """Adjust the whole segment with its calibration where that is a guess, and due."""
+        active = self.active
+        if active is None or not is_guess(self._parameters.calibration):
+            return []
+        due = len(active.keyframes) >= self.calibration.next_keyframes
+        if not (due and self._is_adjusted_whole(active.segment)):
+            return []
+        newest = active.keyframes[-1]
+        before = newest.T_world_camera
+        self._adjust(active)
+        self.whole_map = WholeMap()  # what was asked is of another map
+        return [Moved(newest.T_world_camera @ inverse(before))]
+
+    def _adjust(self, active: ActiveMap) -> None:
+        self.calibration = active.adjust_all(self.calibration)
+        self._adjusted = True
+
+    def stay(self) -> None:
+        """Forget what is about to move the map: nobody has it yet."""
+        self.whole_map, self.places.meetings = WholeMap(), Meetings()
+
+    def finish(self) -> list[Moved]:
+        """What is still to be corrected at the end of the stream."""
+        moved = self._join_met(0)
+        self._earlier.adjust(self._parameters)
+        active = self.active
+        if active is None:
+            return moved
+        while self.whole_map.loops or self.whole_map.closing:
+            self._ask(0, active)
+            if (answer := self.whole_map.settle()) is not None:
+                moved += self.take_over(answer)
+        if self._is_adjusted_whole(active.segment):
+            active.collect_garbage()
+            self._adjust(active)
+        return moved
+
+    def _is_adjusted_whole(self, *segments: Segment) -> bool:
+        """Whether segments are few enough keyframes to be adjusted as a whole, as one."""
+        limits = self._parameters.window
+        few = sum(len(s.keyframes) + s.culled for s in segments) <= limits.final_max_keyframes
+        return limits.final_adjustment and few
+
+    def take_changed(self, *, everything: bool) -> tuple[list[Keyframe], I32]:
+        """The keyframes, and rows of the points, that may have changed since the last call.
+
+        everything: not only the points that the last frame sees.
+        """
+        adjusted, self._adjusted = self._adjusted, False
+        keyframes: list[Keyframe] = []
+        rows = np.zeros(0, np.int32)
+        if self.active is not None and adjusted:
+            keyframes, rows = self.active.keyframes, self.active.segment.mapped_rows()
+        elif self.active is not None:
+            window = self.active.window
+            keyframes = window.keyframes
+            rows = window.rows if everything else window.current_rows()
+        for earlier in self._earlier.adjusted:
+            keyframes = [*keyframes, *earlier.keyframes]
+            rows = np.concatenate([rows, earlier.mapped_rows()])
+        return keyframes, rows

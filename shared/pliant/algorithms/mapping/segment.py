@@ -1,0 +1,161 @@
+"""A segment of the map: keyframes and points that lie in one world.
+
+A segment begins where a map starts, and rests where the camera is lost.  The camera may come back
+to it, other segments may become a part of it, and at the end all of it is adjusted.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I32
+from pliant.algorithms.geometry import move_by_similarity
+from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.covisibility import focus_of, seen_by_none
+from pliant.algorithms.mapping.final_adjustment import adjust_keyframes
+from pliant.algorithms.mapping.map_store import FREE, MAPPED, UNLINKED, Keyframe, PointRows
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
+
+_MIN_DEPTH = 1e-6
+
+
+class Moved(NamedTuple):
+    """What has moved the end of a segment, by a similarity S (4, 4).
+
+    moves: of all that readers have; None where they learn of it by what is published anyway.
+    gone: the segment that has become a part of this one.
+    """
+
+    S: F64
+    moves: MapMoves | None = None
+    gone: int | None = None
+
+
+@dataclass(kw_only=True)
+class Segment:
+    """points: rows shared by all segments.    keyframes: oldest first.   path: of its frames.
+    since: index of the first keyframe after the camera was last recognised: older ones do not move
+    with the window.   culled: keyframes that it has forgotten.   inverse_distance: median of its
+    points from the newest keyframe.
+    """
+
+    id: int
+    points: PointRows
+    keyframes: list[Keyframe] = field(default_factory=list[Keyframe])
+    path: Path = field(default_factory=Path)
+    since: int = 0
+    culled: int = 0
+    inverse_distance: float = 1.0
+
+    @property
+    def resumes(self) -> bool:
+        """Whether no keyframe has been made since the camera was recognised."""
+        return self.since == len(self.keyframes)
+
+    def first_of_window(self, size: int) -> int:
+        """Index of the first keyframe that may move with a window of so many."""
+        return max(self.since, len(self.keyframes) - size)
+
+    def leave_window(self, keyframe: Keyframe) -> None:
+        """A keyframe does not move with the window any more."""
+        self.points.base_keyframes[keyframe.rows] += 1
+        self.points.base_parallax_rad[keyframe.rows] = self.points.parallax_rad[keyframe.rows]
+        keyframe.focus = focus_of(keyframe, self.points)
+
+    def rest(self, window: int) -> None:
+        """The camera is not in it any more: the keyframes of a window of that size leave it."""
+        for keyframe in self.keyframes[self.first_of_window(window) :]:
+            self.leave_window(keyframe)
+        self.since = len(self.keyframes)
+
+    def cull(self, index: int, linked: I32) -> None:
+        """The map forgets a keyframe, and the points that only this one saw.
+
+        linked: row of each living track, negative where it has none.
+        """
+        gone = self.keyframes.pop(index)
+        self.since -= index < self.since
+        self.culled += 1
+        self.points.cull(seen_by_none(gone.rows, self.keyframes, linked, self.points))
+
+    def mapped_rows(self) -> I32:
+        """Rows of all its points, oldest first."""
+        rows = self.points.mapped(self.id)
+        return rows[np.argsort(self.points.first_keyframe[rows], kind="stable")]
+
+    def inverse_depths(self, rows: I32, T_world_camera: F64) -> F64:
+        """(n,) of the rows (UNLINKED among them) in a camera; the map's where they are unknown."""
+        mapped = (rows != UNLINKED) & (self.points.state[rows] == MAPPED)
+        z = (self.points.xyz[rows] - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
+        known = mapped & (z > _MIN_DEPTH)
+        return np.divide(1.0, z, out=np.full(len(rows), self.inverse_distance), where=known)
+
+    def rolled(self, calibration: SelfCalibration, motion: F64) -> RolledFrame:
+        """What the readout does to a frame that moves so."""
+        camera, readout = calibration.view.camera, calibration.readout
+        return RolledFrame(camera, readout, motion, self.inverse_distance)
+
+    def unroll(self, keyframes: list[Keyframe], calibration: SelfCalibration) -> None:
+        """Let keyframes see as if they had been taken at once, as is now known of readout, motion
+        and depths; those of which no motion is known any more stay."""
+        for keyframe, motion in zip(keyframes, self.path.motions(keyframes), strict=True):
+            if not motion.any():
+                continue
+            seen = keyframe.points_px + keyframe.rolled_px
+            depths = self.inverse_depths(keyframe.rows, keyframe.T_world_camera)
+            keyframe.rolled_px = self.rolled(calibration, motion).shifts(seen, depths)
+            keyframe.points_px = seen - keyframe.rolled_px
+
+    def move(self, moves: MapMoves) -> F64:
+        """Move keyframes, points and frames.  Returns the similarity (4, 4) of the newest
+        keyframe."""
+        keyframes, points = self.keyframes, self.points
+        S = moves.matrices(np.array([keyframe.id for keyframe in keyframes], np.int64))
+        poses = move_by_similarity(S, np.array([keyframe.T_world_camera for keyframe in keyframes]))
+        for keyframe, move, T_world_camera in zip(keyframes, S, poses, strict=True):
+            still = keyframe.published_pose is not None and np.array_equal(
+                keyframe.published_pose, keyframe.T_world_camera
+            )
+            keyframe.T_world_camera = T_world_camera
+            if still:  # who reads of the move finds the pose
+                keyframe.published_pose = T_world_camera.copy()
+            if keyframe.focus is not None:
+                keyframe.focus = move[:3, :3] @ keyframe.focus + move[:3, 3]
+        used = slice(0, points.count)  # candidates have a provisional place, too
+        here = (points.state[used] != FREE) & (points.segment[used] == self.id)
+        rows = np.flatnonzero(here)
+        hosts = points.first_keyframe[rows].astype(np.int64)
+        points.xyz[rows] = moves.points(points.xyz[rows], hosts)
+        points.published_xyz[rows] = moves.points(points.published_xyz[rows], hosts)
+        turned = moves.matrices(hosts)[:, :3, :3] @ points.spread[rows][:, :, None]
+        points.spread[rows] = turned[:, :, 0]
+        self.path.scale(moves)
+        return S[-1]
+
+    def take_in(self, earlier: "Segment", id: int) -> None:
+        """Become one with a segment that rests, in whose world this one lies by now, or the other
+        way round.
+
+        id: of both, from now on.  What was mapped there does not move with the window.
+        """
+        both = np.isin(self.points.segment, (self.id, earlier.id))
+        self.points.segment[both] = self.id = id
+        older = [*earlier.keyframes, *self.keyframes[: self.since]]
+        older.sort(key=lambda keyframe: keyframe.id)
+        self.keyframes = [*older, *self.keyframes[self.since :]]
+        for keyframe in self.keyframes:
+            keyframe.segment = id
+        self.since = len(older)
+        self.culled += earlier.culled
+        self.path.take_in(earlier.path)
+
+    def adjust(self, known: SelfCalibration, parameters: MappingParameters) -> SelfCalibration:
+        """Adjust all but the first keyframe and the calibration, from what is known of it."""
+        motions = self.path.motions(self.keyframes)
+        known, gone = adjust_keyframes(self.keyframes, self.points, known, parameters, motions)
+        self.points.remove(gone)
+        self.unroll(self.keyframes, known)
+        return known
