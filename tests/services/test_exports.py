@@ -21,6 +21,7 @@ from pliant.algorithms.tracks import FrameTracks
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config
 from pliant.datasets import open_source
+from pliant.datasets.depth import DepthRectifier
 from pliant.errors import ResultError
 from pliant.export.export import export_result
 from pliant.export.open3d_import import Open3dError, require_open3d
@@ -178,7 +179,41 @@ def test_nerfstudio_gets_the_images_points_and_poses_of_the_colmap_model(
             np.testing.assert_allclose(pixels[row], seen, atol=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["colmap", "nerfstudio", "images"])
+def test_depth_is_that_of_the_map_in_the_unit_that_is_said(
+    result: Path, model: Path, tmp_path: Path
+) -> None:
+    pycolmap: Any = import_module("pycolmap")
+    read = pycolmap.Reconstruction(str(model / "sparse" / "0"))
+    folder = export_result(result, "depth", tmp_path / "depth")
+    source = open_source(str(folder), depth="all")
+    rectifier, lens = DepthRectifier(source.calibration), source.calibration.lens
+    assert source.frame_count is not None
+    assert source.frame_count >= read.num_images() - 1
+    frames = [frame for frame in source if frame.depth]
+    names = [line.split()[1] for line in (folder / "depth.txt").read_text().splitlines()[1:]]
+    depths = {Path(n).name: rectifier.rectify(f.index, f.depth) for n, f in zip(names, frames)}
+    assert len(read_tum(folder / "groundtruth.txt")) == source.frame_count
+    errors = list[float]()
+    for image in read.images.values():
+        for seen in image.points2D if image.name in depths else ():
+            z = (image.cam_from_world() * read.points3D[seen.point3D_id].xyz)[2]
+            column, row = np.floor(seen.xy).astype(int)
+            if known := depths[image.name][row, column]:
+                errors.append(abs(known / z - 1.0))
+    assert len(errors) > 5000
+    assert np.median(errors) < 1e-2  # the surface is smoothed
+    for name, known in depths.items():
+        coloured = cv2.imread(str(folder / "normals" / name))[..., ::-1]
+        there = coloured.any(axis=2)
+        assert there[known > 0.0].mean() > 0.99
+        normals = coloured[there] / 127.5 - 1.0
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=0.02)
+        v, u = np.nonzero(there)
+        rays = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones(len(u))], axis=1)
+        assert ((normals * rays).sum(axis=1) < 0.02).all()  # towards the camera
+
+
+@pytest.mark.parametrize("kind", ["colmap", "nerfstudio", "depth", "images"])
 def test_images_that_were_not_recorded_are_one_line(
     kind: str, corrected_run: Path, tmp_path: Path
 ) -> None:

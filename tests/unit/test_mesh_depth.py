@@ -10,7 +10,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.delaunay import triangulate
 from pliant.algorithms.meshing.keyframe_surface import filter_triangles
 from pliant.algorithms.meshing.parameters import TriangleFilterParameters
-from pliant.algorithms.meshing.rendering import render_depth
+from pliant.algorithms.meshing.rendering import normals_of, render_depth
 
 CAMERA = PinholeCamera(width=80, height=60, fx=70.0, fy=75.0, cx=38.5, cy=31.0)
 LOOSE = TriangleFilterParameters(
@@ -160,3 +160,20 @@ def test_slant_is_the_angle_between_normal_and_ray(slant_deg: float) -> None:
     if slant_deg:
         below = LOOSE.model_copy(update={"max_slant_deg": slant_deg - 1.0})
         assert not kept(depths, below, points=points)
+
+
+def test_normals_are_those_of_the_planes_up_to_the_edge_between_them():
+    u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 0.0 * u + 1.0], -1)
+    near, far = np.array([0.3, -0.2, 0.8]), np.array([-0.1, 0.1, 0.3])
+    left = u < 40
+    planes = np.where(left[..., None], near, far)
+    depths = (1.0 / (planes * rays).sum(axis=-1)).astype(np.float32)
+    depths[10:12, 20:22] = 0.0
+    normals = normals_of(depths, CAMERA)
+    expected = -planes / np.linalg.norm(planes, axis=-1, keepdims=True)
+    expected[10:12, 20:22] = 0.0
+    np.testing.assert_allclose(normals, expected, atol=1e-3)
+    alone = np.zeros_like(depths)
+    alone[30, 30] = 1.0
+    assert not normals_of(alone, CAMERA).any()

@@ -12,7 +12,7 @@ def export(
         str,
         typer.Option(
             "--to",
-            help="foxglove, rerun, tum, kitti, euroc, ply, colmap, nerfstudio, images, glb, "
+            help="foxglove, rerun, tum, kitti, euroc, ply, colmap, nerfstudio, depth, images, glb, "
             "obj, surface, overlay, picture or overview.",
         ),
     ],

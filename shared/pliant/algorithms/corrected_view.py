@@ -55,11 +55,11 @@ class CorrectedView:
 
     @property
     def shows(self) -> BoolArray:
-        """(H, W) which pixels of the ideal image the rectified one shows; the others are made up of
-        its border."""
+        """(H, W) which pixels of the ideal image have their centre within the rectified one: the
+        others are made up of its border."""
         u, v = self._places
-        across = (u >= 0.0) & (u <= self.camera.width - 1.0)
-        return across & (v >= 0.0) & (v <= self.camera.height - 1.0)
+        width, height = self.camera.width, self.camera.height
+        return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
 
     @cached_property
     def _places(self) -> tuple[F32, F32]:

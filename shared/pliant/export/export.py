@@ -12,6 +12,7 @@ from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.errors import ResultError
 from pliant.export.colmap import colmap
+from pliant.export.depth import depth
 from pliant.export.images import camera_of, images, rectified_images
 from pliant.export.models import foxglove, ply, rerun
 from pliant.export.nerfstudio import nerfstudio
@@ -243,6 +244,7 @@ EXPORTS: dict[str, tuple[str, Export]] = {
     "ply": ("points_longest.ply", ply),
     "colmap": ("colmap", colmap),
     "nerfstudio": ("nerfstudio", nerfstudio),
+    "depth": ("depth", depth),
     "images": ("images", images),
     "glb": ("mesh.glb", glb),
     "obj": ("obj", obj),

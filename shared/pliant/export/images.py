@@ -7,15 +7,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, U8, BoolArray
+from pliant.algorithms.arrays import F32, U8, U16, BoolArray
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame
 from pliant.datasets.base import BrokenFrame
-from pliant.datasets.calibration import Calibration, calibration_from_yaml, calibration_yaml
+from pliant.datasets.calibration import (
+    Calibration,
+    DepthImages,
+    calibration_from_yaml,
+    calibration_yaml,
+)
 from pliant.datasets.own_recording import recorded_frame
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import ResultError
-from pliant.formats.text import format_seconds, write_bytes
+from pliant.formats.text import format_seconds, write_bytes, write_lines
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, MapUpdate, SourceImage
 from pliant.recording.reader import Recording
@@ -69,13 +75,12 @@ def images(recording: Recording, path: Path, folder: Path | None) -> None:
     stream = camera_of(recording)
     view = ShownView(corrected_view(stream.camera, _correction(recording)))
     make_folder(path / "images")
-    lines = ["# seconds file"]
+    names: dict[int, str] = {}
     for frame, stamp_ns, pixels in rectified_images(recording, stream):
         write_png(path / "images" / image_name(frame), view.image(pixels))
-        lines.append(f"{format_seconds(stamp_ns)} images/{image_name(frame)}")
-    pinhole = calibration_yaml(Calibration(model="pinhole", **vars(view.camera)))
-    write_bytes(path / "calib.yaml", pinhole.encode())
-    write_bytes(path / "rgb.txt", "".join(f"{line}\n" for line in lines).encode())
+        names[stamp_ns] = image_name(frame)
+    write_bytes(path / "calib.yaml", pinhole_yaml(view.camera).encode())
+    write_list(path / "rgb.txt", "images", names)
 
 
 def _correction(recording: Recording) -> tuple[float, ...]:
@@ -117,6 +122,17 @@ def rectified_images(
         raise ResultError("the recording has no images (--no-images): run its source again")
 
 
+def pinhole_yaml(camera: PinholeCamera, depth: DepthImages | None = None) -> str:
+    """The ``calib.yaml`` of images that were written."""
+    return calibration_yaml(Calibration(model="pinhole", depth=depth, **vars(camera)))
+
+
+def write_list(path: Path, folder: str, names: dict[int, str]) -> None:
+    """The times and files of images.  names: by their stamps, ns."""
+    lines = (f"{format_seconds(stamp)} {folder}/{name}" for stamp, name in names.items())
+    write_lines(path, ["# seconds file", *lines])
+
+
 def image_name(frame: int) -> str:
     """The file of a frame."""
     return f"{frame:06d}.png"
@@ -130,8 +146,8 @@ def make_folder(folder: Path) -> None:
         raise ResultError(f"{folder}: cannot be made ({error.strerror})") from None
 
 
-def write_png(path: Path, pixels: U8) -> None:
-    """Write (H, W) grey or (H, W, 3) RGB, losslessly."""
+def write_png(path: Path, pixels: U8 | U16) -> None:
+    """Write (H, W) of one channel or (H, W, 3) RGB, losslessly."""
     bgr = pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[:, :, ::-1])
     _, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     write_bytes(path, data.tobytes())

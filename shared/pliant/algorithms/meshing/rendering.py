@@ -50,6 +50,29 @@ def render_depth(
     return DepthMap(depths, weights)
 
 
+def normals_of(depths: F32, camera: PinholeCamera) -> F32:
+    """(H, W, 3) unit normals of a depth map (H, W), in the camera and towards it; 0: unknown.
+
+    On a plane n . X = 1 inverse depth is n . ray, so its slopes in the image are n_x / fx and
+    n_y / fy.  Of the slopes to either side the lesser one counts: the other may lead over an edge.
+    """
+    inverse = np.where(depths > 0.0, 1.0 / np.where(depths > 0.0, depths, 1.0), np.nan)
+    gu, gv = _slopes(inverse), _slopes(inverse.T).T
+    u = np.arange(camera.width) - camera.cx
+    v = np.arange(camera.height)[:, None] - camera.cy
+    normals = np.stack([camera.fx * gu, camera.fy * gv, inverse - gu * u - gv * v], axis=-1)
+    normals /= -np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.nan_to_num(normals).astype(np.float32)
+
+
+def _slopes(values: F64) -> F64:
+    """(H, W) differences along the rows of an image, NaN where neither neighbour is known."""
+    nothing = np.full((len(values), 1), np.nan)
+    steps = np.diff(values, axis=1)
+    left, right = np.hstack([nothing, steps]), np.hstack([steps, nothing])
+    return np.where(np.isnan(right) | (np.abs(left) < np.abs(right)), left, right)
+
+
 @kernel
 def _rasterise(
     triangles: I32, pixels: F64, inverse: F64, sigmas: F64,
