@@ -72,6 +72,30 @@ def sessions(sources: Sources, overrides: Overrides = None) -> None:
     _print(measure(sources, load_config(None, overrides or [])))
 
 
+@app.command("merged-maps")
+def merged_maps(sources: Sources, overrides: Overrides = None) -> None:
+    """Two sessions whose frames overlap by a fifth, and their maps merged into one.
+
+    scripts/bench merged-maps path/to/7scenes_redkitchen400 built-in:room
+    """
+    from benchmarks.merged_maps import measure
+    from pliant.config import load_config
+
+    _print(measure(sources, load_config(None, overrides or [])))
+
+
+@app.command("without-places")
+def without_places(sources: Sources, overrides: Overrides = None) -> None:
+    """Sources with and without places, as they are and with two seconds in the dark.
+
+    scripts/bench without-places path/to/7scenes_redkitchen400 built-in:court
+    """
+    from benchmarks.without_places import measure
+    from pliant.config import load_config
+
+    _print(measure(sources, load_config(None, overrides or [])))
+
+
 @app.command("surfel-speed")
 def surfel_speed(
     source: Annotated[

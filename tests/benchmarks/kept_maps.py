@@ -46,7 +46,7 @@ class _Half:
         return {f: pose_to_matrix(pose) for f, (s, pose) in final if s == segment}
 
 
-class _Source:
+class Source:
     """A sequence with its truth."""
 
     def __init__(self, name: str, config: Config) -> None:
@@ -90,20 +90,30 @@ class _Source:
         mine, true = associate(stamps, self._truth.stamps_ns)
         return [frames[i] for i in mine.tolist()], self._truth.T_world_camera[true]
 
+    def ate_mm(self, poses: list[tuple[int, F64]]) -> float:
+        """Of frames, each maybe several times, with their poses (4, 4), in one world: the Sim(3)
+        that aligns their positions leaves so much."""
+        known, truth = self.truth_of(dict(poses))
+        at = dict(zip(known, truth[:, :3, 3], strict=True))
+        mine = np.array([pose[:3, 3] for frame, pose in poses if frame in at])
+        true = np.array([at[frame] for frame, _ in poses if frame in at])
+        scale, R, t = align_umeyama(mine, true, with_scale=True)
+        return 1e3 * float(np.sqrt(((scale * mine @ R.T + t - true) ** 2).sum(axis=1).mean()))
+
 
 def measure(sources: list[str], config: Config) -> Iterator[str]:
     """A row for each source, whose frames have true poses."""
     yield markdown_header(_HEADER)
     for name in sources:
-        yield markdown_row(_row(name, _Source(name, config)))
+        yield markdown_row(_row(name, Source(name, config)))
 
 
-def _row(name: str, source: _Source) -> tuple[str, ...]:
+def _row(name: str, source: Source) -> tuple[str, ...]:
     count = len(source.stamps_ns)
     first, second = range(count // 2), range(count // 2, count)
     mapped = source.run(first)
     assert isinstance(mapped.mapper, Mapper)
-    size, load_ms, kept = _through_file(mapped.mapper)
+    size, load_ms, kept = through_file(mapped.mapper)
     segment = mapped.history.longest_segment()
     scale, R, t = _alignment(source, mapped.poses(segment))
     localised = source.run(second, kept, only=True)
@@ -133,12 +143,12 @@ def _row(name: str, source: _Source) -> tuple[str, ...]:
         _median_error(source, poses, (scale, R, t)),
         _median_error(source, mapped.poses(segment), (scale, R, t)),
         ", ".join(f"{ms:.0f}" for ms in times),
-        f"{_ate_mm(source, whole):.2f} mm",
-        f"{_ate_mm(source, both):.2f} mm of {len(both)} frames",
+        f"{source.ate_mm(list(whole.items())):.2f} mm",
+        f"{source.ate_mm(list(both.items())):.2f} mm of {len(both)} frames",
     )
 
 
-def _through_file(mapper: Mapper) -> tuple[int, float, list[MapKeyframe]]:
+def through_file(mapper: Mapper) -> tuple[int, float, list[MapKeyframe]]:
     """Bytes of the file, ms to read it, and the map."""
     with tempfile.TemporaryDirectory() as folder:
         headers = (Header(frame=n, stamp_ns=0, frame_id="") for n in range(1 << 30))
@@ -150,13 +160,13 @@ def _through_file(mapper: Mapper) -> tuple[int, float, list[MapKeyframe]]:
         return (Path(folder) / MAP_NAME).stat().st_size, 1e3 * spent, read
 
 
-def _alignment(source: _Source, poses: dict[int, F64]) -> tuple[float, F64, F64]:
+def _alignment(source: Source, poses: dict[int, F64]) -> tuple[float, F64, F64]:
     frames, truth = source.truth_of(poses)
     mine = np.array([poses[frame][:3, 3] for frame in frames])
     return align_umeyama(mine, truth[:, :3, 3], with_scale=True)
 
 
-def _median_error(source: _Source, poses: dict[int, F64], alignment: tuple[float, F64, F64]) -> str:
+def _median_error(source: Source, poses: dict[int, F64], alignment: tuple[float, F64, F64]) -> str:
     """Of positions and orientations to the truth, under the alignment of the map's positions."""
     scale, R, t = alignment
     frames, truth = source.truth_of(poses)
@@ -169,13 +179,6 @@ def _median_error(source: _Source, poses: dict[int, F64], alignment: tuple[float
     ]
     centimetres, degrees = np.median(np.array(off), axis=0)
     return f"{centimetres:.2f} cm, {degrees:.2f} deg"
-
-
-def _ate_mm(source: _Source, poses: dict[int, F64]) -> float:
-    scale, R, t = _alignment(source, poses)
-    frames, truth = source.truth_of(poses)
-    mine = scale * np.array([poses[frame][:3, 3] for frame in frames]) @ R.T + t
-    return 1e3 * float(np.sqrt(((mine - truth[:, :3, 3]) ** 2).sum(axis=1).mean()))
 
 
 def _in_view(

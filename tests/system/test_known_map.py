@@ -1,4 +1,4 @@
-"""``pliant run --map``: another session in the map that the first one has left."""
+"""``pliant run --map`` and ``pliant map``: sessions in the map that an earlier one has left."""
 
 import json
 from pathlib import Path
@@ -67,6 +67,33 @@ def test_a_map_tells_python_where_an_image_was_taken(office: Path) -> None:
     assert known.localise(np.zeros_like(decode(frames[10]))) is None
     assert known.localise(decode(frames[10]), known.calibration) is not None
     assert len(known.points) == len(known.colours) == len(known.segments) > 100
+
+
+def test_two_maps_become_one_in_which_a_run_goes_on(office: Path, tmp_path: Path) -> None:
+    tuesday, one = tmp_path / "tuesday", tmp_path / "one.pliant"
+    assert pliant("run", TINY, "--start", "0.4", "--output", tuesday).returncode == 0
+    done = pliant("map", "merge", office, tuesday, "--output", one)
+    assert done.returncode == 0, done.stderr
+    assert "lies in segment 0 now" in done.stdout
+    told = pliant("map", "info", one).stdout
+    assert "sessions: 2" in told
+    assert "segment 0:" in told
+    assert "segment 1:" not in told
+    done = pliant("run", TINY, "--map", one, "--localise", "--output", tmp_path / "robot")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "robot" / "report.json").read_text())
+    assert report["frames_with_pose"] == report["frames"]
+    whole = one.read_bytes()
+    damaged = tmp_path / "damaged.pliant"
+    damaged.write_bytes(whole[: len(whole) // 2])
+    for arguments, why in (
+        ((office, tuesday, "--output", one), "--force"),
+        ((office, one, "--output", one, "--force"), "is read from there"),
+        ((office, damaged, "--output", tmp_path / "new.pliant"), "damaged"),
+    ):
+        assert_one_line(pliant("map", "merge", *arguments), why)
+    assert one.read_bytes() == whole
+    assert not (tmp_path / "new.pliant").exists()
 
 
 def test_what_is_no_map_of_use_is_said_before_anything_is_touched(

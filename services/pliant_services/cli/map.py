@@ -1,4 +1,4 @@
-"""``pliant map``: what a kept map holds."""
+"""``pliant map``: what a kept map holds, and two that become one."""
 
 from pathlib import Path
 from typing import Annotated
@@ -26,4 +26,21 @@ def info(
     from pliant.recording.map_file import describe
 
     for line in describe(path):
+        typer.echo(line)
+
+
+@app.command()
+def merge(
+    first: Annotated[Path, typer.Argument(help="A result folder or its map.pliant.")],
+    second: Annotated[Path, typer.Argument(help="Another one, of places that the first shows.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File of the one map.")],
+    force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
+) -> None:
+    """One map of two that show the same places, in the world and at the scale of the first.
+
+    pliant map merge results/monday results/tuesday --output results/office.pliant
+    """
+    from pliant.results.merged_map import merge_maps
+
+    for line in merge_maps(first, second, output, force=force):
         typer.echo(line)

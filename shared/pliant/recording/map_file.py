@@ -110,8 +110,9 @@ def write_map(path: Path, header: MapHeader, keyframes: Iterable[MapKeyframe]) -
                 _write(writer, keyframe)
         put_in_place(partial, path)
     except (OSError, RecordingError) as error:
-        partial.unlink(missing_ok=True)
         raise MapError(f"{path}: the map cannot be written: {_why(error, partial)}") from None
+    finally:
+        partial.unlink(missing_ok=True)  # an interruption leaves none either
     return True
 
 

@@ -17,7 +17,7 @@ from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
-from pliant.algorithms.mapping.kept_map import Origin, keep, take_in
+from pliant.algorithms.mapping.kept_map import Origin, keep, spans_of, take_in
 from pliant.algorithms.mapping.known_places import KnownPlaces
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.meetings import Meetings, join
@@ -52,10 +52,7 @@ class Atlas:
         self._parameters = parameters
         self._earlier = EarlierSegments()
         self._origins = {each.id: Origin(each.session, each.source_frame) for each in known}
-        self._spans: list[tuple[int, int]] = []  # as of ``held``
-        for each in known:
-            if not self._spans or self._spans[-1][1] != each.segment:
-                self._spans.append((each.id, each.segment))
+        self._spans = spans_of(known)
         self._next_segment = 1 + max((each.segment for each in known), default=-1)
         self._next_keyframe = known[-1].id + 1 if known else 0
         self._adjusted = False  # all of the active segment, and nobody has been told

@@ -143,6 +143,57 @@ def take_in(
     return segments
 
 
+def spans_of(kept: Sequence[KeptKeyframe]) -> list[tuple[int, int]]:
+    """(first keyframe id, segment) of each stretch of keyframes of one segment, see ``held``."""
+    spans: list[tuple[int, int]] = []
+    for each in kept:
+        if not spans or spans[-1][1] != each.segment:
+            spans.append((each.id, each.segment))
+    return spans
+
+
+def numbered_after(
+    kept: Sequence[KeptKeyframe], known: Sequence[KeptKeyframe]
+) -> list[KeptKeyframe]:
+    """The keyframes of a map under numbers that follow on those of another one: of keyframes,
+    segments, sessions and points."""
+    ids = [ids for each in known for ids in (each.seen_ids, each.point_ids) if len(ids)]
+    points = 1 + max((int(each[-1]) for each in ids), default=-1)
+    segments = 1 + max(each.segment for each in known)
+    sessions = 1 + max(each.session for each in known)
+    first = 1 + known[-1].id
+    return [
+        replace(
+            each, id=first + each.id, segment=segments + each.segment,
+            session=sessions + each.session, seen_ids=points + each.seen_ids,
+            point_ids=points + each.point_ids,
+        )
+        for each in kept
+    ]  # fmt: skip
+
+
+def corrected_as(kept: KeptKeyframe, calibration: SelfCalibration) -> KeptKeyframe:
+    """The keyframe with what another session has found wrong with the same camera: what was seen
+    stays where it was in the image.  One of another camera stays as it is.
+
+    Two sessions differ by a thousandth in the focal length, and rays by as much: as rays the same
+    image would be seen from two places.
+    """
+    if kept.given_camera != calibration.given:
+        return kept
+    before, after = view_of(kept), calibration.view
+
+    def moved(points_px: F32) -> F32:
+        return after.pixels(before.seen(points_px))
+
+    seen_px = moved(kept.seen_px)
+    return replace(
+        kept, correction=calibration.correction.copy(), sigmas=calibration.sigmas,
+        seen_px=seen_px, rolled_px=moved(kept.seen_px + kept.rolled_px) - seen_px,
+        corners_px=moved(kept.corners_px),
+    )  # fmt: skip
+
+
 def features_for(kept: KeptKeyframe, calibration: SelfCalibration) -> Features:
     """Its corners at the pixels of the rectified image of a camera."""
     moved = _moved(kept.corners_px, view_of(kept).camera, calibration.view.camera)

@@ -1,0 +1,164 @@
+"""Two kept maps that show the same places become one.
+
+The second one is taken as a session whose segments all lie before us: its keyframes are compared
+with the places of the first map as those of a new segment are (``meetings``), what is proved moves
+it into the world of the first one, and what is left between the two its loops take out, with the
+adjustment of the whole map (``loops``, ``whole_map``).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from pliant.algorithms.kept_keyframe import KeptKeyframe
+from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.kept_map import (
+    Origin,
+    corrected_as,
+    keep,
+    known_camera,
+    numbered_after,
+    spans_of,
+    take_in,
+)
+from pliant.algorithms.mapping.known_places import KnownPlaces
+from pliant.algorithms.mapping.loops import Loop
+from pliant.algorithms.mapping.map_store import Keyframe, PointRows
+from pliant.algorithms.mapping.meetings import join
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.segment import Segment
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.mapping.whole_map import WholeMap, held
+
+
+@dataclass(frozen=True, kw_only=True)
+class Merged:
+    """joined: (segment of the second map, segment of the first map in whose world it lies now).
+    apart: (segment of the second map that was not recognised, its number now).   proofs: pairs of
+    keyframes that show one place.   keyframes: of the one map, oldest first.
+    """
+
+    joined: list[tuple[int, int]]
+    apart: list[tuple[int, int]]
+    proofs: int
+    keyframes: list[KeptKeyframe]
+
+
+def merge(
+    first: Sequence[KeptKeyframe], second: Sequence[KeptKeyframe], parameters: MappingParameters
+) -> Merged | None:
+    """One map of two, each with its keyframes oldest first; None where no place of the first one is
+    proved to be in the second.
+
+    Worlds, scales and the camera are those of the first map, numbers of the second follow on it.
+    Raises ValueError where a map tells a point twice.
+    """
+    camera = known_camera(first, first[-1].given_camera)
+    assert camera is not None, "of its own last session"
+    return _Merging(first, numbered_after(second, first), camera, parameters).result()
+
+
+class _Merging:
+    """worlds: segments of the first map and what has been joined to them.   rest: segments of the
+    second one that have not been recognised yet.   told: pairs of keyframes that show one place."""
+
+    def __init__(
+        self,
+        first: Sequence[KeptKeyframe],
+        second: list[KeptKeyframe],
+        calibration: SelfCalibration,
+        parameters: MappingParameters,
+    ) -> None:
+        self._given = [*first, *second]
+        both = [corrected_as(each, calibration) for each in self._given]
+        self._calibration, self._parameters = calibration, parameters
+        known = {each.segment for each in first}
+        self._shift = 1 + max(known)
+        self._spans = spans_of(both)
+        self._places = KnownPlaces()
+        self._places.know(both, calibration)
+        segments = take_in(both, PointRows(), calibration)
+        self._worlds = [each for each in segments if each.id in known]
+        self._rest = [each for each in segments if each.id not in known]
+        self._told = WholeMap()
+
+    def result(self) -> Merged | None:
+        """What has become of both."""
+        joined: dict[int, Keyframe] = {}  # numbers of segments, and a keyframe of each
+        while found := self._next_joined():
+            joined |= found
+        if not joined:
+            return None
+        proofs = len(self._told.loops)
+        kept = sorted(self._kept(), key=lambda keyframe: keyframe.id)
+        return Merged(
+            joined=[(number - self._shift, joined[number].segment) for number in sorted(joined)],
+            apart=[(each.id - self._shift, each.id) for each in self._rest],
+            proofs=proofs,
+            keyframes=kept,
+        )
+
+    def _next_joined(self) -> dict[int, Keyframe]:
+        """Let the next segment that shows a known place become a part of what is known."""
+        for each in self._rest:
+            number = each.id
+            proved = self._met(each)
+            if proved:
+                self._rest.remove(each)
+                self._join(each, proved)
+                return {number: each.keyframes[-1]}
+        return {}
+
+    def _met(self, segment: Segment) -> list[Loop]:
+        """What proves that keyframes of a segment show places of the worlds."""
+        self._places.enter()
+        view = self._calibration.view
+        for keyframe in segment.keyframes:
+            corners = self._places.index.features.get(keyframe.id)
+            if corners is not None:
+                seen = replace(corners, points_px=view.pixels(corners.points_px))
+                self._places.compare(
+                    keyframe, seen, segment, self._worlds, view, self._parameters, loops=False
+                )
+        return self._places.meetings.proved
+
+    def _join(self, segment: Segment, proved: list[Loop]) -> None:
+        """Become one with all worlds of which a place was seen."""
+        self._told.loops += proved
+        seen = {loop.old for loop in proved}
+        for world in [w for w in self._worlds if any(k.id in seen for k in w.keyframes)]:
+            there = {keyframe.id for keyframe in world.keyframes}
+            here = {keyframe.id for keyframe in segment.keyframes}
+            met = [e for e in self._told.loops if e.old in there and e.new in here]
+            moved = join(self._active(segment), world, met, self._spans, self._calibration)
+            self._spans = [(k, segment.id if of == moved.gone else of) for k, of in self._spans]
+            assert moved.moves is not None
+            self._told.move(moved.moves)
+            self._worlds.remove(world)
+        self._worlds.append(segment)
+
+    def _active(self, segment: Segment) -> ActiveMap:
+        return ActiveMap(segment, 0, self._calibration.view.camera, self._parameters)
+
+    def _kept(self) -> Iterator[KeptKeyframe]:
+        """Of all segments: those that have met nothing are as they were given."""
+        features, changed = self._places.index.features, set[int]()
+        origins = {each.id: Origin(each.session, each.source_frame) for each in self._given}
+        for each in self._worlds:
+            ids = {keyframe.id for keyframe in each.keyframes}
+            loops = [loop for loop in self._told.loops if loop.new in ids]
+            if loops:
+                yield from keep(each, self._close(each, loops), features, origins)
+                changed |= ids
+        yield from (each for each in self._given if each.id not in changed)
+
+    def _close(self, segment: Segment, loops: list[Loop]) -> SelfCalibration:
+        """Take out what is left between maps that were joined.  Returns what is known then."""
+        active, closing = self._active(segment), WholeMap(loops=loops)
+        closing.ask(0, segment, self._calibration, self._parameters)
+        answer = closing.settle()
+        if answer is not None and answer.moves is not None:
+            segment.move(held(answer.moves, self._spans, segment.id))
+            for loop in answer.loops:
+                active.join(loop)
+        active.collect_garbage()
+        return segment.adjust(self._calibration, self._parameters)

@@ -1,0 +1,63 @@
+"""Two map files become one."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pliant.algorithms.mapping.merging import Merged, merge
+from pliant.config import load_config
+from pliant.errors import MapError
+from pliant.files import make_folder
+from pliant.messages.types import WORLD_FRAME_ID, Header, MapKeyframe
+from pliant.recording.map_file import MapFile, MapHeader, write_map
+from pliant.results.folder import keep_apart
+
+
+def merge_maps(first: Path, second: Path, output: Path, *, force: bool) -> Iterator[str]:
+    """Write the one map of two that show the same places, and tell of it in a few lines.
+
+    first, second: result folders or map files.   output: a file.   Raises MapError and ResultError,
+    and has written nothing then: for what is no map or not recognised, for an output that is read
+    from, and for one that is there already unless ``force``.
+    """
+    files = MapFile(first), MapFile(second)
+    keep_apart(output, [file.path for file in files])
+    if output.is_dir():
+        raise MapError(f"{output} is a folder: name a file, such as {output / 'map.pliant'}")
+    if output.exists() and not force:
+        raise MapError(f"{output} exists: choose another --output, or --force to replace it")
+    if files[0].path.resolve() == files[1].path.resolve():
+        raise MapError(f"{second}: the same map twice")
+    known, other = (list(file.keyframes()) for file in files)
+    parameters = load_config().bundle_adjustment
+    try:
+        merged = merge(known, other, parameters)
+    except ValueError as error:
+        raise MapError(f"{first} and {second}: damaged: {error}") from None
+    if merged is None:
+        raise MapError(
+            f"{second}: none of its {len(other)} keyframes shows a place of {first}: nothing is "
+            "written; a run through both with --map joins them"
+        )
+    header = MapHeader(source=files[1].header.source, calibration=files[0].header.calibration)
+    try:
+        make_folder(output.parent)
+    except OSError as error:
+        raise MapError(f"{output}: the map cannot be written: {error.strerror}") from None
+    write_map(output, header, _messages(merged))
+    yield from _told(merged, second, output)
+
+
+def _messages(merged: Merged) -> Iterator[MapKeyframe]:
+    for number, keyframe in enumerate(merged.keyframes):
+        header = Header(frame=number, stamp_ns=0, frame_id=WORLD_FRAME_ID)
+        yield MapKeyframe.of(header, keyframe)
+
+
+def _told(merged: Merged, second: Path, output: Path) -> Iterator[str]:
+    points = sum(len(each.point_ids) for each in merged.keyframes)
+    yield f"{output}: {len(merged.keyframes)} keyframes, {points} points"
+    for old, segment in merged.joined:
+        yield f"segment {old} of {second} lies in segment {segment} now"
+    for old, segment in merged.apart:
+        yield f"segment {old} of {second} shows no place of the other map: it is segment {segment}"
+    yield f"{merged.proofs} pairs of keyframes show the same place"
