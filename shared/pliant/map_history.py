@@ -253,15 +253,22 @@ class MapHistory(CurrentMap):
         """Segment and T_world_camera of every supported frame, after all corrections."""
         return {
             frame: (pose.segment, matrix_to_pose(self._world(pose)))
-            for frame, pose in sorted(self.frames.items())
-            if pose.inliers >= MIN_INLIERS and pose.keyframe in self.keyframes
+            for frame, pose in self._supported()
         }
+
+    def _supported(self) -> list[tuple[int, FramePose]]:
+        """Frames whose poses count, in their order."""
+        return [
+            (frame, pose)
+            for frame, pose in sorted(self.frames.items(), key=lambda item: item[0])
+            if pose.inliers >= MIN_INLIERS and pose.keyframe in self.keyframes
+        ]
 
     def longest_segment(self) -> int:
         """The segment with the most supported frames (the earliest of equals); -1 without any."""
         counts: dict[int, int] = {}
-        for segment, _ in self.final().values():
-            counts[segment] = counts.get(segment, 0) + 1
+        for _, pose in self._supported():
+            counts[pose.segment] = counts.get(pose.segment, 0) + 1
         return max(counts, key=counts.__getitem__, default=-1)
 
     def trajectory_in(self, segment: int, poses: dict[int, tuple[int, F64]]) -> Trajectory:

@@ -330,7 +330,11 @@ def test_viewers_are_told_the_corrected_camera_in_the_end(corrected_run: Path) -
 
 
 def test_images_are_a_source_with_the_pixels_of_the_run(result: Path, tmp_path: Path) -> None:
-    folder = export_result(result, "images", tmp_path / "images")
+    told: list[tuple[int, int]] = []
+    folder = export_result(
+        result, "images", tmp_path / "images", progress=lambda *each: told.append(each)
+    )
+    assert told == [(done, FRAMES) for done in range(1, FRAMES + 1)]
     source, built_in = open_source(str(folder)), open_source("built-in:tiny")
     assert source.frame_count == FRAMES
     assert not source.calibration.lens.distorts

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.image.splats import draw_discs
 from pliant.pictures.movie import write_image
 
 BACKGROUND = (16, 19, 24)
@@ -157,37 +158,15 @@ def _project(points: F64, view: MapView, width: int, height: int) -> tuple[F64, 
 def _splat(
     px: F64, z: F64, colours: U8, size: tuple[int, int], radius: float, reach: float
 ) -> tuple[F32, F32]:
-    """Discs written from far to near, so that the nearest stays: image and depth."""
+    """Discs, of which the nearest is seen: image and depth."""
     width, height = size
     near = 0.02 * reach
     front = z > near
     px, z, colours = px[front], z[front], colours[front]
     radii = np.clip(radius * 0.55 * reach / np.maximum(z, near), 0.8, 3.0 * radius)
-    span = int(np.ceil(3.0 * radius))
-    us: list[F64] = []
-    vs: list[F64] = []
-    rows: list[F64] = []
-    for dv in range(-span, span + 1):
-        for du in range(-span, span + 1):
-            covered = np.flatnonzero(du * du + dv * dv <= radii * radii)
-            if len(covered):
-                us.append(np.floor(px[covered, 0] + 0.5) + du)
-                vs.append(np.floor(px[covered, 1] + 0.5) + dv)
-                rows.append(covered.astype(np.float64))
     image = np.empty((height, width, 3), np.float32)
     image[:] = BACKGROUND
-    depth = np.full((height, width), np.inf, np.float32)
-    if not us:
-        return image, depth
-    u, v = np.concatenate(us).astype(np.int64), np.concatenate(vs).astype(np.int64)
-    row = np.concatenate(rows).astype(np.int64)
-    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    u, v, row = u[inside], v[inside], row[inside]
-    order = np.argsort(-z[row], kind="stable")
-    u, v, row = u[order], v[order], row[order]
-    image[v, u] = colours[row]
-    depth[v, u] = z[row]
-    return image, depth
+    return image, draw_discs(px, z, radii, colours, image)
 
 
 def _shade(image: F32, depth: F32, reach: float) -> U8:
