@@ -23,6 +23,7 @@ from pliant.algorithms.mapping.parameters import (
     WholeMapParameters,
     WindowParameters,
 )
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.whole_map import find_moves
 from pliant.map_history import MapHistory
 from pliant.state import load_state, save_state
@@ -47,17 +48,17 @@ def path(frames):
     return [looking((0.06 * k, 0.03 * np.sin(0.3 * k), 0.0)) for k in range(frames)]
 
 
-def fold(parameters, *, frames=FRAMES, beside=False, killed=False):
+def fold(parameters, *, frames=FRAMES, camera=CAMERA, poses=None, beside=False, killed=False):
     """The mapper, its deltas, and what a reader makes of them.
 
     beside: the answer is found in a thread.   killed: the mapper is another one in every frame.
     """
     asking = Beside()
-    mapper, history, deltas = Mapper(CAMERA, parameters, 0), MapHistory(), []
+    mapper, history, deltas = Mapper(camera, parameters, 0), MapHistory(), []
     generator = np.random.default_rng(0)
     points = generator.uniform((-4.0, -3.0, 3.0), (14.0, 3.0, 9.0), (1500, 3))
     kappas = generator.uniform(5.0, 500.0, len(points)).astype(np.float32)
-    tracks = Scene(points, kappas, death=0.02).frames(path(frames))
+    tracks = Scene(points, kappas, death=0.02).frames(poses or path(frames))
     for frame, some in enumerate(tracks):
         if killed and mapper.whole_map.question is not None:
             mapper = load_state(save_state(mapper))
@@ -186,3 +187,69 @@ def test_poses_of_frames_scale_with_the_map_around_them(grown):
         T = similarity_to_matrix(np.append(pose, 1.0))
         expected = matrix_to_pose(move_by_similarity(similarity_to_matrix(one), T))
         np.testing.assert_allclose(history.final()[frame][1], expected, atol=1e-9)
+
+
+WRONG = replace(CAMERA, fx=1.06 * CAMERA.fx, fy=1.06 * CAMERA.fy)
+"""As it is given; the scene is seen by ``CAMERA``."""
+
+
+def turning(frames=FRAMES):
+    """As ``path``, and it looks about, which tells the focal length."""
+    turns = [(0.2 * np.sin(0.15 * k), 0.3 * np.sin(0.1 * k), 0.0) for k in range(frames)]
+    return [looking(T[:3, 3], turn) for T, turn in zip(path(frames), turns, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def mistaken():
+    return fold(GROWING, camera=WRONG, poses=turning())
+
+
+def test_a_wrong_lens_is_taken_over(mistaken, monkeypatch):
+    mapper, deltas, history = mistaken
+    found = mapper.calibration
+    assert abs(found.correction[0] + np.log(1.06)) < found.sigmas[0]
+    assert abs(found.view.camera.fx / CAMERA.fx - 1.0) < 0.004
+    assert mapper.atlas.active.camera == found.view.camera
+    told = [delta.calibration_correction for delta in deltas]
+    assert 1 <= len(set(told) - {()}) <= 3  # seldom, and then for all that follow
+    assert told[-1] == tuple(found.correction.tolist())
+    monkeypatch.setattr(SelfCalibration, "is_refuted", lambda *_: False)
+    other, _, without = fold(GROWING, camera=WRONG, poses=turning())
+    assert other.calibration.view.camera == WRONG
+    assert causal_error(history) < 0.5 * causal_error(without)
+    assert error_of(mapper.atlas.active, turning()) < 0.1 * error_of(other.atlas.active, turning())
+
+
+def test_a_lens_that_is_found_at_once_needs_no_prior(mistaken):
+    """The final adjustment is not drawn to what has been refuted."""
+    mapper = load_state(save_state(mistaken[0]))
+    mapper.finish()
+    assert abs(mapper.calibration.correction[0] + np.log(1.06)) < 0.005
+
+
+def test_a_right_lens_stays(grown):
+    mapper, deltas, _ = grown
+    assert mapper.calibration.view.camera == CAMERA
+    assert not any(delta.calibration_correction for delta in deltas)
+
+
+def test_readers_have_the_map_under_another_lens(mistaken):
+    test_readers_have_the_map_that_the_mapper_has(mistaken)
+
+
+@pytest.mark.parametrize("how", ["beside", "killed"])
+def test_where_a_lens_was_found_changes_nothing(mistaken, how):
+    _, deltas, _ = mistaken
+    _, others, _ = fold(GROWING, camera=WRONG, poses=turning(), **{how: True})
+    for one, other in zip(deltas, others, strict=True):
+        for name, value in vars(one).items():
+            np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
+
+
+def causal_error(history):
+    """Sim(3) RMSE of the poses of the last frames as they were known at once."""
+    last = [frame for frame in history.causal if frame >= FRAMES - 30]
+    true = np.array(turning())[last, :3, 3]
+    at = np.array([history.causal[frame][1][:3] for frame in last])
+    scale, R, t = align_umeyama(at, true, with_scale=True)
+    return np.sqrt(((scale * at @ R.T + t - true) ** 2).sum(axis=1).mean())

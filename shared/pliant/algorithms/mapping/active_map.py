@@ -300,6 +300,16 @@ class ActiveMap:
         self.window.see_anew()
         self._adjust_window()
 
+    def see_anew(self, camera: PinholeCamera) -> None:
+        """The camera is another one by now, and the keyframes have its pixels."""
+        self.camera, before = camera, self.window
+        self.window = self._window(before.keyframes, fixed=before.fixed, outside=before.outside)
+        self.window.T_world_camera[-1] = before.T_world_camera[-1]
+        if before.keyframes:
+            self._adjust_window()
+            distance = self.segment.inverse_distance
+            self.segment.inverse_distance = self.window.place_directions(distance)
+
     def collect_garbage(self) -> None:
         """Give back the rows of dead candidates and of merged points."""
         collect_garbage(self.points, self.keyframes, self.links.rows, self.segment.id)

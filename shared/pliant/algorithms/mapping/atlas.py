@@ -19,6 +19,7 @@ from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.kept_map import Origin, keep, spans_of, take_in
 from pliant.algorithms.mapping.known_places import KnownPlaces
+from pliant.algorithms.mapping.lens_change import see_by
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.meetings import Meetings, join
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -212,12 +213,23 @@ class Atlas:
             moved = [self.move(held(answer.moves, self._spans, self.segment))]
             for loop in answer.loops:
                 self.active.join(loop)
-        before = self.calibration.readout
-        self.calibration = self.calibration.with_readout(answer.readout, answer.sigma)
-        if not before:
+        before, self.calibration = self.calibration, answer.calibration
+        if not self.calibration.sees_like(before):
+            return [*moved, self._change_lens(self.active, before)]
+        if not before.readout:
             return [*moved, *self.begin_to_unroll()]
         self.active.segment.unroll(self.active.keyframes, self.calibration)
         return moved
+
+    def _change_lens(self, active: ActiveMap, before: SelfCalibration) -> Moved:
+        """Go on under the lens that is known now."""
+        newest = active.keyframes[-1]
+        pose = newest.T_world_camera
+        see_by(active.segment, before.view, self.calibration)
+        active.see_anew(self.calibration.view.camera)
+        self._earlier.see_by(before, self.calibration)
+        self._adjusted = True  # readers have the points as the other lens had them
+        return Moved(newest.T_world_camera @ inverse(pose))
 
     def move(self, moves: MapMoves) -> Moved:
         """Move the segment that the camera is in."""

@@ -3,6 +3,7 @@ when each is adjusted as a whole."""
 
 from typing import NamedTuple
 
+from pliant.algorithms.mapping.lens_change import see_by
 from pliant.algorithms.mapping.map_store import PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.segment import Segment
@@ -38,11 +39,14 @@ class EarlierSegments:
     def like(self, calibration: SelfCalibration) -> list[Segment]:
         """Those whose keyframes have the pixels of a calibration, whatever its readout was, oldest
         first."""
-        view = calibration.view
-        known = view.camera, view.lens
-        views = [each.calibration.view for each in self._kept]
-        same = [(view.camera, view.lens) == known for view in views]
-        return [e.segment for e, fits in zip(self._kept, same, strict=True) if fits]
+        return [each.segment for each in self._kept if each.calibration.sees_like(calibration)]
+
+    def see_by(self, before: SelfCalibration, known: SelfCalibration) -> None:
+        """Those with the pixels of a calibration get those of a better one."""
+        for n, each in enumerate(self._kept):
+            if each.calibration.sees_like(before):
+                see_by(each.segment, each.calibration.view, known)
+                self._kept[n] = each._replace(calibration=known)
 
     def take(self, id: int) -> Segment:
         """A segment goes on."""

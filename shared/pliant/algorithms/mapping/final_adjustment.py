@@ -18,9 +18,6 @@ from pliant.algorithms.mapping.rolling_shutter import readout_flow
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.triangulation import spread_of_rays
 
-_ROLLING = 1.0
-"""Standard deviation of the readout of a shutter that is known to roll."""
-
 _CHUNK = 4096
 """Points whose rays are compared at a time: bounds a dense table of keyframes x points."""
 
@@ -64,7 +61,7 @@ def adjust_keyframes(
     known: of the camera, whose pixels the keyframes have.    motions: (M, 6) of the keyframes, see
     ``Path``.    Returns what is known now, and the rows of points that too few keyframes see.
     """
-    camera, before = known.given, known.view
+    before = known.view
     seen = list_map(keyframes, points, before.camera, parameters.window.lens_radius)
     seen.px = before.seen(seen.px)
     if parameters.calibration.sigmas.any():
@@ -72,10 +69,7 @@ def adjust_keyframes(
             seen.T_world_camera, motions, seen.xyz, seen.camera, seen.point, seen.px, before.camera
         )
     iterations = parameters.window.final_iterations
-    found = adjust_listed(
-        seen, camera, parameters, iterations=iterations, start=known.correction,
-        with_covariance=True,
-    )  # fmt: skip
+    found = adjust_listed(seen, known, parameters, iterations=iterations, start=known.correction)
     known = known.corrected(found.correction, found.covariance, len(keyframes))
     view = known.view
     if seen.flow is not None:
@@ -95,28 +89,23 @@ def adjust_keyframes(
 
 def adjust_listed(
     seen: ListedMap,
-    camera: PinholeCamera,
+    known: SelfCalibration,
     parameters: MappingParameters,
     *,
     iterations: int,
-    start: F64 | None = None,
-    with_covariance: bool = False,
+    start: F64,
 ) -> BundleResult:
     """Schur LM over all but the first keyframe, all points that two see, and the calibration.
 
-    ``seen`` is changed, but for its observations.  start: (6,) correction of the calibration to
-    begin from; where that has a readout, nothing draws it to 0.
+    ``seen`` is changed, but for its observations, which are pixels of the rectified image.
+    known: of the camera.   start: (6,) correction of the calibration to begin from.
     """
     chosen = np.bincount(seen.point, minlength=len(seen.rows)) >= 2
     bundle = parameters.bundle.model_copy(update={"max_iterations": iterations})
-    uncertainty = parameters.calibration if parameters.calibration.sigmas.any() else None
-    if start is not None and start[3] and parameters.calibration.readout > 0.0:
-        wide = max(parameters.calibration.readout, _ROLLING)
-        uncertainty = parameters.calibration.model_copy(update={"readout": wide})
-    problem = _problem(seen, chosen, camera)
-    found = solve_schur(
-        problem, bundle, uncertainty=uncertainty, start=start, with_covariance=with_covariance
-    )
+    uncertain = parameters.calibration.sigmas.any()
+    uncertainty = known.prior(parameters.calibration, start) if uncertain else None
+    problem = _problem(seen, chosen, known.given)
+    found = solve_schur(problem, bundle, uncertainty=uncertainty, start=start, with_covariance=True)
     seen.xyz[chosen] = found.points_world
     seen.T_world_camera = found.T_world_camera
     return found

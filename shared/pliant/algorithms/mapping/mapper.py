@@ -116,11 +116,14 @@ class Mapper:
         stamp_ns: when it was taken, increasing.    grey: (H, W).    colour: (H, W, 3) RGB.
         """
         self._timer, atlas = timer, self.atlas
-        tracks, grey, colour = self.calibration.ideal(tracks, grey, colour)
         if atlas.active is not None:
             with self._timer("whole map"):
+                before = self.calibration
                 self.follow(atlas.catch_up(frame))
+                if not self.calibration.sees_like(before):
+                    self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
             atlas.active.links.follow(tracks.ids)
+        tracks, grey, colour = self.calibration.ideal(tracks, grey, colour)
         seen, rolled = tracks, None
         located = self._locate(frame, stamp_ns, seen, grey)
         active = atlas.active

@@ -37,8 +37,19 @@ _PRINCIPAL_POINT = 0.03
 _HYPOTHESES = np.linspace(-2.0, 2.0, 7)
 """Focal lengths that a start is tried under, in standard deviations of the prior."""
 
+_OF_LENS = np.arange(6) != 3
+"""Which of a correction move pixels: all but the readout."""
+
 _CERTAIN = 4.0
-"""Standard deviations by which the readout of a rolling shutter differs from none."""
+"""Standard deviations by which the readout of a rolling shutter differs from none, and a lens from
+the one in use."""
+
+_UNLIKELY = 2.0
+"""Standard deviations of the given calibration by which a lens that is taken over differs from it:
+what changes under way costs more than what a smaller error does."""
+
+_ROLLING = 1.0
+"""Standard deviation of the readout of a shutter that is known to roll."""
 
 _SLOWEST = 0.1
 """Readout that a rolling shutter exceeds; less is what other errors look like."""
@@ -86,6 +97,50 @@ class SelfCalibration:
         return dataclasses.replace(self, correction=correction, covariance=covariance)
 
     @property
+    def in_use(self) -> F64:
+        """(6,) the correction that is mapped with."""
+        correction = self.correction.copy()
+        correction[3] = self.readout
+        return correction
+
+    def is_refuted(self, correction: F64, covariance: F64, given: CalibrationUncertainty) -> bool:
+        """Whether a correction (6,) that was found with its covariance (6, 6) is certainly of
+        another lens than that in use, and hardly one that is given with this uncertainty."""
+        far = _is_far(correction - self.correction, covariance, _CERTAIN)
+        return far and _is_far(correction, np.diag(given.sigmas**2), _UNLIKELY)
+
+    def prior(self, given: CalibrationUncertainty, start: F64) -> CalibrationUncertainty:
+        """What draws an adjustment that begins from a correction (6,) to the calibration as it was
+        given: next to nothing, where that has been refuted already."""
+        wider: dict[str, float] = {}
+        if given.readout > 0.0 and start[3]:
+            wider["readout"] = max(given.readout, _ROLLING)
+        nothing = dataclasses.replace(self, correction=np.zeros(6))
+        if nothing.is_refuted(self.correction, self.covariance, given):
+            widths = {
+                "focal": _GUESS,
+                "k1": _LENS,
+                "k2": _LENS,
+                "principal_point": _PRINCIPAL_POINT,
+            }
+            known = given.model_dump()
+            wider |= {k: max(known[k], width) for k, width in widths.items() if known[k] > 0.0}
+        return given.model_copy(update=wider)
+
+    def with_lens(self, correction: F64, covariance: F64) -> "SelfCalibration":
+        """With a lens that was found, with its covariance; the readout stays."""
+        correction = np.where(_OF_LENS, correction, self.correction)
+        both = _OF_LENS[:, None] & _OF_LENS
+        return dataclasses.replace(
+            self, correction=correction, covariance=np.where(both, covariance, self.covariance)
+        )
+
+    def sees_like(self, other: "SelfCalibration") -> bool:
+        """Whether both have the same pixels, whatever their readouts are."""
+        one, view = self.view, other.view
+        return (one.camera, one.lens) == (view.camera, view.lens)
+
+    @property
     def view(self) -> CorrectedView:
         """Moves what is seen to where the camera found so far, were it ideal, would see it."""
         return corrected_view(self.given, tuple(self.correction.tolist()))
@@ -117,6 +172,15 @@ class SelfCalibration:
         """With what so many keyframes told of it."""
         following = max(keyframes + 1, int(np.ceil(_GROWTH * keyframes)))
         return SelfCalibration(self.given, correction, covariance, following)
+
+
+def _is_far(step: F64, covariance: F64, sigmas: float) -> bool:
+    """By the Mahalanobis distance of all but the readout."""
+    unknown = (np.diag(covariance) > 0.0) & _OF_LENS
+    C = covariance[np.ix_(unknown, unknown)]
+    if not unknown.any() or not np.isfinite(C).all():
+        return False
+    return float(step[unknown] @ np.linalg.solve(C, step[unknown])) > sigmas**2
 
 
 def is_certain(readout: float, sigma: float) -> bool:

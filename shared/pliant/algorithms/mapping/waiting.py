@@ -6,13 +6,15 @@ turned as the tracks that each shares with the next one tell.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.epipolar import rotation_between
+from pliant.algorithms.mapping.lens_change import moved
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.parameters import LocalisationParameters, MappingParameters
@@ -85,6 +87,11 @@ class Waiting:
             turn = turn_between(self.frames[-1], newest, camera, parameters.localisation)
             turns = [*turns[1 - _KEPT_TURNS :], turn]
         return Waiting(keep_waiting(self.frames, newest, parameters.start), turns)
+
+    def seen_by(self, before: CorrectedView, after: CorrectedView) -> "Waiting":
+        """With the pixels of another ideal camera."""
+        frames = [replace(f, points_px=moved(f.points_px, before, after)) for f in self.frames]
+        return Waiting(frames, self.turns)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,8 @@ Meanwhile the map has grown and the window has moved.  So the result is not wher
 but how the map around each keyframe moves: one similarity for each, as drift is small within what
 a keyframe sees.  The window and all that is new move rigidly with the last keyframe that has left
 the window.  The first keyframe stays, and with it place and scale of the beginning.  Lens, focal
-length and readout are found anew each time; the readout alone is used for what comes next.
+length and readout are found anew each time, and used for what comes next once they are certainly
+other than those in use.
 
 A place that is recognised asks at once, and then the window moves as the rest does: what drifted
 since drifted in the window, too.
@@ -22,7 +23,6 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
-from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.final_adjustment import ListedMap, adjust_listed, list_map
@@ -30,7 +30,7 @@ from pliant.algorithms.mapping.loops import Loop, close_loops
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import readout_flow
 from pliant.algorithms.mapping.segment import Segment
-from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_certain
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 
 _MIN_DEPTH = 1e-6
 
@@ -43,17 +43,16 @@ class Question:
     """A copy of the map of a frame, to be adjusted.
 
     keyframe_ids: (M,).   seen: what they see.   settled: how many of them, the oldest, move each
-    by itself.   readout: as it is known.   loops: to be closed.   hosts, sigmas: (N,) of the points
-    that are seen.
+    by itself.   known: of the camera; ``seen`` has pixels of the rectified image.   loops: to be
+    closed.   hosts, sigmas: (N,) of the points that are seen.
     """
 
     frame: int
     keyframe_ids: I64
     settled: int
     seen: ListedMap
-    camera: PinholeCamera
+    known: SelfCalibration
     parameters: MappingParameters
-    readout: float
     loops: list[Loop] = field(default_factory=list)
     hosts: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))
@@ -61,12 +60,11 @@ class Question:
 
 class Answer(NamedTuple):
     """How the map moves, None where it does not; the loops that were closed, whose points are to be
-    joined; the readout and its standard deviation."""
+    joined; what is known of the camera by now."""
 
     moves: MapMoves | None
     loops: list[Loop]
-    readout: float
-    sigma: float
+    calibration: SelfCalibration
 
 
 @dataclass(kw_only=True)
@@ -100,8 +98,8 @@ class WholeMap:
         camera = calibration.view.camera
         window, growth = parameters.window.keyframes, parameters.whole_map.growth
         count = len(segment.keyframes)
-        # While the window has half of the map it does well by itself, but for the readout.
-        least = parameters.start.keyframes if parameters.calibration.readout > 0.0 else 2 * window
+        # While the window has half of the map it does well by itself, but for the calibration.
+        least = parameters.start.keyframes if parameters.calibration.sigmas.any() else 2 * window
         early = growth == 0.0 or count < max(least, self.due)
         # The window would move with what was there before the camera was recognised.
         early = early or (segment.since > 0 and count - segment.since <= window)
@@ -111,6 +109,7 @@ class WholeMap:
         loops, self.loops = self.loops, []
         points = segment.points
         seen = list_map(segment.keyframes, points, camera, parameters.window.lens_radius)
+        seen.px = calibration.view.seen(seen.px)
         if parameters.calibration.readout > 0.0:
             seen.flow = readout_flow(
                 seen.T_world_camera, segment.path.motions(segment.keyframes), seen.xyz, seen.camera,
@@ -124,9 +123,8 @@ class WholeMap:
             keyframe_ids=keyframe_ids,
             settled=count if loops or count < 2 * window else count - window,
             seen=seen,
-            camera=camera,
+            known=calibration,
             parameters=parameters,
-            readout=calibration.readout,
             loops=loops,
             hosts=np.maximum(hosts, 0),
             sigmas=points.sigmas[seen.rows].astype(np.float64),
@@ -173,28 +171,34 @@ def find_moves(question: Question) -> Answer:
     before, xyz = question.seen.T_world_camera, question.seen.xyz
     depths, loops = question.seen.depths(), question.loops
     seen = replace(question.seen, T_world_camera=before.copy(), xyz=xyz.copy())
+    known, parameters = question.known, question.parameters
     if loops:
+        focal_px = known.view.camera.fx
         seen, kept, loops = close_loops(
-            seen, question.keyframe_ids, question.hosts, question.sigmas, loops, question.camera.fx
+            seen, question.keyframe_ids, question.hosts, question.sigmas, loops, focal_px
         )
         depths = depths[kept]
-    parameters = question.parameters
     found = adjust_listed(
-        seen,
-        question.camera,
-        parameters,
-        iterations=parameters.whole_map.iterations,
-        start=np.array([0.0, 0.0, 0.0, question.readout, 0.0, 0.0]),
-        with_covariance=question.seen.flow is not None,
+        seen, known, parameters, iterations=parameters.whole_map.iterations, start=known.in_use
     )
-    readout, sigma = float(found.correction[3]), float(np.sqrt(found.covariance[3, 3]))
-    if question.readout == 0.0:
-        readout, sigma = _without_prior(readout, sigma, parameters.calibration)
-    # A window that is half of the map does as well, unless it did not know the readout.
-    bent = question.readout == 0.0 and is_certain(readout, sigma)
+    after = _learned(known, found.correction, found.covariance, parameters.calibration)
+    # A window that is half of the map does as well, unless it did not know the camera.
+    bent = (known.readout == 0.0 and after.readout != 0.0) or not after.sees_like(known)
     moving = bent or loops or len(question.keyframe_ids) >= 2 * parameters.window.keyframes
     moves = _moves(question, seen, before, depths) if moving else None
-    return Answer(moves, loops, readout, sigma)
+    return Answer(moves, loops, after)
+
+
+def _learned(
+    known: SelfCalibration, correction: F64, covariance: F64, prior: CalibrationUncertainty
+) -> SelfCalibration:
+    """What is known with what was found."""
+    readout, sigma = float(correction[3]), float(np.sqrt(covariance[3, 3]))
+    if known.readout == 0.0:
+        readout, sigma = _without_prior(readout, sigma, prior)
+    if known.is_refuted(correction, covariance, prior):
+        known = known.with_lens(correction, covariance)
+    return known.with_readout(readout, sigma)
 
 
 def _without_prior(
