@@ -51,6 +51,14 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def open3d_or_skip() -> Any:
+    """The module open3d; skips where it cannot be loaded, as on a machine without its libraries."""
+    try:
+        return require_open3d()
+    except Open3dError as error:
+        pytest.skip(str(error))
+
+
 @pytest.fixture(scope="module")
 def model(result: Path) -> Path:
     return export_result(result, "colmap", None)
@@ -239,7 +247,7 @@ def test_poses_are_those_of_the_result(kind: str, result: Path, tmp_path: Path) 
 
 
 def test_open3d_reads_the_points(result: Path, tmp_path: Path) -> None:
-    open3d: Any = pytest.importorskip("open3d")
+    open3d: Any = open3d_or_skip()
     path = export_result(result, "ply", tmp_path / "points.ply")
     cloud = open3d.io.read_point_cloud(str(path))
     assert len(cloud.points) == len(read_ply(result / "points.ply").points)
@@ -338,10 +346,7 @@ def test_every_is_for_surfaces(result: Path, tmp_path: Path) -> None:
 def test_a_textured_mesh_has_the_colours_that_its_keyframes_show(
     result: Path, tmp_path: Path
 ) -> None:
-    try:
-        require_open3d()
-    except Open3dError as error:
-        pytest.skip(str(error))
+    open3d_or_skip()
     path = export_result(result, "glb", tmp_path / "mesh.glb", triangles=8000)
     assert path.read_bytes()[:4] == b"glTF"
     again = export_result(result, "glb", tmp_path / "again.glb", triangles=8000)
