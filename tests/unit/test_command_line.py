@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 import pliant
 from pliant_services.cli import app, doctor
+from pliant_services.cli.groups import DEVELOPMENT, EVERYDAY, LOOK, MACHINES
 
 importlib.import_module("pliant_services.cli.commands")  # registers them
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
@@ -34,6 +35,26 @@ def test_help_texts_are_shown_whole(name: str) -> None:
     texts = [p.help for p in command.params if getattr(p, "help", "") and not p.hidden]
     for text in (*texts, *command.help.split("\n\n")):
         assert without_spaces(text) in page
+
+
+def headings(page: str) -> list[str]:
+    return [line.rstrip(":") for line in page.splitlines() if line.rstrip().endswith(":")]
+
+
+def test_commands_stand_in_groups() -> None:
+    page = shown("--help")
+    groups = [EVERYDAY, LOOK, MACHINES, DEVELOPMENT]
+    assert headings(page) == ["Options", *groups]
+    assert {command.rich_help_panel for command in COMMANDS.values()} == set(groups)
+    assert page.index("  run ") < page.index("  export ") < page.index(f"{LOOK}:")
+
+
+def test_options_of_run_stand_in_groups_the_everyday_ones_first() -> None:
+    page = shown("run", "--help")
+    first, second, *_, last = headings(page)[1:]  # after the arguments
+    assert (first, last) == ("Everyday options", "Other options")
+    assert page.index(first) < page.index("--output <") < page.index("--fov <") < page.index(second)
+    assert page[page.index(last) :].split()[2] == "--help"
 
 
 def test_the_version_is_said() -> None:

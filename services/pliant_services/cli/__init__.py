@@ -12,10 +12,12 @@ import typer
 
 from pliant import __version__
 from pliant.errors import PliantError, SourceLostError
+from pliant_services.cli.groups import GroupedCommands
 from pliant_services.runtime.interruptions import deliver_swallowed_interruptions
 
 app = typer.Typer(
     name="pliant",
+    cls=GroupedCommands,
     no_args_is_help=True,
     add_completion=False,
     context_settings={"max_content_width": 100},

@@ -1,4 +1,4 @@
-"""Registers every command; each lives in a file of its own."""
+"""Registers every command, in the order of the help page; each lives in a file of its own."""
 
 from pliant_services.cli import (
     app,
@@ -20,21 +20,22 @@ from pliant_services.cli import (
 )
 from pliant_services.cli import evaluate as evaluate_command
 from pliant_services.cli import map as map_commands
+from pliant_services.cli.groups import DEVELOPMENT, EVERYDAY, LOOK, MACHINES, GroupedOptions
 
-app.command("run")(run.run)
-app.command("service")(service.service)
-app.command("certs")(certs.certs)
-app.command("router")(router.router)
-app.command("status")(status.status)
-app.command("stop")(stop.stop)
-app.command("eval")(evaluate_command.evaluate)
-app.command("export")(export.export)
-app.command("view")(view.view)
-app.command("mesh")(mesh.mesh)
-app.command("info")(info.info)
-app.add_typer(map_commands.app, name="map")
-app.command("recover")(recover.recover)
-app.command("replay")(replay.replay)
-app.command("render")(render.render)
-app.command("config")(config.config)
-app.command("doctor")(doctor.doctor)
+app.command("run", cls=GroupedOptions, rich_help_panel=EVERYDAY)(run.run)
+app.command("export", rich_help_panel=EVERYDAY)(export.export)
+app.command("mesh", rich_help_panel=EVERYDAY)(mesh.mesh)
+app.add_typer(map_commands.app, name="map", rich_help_panel=EVERYDAY)
+app.command("config", rich_help_panel=EVERYDAY)(config.config)
+app.command("doctor", rich_help_panel=EVERYDAY)(doctor.doctor)
+app.command("view", rich_help_panel=LOOK)(view.view)
+app.command("info", rich_help_panel=LOOK)(info.info)
+app.command("eval", rich_help_panel=LOOK)(evaluate_command.evaluate)
+app.command("status", rich_help_panel=LOOK)(status.status)
+app.command("stop", rich_help_panel=MACHINES)(stop.stop)
+app.command("service", rich_help_panel=MACHINES)(service.service)
+app.command("router", rich_help_panel=MACHINES)(router.router)
+app.command("certs", rich_help_panel=MACHINES)(certs.certs)
+app.command("replay", rich_help_panel=DEVELOPMENT)(replay.replay)
+app.command("recover", rich_help_panel=DEVELOPMENT)(recover.recover)
+app.command("render", rich_help_panel=DEVELOPMENT)(render.render)

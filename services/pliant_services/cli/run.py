@@ -1,9 +1,19 @@
 """``pliant run``: the whole pipeline on one source."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+
+# The headings of the help page, in this order.
+_everyday = partial(typer.Option, rich_help_panel="Everyday options")
+_source = partial(typer.Option, rich_help_panel="The source")
+_maps = partial(typer.Option, rich_help_panel="Maps of earlier runs")
+_deforming = partial(typer.Option, rich_help_panel="Scenes that deform")
+_recording = partial(typer.Option, rich_help_panel="The recording")
+_settings = partial(typer.Option, rich_help_panel="Settings")
+_faults = partial(typer.Option, rich_help_panel="Faults and network")
 
 
 def run(
@@ -13,91 +23,89 @@ def run(
             help="Folder, video, bag, MCAP file, camera:0 or built-in:room.", show_default=False
         ),
     ],
+    output: Annotated[
+        Path | None, _everyday("--output", "-o", help="Result folder [results/<source>].")
+    ] = None,
+    force: Annotated[bool, _everyday("--force", help="Write into an existing folder.")] = False,
+    calibration: Annotated[
+        Path | None, _everyday(help="Calibration of a video, a camera or bare images.")
+    ] = None,
+    fov: Annotated[
+        float | None, _everyday(help="Horizontal field of view in degrees, for a first try.")
+    ] = None,
+    start: Annotated[
+        float | None, _everyday(min=0.0, help="Begin so many seconds after the first frame.")
+    ] = None,
+    end: Annotated[
+        float | None, _everyday(min=0.0, help="End so many seconds after the first frame.")
+    ] = None,
+    every: Annotated[int | None, _everyday(min=1, help="Take one of so many frames [1].")] = None,
+    sharpest: Annotated[
+        bool, _everyday("--sharpest", help="With --every: the sharpest of them, not the first.")
+    ] = False,
+    view: Annotated[
+        Literal["window", "web"] | None, _everyday(help="Look on in Rerun (pliant view).")
+    ] = None,
+    topic: Annotated[
+        str, _source(help="The images of an MCAP file or ROS bag that has several.")
+    ] = "",
+    max_size: Annotated[
+        int | None,
+        _source(min=1, help="Pixels along the longer side [what the details need]."),
+    ] = None,
+    mode: Annotated[
+        Literal["lossless", "live"] | None,
+        _source(help="Nobody drops a frame, or the newest wins [live for a camera]."),
+    ] = None,
+    known: Annotated[
+        Path | None,
+        _maps("--map", help="Go on in the map of an earlier run: its folder or map.pliant."),
+    ] = None,
+    localise: Annotated[
+        bool, _maps("--localise", help="Find each frame in that map, and map nothing.")
+    ] = False,
     profile: Annotated[
         Literal["rigid", "deformable"],
-        typer.Option(help="A rigid scene's map, or surfels on a surface that deforms."),
+        _deforming(help="A rigid scene's map, or surfels on a surface that deforms."),
     ] = "rigid",
     camera: Annotated[
         Literal["static", "moving"] | None,
-        typer.Option(help="deformable: whether the camera stands still [surfels.camera]."),
-    ] = None,
-    depth_frames: Annotated[
-        Literal["first", "all"] | None,
-        typer.Option(help="deformable: depth maps that are used [ingest.depth]."),
+        _deforming(help="deformable: whether the camera stands still [surfels.camera]."),
     ] = None,
     depth: Annotated[
         Literal["sensor", "map", "flat"] | None,
-        typer.Option(
+        _deforming(
             help="deformable: where surfels start: on depth maps of the source, on our own map of "
             "a scene that holds still at first, or on a plane [surfels.depth_from]."
         ),
     ] = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Result folder [results/<source>].")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write into an existing folder.")] = False,
-    config_file: Annotated[
-        Path | None, typer.Option("--config", help="YAML file over the defaults.")
-    ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE over the file; may be repeated.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of every random choice.")] = None,
-    calibration: Annotated[
-        Path | None, typer.Option(help="Calibration of a video, a camera or bare images.")
-    ] = None,
-    fov: Annotated[
-        float | None, typer.Option(help="Horizontal field of view in degrees, for a first try.")
-    ] = None,
-    known: Annotated[
-        Path | None,
-        typer.Option("--map", help="Go on in the map of an earlier run: its folder or map.pliant."),
-    ] = None,
-    localise: Annotated[
-        bool, typer.Option("--localise", help="Find each frame in that map, and map nothing.")
-    ] = False,
-    topic: Annotated[
-        str, typer.Option(help="The images of an MCAP file or ROS bag that has several.")
-    ] = "",
-    start: Annotated[
-        float | None, typer.Option(min=0.0, help="Begin so many seconds after the first frame.")
-    ] = None,
-    end: Annotated[
-        float | None, typer.Option(min=0.0, help="End so many seconds after the first frame.")
-    ] = None,
-    every: Annotated[
-        int | None, typer.Option(min=1, help="Take one of so many frames [1].")
-    ] = None,
-    sharpest: Annotated[
-        bool, typer.Option("--sharpest", help="With --every: the sharpest of them, not the first.")
-    ] = False,
-    max_size: Annotated[
-        int | None,
-        typer.Option(min=1, help="Pixels along the longer side [what the details need]."),
-    ] = None,
-    view: Annotated[
-        Literal["window", "web"] | None, typer.Option(help="Look on in Rerun (pliant view).")
-    ] = None,
-    save: Annotated[
-        Path | None, typer.Option(help="What a viewer sees, as an .rrd file of Rerun's.")
-    ] = None,
-    mode: Annotated[
-        Literal["lossless", "live"] | None,
-        typer.Option(help="Nobody drops a frame, or the newest wins [live for a camera]."),
-    ] = None,
-    on_crash: Annotated[
-        Literal["stop", "restart"],
-        typer.Option(help="A service that dies ends the run, or goes on where it was."),
-    ] = "stop",
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Take up a run again that was cut off (power, kill).")
-    ] = False,
-    port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Port of the router [a free one].")
+    depth_frames: Annotated[
+        Literal["first", "all"] | None,
+        _deforming(help="deformable: depth maps that are used [ingest.depth]."),
     ] = None,
     images: Annotated[
-        bool, typer.Option("--images/--no-images", help="Record the images, too.")
+        bool, _recording("--images/--no-images", help="Record the images, too.")
     ] = True,
+    save: Annotated[
+        Path | None, _recording(help="What a viewer sees, as an .rrd file of Rerun's.")
+    ] = None,
+    config_file: Annotated[
+        Path | None, _settings("--config", help="YAML file over the defaults.")
+    ] = None,
+    overrides: Annotated[
+        list[str] | None, _settings("--set", help="KEY=VALUE over the file; may be repeated.")
+    ] = None,
+    seed: Annotated[int | None, _settings(help="Seed of every random choice.")] = None,
+    on_crash: Annotated[
+        Literal["stop", "restart"],
+        _faults(help="A service that dies ends the run, or goes on where it was."),
+    ] = "stop",
+    resume: Annotated[
+        bool, _faults("--resume", help="Take up a run again that was cut off (power, kill).")
+    ] = False,
+    port: Annotated[
+        int | None, _faults(min=1, max=65535, help="Port of the router [a free one].")
+    ] = None,
 ) -> None:
     """Track, map and record a video; write trajectory, points and report.
 

@@ -1,0 +1,47 @@
+"""Help pages in groups: commands and options under the heading that they are declared with."""
+
+from typing import Any
+
+from typer.core import TyperCommand, TyperGroup
+
+EVERYDAY, LOOK, MACHINES, DEVELOPMENT = "Everyday", "Look", "Machines", "Development"
+"""Of commands, as their ``rich_help_panel``, which typer shows with Rich alone: that would load
+half of Rich for each help page, and take [the defaults] in help texts for markup."""
+
+
+class GroupedCommands(TyperGroup):
+    """``pliant``: each command with the whole first sentence of its help."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        groups: dict[str, list[tuple[str, str]]] = {
+            name: [] for name in (EVERYDAY, LOOK, MACHINES, DEVELOPMENT)
+        }
+        for name in self.list_commands(ctx):
+            command: Any = self.get_command(ctx, name)
+            if not command.hidden:
+                row = name, command.get_short_help_str(1000)
+                groups.setdefault(command.rich_help_panel or "Other", []).append(row)
+        _write(groups, formatter)
+
+
+class GroupedOptions(TyperCommand):
+    """A command with many options: each under its heading, in the order of declaration."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None:
+                kind = "Arguments" if parameter.param_type_name == "argument" else "Other options"
+                panel: str | None = getattr(parameter, "rich_help_panel", None)
+                groups.setdefault(panel or kind, []).append(record)
+        _write(groups, formatter)
+
+
+def _write(groups: dict[str, list[tuple[str, str]]], formatter: Any) -> None:
+    # One width for all, so that the second column is one.
+    widest = max(len(first) for rows in groups.values() for first, _ in rows)
+    for heading, rows in groups.items():
+        if rows:
+            with formatter.section(heading):
+                formatter.write_dl([(first.ljust(widest), text) for first, text in rows])
