@@ -19,6 +19,8 @@ from pliant.formats.tum import read_tum
 
 TINY = "built-in:tiny"
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> pliant.Result:

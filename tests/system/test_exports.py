@@ -32,23 +32,14 @@ from pliant.results.run import read_run
 from pliant.viewers.point_blocks import BLOCK_POINTS, PointBlocks
 from pliant_services.nodes import recorder
 
+pytestmark = pytest.mark.system
 FRAMES = 40
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The result of a run on the smallest built-in sequence."""
-    folder = tmp_path_factory.mktemp("result")
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "pliant_services.cli", "run", "built-in:tiny"),
-            *("--output", folder, "--force"),
-        ],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    return folder
+def result(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run's result, to which exports may be added."""
+    return Path(shutil.copytree(tiny_run, tmp_path_factory.mktemp("result") / "tiny"))
 
 
 def open3d_or_skip() -> Any:

@@ -23,11 +23,12 @@ from pliant.results.page.advice import advice
 from pliant.results.page.scene import MAX_TRIANGLES, make_scene, simplified
 from pliant.results.write import write_results
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> pliant.Result:
-    folder = tmp_path_factory.mktemp("page") / "result"
-    return pliant.run("built-in:tiny", output=folder, quiet=True)
+def result(tiny_run: Path) -> pliant.Result:
+    return pliant.open(tiny_run)
 
 
 @pytest.fixture(scope="module")
