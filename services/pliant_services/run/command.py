@@ -14,7 +14,7 @@ from pliant.config import Config, config_yaml, load_config
 from pliant.datasets import open_source
 from pliant.datasets.base import is_builtin
 from pliant.datasets.calibration import Calibration
-from pliant.datasets.calibration_files import UNDERSTOOD
+from pliant.datasets.calibration_formats import UNDERSTOOD
 from pliant.datasets.rectifier import Rectifier
 from pliant.datasets.working_size import SmallerImages
 from pliant.errors import CalibrationError, PliantError, ResultError
