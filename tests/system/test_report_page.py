@@ -12,6 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from running import TINY
+from running import pliant as pliant_command
 
 import pliant
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
@@ -98,6 +100,27 @@ def test_a_browser_draws_it(result: pliant.Result, tmp_path: Path) -> None:
     assert 0.03 < drawn.mean() < 0.99  # a map on its ground, not a blank canvas
     orange = (view[..., 2] > 180) & (view[..., 0] < 120)
     assert orange.sum() > 20  # the camera's path
+
+
+def test_the_truth_adds_the_error_over_time(result: pliant.Result, tmp_path: Path) -> None:
+    folder = tmp_path / "result"
+    shutil.copytree(result.path, folder)
+    page = folder / "report.html"
+    before = page.read_text(encoding="utf-8")
+    said: list[str] = []
+    for _ in range(2):  # the second instead of the first
+        done = pliant_command("eval", folder, "--groundtruth", TINY)
+        assert done.returncode == 0, done.stderr
+        assert f"error over time: {page}" in done.stdout
+        said.append(page.read_text(encoding="utf-8"))
+    assert said[0] == said[1]
+    head, section, rest = said[0].split("<!-- against the truth -->")
+    assert before == f"{head}{'<!-- against the truth -->' * 2}{rest}"
+    final, causal = re.findall(r'<polyline [^>]*points="([^"]+)"', section)
+    assert len(final.split()) == len(result.trajectory)
+    assert len(causal.split()) == len(result.causal_trajectory)
+    (rmse,) = re.findall(r"final \(blue\): RMSE ([^;]+);", section)
+    assert re.search(rf"ATE RMSE +{re.escape(rmse)} ", done.stdout)
 
 
 def test_a_page_without_a_map_says_why(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 from pliant.datasets.base import is_builtin
 from pliant.datasets.builtin import builtin_folder
 from pliant.errors import ResultError
+from pliant.evaluation.error_over_time import error_over_time
 from pliant.evaluation.report import (
     evaluation_to_json,
     format_evaluation,
@@ -16,8 +17,9 @@ from pliant.evaluation.report import (
     summary_to_json,
     write_json,
 )
-from pliant.evaluation.result import evaluate_result
-from pliant.results.folder import files_read, keep_apart
+from pliant.evaluation.result import Evaluation, evaluate_result
+from pliant.results.folder import PAGE_NAME, files_read, keep_apart
+from pliant.results.page.page import put_truth_in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +67,7 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         for summary in summaries:
             yield format_summary(summary)
         figures = {summary.kind: summary_to_json(summary) for summary in summaries}
+    yield from _tell_pages(request.results, evaluations)
     if request.plot is not None:
         from pliant.evaluation.plots import plot_errors
 
@@ -84,6 +87,20 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         yield from mesh_against_truth(request.results[0], truth, evaluations[0], figures)
     if request.json is not None:
         write_json(request.json, figures)
+
+
+def _tell_pages(results: Sequence[Path], evaluations: Sequence[Evaluation]) -> Iterator[str]:
+    """Draw the error over time into the pages of result folders."""
+    for result, evaluation in zip(results, evaluations, strict=True):
+        page = result / PAGE_NAME
+        drawn = error_over_time(evaluation)
+        if drawn and page.is_file():
+            try:
+                put_truth_in(page, drawn)
+            except OSError as error:
+                yield f"{page}: the error over time is not in it ({error.strerror})"
+            else:
+                yield f"error over time: {page}"
 
 
 def _evaluate_surfels(request: EvaluationRequest) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 import base64
 import math
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -16,11 +16,13 @@ from pliant import __version__
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.geometry import inverse, pose_to_matrix, transform
 from pliant.errors import ResultError
+from pliant.files import write_whole
 from pliant.formats.text import write_bytes
 from pliant.pictures.movie import encode_animation
 from pliant.recording.reader import Recording
 from pliant.results.mesh import mesh_of
 from pliant.results.page.advice import advice
+from pliant.results.page.chart import BLUE, ORANGE, Line, chart
 from pliant.results.page.scene import make_scene
 from pliant.results.run import Run, SeenKeyframe, seen_by_keyframes
 
@@ -28,7 +30,7 @@ _PICTURES = 24
 _WIDTH_PX = 480
 _FPS = 4.0
 _DOT, _DOTS = 1.2, 3000
-_CHART = (720, 150)
+_TRUTH = "<!-- against the truth -->"
 _SOME_READOUT = 0.05
 """Of the frame interval: less is none, as well as images tell."""
 
@@ -47,12 +49,20 @@ def write_page(
         clip=_clip(run, recording),
         figures=_rows(_figures(run, report)),
         chart=_chart(run, report, final),
+        truth=_TRUTH * 2,
         advice=_advice(report, run),
         times=_rows(_times(report)),
         files=_rows([(name, what) for name, what in _FILES.items() if name in names]),
         version=escape(__version__),
     )
     write_bytes(path, text.encode())
+
+
+def put_truth_in(path: Path, section: str) -> None:
+    """Put what the truth says into a page, instead of what it said before.  Raises OSError."""
+    parts = path.read_text(encoding="utf-8").split(_TRUTH)
+    if len(parts) == 3:
+        write_whole(path, f"{parts[0]}{_TRUTH}{section}{_TRUTH}{parts[2]}")
 
 
 _FILES = {
@@ -191,36 +201,19 @@ def _chart(run: Run, report: dict[str, Any], final: dict[int, tuple[int, F64]]) 
     frames = sorted(run.tracks)
     if len(frames) < 2:
         return ""
-    width, height = _CHART
-    most = max(*tracks, *inliers, 1)
-    across = (width - 60.0) / (frames[-1] - frames[0])
-    at = {frame: 50.0 + across * (frame - frames[0]) for frame in frames}
-
-    def line(values: Sequence[float], numbers: Sequence[int], colour: str) -> str:
-        step = max(1, len(numbers) // width)
-        places = " ".join(
-            f"{at[frame]:.1f},{height - 20.0 - (height - 30.0) * value / most:.1f}"
-            for frame, value in list(zip(numbers, values, strict=True))[::step]
-        )
-        return f'<polyline fill="none" stroke="{colour}" stroke-width="1.5" points="{places}"/>'
-
-    wide = max(across, 0.7)
-    lost = "".join(
-        f'<rect class="lost" x="{at[f]:.1f}" y="10" width="{wide:.1f}" height="{height - 30}"/>'
-        for f in frames
-        if f not in final
-    )
     stamps = run.history.stamps_ns
     seconds = 1e-9 * (max(stamps.values()) - min(stamps.values())) if stamps else 0.0
-    mapped = sorted(run.inliers)
+    most = max(*tracks, *inliers, 1)
+    drawn = chart(
+        [Line(frames, tracks, BLUE), Line(sorted(run.inliers), inliers, ORANGE)],
+        span=(frames[0], frames[-1]),
+        top=most,
+        says=("tracks and inliers", f"{most:,}", f"{seconds:.1f} s"),
+        shaded=[frame for frame in frames if frame not in final],
+    )
     return (
-        f'<figure><svg viewBox="0 0 {width} {height}" role="img" aria-label="tracks and inliers">'
-        f'{lost}<line class="axis" x1="50" x2="{width - 10}" y1="{height - 20}" '
-        f'y2="{height - 20}"/>{line(tracks, frames, "#3d8bfd")}{line(inliers, mapped, "#f08c2e")}'
-        f'<text x="4" y="16">{most:,}</text><text x="4" y="{height - 16}">0</text>'
-        f'<text x="{width - 10}" y="{height - 4}" text-anchor="end">{seconds:.1f} s</text></svg>'
-        "<figcaption>Tracks (blue), and those of them that the map explains (orange). "
-        "Shaded: frames without a pose.</figcaption></figure>"
+        f"<figure>{drawn}<figcaption>Tracks (blue), and those of them that the map explains "
+        "(orange). Shaded: frames without a pose.</figcaption></figure>"
     )
 
 

@@ -1,0 +1,35 @@
+"""The error over time (VITAMIN-E Fig. 4) as a section of report.html."""
+
+from html import escape
+
+from pliant.evaluation.report import metres
+from pliant.evaluation.result import Evaluation
+from pliant.results.page.chart import BLUE, ORANGE, Line, chart
+
+
+def error_over_time(evaluation: Evaluation) -> str:
+    """HTML: the distance to the true position, final and causal; "" where nothing was aligned."""
+    parts = [part for part in (evaluation.final, evaluation.causal) if part and len(part.errors_m)]
+    if not parts:
+        return ""
+    colours = {"final": ("blue", BLUE), "causal": ("orange", ORANGE)}
+    last = max(float(part.times_s[-1]) for part in parts)
+    largest = max(float(part.errors_m.max()) for part in parts)
+    lines = [
+        Line(part.times_s.tolist(), part.errors_m.tolist(), colours[part.kind][1]) for part in parts
+    ]
+    told = "; ".join(
+        f"{part.kind} ({colours[part.kind][0]}): "
+        + (f"RMSE {metres(part.ate_m.rmse)}" if part.ate_m else escape(part.reason))
+        for part in parts
+    )
+    drawn = chart(
+        lines,
+        span=(0.0, last),
+        top=max(largest, 1e-12),
+        says=("error over time", metres(largest), f"{last:.1f} s"),
+    )
+    return (
+        f"<h2>Against the truth</h2><figure>{drawn}<figcaption>Distance to the true position, "
+        f"after the alignment of the whole trajectory (Sim(3)): {told}.</figcaption></figure>"
+    )
