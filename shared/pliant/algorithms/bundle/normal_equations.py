@@ -29,6 +29,7 @@ from pliant.algorithms.bundle.packed_layout import Places, Slots
 from pliant.algorithms.bundle.projection import (
     Cameras,
     Limits,
+    Seen,
     apply_metric,
     corner,
     couple,
@@ -85,7 +86,7 @@ def linearise_observations(
         _gather(points, slots.point[b], near)
         _linearise(
             motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m),
-            near[0], near[1], near[2], slots.u[b], slots.v[b], slots.w[b], limits, local,
+            (near[0], near[1], near[2]), Seen(slots.u[b], slots.v[b], slots.w[b]), limits, local,
         )  # fmt: skip
         camera_block(local, normal[m])
         for i in range(BLOCK):
@@ -104,12 +105,13 @@ def _gather(points: F64, columns: I32, near: F64) -> None:
 
 @fast_kernel
 def _linearise(
-    T: Any, K: Any, lens: Any, X: F64, Y: F64, Z: F64, u: F32, v: F32, w: F32, limits: Limits,
-    local: F64,
-) -> None:  # fmt: skip
+    T: Any, K: Any, lens: Any, points: tuple[F64, F64, F64], seen: Seen, limits: Limits, local: F64
+) -> None:
+    X, Y, Z = points
+    u, v, w = seen
     for i in range(BLOCK):
         x, y, iz, m00, m01, m11, e0, e1, _ = observe(
-            1.0, T, K, lens, X[i], Y[i], Z[i], u[i], v[i], w[i], limits
+            1.0, T, K, lens, (X[i], Y[i], Z[i]), Seen(u[i], v[i], w[i]), limits
         )
         local[i] = x
         local[BLOCK + i] = y
@@ -131,18 +133,20 @@ def cost_of_observations(cameras: Cameras, points: F64, slots: Slots, limits: Li
         _gather(points, slots.point[b], near)
         total += _cost(
             motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m),
-            near[0], near[1], near[2], slots.u[b], slots.v[b], slots.w[b], limits,
+            (near[0], near[1], near[2]), Seen(slots.u[b], slots.v[b], slots.w[b]), limits,
         )  # fmt: skip
     return 0.5 * total
 
 
 @fast_kernel
 def _cost(
-    T: Any, K: Any, lens: Any, X: F64, Y: F64, Z: F64, u: F32, v: F32, w: F32, limits: Limits
+    T: Any, K: Any, lens: Any, points: tuple[F64, F64, F64], seen: Seen, limits: Limits
 ) -> float:
+    X, Y, Z = points
+    u, v, w = seen
     total = 0.0
     for i in range(BLOCK):
-        _, _, _, front, du, dv = residual(1.0, T, K, lens, X[i], Y[i], Z[i], u[i], v[i], limits)
+        _, _, _, front, du, dv = residual(1.0, T, K, lens, (X[i], Y[i], Z[i]), u[i], v[i], limits)
         total += robust_cost(1.0, du, dv, w[i], front, limits)
     return total
 
@@ -162,8 +166,8 @@ def squared_residuals(
         for i in range(BLOCK):
             n = slots.point[b, i]
             _, _, _, front, du, dv = residual(
-                1.0, T, K, lens, points[0, n], points[1, n], points[2, n], slots.u[b, i],
-                slots.v[b, i], limits,
+                1.0, T, K, lens, (points[0, n], points[1, n], points[2, n]),
+                slots.u[b, i], slots.v[b, i], limits,
             )  # fmt: skip
             good = front & (slots.w[b, i] > 0.0)
             out[slots.place[b, i]] = np.float32(du * du + dv * dv) if good else np.float32(np.inf)

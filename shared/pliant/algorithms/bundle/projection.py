@@ -28,6 +28,7 @@ from pliant.compiler.kernel import fast_kernel, kernel
 
 _Number: TypeAlias = Any
 _Camera: TypeAlias = Any
+_Point: TypeAlias = tuple[Any, Any, Any]
 
 _BEHIND_PX2 = 1e8
 """Squared residual charged behind a camera without a kernel; above all real ones, and constant."""
@@ -51,6 +52,14 @@ class Cameras(NamedTuple):
     def single(self) -> "Cameras":
         """In float32."""
         return Cameras(*(np.asarray(each, np.float32) for each in self))
+
+
+class Seen(NamedTuple):
+    """Where a camera sees a point, px, and how much that counts; or arrays of these."""
+
+    u: Any
+    v: Any
+    w: Any
 
 
 class Limits(NamedTuple):
@@ -117,10 +126,10 @@ def _lens_of(lens: Any, m: int) -> Any:
 
 @fast_kernel
 def residual(
-    one: _Number, T: _Camera, K: _Camera, lens: Any, X: Any, Y: Any, Z: Any, u: Any, v: Any,
-    limits: Limits,
-) -> Any:  # fmt: skip
+    one: _Number, T: _Camera, K: _Camera, lens: Any, point: _Point, u: Any, v: Any, limits: Limits
+) -> Any:
     """(x, y, 1/z, in front, residual u, residual v); behind the camera: finite nonsense."""
+    X, Y, Z = point
     z = T[6] * X + T[7] * Y + T[8] * Z + T[11]
     front = (z > limits.min_depth) & (abs(z) > limits.min_distance)
     iz = one / (z if front else one)
@@ -142,11 +151,11 @@ def robust_cost(one: _Number, du: Any, dv: Any, w: Any, front: Any, limits: Limi
 
 @fast_kernel
 def observe(
-    one: _Number, T: _Camera, K: _Camera, lens: Any, X: Any, Y: Any, Z: Any, u: Any, v: Any, w: Any,
-    limits: Limits,
-) -> Any:  # fmt: skip
+    one: _Number, T: _Camera, K: _Camera, lens: Any, point: _Point, seen: Seen, limits: Limits
+) -> Any:
     """(x, y, 1/z, m00, m01, m11, e0, e1, cost): one observation linearised, see the module."""
-    x, y, iz, front, du, dv = residual(one, T, K, lens, X, Y, Z, u, v, limits)
+    u, v, w = seen
+    x, y, iz, front, du, dv = residual(one, T, K, lens, point, u, v, limits)
     s = du * du + dv * dv
     k = one / (one + s * limits.inverse_sigma2)
     cost = w * (s * k if front else limits.behind)

@@ -221,7 +221,7 @@ def _total_cost(cameras: Cameras, points: F64, table: Table, limits: Limits) -> 
             um, vm, wm = table.u[m, lo:], table.v[m, lo:], table.w[m, lo:]
             for i in range(BLOCK):
                 _, _, _, front, du, dv = residual(
-                    1.0, T, K, lens, X[i], Y[i], Z[i], um[i], vm[i], limits
+                    1.0, T, K, lens, (X[i], Y[i], Z[i]), um[i], vm[i], limits
                 )
                 total += robust_cost(1.0, du, dv, wm[i], front, limits)
     return 0.5 * total
@@ -236,7 +236,7 @@ def _squared_residuals(cameras: Cameras, points: F64, table: Table, limits: Limi
         um, vm, wm, om = table.u[m], table.v[m], table.w[m], out[m]
         for i in range(X.size):
             _, _, _, front, du, dv = residual(
-                1.0, T, K, lens, X[i], Y[i], Z[i], um[i], vm[i], limits
+                1.0, T, K, lens, (X[i], Y[i], Z[i]), um[i], vm[i], limits
             )
             good = front & (wm[i] > 0.0)
             om[i] = np.float32(du * du + dv * dv) if good else np.float32(np.inf)

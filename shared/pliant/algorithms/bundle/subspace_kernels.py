@@ -9,6 +9,7 @@ from pliant.algorithms.bundle.layout import BLOCK, Table
 from pliant.algorithms.bundle.projection import (
     Cameras,
     Limits,
+    Seen,
     apply_metric,
     corner,
     lens_of,
@@ -47,7 +48,7 @@ def _linearise_points(
     um, vm, wm = table.u[m, lo:hi], table.v[m, lo:hi], table.w[m, lo:hi]
     for i in range(BLOCK):
         x, y, iz, m00, m01, m11, e0, e1, own = observe(
-            ONE, T, K, lens, X[i], Y[i], Z[i], um[i], vm[i], wm[i], limits
+            ONE, T, K, lens, (X[i], Y[i], Z[i]), Seen(um[i], vm[i], wm[i]), limits
         )
         cost[i] += own
         p0, p1, p2, q0, q1, q2 = point_rows(T, x, y, iz)
@@ -81,17 +82,9 @@ def _cost_of_points(
     um, vm, wm = table.u[m, lo:hi], table.v[m, lo:hi], table.w[m, lo:hi]
     for i in range(BLOCK):
         _, _, _, front, du, dv = residual(
-            ONE,
-            T,
-            K,
-            lens,
-            points[i],
-            points[BLOCK + i],
-            points[2 * BLOCK + i],
-            um[i],
-            vm[i],
-            limits,
-        )
+            ONE, T, K, lens, (points[i], points[BLOCK + i], points[2 * BLOCK + i]),
+            um[i], vm[i], limits,
+        )  # fmt: skip
         cost[i] += robust_cost(ONE, du, dv, wm[i], front, limits)
 
 
@@ -182,7 +175,7 @@ def linearise_camera(
         g0 = g1 = g2 = g3 = g4 = g5 = ZERO
         for i in range(hi - lo):
             x, y, iz, m00, m01, m11, e0, e1, cost = observe(
-                ONE, T, K, lens, X[i], Y[i], Z[i], um[i], vm[i], wm[i], limits
+                ONE, T, K, lens, (X[i], Y[i], Z[i]), Seen(um[i], vm[i], wm[i]), limits
             )
             total += cost
             a2, b2 = -x * iz, -y * iz
@@ -243,7 +236,7 @@ def camera_cost(
     um, vm, wm = table.u[m], table.v[m], table.w[m]
     total = ZERO
     for i in range(X.size):
-        _, _, _, front, du, dv = residual(ONE, T, K, lens, X[i], Y[i], Z[i], um[i], vm[i], limits)
+        _, _, _, front, du, dv = residual(ONE, T, K, lens, (X[i], Y[i], Z[i]), um[i], vm[i], limits)
         total += robust_cost(ONE, du, dv, wm[i], front, limits)
     return float(total)
 
