@@ -30,9 +30,11 @@ from pliant.algorithms.bundle.projection import (
     Cameras,
     Limits,
     Seen,
+    Triangle,
     apply_metric,
     corner,
     couple,
+    factor_point,
     lens_of,
     motion_of,
     observe,
@@ -48,6 +50,32 @@ RECORD, FACTOR = 8, 9
 SHARED = 6
 """Unknowns of a shared calibration: see ``calibration``."""
 _SINGULAR = 1e-14
+
+
+class Linearised(NamedTuple):
+    """The observations of one state: what no damping changes.
+
+    records: (O + 1, RECORD).     motion: (M, 12).     shared: (P, SHARED 3) H_cp of the shared
+    calibration by rows, whose position is the last; (0, ...): there is none.
+    """
+
+    records: F64
+    shared: F64
+    places: Places
+    motion: F64
+
+
+class CameraSystem(NamedTuple):
+    """``S x = b`` of the F movable cameras, and of a shared calibration, packed as in ``reduced``.
+
+    position: (M,) of each camera, -1 for a fixed one.     block: (N, N) of ``Pattern``.
+    S: (K, 36).     b: (N, 6).
+    """
+
+    position: I32
+    block: I32
+    S: F64
+    b: F64
 
 
 class Scratch(NamedTuple):
@@ -233,26 +261,15 @@ def camera_block(local: F64, normal: F64) -> None:
 
 @fast_kernel
 def eliminate_points(
-    records: F64,
-    shared: F64,
-    places: Places,
-    free: I32,
-    motion: F64,
-    damping: float,
-    block: I32,
-    scratch: Scratch,
-    factors: F64,
-    S: F64,
-    b: F64,
+    state: Linearised, damping: float, system: CameraSystem, scratch: Scratch, factors: F64
 ) -> None:
-    """Factor every point's block and take the points out of the system of the F movable cameras.
+    """Factor every point's block and take the points out of the system.
 
-    shared: (P, SHARED 3) H_cp of the shared calibration by rows, whose position is the last;
-    (0, ...): there is none.     free: (M,) position of each camera, -1 for a fixed one.
-    motion: (M, 12).     block: (N, N) of ``Pattern``.
+    To S ``- U U^T`` is added, to b ``- U y``.
     factors: (P, FACTOR) are written, 0 for a point without information.
-    S: (K, 36): ``- U U^T`` is added.     b: (N, 6): ``- U y`` is added.
     """
+    records, shared, places, motion = state.records, state.shared, state.places, state.motion
+    free, block, S, b = system.position, system.block, system.S, system.b
     grow = 1.0 + damping
     seen, U, rows = scratch.seen, scratch.U, scratch.rows
     for point in range(places.start.size):
@@ -285,9 +302,8 @@ def eliminate_points(
                 seen[q, 0], seen[q, 1], seen[q, 2] = x, y, iz
                 seen[q, 3], seen[q, 4], seen[q, 5] = a0, a1, a2
                 seen[q, 6], seen[q, 7], seen[q, 8] = c0, c1, c2
-        i00, l10, i11, l20, l21, i22 = factor_point(
-            1.0, grow * v00, v10, grow * v11, v20, v21, grow * v22, _SINGULAR
-        )
+        damped = Triangle(grow * v00, v10, grow * v11, v20, v21, grow * v22)
+        i00, l10, i11, l20, l21, i22 = factor_point(1.0, damped, _SINGULAR)
         y0 = g0 * i00
         y1 = (g1 - l10 * y0) * i11
         y2 = (g2 - l20 * y0 - l21 * y1) * i22
@@ -340,43 +356,15 @@ def eliminate_points(
 
 
 @fast_kernel
-def factor_point(
-    one: Any, d00: Any, v10: Any, d11: Any, v20: Any, v21: Any, d22: Any, smallest: Any
-) -> Any:
-    """1/l00, l10, 1/l11, l20, l21, 1/l22; all 0 where not positive definite."""
-    zero = one - one
-    ok = d00 > zero
-    i00 = one / np.sqrt(d00 if ok else one)
-    l10, l20 = v10 * i00, v20 * i00
-    rest = d11 - l10 * l10
-    ok = ok & (rest > smallest * d11)
-    i11 = one / np.sqrt(rest if ok else one)
-    l21 = (v21 - l20 * l10) * i11
-    rest = d22 - l20 * l20 - l21 * l21
-    ok = ok & (rest > smallest * d22)
-    i22 = one / np.sqrt(rest if ok else one)
-    if not ok:
-        return zero, zero, zero, zero, zero, zero
-    return i00, l10, i11, l20, l21, i22
-
-
-@fast_kernel
 def substitute(
-    records: F64,
-    shared: F64,
-    places: Places,
-    motion: F64,
-    steps: F64,
-    change: F64,
-    factors: F64,
-    points: F64,
-    out: F64,
+    state: Linearised, steps: F64, change: F64, factors: F64, points: F64, out: F64
 ) -> None:
     """Move the points (Eq. 10).
 
     steps: (M, 6) of every camera, 0 where fixed.     change: (SHARED,) of the shared calibration.
     points, out: (3, P).
     """
+    records, shared, places, motion = state.records, state.shared, state.places, state.motion
     for n in range(places.start.size):
         t0 = t1 = t2 = 0.0
         for o in range(places.start[n], places.stop[n]):

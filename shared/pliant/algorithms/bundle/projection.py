@@ -62,6 +62,17 @@ class Seen(NamedTuple):
     w: Any
 
 
+class Triangle(NamedTuple):
+    """The lower triangle of a (3, 3) matrix, by rows."""
+
+    xx: Any
+    yx: Any
+    yy: Any
+    zx: Any
+    zy: Any
+    zz: Any
+
+
 class Limits(NamedTuple):
     """Of the robust kernel and the camera's front, in the precision of a kernel's arithmetic.
 
@@ -207,25 +218,44 @@ def couple(x: Any, y: Any, iz: Any, a: Any, c: Any) -> Any:
 
 
 @fast_kernel
-def solve_point(
-    one: _Number, v00: Any, v10: Any, v11: Any, v20: Any, v21: Any, v22: Any, g0: Any, g1: Any,
-    g2: Any, smallest: _Number,
-) -> Any:  # fmt: skip
-    """Solve a symmetric 3 x 3 system by Cholesky; 0 where not positive definite."""
+def factor_point(one: _Number, V: Triangle, smallest: _Number) -> Triangle:
+    """L of ``L L^T = V`` with the inverse of its diagonal; all 0 where not positive definite."""
     zero = one - one
-    ok = v00 > zero
-    i00 = one / np.sqrt(v00 if ok else one)
-    l10, l20 = v10 * i00, v20 * i00
-    d11 = v11 - l10 * l10
-    ok = ok & (d11 > smallest * v11)
+    ok = V.xx > zero
+    xx = one / np.sqrt(V.xx if ok else one)
+    yx, zx = V.yx * xx, V.zx * xx
+    rest = V.yy - yx * yx
+    ok = ok & (rest > smallest * V.yy)
+    yy = one / np.sqrt(rest if ok else one)
+    zy = (V.zy - zx * yx) * yy
+    rest = V.zz - zx * zx - zy * zy
+    ok = ok & (rest > smallest * V.zz)
+    zz = one / np.sqrt(rest if ok else one)
+    if not ok:
+        return Triangle(zero, zero, zero, zero, zero, zero)
+    return Triangle(xx, yx, yy, zx, zy, zz)
+
+
+@fast_kernel
+def solve_point(one: _Number, V: Triangle, g: _Point, smallest: _Number) -> _Point:
+    """Solve ``V s = g`` by Cholesky; 0 where V is not positive definite.
+
+    In one with its factor: after ``factor_point`` the same would be rounded in another way.
+    """
+    zero = one - one
+    ok = V.xx > zero
+    i00 = one / np.sqrt(V.xx if ok else one)
+    l10, l20 = V.yx * i00, V.zx * i00
+    d11 = V.yy - l10 * l10
+    ok = ok & (d11 > smallest * V.yy)
     i11 = one / np.sqrt(d11 if ok else one)
-    l21 = (v21 - l20 * l10) * i11
-    d22 = v22 - l20 * l20 - l21 * l21
-    ok = ok & (d22 > smallest * v22)
+    l21 = (V.zy - l20 * l10) * i11
+    d22 = V.zz - l20 * l20 - l21 * l21
+    ok = ok & (d22 > smallest * V.zz)
     i22 = one / np.sqrt(d22 if ok else one)
-    y0 = g0 * i00
-    y1 = (g1 - l10 * y0) * i11
-    s2 = (g2 - l20 * y0 - l21 * y1) * i22 * i22
+    y0 = g[0] * i00
+    y1 = (g[1] - l10 * y0) * i11
+    s2 = (g[2] - l20 * y0 - l21 * y1) * i22 * i22
     s1 = (y1 - l21 * s2) * i11
     s0 = (y0 - l10 * s1 - l20 * s2) * i00
     return s0 if ok else zero, s1 if ok else zero, s2 if ok else zero

@@ -17,6 +17,8 @@ from pliant.algorithms.bundle.normal_equations import (
     FACTOR,
     RECORD,
     SHARED,
+    CameraSystem,
+    Linearised,
     cost_of_observations,
     eliminate_points,
     linearise_observations,
@@ -199,10 +201,7 @@ class SchurSystem:
         if self.calibration is not None:
             change = solution[-1, :SHARED].copy()
         moved = np.empty_like(state.points)
-        substitute(
-            self._records, self.shared.points, self.layout.places, state.motion, steps, change,
-            self._factors, state.points, moved,
-        )  # fmt: skip
+        substitute(self._linearised(state), steps, change, self._factors, state.points, moved)
         return self.state(move_cameras(state.motion, steps), moved, state.calibration + change)
 
     def calibration_covariance(self, state: State) -> F64:
@@ -225,13 +224,13 @@ class SchurSystem:
     def _reduced_system(self, state: State, damping: float) -> tuple[F64, F64, F64]:
         """Of Eq. 9, at a linearised state: S without damping, the right side (N, 6) and diag(H)
         (N, 6)."""
-        pattern, layout, S = self.pattern, self.layout, self._S
+        pattern, S = self.pattern, self._S
         N = len(pattern.start) - 1
         b, diagonal = np.zeros((2, N, 6))
         S[:] = 0.0
+        system = CameraSystem(self._position, pattern.block, S, b)
         eliminate_points(
-            self._records, self.shared.points, layout.places, self._position, state.motion,
-            damping, pattern.block, self._scratch, self._factors, S, b,
+            self._linearised(state), damping, system, self._scratch, self._factors
         )  # fmt: skip
         at, normal = self._position[self._moving], self.normal[self._moving]
         S[pattern.start[at, None], 6 * LOWER6[0] + LOWER6[1]] += normal[:, :21]
@@ -246,6 +245,10 @@ class SchurSystem:
             b[-1, :SHARED] += shared.gradient - prior * departure
             diagonal[-1, :SHARED] = np.diag(own)
         return S, b, diagonal
+
+    def _linearised(self, state: State) -> Linearised:
+        """What ``linearise`` has found of a state."""
+        return Linearised(self._records, self.shared.points, self.layout.places, state.motion)
 
     def _seen_by(self, motion: F64, q: F64) -> tuple[Cameras, Slots]:
         """Cameras and observations of a state."""

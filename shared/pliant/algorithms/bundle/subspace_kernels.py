@@ -10,6 +10,7 @@ from pliant.algorithms.bundle.projection import (
     Cameras,
     Limits,
     Seen,
+    Triangle,
     apply_metric,
     corner,
     lens_of,
@@ -118,11 +119,12 @@ def sweep_points(
             if table.seen[m, b] != 0:
                 _linearise_points(cameras, m, lo, points, table, limits, V, before)
         for i in range(BLOCK):
-            s0, s1, s2 = solve_point(
-                ONE, V[i] * grow, V[BLOCK + i], V[2 * BLOCK + i] * grow, V[3 * BLOCK + i],
-                V[4 * BLOCK + i], V[5 * BLOCK + i] * grow, V[6 * BLOCK + i], V[7 * BLOCK + i],
-                V[8 * BLOCK + i], SINGULAR,
+            damped = Triangle(
+                V[i] * grow, V[BLOCK + i], V[2 * BLOCK + i] * grow,
+                V[3 * BLOCK + i], V[4 * BLOCK + i], V[5 * BLOCK + i] * grow,
             )  # fmt: skip
+            descent = (V[6 * BLOCK + i], V[7 * BLOCK + i], V[8 * BLOCK + i])
+            s0, s1, s2 = solve_point(ONE, damped, descent, SINGULAR)
             trial[i] = X[i] + s0
             trial[BLOCK + i] = Y[i] + s1
             trial[2 * BLOCK + i] = Z[i] + s2
