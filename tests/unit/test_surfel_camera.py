@@ -16,6 +16,7 @@ from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import X
 from pliant.algorithms.surfels.surfel_alignment import (
     Equilibrium,
+    Matcher,
     align_all,
     evaluate_all,
     make_workspace,
@@ -78,11 +79,12 @@ def problem(seed: int = 0, count: int = 12) -> dict[str, object]:
     poses[:, X : X + 3] += 0.002 * rng.standard_normal((count, 3))
     work, limits = make_workspace(23), tracker._limits(fine=True)
     active = np.ones(count, np.uint8)
-    found = evaluate_all(poses, active, level, templates, limits, work)
+    matcher = Matcher(level, templates, limits, work)
+    found = evaluate_all(poses, active, matcher)
     assert (found.costs >= 0.0).all()
     return {
         "poses": poses, "active": active, "level": level, "work": work, "sums": found.sums,
-        "matrices": templates.matrices, "templates": templates, "limits": limits,
+        "matrices": templates.matrices, "matcher": matcher,
     }  # fmt: skip
 
 
@@ -142,7 +144,7 @@ def test_an_equilibrium_holds_as_firmly_as_its_weight() -> None:
     for weight in (0.0, 1e8, 1e14):
         poses = p["poses"].copy()
         rest = Equilibrium(points, np.full(n, weight))
-        align_all(poses, p["active"], rest, p["level"], p["templates"], p["limits"], p["work"])
+        align_all(poses, p["active"], rest, p["matcher"])
         left.append(float(np.median(np.linalg.norm(poses[:, X : X + 3] - points, axis=1))))
     assert left[0] > 0.01
     assert left[0] > left[1] > left[2]

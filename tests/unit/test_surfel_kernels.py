@@ -24,6 +24,7 @@ from pliant.algorithms.surfels.patch_sampling import (
 )
 from pliant.algorithms.surfels.photometric import (
     FEATURES,
+    Comparison,
     correlation,
     feature_matrix,
     make_features,
@@ -103,9 +104,9 @@ def sums_of(
     matrix, sums = np.zeros((FEATURES, FEATURES)), np.zeros(FEATURES)
     assert homography(pose, level, h)
     assert sample_patch(h, level, grid, HIGH)
-    light = pose[GAIN], pose[BIAS], tau, blend
-    cost, seen = photometric_sums(texture, grid, mean, *light, sums)
-    feature_matrix(texture, grid, mean, *light, features, matrix)
+    comparison = Comparison(mean, pose[GAIN], pose[BIAS], tau, blend)
+    cost, seen = photometric_sums(texture, grid, comparison, sums)
+    feature_matrix(texture, grid, comparison, features, matrix)
     return cost, seen, features[:FEATURES], matrix, sums
 
 

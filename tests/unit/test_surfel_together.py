@@ -13,7 +13,7 @@ from pliant.algorithms.surfels.deformation_graph import (
     keep_rows,
     torn_off,
 )
-from pliant.algorithms.surfels.graph_alignment import solve_graph
+from pliant.algorithms.surfels.graph_alignment import Springs, solve_graph
 from pliant.algorithms.surfels.patch_sampling import A, B, F, X
 
 N = 12
@@ -106,7 +106,7 @@ def test_solution_against_dense_least_squares() -> None:
     S = np.broadcast_to(roots @ roots.T, (N, 6, 6)).copy()
     b = rng.standard_normal((N, 6)) * 1e-3
     x = np.zeros((N, 6))
-    solve_graph(S, b, edges, arms, residuals, pull, bend, 500, 1e-24, x)
+    solve_graph(S, b, Springs(edges.ends, arms, pull, bend, residuals), 500, 1e-24, x)
     J = np.zeros((residuals.size, 6 * N))
     for k in range(6 * N):
         step = np.zeros(6 * N)

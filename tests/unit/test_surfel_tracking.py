@@ -101,26 +101,15 @@ def test_batch_is_one_by_one(
     tracker = SurfelTracker(SMALL)
     tracker.start(frames[0].image, frames[0].depth_m, camera)
     level = tracker._pyramid(frames[1].image)[0]
-    templates = tracker._table.templates[0]
+    matcher = tracker._matcher(0, level)
     start = tracker._table.poses
-    limits, work = tracker._limits(fine=True), make_workspace(23)
     together = start.copy()
-    align_all(
-        together,
-        np.ones(len(start), np.uint8),
-        no_equilibrium(len(start)),
-        level,
-        templates,
-        limits,
-        work,
-    )
+    align_all(together, np.ones(len(start), np.uint8), no_equilibrium(len(start)), matcher)
     alone = start.copy()
     for k in range(len(start) - 1, -1, -1):
-        one = Templates(*(each[k : k + 1].copy() for each in templates))
-        fresh = make_workspace(23)
-        align_all(
-            alone[k : k + 1], np.ones(1, np.uint8), no_equilibrium(1), level, one, limits, fresh
-        )
+        one = Templates(*(each[k : k + 1].copy() for each in matcher.templates))
+        fresh = matcher._replace(templates=one, work=make_workspace(23))
+        align_all(alone[k : k + 1], np.ones(1, np.uint8), no_equilibrium(1), fresh)
     assert (together != start).any()
     assert together.tobytes() == alone.tobytes()
 
@@ -138,10 +127,7 @@ def test_a_second_look_finds_what_was_carried_past_its_image(
     wanted = (np.arange(n) % 2).astype(np.uint8)
     for strain, left in ((0.02, 0.5), (0.2, 0.25)):  # neighbours that hold less, let go
         found = off.copy()
-        relocate(
-            found, wanted, table.edges, level, table.templates[0], tracker._limits(fine=True),
-            make_workspace(23), strain,
-        )  # fmt: skip
+        relocate(found, wanted, table.edges, tracker._matcher(0, level), strain)
         np.testing.assert_array_equal(found[wanted == 0], off[wanted == 0])
         errors = np.linalg.norm((found - table.poses)[wanted > 0, X : X + 3], axis=1)
         assert np.median(errors) < left * 1.2 / camera.fx

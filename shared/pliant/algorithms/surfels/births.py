@@ -28,6 +28,7 @@ from pliant.algorithms.surfels.patch_sampling import (
 from pliant.algorithms.surfels.photometric import (
     FEATURES,
     TEMPLATE_IMAGES,
+    Comparison,
     feature_matrix,
     first_inner,
     make_features,
@@ -207,7 +208,8 @@ def _fill(
         for n in range(images.shape[1]):
             if images[0, n] < _FAR:
                 images[0, n] -= np.float32(mean)
-        feature_matrix(images, wide, mean, 1.0, 0.0, 1.0, 0.0, scratch, templates.matrices[s])
+        plain = Comparison(mean, 1.0, 0.0, 1.0, 0.0)
+        feature_matrix(images, wide, plain, scratch, templates.matrices[s])
         templates.usable[s] = 1 if squares / count - mean * mean > _MIN_VARIANCE else 0
 
 

@@ -15,8 +15,7 @@ from pliant.algorithms.surfels.graph_alignment import eliminate_all
 from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, Level, X
 from pliant.algorithms.surfels.surfel_alignment import (
     MIN_GAIN,
-    Limits,
-    Templates,
+    Matcher,
     Workspace,
     evaluate_all,
 )
@@ -42,16 +41,14 @@ def se3_exp(zeta: F64) -> F64:
     return T
 
 
-def align_rigid(
-    poses: F64, active: U8, T_camera_world: F64, level: Level, templates: Templates,
-    limits: Limits, work: Workspace,
-) -> F64:  # fmt: skip
+def align_rigid(poses: F64, active: U8, T_camera_world: F64, matcher: Matcher) -> F64:
     """Move the camera alone: all surfels stand still in the world.
 
     The matrices are the textures' own, which shape the steps and not where they end.
     poses: (N, POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
     """
-    now = evaluate_all(poses, active, level, templates, limits, work)
+    level, templates, limits, work = matcher
+    now = evaluate_all(poses, active, matcher)
     damping, accepted = limits.start_lambda, 0
     for _ in range(limits.iterations):
         usable: BoolArray = now.costs >= 0.0
@@ -66,7 +63,7 @@ def align_rigid(
         light_steps = light @ np.r_[1.0, zeta]
         moved[:, GAIN] = np.maximum(moved[:, GAIN] + light_steps[:, 0], MIN_GAIN)
         moved[:, BIAS] += light_steps[:, 1]
-        new = evaluate_all(moved, rows, level, templates, limits, work)
+        new = evaluate_all(moved, rows, matcher)
         both: BoolArray = new.costs >= 0.0
         if 2 * np.count_nonzero(both) > np.count_nonzero(usable) and (
             new.costs[both].sum() < now.costs[both].sum() * (1.0 + limits.slack)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, U8, BoolArray
+from pliant.algorithms.arrays import F64, I64, U8, BoolArray
 from pliant.algorithms.surfels import deformation_models as models
 from pliant.algorithms.surfels.deformation_graph import Edges, edge_rows, pull_of_edges, torn_off
 from pliant.algorithms.surfels.deformation_models import RIGID
@@ -27,8 +27,7 @@ from pliant.algorithms.surfels.surfel_alignment import (
     OMEGA_E,
     Equilibrium,
     Evaluation,
-    Limits,
-    Templates,
+    Matcher,
     Workspace,
     align_all,
     copy,
@@ -60,6 +59,16 @@ class Eliminated(NamedTuple):
     b: F64  # (N, 6)
     inner: F64  # (N, 5)
     follow: F64  # (N, 5, 6)
+
+
+class Springs(NamedTuple):
+    """E pairs of surfels at their poses: what both residuals cost, and how they change."""
+
+    ends: I64  # (E, 2) rows of the two surfels
+    arms: F64  # (E, 2, 3) R_i d and R_j d, metres
+    pull: F64  # (E,) weight of the first residual, DN^2 / m^2
+    bend: F64  # (E,) weight of the second
+    residuals: F64  # (E, 2, 3) metres
 
 
 def eliminate_all(
@@ -119,15 +128,14 @@ def _eliminate_all(
 
 
 @fast_kernel
-def _add_edges(
-    edges: Edges, arms: F64, w: F64, bend: F64, residuals: F64, x: F64, sign: float, y: F64
-) -> None:
+def _add_edges(springs: Springs, x: F64, sign: float, y: F64) -> None:
     """y += sign J' W (J x + residuals), J being the derivative of all pairs' residuals.
 
     omega x v is the change of an arm v under a turn omega, and u . (omega x v) = omega . (v x u).
     """
-    for e in range(len(edges.ends)):
-        i, j = edges.ends[e, 0], edges.ends[e, 1]
+    ends, arms, w, bend, residuals = springs
+    for e in range(len(ends)):
+        i, j = ends[e, 0], ends[e, 1]
         p0, p1, p2 = arms[e, 0, 0], arms[e, 0, 1], arms[e, 0, 2]
         q0, q1, q2 = arms[e, 1, 0], arms[e, 1, 1], arms[e, 1, 2]
         i3, i4, i5, j3, j4, j5 = x[i, 3], x[i, 4], x[i, 5], x[j, 3], x[j, 4], x[j, 5]
@@ -157,14 +165,14 @@ def _add_edges(
 
 
 @fast_kernel
-def _times(S: F64, edges: Edges, arms: F64, w: F64, bend: F64, none: F64, x: F64, y: F64) -> None:
-    """y = (S + J' W J) x.  none: residuals that are all zero."""
+def _times(S: F64, relaxed: Springs, x: F64, y: F64) -> None:
+    """y = (S + J' W J) x.  relaxed: their residuals are all zero."""
     for s in range(len(x)):
         x0, x1, x2, x3, x4, x5 = x[s, 0], x[s, 1], x[s, 2], x[s, 3], x[s, 4], x[s, 5]
         for k in range(RIGID):
             m = S[s, k]
             y[s, k] = m[0] * x0 + m[1] * x1 + m[2] * x2 + m[3] * x3 + m[4] * x4 + m[5] * x5
-    _add_edges(edges, arms, w, bend, none, x, 1.0, y)
+    _add_edges(relaxed, x, 1.0, y)
 
 
 @fast_kernel
@@ -186,15 +194,14 @@ def _add_block(v: F64, w: float, bend: float, side: float, block: F64) -> None:
 
 
 @fast_kernel
-def _inverses(
-    edges: Edges, arms: F64, w: F64, bend: F64, blocks: F64, L: F64, scale: F64, out: F64
-) -> None:
+def _inverses(springs: Springs, blocks: F64, L: F64, scale: F64, out: F64) -> None:
     """Inverse of each surfel's own block with its pairs.  blocks: (N, 6, 6) S, overwritten.
 
     L: (6, 6), scale: (2, 6), scratch.  out: (N, 6, 6).
     """
-    for e in range(len(edges.ends)):
-        i, j = edges.ends[e, 0], edges.ends[e, 1]
+    ends, arms, w, bend, _ = springs
+    for e in range(len(ends)):
+        i, j = ends[e, 0], ends[e, 1]
         _add_block(arms[e, 0], w[e], bend[e], -1.0, blocks[i])
         _add_block(arms[e, 1], w[e], bend[e], 1.0, blocks[j])
     n = blocks.shape[1]
@@ -243,34 +250,29 @@ def _scale_and_add(factor: float, a: F64, out: F64) -> None:
 
 
 @fast_kernel
-def solve_graph(
-    S: F64, b: F64, edges: Edges, arms: F64, residuals: F64, w: F64, bend: F64, iterations: int,
-    tolerance: float, x: F64,
-) -> int:  # fmt: skip
+def solve_graph(S: F64, b: F64, springs: Springs, iterations: int, tolerance: float, x: F64) -> int:
     """Conjugate gradients, preconditioned by each surfel's own block.
 
-    S: (N, 6, 6), b: (N, 6) from ``eliminate_all``, damped.  w, bend: (E,) weights of the two
-    residuals, DN^2 / m^2.  tolerance: of the squared residual, relative.  x: (N, 6) receives the
-    steps.  Returns iterations.
+    S: (N, 6, 6), b: (N, 6) from ``eliminate_all``, damped.  tolerance: of the squared residual,
+    relative.  x: (N, 6) receives the steps.  Returns iterations.
     """
     n = len(S)
     inverses = np.zeros((n, RIGID, RIGID))
     z, p, y = np.zeros((n, RIGID)), np.zeros((n, RIGID)), np.zeros((n, RIGID))
-    none = np.zeros(residuals.shape)
-    _inverses(
-        edges, arms, w, bend, S.copy(), np.zeros((RIGID, RIGID)), np.zeros((2, RIGID)), inverses
-    )
+    ends, arms, pull, bend, residuals = springs
+    relaxed = Springs(ends, arms, pull, bend, np.zeros(residuals.shape))
+    _inverses(springs, S.copy(), np.zeros((RIGID, RIGID)), np.zeros((2, RIGID)), inverses)
     x[:] = 0.0
     # q is the gradient at x, and z the preconditioned descent.
     q = b.copy()
-    _add_edges(edges, arms, w, bend, residuals, x, 1.0, q)
+    _add_edges(springs, x, 1.0, q)
     rho = _precondition(inverses, q, z)
     first = rho
     p[:] = z
     for iteration in range(iterations):
         if not rho > tolerance * first:
             return iteration
-        _times(S, edges, arms, w, bend, none, p, y)
+        _times(S, relaxed, p, y)
         energy = _dot(p, y)
         if not energy > 0.0:
             return iteration
@@ -284,8 +286,8 @@ def solve_graph(
 
 
 def align_graph(
-    poses: F64, start: F64, active: U8, edges: Edges, equilibrium: Equilibrium, level: Level,
-    templates: Templates, limits: Limits, work: Workspace, parameters: SurfelParameters, steps: int,
+    poses: F64, start: F64, active: U8, edges: Edges, equilibrium: Equilibrium, matcher: Matcher,
+    parameters: SurfelParameters, steps: int,
 ) -> BoolArray:  # fmt: skip
     """Move all surfels as one, from the present poses, which are overwritten.
 
@@ -296,7 +298,8 @@ def align_graph(
     pose is that of ``start``.
     """
     p, n = parameters, len(poses)
-    now = evaluate_all(poses, active, level, templates, limits, work, zncc=True, matrices=True)
+    level, templates, limits, work = matcher
+    now = evaluate_all(poses, active, matcher, zncc=True, matrices=True)
     found = (now.costs >= 0.0) & (now.seen >= p.min_visible * templates.counts)
     found &= now.zncc >= p.min_zncc
     poses[~found] = start[~found]
@@ -312,13 +315,11 @@ def align_graph(
         damped[:, _DIAGONAL[:3], _DIAGONAL[:3]] += weights[:, None]
         descent[:, :3] += weights[:, None] * (poses[:, X : X + 3] - equilibrium.points)
         pull = OMEGA_E * w / edges.lengths**2
-        solve_graph(
-            damped, descent, edges, arms, residuals, pull / p.strain**2, pull / p.bend**2,
-            _CG_ITERATIONS, _CG_TOLERANCE, x,
-        )  # fmt: skip
+        springs = Springs(edges.ends, arms, pull / p.strain**2, pull / p.bend**2, residuals)
+        solve_graph(damped, descent, springs, _CG_ITERATIONS, _CG_TOLERANCE, x)
         if not np.isfinite(x).all():
             break
-        _step(poses, x, own, seen, now, damping, travelled, level, templates, limits, work)
+        _step(poses, x, own, seen, now, damping, travelled, matcher)
     torn = torn_off(edges, edge_rows(poses, edges)[0], n)
     poses[torn] = start[torn]
     return torn
@@ -326,22 +327,22 @@ def align_graph(
 
 def _step(
     poses: F64, x: F64, own: Eliminated, seen: U8, now: Evaluation, damping: F64, travelled: F64,
-    level: Level, templates: Templates, limits: Limits, work: Workspace,
+    matcher: Matcher,
 ) -> None:  # fmt: skip
     """Take the steps of all surfels whose images agree; the others' damping grows.
 
     seen: (N,) 0 where a surfel is carried whatever the image shows.  now: of the present poses,
     updated with them.
     """
-    candidates = poses.copy()
-    _step_all(poses, x, own, limits.model, work.step, candidates)
-    new = evaluate_all(candidates, seen, level, templates, limits, work)
+    limits, candidates = matcher.limits, poses.copy()
+    _step_all(poses, x, own, limits.model, matcher.work.step, candidates)
+    new = evaluate_all(candidates, seen, matcher)
     expected = np.einsum("nr,nr->n", x, 2.0 * own.b + np.einsum("nrc,nc->nr", own.S, x))
     bound = now.costs * (1.0 + limits.slack) + 2.0 * np.maximum(expected, 0.0)
     looked_at: BoolArray = seen > 0
     better = looked_at & (new.costs >= 0.0) & (new.costs < bound)
     moved = np.zeros(len(poses))
-    patch_steps_px(now.homographies, new.homographies, 0.5 * (level.side - 1), moved)
+    patch_steps_px(now.homographies, new.homographies, 0.5 * (matcher.level.side - 1), moved)
     travelled[better] += moved[better]
     taken = better | ~looked_at
     poses[taken] = candidates[taken]
@@ -349,9 +350,7 @@ def _step(
         old[better] = value[better]
     stale = better & (travelled > limits.stale_px)
     if stale.any():
-        again = evaluate_all(
-            poses, stale.astype(np.uint8), level, templates, limits, work, matrices=True
-        )
+        again = evaluate_all(poses, stale.astype(np.uint8), matcher, matrices=True)
         now.matrices[stale] = again.matrices[stale]
         travelled[stale] = 0.0
     damping[better] /= limits.lambda_down
@@ -371,10 +370,7 @@ def _step_all(poses: F64, x: F64, own: Eliminated, model: int, step: F64, candid
         candidates[s, GAIN] = max(candidates[s, GAIN], MIN_GAIN)
 
 
-def relocate(
-    poses: F64, wanted: U8, edges: Edges, level: Level, templates: Templates, limits: Limits,
-    work: Workspace, strain: float,
-) -> None:  # fmt: skip
+def relocate(poses: F64, wanted: U8, edges: Edges, matcher: Matcher, strain: float) -> None:
     """Align surfels alone at full size that the image did not show where they were expected.
 
     ``align_graph`` looks at the image only where it already fits.  A surfel that the coarse scales
@@ -388,4 +384,4 @@ def relocate(
     """
     pulls = pull_of_edges(edges, len(poses), OMEGA_E, strain)
     carried = Equilibrium(np.ascontiguousarray(poses[:, X : X + 3]), pulls)
-    align_all(poses, wanted, carried, level, templates, limits, work)
+    align_all(poses, wanted, carried, matcher)

@@ -20,6 +20,7 @@ its neighbours stand at fixed distances and one loop serves all: sample k is at 
 """
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,20 @@ TEMPLATE_IMAGES = 3
 _FAR = 1.0e6
 _I, _J, _D = FEATURES, FEATURES + 1, FEATURES + 2
 """Rows of the scratch of ``feature_matrix``: the grid, and D; before them the features."""
+
+
+class Comparison(NamedTuple):
+    """How a patch of a frame is compared with a texture: ``gain (patch - mean) + bias - texture``.
+
+    mean, bias: grey levels.    saturation: DN, of a residual.    blend: share of the frame in the
+    derivatives; the rest are the texture's.
+    """
+
+    mean: Any
+    gain: Any
+    bias: Any
+    saturation: Any
+    blend: Any
 
 
 def padded(side: int) -> int:
@@ -58,28 +73,35 @@ def first_inner(grid: Grid) -> int:
 
 @fast_kernel(inline=True)
 def photometric_sums(
-    images: F32, grid: Grid, mean: float, gain: float, bias: float, tau: float, blend: float,
-    out: F64,
-) -> tuple[float, int]:  # fmt: skip
+    images: F32, grid: Grid, comparison: Comparison, out: F64
+) -> tuple[float, int]:
     """Saturated cost, and the sums of features times residual.
 
-    images: (TEMPLATE_IMAGES, n) of the texture.  blend: share of the frame in the derivatives; the
-    rest are the texture's.  out: (FEATURES,).  Returns (cost DN^2, samples not saturated).
+    images: (TEMPLATE_IMAGES, n) of the texture.  out: (FEATURES,).  Returns (cost DN^2, samples not
+    saturated).
     """
     # Where none of it is asked for, the texture's derivatives need not come out of memory.
-    u, v = (images[1], images[2]) if blend < 1.0 else (images[0], images[0])
-    return _sums(
-        grid.i, grid.j, grid.values, grid.side, images[0], u, v,
-        np.float32(mean), np.float32(gain), np.float32(bias), np.float32(tau), np.float32(blend),
-        out,
+    u, v = (images[1], images[2]) if comparison.blend < 1.0 else (images[0], images[0])
+    texture = (images[0], u, v)
+    return _sums(grid.i, grid.j, grid.values, grid.side, texture, _single(comparison), out)
+
+
+@fast_kernel(inline=True)
+def _single(comparison: Comparison) -> Comparison:
+    c = comparison
+    return Comparison(
+        np.float32(c.mean), np.float32(c.gain), np.float32(c.bias), np.float32(c.saturation),
+        np.float32(c.blend),
     )  # fmt: skip
 
 
 @fast_kernel
 def _sums(
-    gi: F32, gj: F32, values: F32, wide: int, t: F32, tu: F32, tv: F32, m: np.float32,
-    g: np.float32, b: np.float32, limit: np.float32, blend: np.float32, out: F64,
+    gi: F32, gj: F32, values: F32, wide: int, texture: tuple[F32, F32, F32], single: Comparison,
+    out: F64,
 ) -> tuple[float, int]:  # fmt: skip
+    t, tu, tv = texture
+    m, g, b, limit, blend = single
     n, at = len(t), wide + 1
     i, j, here = gi[at : at + n], gj[at : at + n], values[at : at + n]
     left, right = values[at - 1 : at - 1 + n], values[at + 1 : at + 1 + n]
@@ -114,26 +136,24 @@ def _sums(
 
 @fast_kernel
 def feature_matrix(
-    images: F32, grid: Grid, mean: float, gain: float, bias: float, tau: float, blend: float,
-    features: F32, out: F64,
-) -> None:  # fmt: skip
+    images: F32, grid: Grid, comparison: Comparison, features: F32, out: F64
+) -> None:
     """Sums of products of the features, for the samples that ``photometric_sums`` counts.
 
     The arguments are those of ``photometric_sums``.  features: from ``make_features``, filled.
     out: (FEATURES, FEATURES).
     """
-    _features(
-        grid.values, grid.side, images[0], images[1], images[2], np.float32(mean),
-        np.float32(gain), np.float32(bias), np.float32(tau), np.float32(blend), features,
-    )  # fmt: skip
+    texture = (images[0], images[1], images[2])
+    _features(grid.values, grid.side, texture, _single(comparison), features)
     _products(features, out)
 
 
 @fast_kernel
 def _features(
-    values: F32, wide: int, t: F32, tu: F32, tv: F32, m: np.float32, g: np.float32, b: np.float32,
-    limit: np.float32, blend: np.float32, features: F32,
-) -> None:  # fmt: skip
+    values: F32, wide: int, texture: tuple[F32, F32, F32], single: Comparison, features: F32
+) -> None:
+    t, tu, tv = texture
+    m, g, b, limit, blend = single
     n, at = len(t), wide + 1
     here = values[at : at + n]
     left, right = values[at - 1 : at - 1 + n], values[at + 1 : at + 1 + n]

@@ -3,8 +3,8 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I64, U8
-from pliant.algorithms.surfels.patch_sampling import Level, X
-from pliant.algorithms.surfels.surfel_alignment import Limits, Templates, Workspace, evaluate_all
+from pliant.algorithms.surfels.patch_sampling import X
+from pliant.algorithms.surfels.surfel_alignment import Matcher, evaluate_all
 from pliant.algorithms.tracks import FrameTracks
 from pliant.compiler.kernel import fast_kernel
 
@@ -14,21 +14,19 @@ _RADIUS_PX = 30.0
 """About a patch and its margin: what is farther away may move otherwise."""
 
 
-def start_at(
-    poses: F64, active: U8, targets_px: F64, level: Level, templates: Templates, limits: Limits,
-    work: Workspace,
-) -> None:  # fmt: skip
+def start_at(poses: F64, active: U8, targets_px: F64, matcher: Matcher) -> None:
     """Move each surfel to where it was predicted, at its depth, if it fits better there.
 
     targets_px: (N, 2) pixels of this level, NaN where there is no prediction.  Both starts are
     rated by Eq. 5 at this level, the coarsest.
     """
+    level = matcher.level
     led = active * np.isfinite(targets_px).all(axis=1)
     moved, z = poses.copy(), poses[:, X + 2]
     moved[:, X] = (targets_px[:, 0] - level.cx) / level.fx * z
     moved[:, X + 1] = (targets_px[:, 1] - level.cy) / level.fy * z
-    here = evaluate_all(poses, led, level, templates, limits, work).costs
-    there = evaluate_all(moved, led, level, templates, limits, work).costs
+    here = evaluate_all(poses, led, matcher).costs
+    there = evaluate_all(moved, led, matcher).costs
     # A negative cost is that of a patch behind the camera.
     better = (there >= 0.0) & ((here < 0.0) | (there < here))
     poses[better] = moved[better]

@@ -26,6 +26,7 @@ from pliant.algorithms.surfels.patch_sampling import (
 )
 from pliant.algorithms.surfels.photometric import (
     FEATURES,
+    Comparison,
     correlation,
     feature_matrix,
     first_inner,
@@ -105,6 +106,15 @@ def make_workspace(side: int) -> Workspace:
         np.zeros(_N), np.zeros(_N), np.zeros(_N),
         np.zeros(POSE_FLOATS),
     )  # fmt: skip
+
+
+class Matcher(NamedTuple):
+    """What finds surfels in one level of an image."""
+
+    level: Level
+    templates: Templates
+    limits: Limits
+    work: Workspace
 
 
 class Equilibrium(NamedTuple):
@@ -217,9 +227,12 @@ def evaluate(
         return -1.0, 0
     if not sample_patch(work.h, level, work.grid, limits.highlight):
         return -1.0, 0
-    return photometric_sums(
-        images, work.grid, mean, pose[GAIN], pose[BIAS], limits.saturation, limits.blend, sums
-    )
+    return photometric_sums(images, work.grid, _comparison(pose, mean, limits), sums)
+
+
+@fast_kernel(inline=True)
+def _comparison(pose: F64, mean: float, limits: Limits) -> Comparison:
+    return Comparison(mean, pose[GAIN], pose[BIAS], limits.saturation, limits.blend)
 
 
 @fast_kernel(inline=True)
@@ -227,17 +240,12 @@ def curvature(
     pose: F64, images: F32, mean: float, limits: Limits, work: Workspace, matrix: F64
 ) -> None:
     """Fill the (FEATURES, FEATURES) matrix of the pose that was evaluated last."""
-    feature_matrix(
-        images, work.grid, mean, pose[GAIN], pose[BIAS], limits.saturation, limits.blend,
-        work.features, matrix,
-    )  # fmt: skip
+    feature_matrix(images, work.grid, _comparison(pose, mean, limits), work.features, matrix)
 
 
 @fast_kernel
-def _evaluate_all(
-    poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
-    out: Evaluation,
-) -> None:  # fmt: skip
+def _evaluate_all(poses: F64, active: U8, matcher: Matcher, out: Evaluation) -> None:
+    level, templates, limits, work = matcher
     for s in range(len(poses)):
         if not active[s] or not templates.usable[s]:
             continue
@@ -255,9 +263,8 @@ def _evaluate_all(
 
 
 def evaluate_all(
-    poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
-    *, zncc: bool = False, matrices: bool = False,
-) -> Evaluation:  # fmt: skip
+    poses: F64, active: U8, matcher: Matcher, *, zncc: bool = False, matrices: bool = False
+) -> Evaluation:
     """Look at the image at the poses of active surfels that have a template of this level."""
     n = len(poses)
     k, m = n if zncc else 0, n if matrices else 0
@@ -265,7 +272,7 @@ def evaluate_all(
         np.full(n, -1.0), np.zeros(n), np.zeros((n, 9)), np.zeros((n, FEATURES)),
         np.zeros(k), np.zeros((m, FEATURES, FEATURES)),
     )  # fmt: skip
-    _evaluate_all(poses, active, level, templates, limits, work, out)
+    _evaluate_all(poses, active, matcher, out)
     return out
 
 
@@ -293,15 +300,13 @@ def _patch_step_px(before: F64, after: F64, half: float) -> float:
 
 
 @fast_kernel
-def align_all(
-    poses: F64, active: U8, equilibrium: Equilibrium, level: Level, templates: Templates,
-    limits: Limits, work: Workspace,
-) -> None:  # fmt: skip
+def align_all(poses: F64, active: U8, equilibrium: Equilibrium, matcher: Matcher) -> None:
     """Minimise Eq. 11, or 21 for a camera that is held, for every active surfel by itself.
 
     poses: (N, POSE_FLOATS) in the camera's frame, overwritten; that of a surfel which is not in
     front of the camera, or has no template of this level, stays.
     """
+    level, templates, limits, work = matcher
     before, candidate = work.before, work.pose
     n = models.parameter_count(limits.model)
     half = float((work.grid.side - 2) // 2)

@@ -28,6 +28,7 @@ from pliant.algorithms.surfels.surfel_alignment import (
     OMEGA_E,
     Equilibrium,
     Limits,
+    Matcher,
     Workspace,
     align_all,
     make_workspace,
@@ -192,19 +193,15 @@ class SurfelTracker:
 
     def _start_at(self, goals: F64 | None, level: Level, poses: F64, active: U8) -> None:
         if goals is not None and self._table.templates:
-            templates, limits = self._table.templates[-1], self._limits(fine=False)
-            start_at(poses, active, goals, level, templates, limits, self._works[-1])
+            start_at(poses, active, goals, self._matcher(-1, level))
 
     def _align_rigid(
         self, level: Level, poses: F64, guides: U8, T_camera_world: F64, timer: StageTimer
     ) -> F64:
-        templates = self._table.templates[-1]
-        some = _spread(guides * templates.usable)
+        matcher = self._matcher(-1, level)
+        some = _spread(guides * matcher.templates.usable)
         with timer("camera alone"):
-            return align_rigid(
-                poses, some, T_camera_world, level, templates, self._limits(fine=False),
-                self._works[-1],
-            )  # fmt: skip
+            return align_rigid(poses, some, T_camera_world, matcher)
 
     def _align_alone(
         self,
@@ -215,9 +212,8 @@ class SurfelTracker:
         equilibrium: Equilibrium,
         timer: StageTimer,
     ) -> None:
-        templates, limits = self._table.templates[number], self._limits(fine=number == 0)
         with timer(f"alone, level {number}"):
-            align_all(poses, active, equilibrium, level, templates, limits, self._works[number])
+            align_all(poses, active, equilibrium, self._matcher(number, level))
 
     def _align_graph(
         self,
@@ -231,23 +227,21 @@ class SurfelTracker:
     ) -> BoolArray:
         with timer(f"together, level {number}"):
             return align_graph(
-                poses, start, active, self._table.edges, equilibrium, level,
-                self._table.templates[number], self._limits(fine=number == 0), self._works[number],
+                poses, start, active, self._table.edges, equilibrium, self._matcher(number, level),
                 self._parameters, STEPS if number == 0 else COARSE_STEPS,
             )  # fmt: skip
 
     def _validate(self, level: Level, poses: F64, torn: BoolArray) -> None:
         """Keep what was found; what was not stays where it was last good."""
         table, p = self._table, self._parameters
-        found, templates, limits = table.validations, table.templates[0], self._limits(fine=True)
-        everyone, work = np.ones(len(poses), np.uint8), self._works[0]
-        validation.validate_all(poses, everyone, level, templates, limits, work, found)
+        found, matcher = table.validations, self._matcher(0, level)
+        validation.validate_all(poses, np.ones(len(poses), np.uint8), matcher, found)
         if len(table.edges.ends):
             unlike = (found[:, validation.ZNCC] < p.min_zncc) & (found[:, validation.FRONT] > 0.0)
             passed = (unlike | torn) & (found[:, validation.INSIDE] >= p.min_visible)
             rows = passed.astype(np.uint8)
-            relocate(poses, rows, table.edges, level, templates, limits, work, p.strain)
-            validation.validate_all(poses, rows, level, templates, limits, work, found)
+            relocate(poses, rows, table.edges, matcher, p.strain)
+            validation.validate_all(poses, rows, matcher, found)
             torn = torn & ~passed
         wanted = np.where(table.missing > 0, max(p.min_zncc, _RELOCATED_ZNCC), p.min_zncc)
         state = np.full(len(table), SurfelState.TRACKED, np.uint8)
@@ -290,9 +284,14 @@ class SurfelTracker:
         self._next_id += n
         self._lost = int(table.tracked.sum()) < p.min_alive
         rows = (table.born == self._frame).astype(np.uint8)
-        validation.validate_all(
-            move_poses(table.poses, inverse(self._T_world_camera)), rows, pyramid[0],
-            table.templates[0], self._limits(fine=True), self._works[0], table.validations,
+        poses = move_poses(table.poses, inverse(self._T_world_camera))
+        validation.validate_all(poses, rows, self._matcher(0, pyramid[0]), table.validations)
+
+    def _matcher(self, number: int, level: Level) -> Matcher:
+        """number: of the level, 0 being that of full size, -1 the coarsest."""
+        return Matcher(
+            level, self._table.templates[number], self._limits(fine=number == 0),
+            self._works[number],
         )  # fmt: skip
 
     def _limits(self, *, fine: bool) -> Limits:

@@ -16,9 +16,7 @@ from pliant.algorithms.surfels.patch_sampling import (
 )
 from pliant.algorithms.surfels.photometric import correlation, first_inner
 from pliant.algorithms.surfels.surfel_alignment import (
-    Limits,
-    Templates,
-    Workspace,
+    Matcher,
     factorise,
     inverse_diagonal,
 )
@@ -34,14 +32,12 @@ _FAR = 1e6
 
 
 @fast_kernel
-def validate_all(
-    poses: F64, active: U8, level: Level, templates: Templates, limits: Limits, work: Workspace,
-    out: F64,
-) -> None:  # fmt: skip
+def validate_all(poses: F64, active: U8, matcher: Matcher, out: F64) -> None:
     """Fill a row of ``out`` (N, COLUMNS) for every active surfel.
 
     The pixel is left alone where a surfel is not in front.
     """
+    level, templates, limits, work = matcher
     parameters = models.parameter_count(limits.model)
     grid, at = work.grid, first_inner(work.grid)
     for s in range(len(poses)):
