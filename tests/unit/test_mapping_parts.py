@@ -136,20 +136,23 @@ def texture(seed=0):
     return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
+def mapped(xyz, grey):
+    """Points at (N, 3), with the patches that an image shows of them."""
+    points = PointRows()
+    rows = points.allocate(len(xyz))
+    points.xyz[rows], points.kappas[rows] = xyz, 10.0
+    cut_patches(grey, CAMERA.project(np.abs(xyz)).astype(np.float32), rows, points.patches)
+    return rows, points
+
+
 def looked_for(shift, grey, min_zncc=0.8, kappa=10.0, kept=None):
     """Re-acquire one point at the image's centre whose maximum is off by ``shift`` px.
 
     kept: the image that the patch of the point is from, this one where it is None."""
-    xyz = np.array([[0.0, 0.0, 4.0]])
-    patches = np.zeros((1, PATCH_SIDE, PATCH_SIDE), np.uint8)
-    centre = np.array([[CAMERA.cx, CAMERA.cy]], np.float32)
-    cut_patches(grey if kept is None else kept, centre, np.zeros(1, np.int32), patches)
+    rows, points = mapped(np.array([[0.0, 0.0, 4.0]]), grey if kept is None else kept)
     maxima = np.array([[CAMERA.cx + shift, CAMERA.cy, kappa]], np.float32)
-    return reacquire(
-        np.eye(4), np.zeros(1, np.int32), xyz, np.full(1, 10.0, np.float32), patches,
-        maxima, grey, CAMERA,
-        ReacquisitionParameters(min_zncc=min_zncc),
-    )  # fmt: skip
+    parameters = ReacquisitionParameters(min_zncc=min_zncc)
+    return reacquire(np.eye(4), rows, points, maxima, grey, CAMERA, parameters)
 
 
 def test_reacquisition_refines_the_maximum_by_the_patch():
@@ -178,14 +181,9 @@ def test_reacquisition_refuses_far_maxima_the_other_sign_and_other_patches():
 def test_reacquisition_gives_a_maximum_to_one_point_only():
     grey = texture()
     xyz = np.array([[0.0, 0.0, 4.0], [0.001, 0.0, 4.0], [0.0, 0.0, -4.0]])
-    patches = np.zeros((3, PATCH_SIDE, PATCH_SIDE), np.uint8)
-    px = CAMERA.project(np.abs(xyz)).astype(np.float32)
-    cut_patches(grey, px, np.arange(3, dtype=np.int32), patches)
+    rows, points = mapped(xyz, grey)
     maxima = np.array([[CAMERA.cx, CAMERA.cy, 10.0]], np.float32)
-    found = reacquire(
-        np.eye(4), np.arange(3, dtype=np.int32), xyz, np.full(3, 10.0, np.float32), patches,
-        maxima, grey, CAMERA, ReacquisitionParameters(),
-    )  # fmt: skip
+    found = reacquire(np.eye(4), rows, points, maxima, grey, CAMERA, ReacquisitionParameters())
     assert found.rows.tolist() == [0]
     assert found.visible.tolist() == [0, 1]
 

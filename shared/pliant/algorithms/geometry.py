@@ -108,6 +108,11 @@ def transform(T: F64, points: F64) -> F64:
     return points @ T[:3, :3].T + T[:3, 3]
 
 
+def transform_each(T: F64, points: F64) -> F64:
+    """Apply to each of (N, 3) points a motion, or a similarity, of its own (N, 4, 4)."""
+    return (T[:, :3, :3] @ points[:, :, None])[:, :, 0] + T[:, :3, 3]
+
+
 def similarity_to_matrix(similarity: F64) -> F64:
     """(..., 8) poses with a scale to (..., 4, 4) matrices of ``X -> scale R X + t``."""
     S = pose_to_matrix(similarity[..., :7])

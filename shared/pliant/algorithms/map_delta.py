@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray, Shape
-from pliant.algorithms.geometry import matrix_to_pose, similarity_to_matrix
+from pliant.algorithms.geometry import matrix_to_pose, similarity_to_matrix, transform_each
 
 WAITING, TRACKING, LOST = 0, 1, 2
 """State of the map after a frame: not started, localised, or lost."""
@@ -41,8 +41,7 @@ class MapMoves:
 
     def points(self, xyz: F64, hosts: I64) -> F64:
         """Points (N, 3) that hang on keyframes (N,), moved."""
-        S = self.matrices(hosts)
-        return (S[:, :3, :3] @ xyz[:, :, None])[:, :, 0] + S[:, :3, 3]
+        return transform_each(self.matrices(hosts), xyz)
 
 
 def _no_ids() -> I64:

@@ -94,8 +94,8 @@ def find_again(
     if not parameters.reacquisition.enabled:
         return T_world_camera, none
     reacquired = reacquire(
-        T_world_camera, active.missing(frame), points.xyz, points.kappas, points.patches,
-        tracks.maxima, grey, active.camera, parameters.reacquisition,
+        T_world_camera, active.missing(frame), points, tracks.maxima, grey, active.camera,
+        parameters.reacquisition,
     )  # fmt: skip
     found = active.take_over(reacquired, tracks)
     if rolled is not None:

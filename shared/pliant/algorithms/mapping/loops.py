@@ -13,7 +13,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.pose_graph import Edges, optimise_pose_graph
-from pliant.algorithms.geometry import inverse, move_by_similarity
+from pliant.algorithms.geometry import inverse, move_by_similarity, transform_each
 from pliant.algorithms.mapping.final_adjustment import ListedMap
 from pliant.compiler.kernel import kernel
 
@@ -66,8 +66,7 @@ def close_loops(
     moves = found @ inverse(S)
     fits = weights[len(weights) - len(loops) :] > _ACCEPTED
     accepted = [loop for loop, fit in zip(loops, fits, strict=True) if fit]
-    moved = moves[hosts]
-    xyz = (moved[:, :3, :3] @ seen.xyz[:, :, None])[:, :, 0] + moved[:, :3, 3]
+    xyz = transform_each(moves[hosts], seen.xyz)
     point = _joined(seen, accepted)
     # One camera sees one point at one place.
     both = seen.camera.astype(np.int64) * len(seen.rows) + point

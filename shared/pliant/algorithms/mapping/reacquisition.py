@@ -24,7 +24,7 @@ from pliant.algorithms.image.patch_alignment import (
 )
 from pliant.algorithms.image.patch_sums import PATCH_PIXELS, PATCH_SIZE, TEMPLATE_FLOATS, UNIFORM
 from pliant.algorithms.image.pixels import Pixels, pixels_of
-from pliant.algorithms.mapping.map_store import PATCH_SIDE
+from pliant.algorithms.mapping.map_store import PATCH_SIDE, PointRows
 from pliant.algorithms.mapping.parameters import ReacquisitionParameters
 from pliant.compiler.kernel import fast_kernel, kernel
 
@@ -142,9 +142,7 @@ class _Limits(NamedTuple):
 def reacquire(
     T_world_camera: F64,
     rows: I32,
-    xyz: F64,
-    kappas: F32,
-    patches: U8,
+    points: PointRows,
     maxima: F32,
     grey: U8 | None,
     camera: PinholeCamera,
@@ -152,16 +150,12 @@ def reacquire(
 ) -> Reacquired:
     """Match points to the maxima of a frame whose pose is known.
 
-    rows: (R,) points looked for; xyz, kappas and patches are indexed by row.  maxima: (M, 3) of
-    the frame.  grey: (H, W), or
-    None: then distance and the sign of the curvature alone decide.
+    rows: (R,) points looked for.  maxima: (M, 3) of the frame.  grey: (H, W), or None: then
+    distance and the sign of the curvature alone decide.
     """
-    T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:3])
-    K = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
-    projected = np.empty((len(rows), 2), np.float32)
-    visible = _project(T_camera_world, rows, xyz, K, projected)
+    projected, visible = _projected(T_world_camera, rows, points, camera)
     visible_rows = rows[visible]
-    wanted = _Wanted(projected[visible], visible_rows, kappas, patches)
+    wanted = _Wanted(projected[visible], visible_rows, points.kappas, points.patches)
     grid = MaximaGrid.build(maxima, camera.width, camera.height, parameters.radius_px)
     choice = np.full(len(visible_rows), -1, np.int32)
     points_px = np.zeros((len(visible_rows), 2), np.float32)
@@ -180,9 +174,7 @@ def reacquire(
 def match_widely(
     T_world_camera: F64,
     rows: I32,
-    xyz: F64,
-    kappas: F32,
-    patches: U8,
+    points: PointRows,
     grid: MaximaGrid,
     grey: U8,
     camera: PinholeCamera,
@@ -192,21 +184,30 @@ def match_widely(
 ) -> tuple[I32, F32]:
     """Match points to the maxima of a frame whose pose is hardly known, by their patches.
 
-    rows, xyz, kappas, patches, grey: as for ``reacquire``.   radius_px: from where T_world_camera
+    rows, grey: as for ``reacquire``.   radius_px: from where T_world_camera
     shows a point.   count: points looked for, at most.   Returns rows (F,) and pixels (F, 2); some
     of them are wrong.
     """
-    T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:3])
-    K = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
-    projected = np.empty((len(rows), 2), np.float32)
-    visible = np.flatnonzero(_project(T_camera_world, rows, xyz, K, projected))
+    projected, inside = _projected(T_world_camera, rows, points, camera)
+    visible = np.flatnonzero(inside)
     visible = visible[:: max(1, -(-len(visible) // count))]
     rows = rows[visible]
-    wanted = _Wanted(projected[visible], rows, kappas, patches)
+    wanted = _Wanted(projected[visible], rows, points.kappas, points.patches)
     points_px = np.zeros((len(rows), 2), np.float32)
     image = pixels_of(grey.astype(np.float32))
     found = _match_patches(wanted, grid, image, radius_px, min_zncc, points_px)
     return rows[found], points_px[found]
+
+
+def _projected(
+    T_world_camera: F64, rows: I32, points: PointRows, camera: PinholeCamera
+) -> tuple[F32, BoolArray]:
+    """Where a frame should show points, px (R, 2), and whether it does."""
+    T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:3])
+    K = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
+    projected = np.empty((len(rows), 2), np.float32)
+    visible = _project(T_camera_world, rows, points.xyz, K, projected)
+    return projected, visible
 
 
 @fast_kernel

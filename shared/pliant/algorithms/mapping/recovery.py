@@ -122,8 +122,8 @@ def recover(
         grid = MaximaGrid.build(maxima, camera.width, camera.height, radius)
         for T_world_camera in predictions:
             found, points_px = match_widely(
-                T_world_camera, rows, points.xyz, points.kappas, points.patches, grid, grey,
-                camera, radius, own.points, parameters.reacquisition.min_zncc,
+                T_world_camera, rows, points, grid, grey, camera, radius, own.points,
+                parameters.reacquisition.min_zncc,
             )  # fmt: skip
             if len(found) < own.min_agreeing:
                 continue
@@ -156,11 +156,7 @@ def prove(
     min_agreement: least share of the points found that support it, see ``RecoveryParameters``.
     Wrong poses find points as well: wherever a maximum is near and its patch looks alike.
     """
-    narrow = parameters.reacquisition
-    found = reacquire(
-        T_world_camera, rows, points.xyz, points.kappas, points.patches, maxima, grey, camera,
-        narrow,
-    )  # fmt: skip
+    found = reacquire(T_world_camera, rows, points, maxima, grey, camera, parameters.reacquisition)
     if len(found.rows) < parameters.localisation.min_inliers:
         return None
     located = refine(
