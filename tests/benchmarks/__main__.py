@@ -465,6 +465,21 @@ def surfels(
     _print(lines)
 
 
+@app.command("how-pictures")
+def how_pictures(
+    rigid: Annotated[Path, typer.Argument(help="Result folder of built-in:room.")],
+    deforming: Annotated[Path, typer.Argument(help="And of built-in:objects?frames=90.")],
+    output: Annotated[Path, typer.Option("--output", "-o")] = Path("docs/how"),
+) -> None:
+    """The pictures of docs/how.md: extrema, flow, depth, map and surfels.
+
+    scripts/bench how-pictures results/room results/objects
+    """
+    from benchmarks.how_pictures import draw
+
+    _print(draw(rigid, deforming, output))
+
+
 def _print(lines: Iterable[str]) -> None:
     for line in lines:
         typer.echo(line)
