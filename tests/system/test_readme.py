@@ -1,5 +1,6 @@
-"""What the README tells a newcomer to type works, in a clean folder."""
+"""What the README tells a newcomer to type works, in a clean folder, and so does the notebook."""
 
+import json
 import os
 import re
 import shlex
@@ -7,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -17,6 +19,7 @@ pytestmark = pytest.mark.system
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+OUTPUTS = (ROOT / "docs" / "outputs.md").read_text(encoding="utf-8")
 TIMEOUT_S = 300
 FRAMES_A_SECOND = 20.0
 
@@ -82,11 +85,11 @@ def test_every_command_of_the_readme_works_in_a_clean_folder(after_all_commands:
 
 
 def test_a_run_leaves_the_files_of_the_table(after_all_commands: Path) -> None:
-    rows = [line for line in README.splitlines() if line.startswith("| `")]
-    promised = {name for row in rows for name in re.findall(r"`([^`]+)`", row.split("|")[1])}
-    assert "trajectory.txt" in promised
-    for name in promised:
-        assert (after_all_commands / "results" / "sequence" / name).stat().st_size > 0, name
+    (table,) = re.findall(r"^\| file \|.*?\n\n", OUTPUTS, re.MULTILINE | re.DOTALL)
+    first = [line.split("|")[1] for line in table.strip().splitlines()[2:]]
+    promised = {name for cell in first for name in re.findall(r"`([^`]+)`", cell)}
+    left = {path.name for path in (after_all_commands / "results" / "sequence").iterdir()}
+    assert promised == left - {"overlay.mp4", "eval.json", ".lock"}
 
 
 @pytest.mark.skipif(os.path.exists("/dev/video0"), reason="there is a camera, which never ends")
@@ -99,22 +102,26 @@ def test_a_camera_that_is_not_there_is_one_line(clean_folder: Path) -> None:
 
 
 def test_the_python_example_maps_a_video(
-    sequence: Path,
-    clean_folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    clean_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (example,) = blocks("python")
     monkeypatch.chdir(clean_folder)
-    images = [str(path) for path in sorted((sequence / "images").iterdir())]
-    exec(compile(example, "README.md", "exec"), {"image_paths": images})
-    said = capsys.readouterr().out
-    rows = re.findall(r"^(\d+) (\d+) (?:None|\[\[)", said, re.MULTILINE)
-    assert [int(frame) for frame, _ in rows] == list(range(len(images)))
-    (poses,) = re.findall(r"^(\d+) poses$", said, re.MULTILINE)
-    assert int(poses) > len(images) // 2
+    names: dict[str, Any] = {}
+    exec(compile(example, "README.md", "exec"), names)
+    assert len(names["result"].trajectory) > 20
+    assert len(names["result"].mesh.triangles) > 1000
 
 
-def test_the_files_that_the_readme_points_to_are_there() -> None:
-    for target in re.findall(r"\]\((?!https?:)([^)#]+)", README):
-        assert (ROOT / target).exists(), target
+def test_the_notebook_runs(tmp_path: Path) -> None:
+    """Its cells one after the other, as a notebook has them, in a process of their own."""
+    cells = json.loads((ROOT / "docs" / "example.ipynb").read_text(encoding="utf-8"))["cells"]
+    assert not any(cell.get("outputs") for cell in cells)
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    script = tmp_path / "cells.py"
+    script.write_text("\n".join(code))
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=TIMEOUT_S, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert "40 poses" in done.stdout
+    assert "good because" in done.stdout
