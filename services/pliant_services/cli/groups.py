@@ -4,7 +4,7 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
-EVERYDAY, LOOK, MACHINES, DEVELOPMENT = "Everyday", "Look", "Machines", "Development"
+GROUPS = EVERYDAY, LOOK, MACHINES, DEVELOPMENT = "Everyday", "Look", "Machines", "Development"
 """Of commands, as their ``rich_help_panel``, which typer shows with Rich alone: that would load
 half of Rich for each help page, and take [the defaults] in help texts for markup."""
 
@@ -13,9 +13,7 @@ class GroupedCommands(TyperGroup):
     """``pliant``: each command with the whole first sentence of its help."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        groups: dict[str, list[tuple[str, str]]] = {
-            name: [] for name in (EVERYDAY, LOOK, MACHINES, DEVELOPMENT)
-        }
+        groups: dict[str, list[tuple[str, str]]] = {name: [] for name in GROUPS}
         for name in self.list_commands(ctx):
             command: Any = self.get_command(ctx, name)
             if not command.hidden:
@@ -28,14 +26,19 @@ class GroupedOptions(TyperCommand):
     """A command with many options: each under its heading, in the order of declaration."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        groups: dict[str, list[tuple[str, str]]] = {}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx)
-            if record is not None:
-                kind = "Arguments" if parameter.param_type_name == "argument" else "Other options"
-                panel: str | None = getattr(parameter, "rich_help_panel", None)
-                groups.setdefault(panel or kind, []).append(record)
-        _write(groups, formatter)
+        _write(grouped_options(self, ctx), formatter)
+
+
+def grouped_options(command: Any, context: Any) -> dict[str, list[tuple[str, str]]]:
+    """Arguments and options of a command as its help page has them, by heading."""
+    groups: dict[str, list[tuple[str, str]]] = {}
+    for parameter in command.get_params(context):
+        record = parameter.get_help_record(context)
+        if record is not None:
+            kind = "Arguments" if parameter.param_type_name == "argument" else "Options"
+            panel: str | None = getattr(parameter, "rich_help_panel", None)
+            groups.setdefault(panel or kind, []).append(record)
+    return groups
 
 
 def _write(groups: dict[str, list[tuple[str, str]]], formatter: Any) -> None:

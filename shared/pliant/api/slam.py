@@ -31,11 +31,13 @@ _FPS = 30.0
 class Slam(Mapped):
     """Localises images in a map that it makes of them::
 
-    slam = pliant.Slam(fov=70)
-    for image, stamp in ...:
-        T_world_camera = slam.track(image, stamp)
-    slam.finish()
-    slam.trajectory.positions, slam.points
+        slam = pliant.Slam(fov=70)
+        for image, stamp in ...:
+            T_world_camera = slam.track(image, stamp)
+        slam.finish()
+        slam.trajectory.positions, slam.points
+
+    All is in this process, and nothing is recorded.
     """
 
     def __init__(
