@@ -1,11 +1,10 @@
-"""The documentation: links, commands and lists are true, and the site reads without a network."""
+"""The documentation as a site: it is whole, and reads without a network, out of a folder."""
 
 import os
 import re
-import shlex
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from importlib import import_module
 from pathlib import Path
@@ -16,16 +15,15 @@ import typer
 
 import pliant
 from pliant.config import describe
-from pliant.export.export import EXPORTS
 from pliant.messages.topics import TOPICS
 from pliant_services.cli import app
 
+pytestmark = pytest.mark.system
+
 ROOT = Path(__file__).parents[2]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
-CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 import_module("pliant_services.cli.commands")  # registers them
-PLIANT: Any = typer.main.get_command(app)
+COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +55,7 @@ class _Loaded(HTMLParser):
 
 def test_the_site_is_read_without_a_network(site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
-    assert len(pages) > len(PAGES)
+    assert len(pages) > len([*(ROOT / "docs").glob("*.md")])
     for page in pages:
         loaded = _Loaded()
         loaded.feed(page.read_text(encoding="utf-8"))
@@ -74,7 +72,7 @@ def test_the_reference_has_everything(site: Path) -> None:
     def page(name: str) -> str:
         return (site / "reference" / f"{name}.html").read_text(encoding="utf-8")
 
-    assert {f'id="pliant-{name}"' for name in PLIANT.commands} <= set(
+    assert {f'id="pliant-{name}"' for name in COMMANDS} <= set(
         re.findall(r'id="pliant-[\w-]+"', page("commands"))
     )
     parameters = page("parameters")
@@ -86,52 +84,21 @@ def test_the_reference_has_everything(site: Path) -> None:
     assert public == []
 
 
-def heading_links(page: Path) -> set[str]:
-    """The anchors that a git host gives the headings of a page."""
-    text = re.sub(CODE, "", page.read_text(encoding="utf-8"))
-    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
-    shown = [re.sub(r"\[([^]]*)\]\([^)]*\)|`", r"\1", heading).lower() for heading in headings]
-    return {re.sub(r"[^\w\- ]", "", heading).replace(" ", "-") for heading in shown}
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_hold_on_a_git_host(page: Path) -> None:
-    text = re.sub(CODE, "", page.read_text(encoding="utf-8"))
-    for target, anchor in re.findall(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)", text):
-        file = (page.parent / target).resolve() if target else page
-        assert file.is_file(), (page.name, target)
-        assert not anchor or anchor in heading_links(file), (page.name, target, anchor)
-
-
-def commands() -> Iterator[tuple[str, str]]:
-    """Each (page, ``pliant`` command) of the pages, without its comment."""
-    for page in PAGES:
-        for block in re.findall(r"^```sh\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL):
-            for line in block.replace("\\\n", " ").splitlines():
-                if line.startswith("pliant "):
-                    yield page.name, line.partition(" #")[0].strip()
-
-
-@pytest.mark.parametrize(("page", "line"), [*commands()])
-def test_commands_of_the_pages_are_commands(page: str, line: str) -> None:
-    """Their names and options: that they work others show."""
-    command, (_, name, *arguments) = PLIANT, shlex.split(line)
-    command = PLIANT.commands[name]
-    if hasattr(command, "commands"):
-        command = command.commands[arguments.pop(0)]
-    command.make_context(name, arguments)
-
-
-def test_lists_of_exports_are_whole() -> None:
-    def told(text: str) -> set[str]:
-        return set(re.findall(r"`([a-z]+)`", text))
-
-    def table(page: str) -> str:
-        text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-        (rows,) = re.findall(r"^\| `--to` \|.*?\n\n", text, re.MULTILINE | re.DOTALL)
-        return "".join(line.split("|")[1] for line in rows.strip().splitlines())
-
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert set(EXPORTS) <= told(readme)
-    assert told(table("outputs.md")) == set(EXPORTS)
-    assert told(table("viewing.md")) == set(EXPORTS) - {"glb", "obj"}  # those are in meshing.md
+def test_the_search_works_out_of_a_folder(site: Path, tmp_path: Path) -> None:
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("chromium is not installed")
+    done = subprocess.run(
+        [
+            *(browser, "--headless", "--no-sandbox", "--virtual-time-budget=20000", "--dump-dom"),
+            *(
+                f"--user-data-dir={tmp_path / 'browser'}",
+                f"{(site / 'index.html').as_uri()}?q=nltgv",
+            ),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    found = re.findall(r'<a href="([^"]*)" class="md-search-result__link"', done.stdout)
+    assert any("meshing.html" in address for address in found), done.stderr
