@@ -30,6 +30,7 @@ ROOT = Path(__file__).parents[2]
 REPOSITORY = "repository/"
 """Where in the site the files beside docs/ are."""
 _BESIDE = ("CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")
+_NOT_SEARCHED = "---\nsearch:\n  exclude: true\n---\n\n"
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)")
 
 
@@ -44,7 +45,7 @@ def on_files(files: Files, *, config: Any) -> Files:
     for path in sorted({*_BESIDE, *linked}):
         text = (ROOT / path).read_text(encoding="utf-8")
         if not path.endswith(".md"):
-            text = f"# {path}\n\n```{path.rpartition('.')[2]}\n{text}\n```\n"
+            text = f"{_NOT_SEARCHED}# {path}\n\n```{path.rpartition('.')[2]}\n{text}\n```\n"
         page = File.generated(config, _in_site(path), content=text)
         page.inclusion = InclusionLevel.INCLUDED if path in _BESIDE else InclusionLevel.NOT_IN_NAV
         files.append(page)

@@ -24,9 +24,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # it would take [the defaults] in help texts for markup
     help="Trajectory, dense map and deforming surfaces from the video of one camera.\n\n"
+    "  pliant run clip.mp4\n\n"
+    "  pliant export results/clip.mp4 --to glb\n\n"
     "  pliant run built-in:room --output results/room\n\n"
-    "  pliant run path/to/tum_sequence\n\n"
-    "  pliant eval results/room --groundtruth path/to/groundtruth.txt\n\n"
+    "  pliant eval results/room --groundtruth built-in:room\n\n"
     "Exit codes: 0 done, 1 error or failed check, 2 wrong usage, 3 finished without a map or with "
     "frames broken or missing, 130 interrupted.",
 )

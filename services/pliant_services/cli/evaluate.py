@@ -38,7 +38,7 @@ def evaluate(
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every figure as JSON.")] = None,
 ) -> None:
-    """ATE under Sim(3), RPE, success rate and retries, for the final and the causal trajectory.
+    """Compare a result with the truth: ATE under Sim(3), RPE, success rate, final and causal.
 
     pliant eval results/room --groundtruth built-in:room --tracks --map --mesh
 

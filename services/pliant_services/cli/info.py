@@ -12,7 +12,7 @@ def info(
         bool, typer.Option("--config", help="Print the configuration that it was made with.")
     ] = False,
 ) -> None:
-    """Duration, topics, counts, rates, sizes, gaps, versions; whether it was closed cleanly.
+    """Say what a recording holds: duration, topics, sizes, gaps, and whether it is whole.
 
     pliant info results/room
 

@@ -30,7 +30,7 @@ def view(
     ] = 0.0,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
-    """Image with tracks, camera path, points, mesh and surfels, in Rerun.  It never slows a run.
+    """Look at a run in Rerun: tracks, camera path, points, mesh, surfels.  It never slows a run.
 
     pliant view results/room
 
