@@ -76,22 +76,26 @@ def test_the_scene_has_the_points_the_path_and_the_mesh(result: pliant.Result, p
     assert np.abs(points - result.points[inside]).max() < step.max()
 
 
-def test_a_browser_draws_it(result: pliant.Result, tmp_path: Path) -> None:
+def in_browser(page: Path, profile: Path, what: str) -> subprocess.CompletedProcess[str]:
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("chromium is not installed")
-    picture = tmp_path / "page.png"
-    done = subprocess.run(
+    return subprocess.run(
         [
             *(browser, "--headless", "--no-sandbox", "--window-size=1000,900"),
             *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-            *(f"--user-data-dir={tmp_path / 'browser'}", "--virtual-time-budget=20000"),
-            *(f"--screenshot={picture}", (result.path / "report.html").as_uri()),
+            *(f"--user-data-dir={profile / 'browser'}", "--virtual-time-budget=20000"),
+            *(what, page.as_uri()),
         ],
         capture_output=True,
         text=True,
         timeout=300,
     )
+
+
+def test_a_browser_draws_it(result: pliant.Result, tmp_path: Path) -> None:
+    picture = tmp_path / "page.png"
+    done = in_browser(result.path / "report.html", tmp_path, f"--screenshot={picture}")
     assert picture.exists(), done.stderr
     shown = cv2.imread(str(picture))
     view = shown[120:740, 20:960].astype(int)
@@ -121,6 +125,29 @@ def test_the_truth_adds_the_error_over_time(result: pliant.Result, tmp_path: Pat
     assert len(causal.split()) == len(result.causal_trajectory)
     (rmse,) = re.findall(r"final \(blue\): RMSE ([^;]+);", section)
     assert re.search(rf"ATE RMSE +{re.escape(rmse)} ", done.stdout)
+
+
+def test_two_points_that_are_picked_tell_how_far_apart_they_are(
+    result: pliant.Result, tmp_path: Path
+) -> None:
+    clicks = """<script>setTimeout(() => {
+      const canvas = document.getElementById("view"), box = canvas.getBoundingClientRect();
+      for (let x = 20; x < box.width; x += 20) for (let y = 20; y < box.height; y += 20)
+        if (!document.getElementById("picked").textContent.includes("apart"))
+          canvas.dispatchEvent(new MouseEvent("dblclick", {clientX: box.left + x, clientY: box.top + y}));
+    }, 1000)</script>"""  # noqa: E501
+    page = tmp_path / "page.html"
+    page.write_text((result.path / "report.html").read_text(encoding="utf-8") + clicks)
+    shown = in_browser(page, tmp_path, "--dump-dom").stdout
+    told = re.search(r'"picked">([\d.]+) apart; [^<]*--points (\S+) (\S+) METRES', shown)
+    assert told is not None
+    apart, a, b = told.groups()
+    between = np.subtract(*(np.array(point.split(","), float) for point in (a, b)))
+    assert abs(np.linalg.norm(between) / float(apart) - 1.0) < 0.01
+    assert result.mesh is not None
+    for point in (a, b):
+        away = result.mesh.positions - np.array(point.split(","), float)
+        assert np.linalg.norm(away, axis=1).min() < 0.05
 
 
 def test_a_page_without_a_map_says_why(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from pliant_services.cli import (
     replay,
     router,
     run,
+    scale,
     service,
     status,
     stop,
@@ -25,6 +26,7 @@ from pliant_services.cli.groups import DEVELOPMENT, EVERYDAY, LOOK, MACHINES, Gr
 app.command("run", cls=GroupedOptions, rich_help_panel=EVERYDAY)(run.run)
 app.command("export", rich_help_panel=EVERYDAY)(export.export)
 app.command("mesh", rich_help_panel=EVERYDAY)(mesh.mesh)
+app.command("scale", rich_help_panel=EVERYDAY)(scale.scale)
 app.add_typer(map_commands.app, name="map", rich_help_panel=EVERYDAY)
 app.command("config", rich_help_panel=EVERYDAY)(config.config)
 app.command("doctor", rich_help_panel=EVERYDAY)(doctor.doctor)

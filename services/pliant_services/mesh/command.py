@@ -18,11 +18,11 @@ from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Header, MeshPiece, MeshUpdate, Status
 from pliant.recording.parts import parts_of
-from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
 from pliant.results.folder import keep_apart, written
 from pliant.results.mesh import mesh_report, meshes_of, write_meshes
 from pliant.results.run import folded_map
+from pliant.results.scale import MetricRecording
 from pliant_services.processes import BY_NAME
 from pliant_services.replay.services import run_on
 
@@ -68,7 +68,7 @@ def mesh_recording(recording: Path, config: Config) -> Meshing:
 
     Raises RecordingError where it has no keyframes; VoxelSizeError before the work starts.
     """
-    reader = Recording(recording)
+    reader = MetricRecording(recording)
     inputs = {topic: reader.decoded(topic) for topic in _MESHING.inputs}
     known = summarise(recording).topics
     missing = [topic.key for topic in inputs if topic.key not in known]

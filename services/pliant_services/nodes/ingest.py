@@ -55,7 +55,7 @@ def run(
     link = Sender(config.bus, dataset.calibration)
 
     def start() -> tuple[Any, ...]:
-        bus.publish(topics.STREAM, _stream(dataset, rectifier, live=live))
+        bus.publish(topics.STREAM, _stream(dataset, rectifier, known, live=live))
         bus.end(topics.STREAM)  # its readers wait for its end before the first frame
         for keyframe in known.keyframes() if known is not None else ():
             bus.publish(topics.MAP_KNOWN, keyframe)
@@ -170,7 +170,9 @@ def newest(
         finished.set()
 
 
-def _stream(dataset: Dataset, rectifier: Rectifier, *, live: bool) -> CameraStream:
+def _stream(
+    dataset: Dataset, rectifier: Rectifier, known: MapFile | None, *, live: bool
+) -> CameraStream:
     camera = rectifier.camera
     size = dataset.source_size if isinstance(dataset, SmallerImages) else (0, 0)
     return CameraStream(
@@ -187,6 +189,7 @@ def _stream(dataset: Dataset, rectifier: Rectifier, *, live: bool) -> CameraStre
         fy=camera.fy,
         cx=camera.cx,
         cy=camera.cy,
+        scale_is_metric=known is not None and known.header.metric,
         focal_sigma=dataset.calibration.focal_sigma,
         source_width=size[0],
         source_height=size[1],

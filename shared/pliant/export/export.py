@@ -32,6 +32,7 @@ from pliant.recording.parts import parts_in
 from pliant.recording.reader import Recorded, Recording
 from pliant.results.folder import RECORDING_NAME, files_read, keep_apart
 from pliant.results.run import read_run
+from pliant.results.scale import MetricRecording
 from pliant.results.surfels import has_surfels, surfel_trajectory
 from pliant.trajectory import Trajectory
 
@@ -95,7 +96,7 @@ def export_result(
     return path
 
 
-class _Followed(Recording):
+class _Followed(MetricRecording):
     """A recording that tells how many of its images have been read: they take the time."""
 
     def __init__(self, path: Path, progress: Progress | None) -> None:

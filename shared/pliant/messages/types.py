@@ -58,7 +58,7 @@ class CameraStream(Header):
     frames: how many will come, -1 if unknown.
     calibration: the source's, as YAML, from which the rectified image can be made again.
     width, height, fx, fy, cx, cy: the rectified pinhole camera, in pixels.
-    scale_is_metric: whether lengths are metres; never so for one camera alone.
+    scale_is_metric: whether lengths are metres, as those of a map are whose scale was measured.
     focal_sigma: standard deviation of the log focal length where it is a guess; 0: calibrated.
     source_width, source_height: of the images before they were made smaller; 0: as they are.
     """

@@ -1,8 +1,9 @@
 """The file of a map that is kept, ``map.pliant``: MCAP, one message for each keyframe.
 
 A metadata record ``map`` stands first: ``version`` of what the fields mean, ``release`` of Pliant,
-``source`` of the last session and its ``calibration`` as YAML.  The messages are those of the topic
-``map/kept``, in the order of their keyframes.  Nothing in it depends on the time or the machine.
+``source`` of the last session and its ``calibration`` as YAML, and whether its lengths are
+``metric``.  The messages are those of the topic ``map/kept``, in the order of their keyframes.
+Nothing in it depends on the time or the machine.
 """
 
 from collections.abc import Iterable, Iterator
@@ -34,6 +35,7 @@ class MapHeader:
     release: str = __version__
     source: str = ""
     calibration: str = ""
+    metric: bool = False
 
 
 class MapFile:
@@ -57,6 +59,7 @@ class MapFile:
             release=found.get("release", ""),
             source=found.get("source", ""),
             calibration=found.get("calibration", ""),
+            metric=found.get("metric") == str(True),
         )
         if self.header.version > MAP_VERSION:
             raise MapError(
@@ -136,6 +139,7 @@ def describe(path: Path) -> Iterator[str]:
     header = file.header
     yield f"{file.path}: version {header.version}, written by pliant {header.release}"
     yield f"sessions: {len(sessions)}, the last of {header.source}"
+    yield f"scale: {'metres' if header.metric else 'arbitrary'}"
     yield f"cameras: {'; '.join(sorted(cameras))}"
     yield (
         f"{count} keyframes, {places} of them places, {size / 1e6:.1f} MB, "

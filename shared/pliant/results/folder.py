@@ -42,8 +42,9 @@ _RIGID_FILES = (
     PAGE_NAME,
 )
 SURFEL_FILES = (TRAJECTORY_NAME, SURFELS_NAME, REPORT_NAME)
-SOMETIMES = (MAP_NAME,)
-"""Of a map that came to its end."""
+SCALE_NAME = "scale.yaml"
+SOMETIMES = (MAP_NAME, SCALE_NAME)
+"""Of a map that came to its end, and of one whose scale is known."""
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
 _LOCK_NAME = ".lock"
 _VERSIONS = ("eclipse-zenoh", "mcap", "msgpack", "numba", "numpy", "opencv-python-headless")

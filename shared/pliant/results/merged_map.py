@@ -38,7 +38,12 @@ def merge_maps(first: Path, second: Path, output: Path, *, force: bool) -> Itera
             f"{second}: none of its {len(other)} keyframes shows a place of {first}: nothing is "
             "written; a run through both with --map joins them"
         )
-    header = MapHeader(source=files[1].header.source, calibration=files[0].header.calibration)
+    first_header = files[0].header
+    header = MapHeader(
+        source=files[1].header.source,
+        calibration=first_header.calibration,
+        metric=first_header.metric,
+    )
     try:
         make_folder(output.parent)
     except OSError as error:

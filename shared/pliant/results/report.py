@@ -68,7 +68,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "tracks_per_frame": [run.tracks[f] for f in sorted(run.tracks)],
         "inliers_per_frame": [run.inliers[f] for f in sorted(run.inliers)],
         "map_points_per_frame": [run.map_points[f] for f in sorted(run.map_points)],
-        "scale_is_metric": bool(run.stream and run.stream.scale_is_metric),
+        "scale_is_metric": run.scale_is_metric,
     }
 
 

@@ -24,6 +24,7 @@ from pliant.messages.types import (
 )
 from pliant.recording.reader import Recording
 from pliant.recording.summary import Summary
+from pliant.results.scale import MetricRecording, Scale
 
 _LEFT_ALONE = (
     *(topics.SOURCE, topics.DEPTH, topics.KEYFRAME, topics.KEYFRAME_FINAL, topics.MESH_BLOCKS),
@@ -57,6 +58,8 @@ class Run:
     ends: dict[str, StreamEnd] = field(default_factory=dict[str, StreamEnd])
     arrivals_ns: list[int] = field(default_factory=list[int])
     recorded: Summary = field(default_factory=Summary)
+    known_segments: set[int] = field(default_factory=set[int])
+    scale: Scale | None = None
 
     def correction_of(self, segment: int) -> tuple[float, ...]:
         """What its last adjustment found wrong with the calibration; () where it had none."""
@@ -66,6 +69,13 @@ class Run:
     def calibration_correction(self) -> tuple[float, ...]:
         """That of the last segment which has one, and so saw what was known before."""
         return self.corrections[max(self.corrections)] if self.corrections else ()
+
+    @property
+    def scale_is_metric(self) -> bool:
+        """Whether lengths of the longest segment are metres: measured, or those of a known map."""
+        if self.stream is None or not self.stream.scale_is_metric:
+            return False
+        return self.scale is not None or self.history.longest_segment() in self.known_segments
 
     @property
     def frames_per_second(self) -> float:
@@ -85,12 +95,17 @@ class Run:
         return whole and all(end.complete for end in self.ends.values())
 
 
-def read_run(path: Path) -> Run:
-    """Fold a recording.  Raises RecordingError for a file that is none."""
-    run = Run()
-    for keyframe in known_keyframes(path):
+def read_run(path: Path, scale: Scale | None = None) -> Run:
+    """Fold a recording, in metres where the scale is known.  scale: None: that beside it.
+
+    Raises RecordingError for a file that is none.
+    """
+    recording = MetricRecording(path, scale)
+    run = Run(scale=recording.scale)
+    for keyframe in known_keyframes(recording):
         run.history.know(keyframe)
-    for recorded in Recording(path).messages():
+        run.known_segments.add(keyframe.segment)
+    for recorded in recording.messages():
         run.recorded.count(recorded)
         if recorded.topic in _LEFT_ALONE:
             continue
@@ -123,10 +138,10 @@ def read_run(path: Path) -> Run:
     return run
 
 
-def known_keyframes(path: Path) -> Iterator[MapKeyframe]:
+def known_keyframes(recording: Recording) -> Iterator[MapKeyframe]:
     """The map of earlier sessions that a run began with: before all else, as only the messages of
     one topic are in order."""
-    for keyframe in Recording(path).decoded(topics.MAP_KNOWN):
+    for keyframe in recording.decoded(topics.MAP_KNOWN):
         assert isinstance(keyframe, MapKeyframe)
         yield keyframe
 
@@ -175,12 +190,12 @@ def _take_status(run: Run, status: Status) -> None:
 
 
 def folded_map(path: Path) -> MapHistory:
-    """The map of a recording alone."""
-    history = MapHistory()
-    for keyframe in known_keyframes(path):
+    """The map of a recording alone, in metres where the scale is known."""
+    recording, history = MetricRecording(path), MapHistory()
+    for keyframe in known_keyframes(recording):
         history.know(keyframe)
     for topic in (topics.MAP_UPDATE, topics.MAP_FINAL):
-        for update in Recording(path).decoded(topic):
+        for update in recording.decoded(topic):
             assert isinstance(update, MapUpdate)
             final = topic == topics.MAP_FINAL
             history.apply(update, frame=update.frame, stamp_ns=update.stamp_ns, final=final)

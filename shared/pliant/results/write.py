@@ -17,33 +17,43 @@ from pliant.messages.types import MapKeyframe
 from pliant.recording.map_file import MAP_NAME, MapHeader, write_map
 from pliant.recording.reader import Recording
 from pliant.results.calibration import found_calibration
-from pliant.results.folder import CALIBRATION_NAME, PAGE_NAME, RECORDING_NAME, REPORT_NAME
+from pliant.results.folder import (
+    CALIBRATION_NAME,
+    PAGE_NAME,
+    RECORDING_NAME,
+    REPORT_NAME,
+    SCALE_NAME,
+)
 from pliant.results.mesh import write_meshes
 from pliant.results.page.page import write_page
 from pliant.results.report import rigid_report
 from pliant.results.run import Run, read_run
+from pliant.results.scale import MetricRecording, Scale
 from pliant.results.surfels import has_surfels, write_surfel_results
 
 
 def write_results(output: Path) -> dict[str, Any]:
     """Write the files of a recording's profile; returns the report.  Raises PliantError."""
     deformable = has_surfels(output / RECORDING_NAME)
-    return write_surfel_results(output) if deformable else _write_rigid_results(output)
+    return write_surfel_results(output) if deformable else write_rigid_results(output)
 
 
-def _write_rigid_results(output: Path) -> dict[str, Any]:
+def write_rigid_results(output: Path, scale: Scale | None = None) -> dict[str, Any]:
     """Write trajectories, keyframes, points and report beside the recording; returns the report.
 
+    scale: None: that of the folder, if there is one; otherwise it is one of the files then.
     All of them, or none where the disk is full.  Raises RecordingError and ResultError.
     """
-    recording = Recording(output / RECORDING_NAME)
-    run = read_run(recording.path)
+    recording = MetricRecording(output / RECORDING_NAME, scale)
+    run = read_run(recording.path, scale)
     final = run.history.final()
     report = rigid_report(run, final)
     try:
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=output) as folder:
             _write_files(Path(folder), run, recording, final, report)
             _write_map(Path(folder), recording, run)
+            if scale is not None:
+                (Path(folder) / SCALE_NAME).write_text(scale.yaml(), encoding="utf-8")
             move_all(Path(folder), output)
     except OSError as error:
         raise ResultError(
@@ -57,7 +67,9 @@ def _write_map(folder: Path, recording: Recording, run: Run) -> None:
     stream = run.stream
     if stream is None:
         return
-    header = MapHeader(source=stream.source, calibration=stream.calibration)
+    header = MapHeader(
+        source=stream.source, calibration=stream.calibration, metric=run.scale_is_metric
+    )
     kept = (k for k in recording.decoded(topics.MAP_KEPT) if isinstance(k, MapKeyframe))
     write_map(folder / MAP_NAME, header, kept)
 

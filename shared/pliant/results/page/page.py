@@ -98,7 +98,8 @@ def _map(run: Run, final: dict[int, tuple[int, F64]]) -> str:
     )
     return (
         '<canvas id="view"></canvas><p class="soft"><span id="layers"></span> drag to turn, '
-        "shift-drag to move, wheel or pinch to come closer</p>"
+        "shift-drag to move, wheel or pinch to come closer, double-click two points to measure</p>"
+        '<p id="picked"></p>'
         f'<script type="application/json" id="scene">{scene.header}</script>'
         f'<script type="text/plain" id="bytes">{scene.bytes}</script>'
         f"<script>{_part('viewer.js')}</script>"

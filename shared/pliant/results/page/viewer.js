@@ -14,8 +14,11 @@ void main() { world = low + place * size; tint = colour; gl_Position = seen * ve
   gl_PointSize = clamp(dot_px / gl_Position.w, 1.5, 12.0); }`;
 const FRAGMENT = `#version 300 es
 precision highp float; in vec3 tint; in vec3 world; uniform vec3 eye; uniform float lit; out vec4 shown;
-void main() { vec3 normal = normalize(cross(dFdx(world), dFdy(world)));
-  float light = mix(1.0, 0.45 + 0.55 * abs(dot(normal, normalize(eye - world))), lit);
+void main() { float light = 1.0;
+  if (lit > 0.5) {
+    vec3 normal = normalize(cross(dFdx(world), dFdy(world)));
+    light = 0.45 + 0.55 * abs(dot(normal, normalize(eye - world)));
+  }
   shown = vec4(tint * light, 1.0); }`;
 
 function compiled(kind, source) {
@@ -80,6 +83,46 @@ function begin() {
     return { right, forward: sum([ch, level], [-sh, up]), above: sum([sh, level], [ch, up]) };
   }
 
+  // Two points that were double-clicked, and how far apart they are.
+  const picked = [], marks = { array: gl.createVertexArray(), buffer: gl.createBuffer() };
+  let rows = [];
+  const seenAt = (place) => {
+    const [x, y, , w] = rows.map((row) => dot(row, place) + row[3]);
+    return { x: (0.5 + 0.5 * x / w) * canvas.clientWidth, y: (0.5 - 0.5 * y / w) * canvas.clientHeight, w };
+  };
+
+  canvas.ondblclick = (event) => {
+    const place = nearest(event.offsetX, event.offsetY);
+    if (!place) return;
+    if (picked.length === 2) picked.length = 0;
+    picked.push(place);
+    const text = picked.map((each) => each.map((value) => value.toPrecision(5)).join(","));
+    const apart = picked.length === 2 ? Math.hypot(...sum([1, picked[0]], [-1, picked[1]])).toPrecision(4) : "";
+    document.getElementById("picked").textContent = apart
+      ? `${apart} apart; in metres by: pliant scale RESULT --points ${text.join(" ")} METRES` : `${text}, double-click another point`;
+    gl.bindVertexArray(marks.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, marks.buffer);
+    const shares = picked.flatMap((each) => each.map((value, k) => (value - header.low[k]) / header.size[k]));
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(shares), gl.DYNAMIC_DRAW);
+    gl.enableVertexAttribArray(gl.getAttribLocation(program, "place"));
+    gl.vertexAttribPointer(gl.getAttribLocation(program, "place"), 3, gl.FLOAT, false, 0, 0);
+    draw();
+  };
+
+  // Of what is shown within a few pixels of the pointer the nearest to the eye; null: nothing is.
+  function nearest(px, py) {
+    let found = null, depth = Infinity;
+    for (const layer of layers.filter((each) => each.shown && !each.line)) {
+      const shares = new Uint16Array(bytes, layer.places, 3 * layer.count);
+      for (let n = 0; n < shares.length; n += 3) {
+        const place = [0, 1, 2].map((k) => header.low[k] + shares[n + k] / 65535 * header.size[k]);
+        const { x, y, w } = seenAt(place);
+        if (w > 0 && w < depth && Math.hypot(x - px, y - py) < 8) [found, depth] = [place, w];
+      }
+    }
+    return found;
+  }
+
   function draw() {
     const { right, forward, above } = axes();
     const eye = sum([1, view.target], [-view.distance, forward]);
@@ -91,7 +134,7 @@ function begin() {
     gl.enable(gl.CULL_FACE);  // one looks into a room through its walls
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const f = 2.4, [near, far] = [0.01 * view.distance, 50 * header.distance];
-    const rows = [
+    rows = [
       [f * canvas.height / canvas.width, right], [f, above], [(far + near) / (far - near), forward], [1, forward],
     ].map(([scale, axis]) => [...axis.map((value) => scale * value), -scale * dot(axis, eye)]);
     rows[2][3] -= 2 * far * near / (far - near);
@@ -106,6 +149,12 @@ function begin() {
       if (layer.triangles) gl.drawElements(gl.TRIANGLES, 3 * layer.triangles, gl.UNSIGNED_INT, 0);
       else gl.drawArrays(layer.line ? gl.LINE_STRIP : gl.POINTS, 0, layer.count);
     }
+    gl.bindVertexArray(marks.array);
+    gl.disable(gl.DEPTH_TEST);
+    gl.uniform1f(places.lit, 0);
+    gl.uniform1f(places.dot, 1e6);
+    gl.vertexAttrib3f(gl.getAttribLocation(program, "colour"), 1, 0.2, 0.5);
+    gl.drawArrays(gl.POINTS, 0, picked.length);
   }
 
   const fingers = new Map();

@@ -1,0 +1,52 @@
+"""``pliant scale``: a result in metres, by what is known of the scene."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def _point(text: str) -> tuple[float, ...]:
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no point: expected X,Y,Z") from None
+    return x, y, z
+
+
+def scale(
+    result: Annotated[Path, typer.Argument(help="A result folder.")],
+    points: Annotated[
+        tuple[str, str, float] | None,
+        typer.Option(
+            "--points",
+            metavar="X,Y,Z X,Y,Z METRES",
+            help="Two points of the map and how far apart they are: report.html picks them.",
+        ),
+    ] = None,
+    marker: Annotated[
+        float | None,
+        typer.Option(
+            "--marker", metavar="METRES", help="Side of the ArUco or AprilTag markers in view."
+        ),
+    ] = None,
+    depth: Annotated[
+        str | None,
+        typer.Option(
+            "--depth", metavar="SOURCE", help="The run's source, if depth or stereo is there."
+        ),
+    ] = None,
+) -> None:
+    """Make a result metric: every file in its folder, its exports, and runs that go on in its map.
+
+    pliant scale results/desk --marker 0.08
+
+    pliant scale results/desk --points 0.12,0.05,1.3 0.48,0.06,1.31 0.60
+
+    pliant scale results/desk --depth path/to/desk
+    """
+    from pliant.scale.command import Known, scale_result
+
+    a_b = None if points is None else (_point(points[0]), _point(points[1]), points[2])
+    for line in scale_result(result, Known(points=a_b, marker=marker, depth=depth)):
+        typer.echo(line)

@@ -1,0 +1,62 @@
+"""Behind ``pliant scale``: a result in metres."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pliant.errors import ResultError
+from pliant.recording import parts
+from pliant.results.folder import RECORDING_NAME, written
+from pliant.results.run import Run, read_run
+from pliant.results.scale import MetricRecording, Scale
+from pliant.results.surfels import has_surfels
+from pliant.results.write import write_rigid_results
+from pliant.scale.lengths import from_depth, from_points
+from pliant.scale.marker import from_marker
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """What is known of the scene: one of these.
+
+    points: two points of the map, and the metres between them.   marker: side of the markers.
+    depth: a source with depth maps.
+    """
+
+    points: tuple[Sequence[float], Sequence[float], float] | None = None
+    marker: float | None = None
+    depth: str | None = None
+
+
+def scale_result(result: Path, known: Known) -> Iterator[str]:
+    """Measure, write the files of a result folder in metres, and say how long a unit was.
+
+    What was told before is forgotten.  Raises PliantError, and has written nothing then.
+    """
+    given = [each for each in (known.points, known.marker, known.depth) if each is not None]
+    if len(given) != 1:
+        raise ResultError("say what is known of the scene: one of --points, --marker, --depth")
+    if not parts.exists(result / RECORDING_NAME):
+        raise ResultError(f"{result}: no result folder with a recording")
+    if has_surfels(result / RECORDING_NAME):
+        raise ResultError(f"{result}: a scene that deforms: only results of rigid ones are scaled")
+    with written(result, force=True):
+        recording = MetricRecording(result / RECORDING_NAME)
+        run = read_run(recording.path)
+        if run.history.longest_segment() < 0:
+            raise ResultError(f"{result}: the run has no map to scale")
+        found = _measure(recording, run, known)
+        before = recording.scale
+        write_rigid_results(result, found if before is None else before.times(found))
+    sure = f", +- {found.sigma:.1%}" if found.sigma >= 0.001 else ""
+    unit = "a unit of the map" if before is None else "a metre so far"
+    yield f"{unit} is {found.metres_per_unit:.4g} m ({found.source}{sure}): {result}/ is in metres"
+
+
+def _measure(recording: MetricRecording, run: Run, known: Known) -> Scale:
+    if known.points is not None:
+        return from_points(*known.points)
+    if known.marker is not None:
+        return from_marker(recording, run, known.marker)
+    assert known.depth is not None
+    return from_depth(recording, run, known.depth)
