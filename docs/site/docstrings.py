@@ -7,13 +7,17 @@ import griffe
 
 
 class OurDocstrings(griffe.Extension):
-    """Docstrings announce code by ``::``, and have <names> in their text."""
+    """Docstrings announce code by ``::``, have <names> in their text, and gaps between fields."""
 
     def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Take the second colon away, and have <names> shown."""
+        """Make the text of a docstring Markdown, and leave its code."""
         if obj.docstring:
-            lines = [
-                line if line.startswith("    ") else re.sub(r"::$", ":", line.replace("<", "&lt;"))
-                for line in obj.docstring.value.splitlines()
-            ]
-            obj.docstring.value = "\n".join(lines)
+            lines = obj.docstring.value.splitlines()
+            shown = [line if line.startswith("    ") else _as_markdown(line) for line in lines]
+            text = "\n".join(shown)
+            obj.docstring.value = re.sub(r"(?<=\.)\n(?=\w[\w ,()]*: )", "<br>\n", text)
+
+
+def _as_markdown(line: str) -> str:
+    line = re.sub(r"::$", ":", line.replace("<", "&lt;"))
+    return re.sub(r"(?<=\S) {3,}(?=\S)", "<br>", line)

@@ -31,6 +31,16 @@ REPOSITORY = "repository/"
 """Where in the site the files beside docs/ are."""
 _BESIDE = ("CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")
 _NOT_SEARCHED = "---\nsearch:\n  exclude: true\n---\n\n"
+_PYTHON = (
+    "What `import pliant` gives ([examples](../python.md)), what that returns, and its errors. "
+    "`F64` is a numpy array of float64, `F32` of float32, `U8` of uint8, `I64` of int64."
+)
+_RETURNED = (
+    "pliant.trajectory.Trajectory",
+    "pliant.api.result.Keyframe",
+    "pliant.algorithms.meshing.mesh_blocks.TriangleMesh",
+    "pliant.errors",
+)
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)")
 
 
@@ -214,8 +224,10 @@ def _python() -> str:
     """What ``import pliant`` gives, by mkdocstrings."""
     first = ["run", "open", "follow", "load_map", "Result", "Slam"]
     names = [*first, *(name for name in sorted(pliant._WHERE) if name not in first)]
-    parts = ["# Python", "What `import pliant` gives. [Examples](../python.md)."]
-    return "\n\n".join([*parts, *(f"::: pliant.{name}" for name in names)])
+    parts = ["# Python", _PYTHON]
+    parts += [f"::: pliant.{name}" for name in names]
+    parts += [f"::: {name}" for name in _RETURNED]
+    return "\n\n".join(parts)
 
 
 _REFERENCE: dict[str, Callable[[], str]] = {
