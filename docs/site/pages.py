@@ -194,7 +194,7 @@ def _message(message: type[Header], without: set[str]) -> Iterator[str]:
     for kind in message.__mro__:
         if is_dataclass(kind) and not (without and kind is Header):
             for paragraph in inspect.cleandoc(kind.__doc__ or "").split("\n\n"):
-                prose, *said = _said_of_fields(paragraph, list(types))
+                prose, *said = _said_of_fields(paragraph, [field.name for field in fields(message)])
                 if prose.strip():
                     yield _plain(prose)
                 meanings.update(said)
@@ -209,11 +209,13 @@ def _message(message: type[Header], without: set[str]) -> Iterator[str]:
 def _said_of_fields(paragraph: str, names: list[str]) -> Iterator[Any]:
     """The text before the first field, and then each (field, what is said of it)."""
     name = rf"(?:{'|'.join(names)})(?: \([^)]*\))?"
-    before, *rest = re.split(rf"(?<!\S)({name}(?:,\s+{name})*):\s", paragraph)
+    before, *rest = re.split(rf"(?<!\S)({name}(?:(?:,| \.\.\.)\s+{name})*):\s", paragraph)
     yield before
     for told, text in zip(rest[::2], rest[1::2], strict=True):
-        for each in re.findall(rf"(?<!\w)({'|'.join(names)})(?!\w)", re.sub(r"\(.*?\)", "", told)):
-            yield each, text
+        some = re.findall(rf"(?<!\w)({'|'.join(names)})(?!\w)", re.sub(r"\(.*?\)", "", told))
+        if "..." in told:  # and those between
+            some = names[names.index(some[0]) : names.index(some[-1]) + 1]
+        yield from ((each, text) for each in some)
 
 
 def _type_name(kind: Any) -> str:
