@@ -2,6 +2,7 @@
 
 from pliant_services.cli import (
     app,
+    calibrate,
     certs,
     config,
     doctor,
@@ -28,6 +29,7 @@ app.command("export", rich_help_panel=EVERYDAY)(export.export)
 app.command("mesh", rich_help_panel=EVERYDAY)(mesh.mesh)
 app.command("scale", rich_help_panel=EVERYDAY)(scale.scale)
 app.add_typer(map_commands.app, name="map", rich_help_panel=EVERYDAY)
+app.command("calibrate", rich_help_panel=EVERYDAY)(calibrate.calibrate)
 app.command("config", rich_help_panel=EVERYDAY)(config.config)
 app.command("doctor", rich_help_panel=EVERYDAY)(doctor.doctor)
 app.command("view", rich_help_panel=LOOK)(view.view)

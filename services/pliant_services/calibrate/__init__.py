@@ -1,0 +1,1 @@
+"""Behind ``pliant calibrate``: with a board, without one, and the board to print."""

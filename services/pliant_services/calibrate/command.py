@@ -1,0 +1,259 @@
+"""A calibration from a video, of a board or of anything."""
+
+import contextlib
+import io
+import json
+import math
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import U8
+from pliant.algorithms.board_calibration import (
+    MIN_VIEWS,
+    BoardCalibration,
+    BoardLens,
+    calibrate,
+    choose_views,
+)
+from pliant.algorithms.boards import BoardFinder, BoardView, boards_seen
+from pliant.algorithms.bundle.problem import CalibrationUncertainty
+from pliant.algorithms.image.sharpness import LONGEST_SIDE_PX, resized, sharpness
+from pliant.datasets import BrokenFrame, Dataset, decode, open_source
+from pliant.datasets.calibration import UNSAID_FOV_DEG, Calibration, calibration_yaml
+from pliant.datasets.calibration_files import read_calibration
+from pliant.datasets.excerpt import Excerpt
+from pliant.errors import CalibrationError, DatasetError, ResultError
+from pliant.files import make_folder, write_whole
+from pliant.pictures.calibration import SeenCorners, coverage, draw_calibration
+from pliant.pictures.movie import write_image
+from pliant.results.folder import CALIBRATION_NAME, REPORT_NAME, keep_apart
+from pliant_services.calibrate.board import PrintedBoard
+from pliant_services.cli.progress import tell_progress
+from pliant_services.run.command import INTERRUPTED, RunRequest, run_pipeline
+
+_LOOKED_AT = 200
+"""Frames in which the board is looked for: the sharpest of so many parts of the source."""
+_TRIED = 8
+"""Frames that are searched for other boards where the wanted one is in none."""
+_KNOWN = 0.05
+"""Standard deviation of the log focal length above which it counts as unknown."""
+_WORST = 2e-3
+"""Share of the width that corners may be off by: more, and it is not that board."""
+_WHOLE_PX = 1 << 20  # no images are this large: they are not made smaller
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """See ``datasets.excerpt.Part``."""
+
+    every: int
+    start_s: float = 0.0
+    end_s: float = 0.0
+    sharpest: bool = True
+
+
+@dataclass(frozen=True)
+class _Found:
+    view: BoardView
+    sharpness: float
+
+
+def check_file(output: Path, *, source: str, force: bool) -> None:
+    """Raise ResultError where the calibration cannot go there.  Changes nothing."""
+    if output.is_dir():
+        raise ResultError(f"{output} is a folder: name a file, such as {output / 'calib.yaml'}")
+    if output.exists() and not force:
+        raise ResultError(f"{output} exists: choose another --output, or --force to replace it")
+    keep_apart(output, [Path(source)] if Path(source).exists() else [])
+
+
+def calibrate_with_board(
+    source: str, printed: PrintedBoard, output: Path, *, lens: BoardLens, topic: str
+) -> list[str]:
+    """Write the calibration of a source that shows a board, and a picture of how good it is.
+
+    Returns what to tell.  Raises PliantError: no board, another one, too few views, no lens.
+    """
+    dataset = open_source(source, fov_deg=UNSAID_FOV_DEG, topic=topic, longest_side_px=_WHOLE_PX)
+    width, height = dataset.calibration.width, dataset.calibration.height
+    found, others, looked = _look_for(dataset, printed, source)
+    if not found:
+        raise CalibrationError(
+            f"{source}: {printed.spelled} is in none of {looked} frames: {_hint(others, printed)}"
+        )
+    views = [each.view for each in found]
+    chosen = choose_views(views, [each.sharpness for each in found], printed.board, width)
+    if len(chosen) < MIN_VIEWS:
+        raise CalibrationError(
+            f"{source}: {printed.spelled} is in {len(found)} of {looked} frames, of which "
+            f"{len(chosen)} differ, and {MIN_VIEWS} are needed: move it through the whole image "
+            f"and tilt it; of the other frames: {_hint(others, printed)}"
+        )
+    chosen_views = [views[i] for i in chosen]
+    result = calibrate(chosen_views, width, height, lens)
+    calibration = _checked(result, source, printed, lens, width)
+    assert result is not None
+    used = [view for view, use in zip(chosen_views, result.used, strict=True) if use]
+    seen = [SeenCorners(v.points_px, r) for v, r in zip(used, result.residuals, strict=True)]
+    covered = coverage(seen, width, height)
+    lines = [
+        _said(calibration, result.focal_sigma),
+        f"reprojection error {result.rms_px:.2f} px in {len(used)} views, of {len(found)} frames "
+        f"with {printed.spelled}; they cover {100.0 * covered:.0f} % of the image",
+    ]
+    picture = output.with_suffix(".png")
+    make_folder(output.parent)
+    write_image(picture, draw_calibration(seen, width, height, [f"{source}: {lines[0]}", lines[1]]))
+    _write(output, calibration, [f"pliant calibrate {source} --board {printed.spelled}", *lines])
+    return [*lines, *_advice(covered, result.focal_sigma), f"written: {output}, {picture}"]
+
+
+def _look_for(
+    dataset: Dataset, printed: PrintedBoard, source: str
+) -> tuple[list[_Found], list[U8], int]:
+    """What the frames show of the board, a few that do not, and how many were looked at."""
+    if dataset.is_live:
+        raise DatasetError(f"{source}: is live: film the board, and give the video")
+    count = dataset.frame_count or sum(1 for _ in dataset)
+    every = max(1, math.ceil(count / _LOOKED_AT))
+    frames = Excerpt(dataset, _Part(every=every, sharpest=every > 1))
+    finder, found = BoardFinder(printed.board), list[_Found]()
+    others: list[U8] = []
+    total, looked = -(-count // every), 0
+    for frame in frames:
+        tell_progress("looking for the board", min(looked, total - 1), total)
+        try:
+            pixels = decode(frame)
+        except BrokenFrame:
+            continue
+        if pixels.ndim == 3:
+            pixels = cast(U8, cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+        if pixels.shape != (dataset.calibration.height, dataset.calibration.width):
+            continue
+        looked += 1
+        view = finder.find(np.ascontiguousarray(pixels))
+        if view is not None:
+            found.append(_Found(view, sharpness(resized(pixels, LONGEST_SIDE_PX))))
+        elif looked % max(1, total // _TRIED) == 0:
+            others.append(pixels)
+    tell_progress("looking for the board", total, total)
+    return found, others, looked
+
+
+def _hint(others: list[U8], printed: PrintedBoard) -> str:
+    """What to do where frames do not show the board: it may be another one that they show."""
+    for seen in boards_seen(others):
+        if seen != f"a chessboard of {printed.board.columns}x{printed.board.rows} squares":
+            return f"there is {seen} in them: is that the --board?"
+    return "show all of it, sharp and evenly lit"
+
+
+def _checked(
+    result: BoardCalibration | None, source: str, printed: PrintedBoard, lens: str, width: int
+) -> Calibration:
+    """The calibration, with how sure it is where that is not very.  Raises CalibrationError."""
+    if result is None:
+        raise CalibrationError(
+            f"{source}: no {lens} lens fits the views of {printed.spelled}: keep the board flat "
+            "and still, fill the image with it"
+            + ("" if lens == "fisheye" else "; a very wide lens needs --lens fisheye")
+        )
+    if result.rms_px > _WORST * width:
+        raise CalibrationError(
+            f"{source}: the corners of {printed.spelled} are {result.rms_px:.1f} px off: is it "
+            "this board, flat, and held still?"
+            + ("" if lens == "fisheye" else " A very wide lens needs --lens fisheye")
+        )
+    if result.focal_sigma > _KNOWN:
+        raise CalibrationError(
+            f"{source}: the focal length stays open (+-{100.0 * result.focal_sigma:.0f} %): tilt "
+            f"{printed.spelled} by 30 degrees and more, both ways"
+        )
+    found = result.lens
+    return Calibration(  # whose checks it passes: the lens could be rectified
+        model=found.model,
+        width=found.width,
+        height=found.height,
+        fx=found.fx,
+        fy=found.fy,
+        cx=found.cx,
+        cy=found.cy,
+        distortion=found.coefficients,
+        focal_sigma=result.focal_sigma
+        if result.focal_sigma > CalibrationUncertainty().focal
+        else 0,
+    )
+
+
+def _advice(covered: float, focal_sigma: float) -> list[str]:
+    lines: list[str] = []
+    if covered < 0.7:
+        lines.append("where no view was, the distortion is a guess: bring the board to the corners")
+    if focal_sigma > 0.5 * CalibrationUncertainty().focal:
+        lines.append("the focal length would be surer with more and steeper tilts of the board")
+    return lines
+
+
+def calibrate_without_board(
+    source: str, output: Path, *, fov_deg: float | None, topic: str
+) -> list[str]:
+    """Write the calibration that a run finds by itself, of any scene; returns what to tell.
+
+    It is a run, without its mesh and images, whose other results are thrown away.
+    """
+    dataset = open_source(source, fov_deg=fov_deg, topic=topic)
+    if dataset.is_live:
+        raise DatasetError(f"{source}: is live: film, and give the video")
+    if dataset.calibration.focal_sigma == 0.0:
+        raise CalibrationError(
+            f"{source}: has a calibration, which `pliant run` takes: --fov DEGREES, a first guess, "
+            "finds one anew"
+        )
+    with tempfile.TemporaryDirectory(prefix="pliant-calibrate-") as folder:
+        request = RunRequest(
+            source=source,
+            output=Path(folder) / "run",
+            overrides=["meshing.enabled=false", "recorder.images=false"],
+            fov_deg=fov_deg,
+            topic=topic,
+        )
+        with contextlib.redirect_stdout(io.StringIO()):  # of results that nobody will find
+            code = run_pipeline(request)
+        if code == INTERRUPTED:
+            raise KeyboardInterrupt
+        report = json.loads((Path(folder) / "run" / REPORT_NAME).read_text(encoding="utf-8"))
+        if not report["segments"]:
+            raise CalibrationError(f"{source}: no map could start: {report['last_reason']}")
+        calibration = read_calibration(Path(folder) / "run" / CALIBRATION_NAME)
+    verdict = str(report["calibration_verdict"]).partition(":")[0]
+    if calibration.focal_sigma > _KNOWN:
+        raise CalibrationError(
+            f"{source}: {verdict}: film sideways and with turns, or film a board "
+            "(pliant calibrate --print-board board.pdf)"
+        )
+    make_folder(output.parent)
+    _write(output, calibration, [f"pliant calibrate {source}", verdict])
+    return [_said(calibration, calibration.focal_sigma), verdict, f"written: {output}"]
+
+
+def _said(calibration: Calibration, focal_sigma: float) -> str:
+    fov = math.degrees(2.0 * math.atan(0.5 * calibration.width / calibration.fx))
+    sure = f" +- {focal_sigma * calibration.fx:.2g} px" if focal_sigma > 0.0 else " px"
+    return (
+        f"{calibration.width}x{calibration.height} px, {calibration.model}, focal length "
+        f"{calibration.fx:.1f}{sure} (about {fov:.0f} degrees across)"
+    )
+
+
+def _write(output: Path, calibration: Calibration, comments: list[str]) -> None:
+    """Raises ResultError."""
+    head = "".join(f"# {line}\n" for line in comments)
+    try:
+        write_whole(output, head + calibration_yaml(replace(calibration, depth=None)))
+    except OSError as error:
+        raise ResultError(f"{output}: cannot be written ({error.strerror})") from None

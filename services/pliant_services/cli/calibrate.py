@@ -1,0 +1,79 @@
+"""``pliant calibrate``: the camera of a video, with a board or without."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+
+def calibrate(
+    source: Annotated[
+        str, typer.Argument(help="Video, folder of images, bag: as for run.", show_default=False)
+    ] = "",
+    board: Annotated[
+        str | None,
+        typer.Option(
+            help="KIND:COLUMNSxROWS[:SQUARE_MM[:MARKER_MM[:DICTIONARY]]]: charuco:7x10 or "
+            "chessboard:10x7, counted in squares. Without one the scene itself has to tell."
+        ),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="The calibration; a picture goes beside it.")
+    ] = Path("calib.yaml"),
+    force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
+    lens: Annotated[
+        Literal["radtan", "fisheye"],
+        typer.Option(help="With a board: k1 k2 p1 p2 k3, or k1 to k4 of a very wide lens."),
+    ] = "radtan",
+    fov: Annotated[
+        float | None, typer.Option(help="Without a board: a first guess, degrees across.")
+    ] = None,
+    topic: Annotated[
+        str, typer.Option(help="The images of an MCAP file or ROS bag that has several.")
+    ] = "",
+    print_board: Annotated[
+        Path | None,
+        typer.Option(help="Write the board as a PDF in its true size [charuco:7x10:25]."),
+    ] = None,
+) -> None:
+    """Find the camera of a video: focal length, centre, distortion, and how sure they are.
+
+    pliant calibrate --print-board board.pdf
+
+    pliant calibrate board.mp4 --board charuco:7x10
+
+    pliant calibrate board.mp4 --board chessboard:10x7 --output phone.yaml
+
+    pliant calibrate anything.mp4
+    """
+    from pliant.errors import ResultError
+    from pliant_services.calibrate import board as boards
+
+    if (source == "") == (print_board is None):
+        raise typer.BadParameter("give a source, or --print-board FILE")
+    if board is not None and fov is not None:
+        raise typer.BadParameter("--fov is for a source without a --board")
+    if print_board is not None:
+        if print_board.suffix.lower() != ".pdf":
+            raise ResultError(f"{print_board}: a board is printed as a .pdf")
+        if print_board.exists() and not force:
+            raise ResultError(f"{print_board} exists: choose another name, or --force")
+        typer.echo(
+            boards.print_board(boards.parse_board(board or boards.DEFAULT_BOARD), print_board)
+        )
+        return
+    from pliant_services.calibrate import command
+
+    command.check_file(output, source=source, force=force)
+    if board is None:
+        lines = command.calibrate_without_board(source, output, fov_deg=fov, topic=topic)
+    else:
+        lines = command.calibrate_with_board(
+            source,
+            boards.parse_board(board),
+            output,
+            lens="fisheye" if lens == "fisheye" else "pinhole-radtan",
+            topic=topic,
+        )
+    for line in lines:
+        typer.echo(line)
