@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32
+from pliant.algorithms.arrays import F32, F64
 from pliant.compiler.kernel import kernel
 from pliant.rendering.intersect import hit_solid
 from pliant.rendering.scene import SolidArrays
@@ -38,19 +38,15 @@ def sky_directions() -> F64:
 
 @kernel
 def _blocked(
-    kind: I32,
-    half: F64,
-    W: F64,
-    C: F64,
-    px: float,
-    py: float,
-    pz: float,
-    dx: float,
-    dy: float,
-    dz: float,
+    solids: SolidArrays,
+    p: tuple[float, float, float],
+    d: tuple[float, float, float],
     reach: float,
 ) -> bool:
     """Whether a solid other than the room lies on the way from p within ``reach`` times d."""
+    kind, half, W, C = solids.kind, solids.half, solids.rotation, solids.centre
+    px, py, pz = p
+    dx, dy, dz = d
     for s in range(len(kind)):
         if kind[s] == 0:
             continue
@@ -82,7 +78,6 @@ def _light_kernel(
     ambient: float,
     out: F32,
 ) -> None:
-    kind, half, W, C = solids.kind, solids.half, solids.rotation, solids.centre
     for n in range(len(points)):
         nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]
@@ -103,14 +98,14 @@ def _light_kernel(
                 i * ay + j * by + up * ny,
                 i * az + j * bz + up * nz,
             )
-            if not _blocked(kind, half, W, C, px, py, pz, dx, dy, dz, _SKY_REACH_M):
+            if not _blocked(solids, (px, py, pz), (dx, dy, dz), _SKY_REACH_M):
                 open_sky += 1
         direct = 0.0
         for k in range(len(lamps)):
             dx, dy, dz = lamps[k, 0] - px, lamps[k, 1] - py, lamps[k, 2] - pz
             square = dx * dx + dy * dy + dz * dz
             cosine = (dx * nx + dy * ny + dz * nz) / math.sqrt(square)
-            if cosine > 0.0 and not _blocked(kind, half, W, C, px, py, pz, dx, dy, dz, 1.0):
+            if cosine > 0.0 and not _blocked(solids, (px, py, pz), (dx, dy, dz), 1.0):
                 direct += cosine / (1.0 + square / (_LAMP_REACH_M * _LAMP_REACH_M))
         direct *= 1.6 * (1.0 - ambient) / _LAMP_SAMPLES
         out[n] = ambient * (0.3 + 0.7 * open_sky / len(sky)) + direct

@@ -1,6 +1,7 @@
 """What each pixel shows of a scene of sheets: triangles into a depth buffer, then their texture."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,27 @@ NEAR_M = 0.02
 _INSIDE = -1e-9  # neighbours share an edge: rounding must leave no gap between them
 _NO_AREA = 1e-12  # px^2
 _SHININESS = 300.0
+
+
+class Surface(NamedTuple):
+    """How one sheet looks, at its (R, C) vertices.
+
+    number: of the sheet.  light: (R, C) factors.  normals: (R, C, 3), camera frame.
+    scale_u, scale_v: metres of texture for a column and a row.
+    """
+
+    number: int
+    light: F32
+    normals: F32
+    scale_u: float
+    scale_v: float
+
+
+class Gloss(NamedTuple):
+    """What a lamp adds where a sheet mirrors it.  toward: (3,) the lamp, camera frame."""
+
+    toward: F32
+    strength: float
 
 
 @fast_kernel
@@ -99,16 +121,15 @@ def pick(points: F64, number: int, pixels: F64, nearness: F64, seen: I32, where:
 
 @fast_kernel
 def shade(
-    depth: F64, seen: I32, where: F32, rays: F32, sheet: int, light: F32, normals: F32,
-    atlas: Atlas, scale_u: float, scale_v: float, pixel: float, toward: F32, gloss: float,
-    weight: float, out: F32,
+    depth: F64, seen: I32, where: F32, rays: F32, surface: Surface, atlas: Atlas, pixel: float,
+    shine: Gloss, weight: float, out: F32,
 ) -> None:  # fmt: skip
     """Add ``weight`` times the light of the pixels that show a sheet to ``out`` (H, W).
 
-    rays: (H, W, 2) on the plane z = 1.  light: (R, C) factors.  normals: (R, C, 3), camera frame.
-    scale_u, scale_v: metres of texture for a column and a row.  pixel: its size on the plane z = 1.
-    toward: (3,) the lamp, camera frame.
+    depth, seen, where: see ``Sight``.  rays: (H, W, 2) on the plane z = 1.  pixel: its size there.
     """
+    sheet, light, normals, scale_u, scale_v = surface
+    toward, gloss = shine
     height, width = seen.shape
     rows, columns = light.shape
     density, last_level = atlas.density[sheet], atlas.offset.shape[1] - 1

@@ -12,7 +12,15 @@ from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.lens import NO_DISTORTION, pixel_rays
 from pliant.rendering.photometry import exposure_gain, sensor_image
 from pliant.rendering.render import FOOTPRINT, SUB_PIXELS
-from pliant.rendering.sheet_kernels import NEAR_M, empty_buffers, pick, rasterise, shade
+from pliant.rendering.sheet_kernels import (
+    NEAR_M,
+    Gloss,
+    Surface,
+    empty_buffers,
+    pick,
+    rasterise,
+    shade,
+)
 from pliant.rendering.sheets import DeformingScene, vertex_normals
 from pliant.rendering.textures import make_texture
 
@@ -138,13 +146,15 @@ class SheetRenderer:
         light = _diffuse(vertices, normals, place, T_world_camera[:3, 3], lamp.ambient, strength)
         R_camera_world = T_world_camera[:3, :3].T
         rows, columns = vertices.shape[:2]
-        shade(
-            sight.depth_m, sight.sheet, sight.where, rays, number, light.astype(np.float32),
-            np.ascontiguousarray(normals @ R_camera_world.T, np.float32), self._atlas,
+        surface = Surface(
+            number, light.astype(np.float32),
+            np.ascontiguousarray(normals @ R_camera_world.T, np.float32),
             sheet.width_m / (columns - 1), sheet.height_m / (rows - 1),
-            FOOTPRINT / self._camera.fx,
-            (R_camera_world @ (place - T_world_camera[:3, 3])).astype(np.float32),
-            lamp.gloss, 1.0 / len(SUB_PIXELS), out,
+        )  # fmt: skip
+        toward = (R_camera_world @ (place - T_world_camera[:3, 3])).astype(np.float32)
+        shade(
+            sight.depth_m, sight.sheet, sight.where, rays, surface, self._atlas,
+            FOOTPRINT / self._camera.fx, Gloss(toward, lamp.gloss), 1.0 / len(SUB_PIXELS), out,
         )  # fmt: skip
 
 
