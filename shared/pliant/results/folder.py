@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
@@ -17,7 +18,7 @@ from typing import Any
 
 from pliant import __version__, arithmetic
 from pliant.errors import ResultError
-from pliant.files import make_folder, write_whole
+from pliant.files import make_folder, move_all, write_whole
 from pliant.recording import parts
 from pliant.recording.map_file import MAP_NAME
 
@@ -77,6 +78,22 @@ def files_read(result: Path) -> list[Path]:
     """What a command may read of a result folder or a recording, or will write to one."""
     names = (RECORDING_NAME, CONFIG_NAME, *_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME)
     return [*parts.parts_of(result), *(result / name for name in names)]
+
+
+@contextmanager
+def all_or_none(output: Path) -> Generator[Path]:
+    """A folder whose files all go into ``output`` at its end, or none where the disk is full.
+
+    Raises ResultError.
+    """
+    try:
+        with tempfile.TemporaryDirectory(prefix=".partial-", dir=output) as folder:
+            yield Path(folder)
+            move_all(Path(folder), output)
+    except OSError as error:
+        raise ResultError(
+            f"{output}: cannot write the results ({error.strerror}); the recording is kept"
+        ) from None
 
 
 @contextmanager

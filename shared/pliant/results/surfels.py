@@ -1,7 +1,6 @@
 """Turns a recording of surfels into the files that a user opens: see docs/surfels.md."""
 
 import json
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,14 +11,18 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.config import recorded_config
-from pliant.errors import ResultError
-from pliant.files import move_all
 from pliant.formats.npz import NpzWriter
 from pliant.formats.tum import write_tum
 from pliant.messages import topics
 from pliant.messages.types import WAITING_FOR_DEPTH, Surfels
 from pliant.recording.reader import Recording
-from pliant.results.folder import RECORDING_NAME, REPORT_NAME, SURFELS_NAME, TRAJECTORY_NAME
+from pliant.results.folder import (
+    RECORDING_NAME,
+    REPORT_NAME,
+    SURFELS_NAME,
+    TRAJECTORY_NAME,
+    all_or_none,
+)
 from pliant.results.report import counted, ended_early, process_figures
 from pliant.results.run import Run, read_run
 from pliant.trajectory import Trajectory
@@ -65,25 +68,18 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
     recording = output / RECORDING_NAME
     run, counts = read_run(recording), _Counts()
     followed: list[tuple[int, F64]] = []
-    try:
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=output) as name:
-            folder = Path(name)
-            with NpzWriter(folder / SURFELS_NAME) as npz:
-                for recorded in Recording(recording).messages(topics.SURFELS):
-                    surfels = recorded.decode()
-                    assert isinstance(surfels, Surfels)
-                    _count(counts, surfels, recorded.log_time_ns)
-                    _add(npz, surfels)
-                    followed += _followed(surfels)
-            write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
-            report = _report(run, counts, len(followed))
-            text = json.dumps(report, indent=1) + "\n"
-            (folder / REPORT_NAME).write_text(text, encoding="utf-8")
-            move_all(folder, output)
-    except OSError as error:
-        raise ResultError(
-            f"{output}: cannot write the results ({error.strerror}); the recording is kept"
-        ) from None
+    with all_or_none(output) as folder:
+        with NpzWriter(folder / SURFELS_NAME) as npz:
+            for recorded in Recording(recording).messages(topics.SURFELS):
+                surfels = recorded.decode()
+                assert isinstance(surfels, Surfels)
+                _count(counts, surfels, recorded.log_time_ns)
+                _add(npz, surfels)
+                followed += _followed(surfels)
+        write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
+        report = _report(run, counts, len(followed))
+        text = json.dumps(report, indent=1) + "\n"
+        (folder / REPORT_NAME).write_text(text, encoding="utf-8")
     return report
 
 

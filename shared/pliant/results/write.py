@@ -1,15 +1,12 @@
 """Turns a recording into the files that a user opens.  A function of the recording alone."""
 
 import json
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pliant.datasets.calibration import calibration_yaml
-from pliant.errors import ResultError
-from pliant.files import move_all
 from pliant.formats.ply import write_ply
 from pliant.formats.tum import write_tum
 from pliant.messages import topics
@@ -23,6 +20,7 @@ from pliant.results.folder import (
     RECORDING_NAME,
     REPORT_NAME,
     SCALE_NAME,
+    all_or_none,
 )
 from pliant.results.mesh import write_meshes
 from pliant.results.page.page import write_page
@@ -48,17 +46,11 @@ def write_rigid_results(output: Path, scale: Scale | None = None) -> dict[str, A
     run = read_run(recording.path, scale)
     final = run.history.final()
     report = rigid_report(run, final)
-    try:
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=output) as folder:
-            _write_files(Path(folder), run, recording, final, report)
-            _write_map(Path(folder), recording, run)
-            if scale is not None:
-                (Path(folder) / SCALE_NAME).write_text(scale.yaml(), encoding="utf-8")
-            move_all(Path(folder), output)
-    except OSError as error:
-        raise ResultError(
-            f"{output}: cannot write the results ({error.strerror}); the recording is kept"
-        ) from None
+    with all_or_none(output) as folder:
+        _write_files(folder, run, recording, final, report)
+        _write_map(folder, recording, run)
+        if scale is not None:
+            (folder / SCALE_NAME).write_text(scale.yaml(), encoding="utf-8")
     return report
 
 
