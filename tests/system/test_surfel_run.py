@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -46,6 +47,19 @@ def test_a_run_leaves_everything_a_user_opens(result: Path) -> None:
         alive = np.split(surfels["state"] == 0, np.cumsum(counts)[:-1])
         assert [int(a.sum()) for a in alive] == report["alive_per_frame"]
         assert surfels["T_world_camera"].shape == (FRAMES, 4, 4)
+
+
+def test_the_page_shows_the_surface(result: Path) -> None:
+    page = (result / "report.html").read_text(encoding="utf-8")
+    (told,) = re.findall(r'id="scene">(.*?)</script>', page, re.DOTALL)
+    layers = {layer["name"]: layer for layer in json.loads(told)["layers"]}
+    assert 0 < layers["points"]["count"] <= 60
+    assert layers["mesh"]["count"] >= 2 * layers["points"]["count"]  # from both sides
+    assert layers["mesh"]["triangles"] > layers["points"]["count"]
+    assert layers["path"]["count"] == FRAMES
+    assert f"{FRAMES}, {FRAMES} followed" in page
+    assert "surfels.npz" in page
+    assert "://" not in page
 
 
 def test_surfels_are_seen_in_both_viewers(result: Path, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ _RIGID_FILES = (
     REPORT_NAME,
     PAGE_NAME,
 )
-SURFEL_FILES = (TRAJECTORY_NAME, SURFELS_NAME, REPORT_NAME)
+SURFEL_FILES = (TRAJECTORY_NAME, SURFELS_NAME, REPORT_NAME, PAGE_NAME)
 SCALE_NAME = "scale.yaml"
 SOMETIMES = (MAP_NAME, SCALE_NAME)
 """Of a map that came to its end, and of one whose scale is known."""

@@ -17,12 +17,15 @@ from pliant.messages import topics
 from pliant.messages.types import WAITING_FOR_DEPTH, Surfels
 from pliant.recording.reader import Recording
 from pliant.results.folder import (
+    PAGE_NAME,
     RECORDING_NAME,
     REPORT_NAME,
     SURFELS_NAME,
     TRAJECTORY_NAME,
     all_or_none,
 )
+from pliant.results.page.surface import Surface
+from pliant.results.page.surfel_page import write_surfel_page
 from pliant.results.report import counted, ended_early, process_figures
 from pliant.results.run import Run, read_run
 from pliant.trajectory import Trajectory
@@ -68,6 +71,7 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
     recording = output / RECORDING_NAME
     run, counts = read_run(recording), _Counts()
     followed: list[tuple[int, F64]] = []
+    surface = Surface()
     with all_or_none(output) as folder:
         with NpzWriter(folder / SURFELS_NAME) as npz:
             for recorded in Recording(recording).messages(topics.SURFELS):
@@ -76,10 +80,15 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
                 _count(counts, surfels, recorded.log_time_ns)
                 _add(npz, surfels)
                 followed += _followed(surfels)
+                if _followed(surfels):
+                    surface.take(surfels)
         write_tum(folder / TRAJECTORY_NAME, _trajectory(followed))
         report = _report(run, counts, len(followed))
         text = json.dumps(report, indent=1) + "\n"
         (folder / REPORT_NAME).write_text(text, encoding="utf-8")
+        names = {path.name for path in folder.iterdir()} | {RECORDING_NAME}
+        drawn = surface if surface.last is not None else None
+        write_surfel_page(folder / PAGE_NAME, report, surfel_summary(report), drawn, names)
     return report
 
 

@@ -23,7 +23,7 @@ from pliant.results.folder import (
     all_or_none,
 )
 from pliant.results.mesh import write_meshes
-from pliant.results.page.page import write_page
+from pliant.results.page.rigid_page import write_page
 from pliant.results.report import rigid_report
 from pliant.results.run import Run, read_run
 from pliant.results.scale import MetricRecording, Scale

@@ -1,7 +1,5 @@
-"""Puts report.html together, of what a recording says."""
+"""What every report.html has: the template, the canvas, tables, and where the truth goes."""
 
-import base64
-import math
 from collections.abc import Container, Iterable
 from html import escape
 from importlib.resources import files
@@ -9,51 +7,26 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-import cv2
-import numpy as np
-
 from pliant import __version__
-from pliant.algorithms.arrays import F64, U8
-from pliant.algorithms.geometry import inverse, pose_to_matrix, transform
-from pliant.errors import ResultError
 from pliant.files import write_whole
 from pliant.formats.text import write_bytes
-from pliant.pictures.movie import encode_animation
-from pliant.recording.reader import Recording
-from pliant.results.mesh import mesh_of
-from pliant.results.page.advice import advice
-from pliant.results.page.chart import BLUE, ORANGE, Line, chart
-from pliant.results.page.scene import make_scene
-from pliant.results.run import Run, SeenKeyframe, seen_by_keyframes
+from pliant.results.page.scene import Scene
 
-_PICTURES = 24
-_WIDTH_PX = 480
-_FPS = 4.0
-_DOT, _DOTS = 1.2, 3000
 _TRUTH = "<!-- against the truth -->"
-_SOME_READOUT = 0.05
-"""Of the frame interval: less is none, as well as images tell."""
 
 
-def write_page(
-    path: Path, run: Run, recording: Recording, final: dict[int, tuple[int, F64]],
-    report: dict[str, Any], names: Container[str],
-) -> None:  # fmt: skip
-    """Write report.html of a rigid run.  names: of the other files beside it."""
-    page = Template(_part("page.html"))
-    text = page.substitute(
+def fill_page(path: Path, report: dict[str, Any], names: Container[str], **parts: str) -> None:
+    """Write a page.  names: of the files beside it.  parts: HTML by its place in page.html.
+
+    Raises ResultError where the disk fails.
+    """
+    text = Template(_part("page.html")).substitute(
         title=escape(report["source"] or "a run"),
-        verdict=escape(report["verdict"]),
-        reason=escape(report["verdict_reason"]),
-        map=_map(run, final),
-        clip=_clip(run, recording),
-        figures=_rows(_figures(run, report)),
-        chart=_chart(run, report, final),
         truth=_TRUTH * 2,
-        advice=_advice(report, run),
-        times=_rows(_times(report)),
-        files=_rows([(name, what) for name, what in _FILES.items() if name in names]),
+        times=table_rows(_times(report)),
+        files=table_rows([(name, what) for name, what in _FILES.items() if name in names]),
         version=escape(__version__),
+        **parts,
     )
     write_bytes(path, text.encode())
 
@@ -73,7 +46,10 @@ _FILES = {
     "mesh.ply": "the surface, fine",
     "mesh_coarse.ply": "the surface, coarse",
     "calibration.yaml": "the camera, for --calibration of the next run",
+    "surfels.npz": "every surfel of every frame",
     "report.json": "all figures",
+    "map.pliant": "the map, for another day: pliant run SOURCE --map",
+    "scale.yaml": "how long a unit of the recording is",
     "recording.mcap": "every message",
 }
 
@@ -82,20 +58,13 @@ def _part(name: str) -> str:
     return (files("pliant.results.page") / name).read_text(encoding="utf-8")
 
 
-def _rows(rows: Iterable[tuple[str, str]]) -> str:
-    return "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in rows)
+def table_rows(told: Iterable[tuple[str, str]]) -> str:
+    """Of a <table>: what, and how much of it."""
+    return "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in told)
 
 
-def _map(run: Run, final: dict[int, tuple[int, F64]]) -> str:
-    """The map that can be turned; "" without one."""
-    longest = run.history.longest_segment()
-    poses = np.array([pose for segment, pose in final.values() if segment == longest])
-    if not len(poses):
-        return ""
-    points = run.history.points_in(longest)
-    scene = make_scene(
-        points.positions, points.colours, pose_to_matrix(poses), mesh_of(run.mesh, longest)
-    )
+def canvas(scene: Scene) -> str:
+    """What can be turned."""
     return (
         '<canvas id="view"></canvas><p class="soft"><span id="layers"></span> drag to turn, '
         "shift-drag to move, wheel or pinch to come closer, double-click two points to measure</p>"
@@ -106,87 +75,12 @@ def _map(run: Run, final: dict[int, tuple[int, F64]]) -> str:
     )
 
 
-def _clip(run: Run, recording: Recording) -> str:
-    """Keyframes with the points of the map that they see; "" where no images were recorded."""
-    longest = run.history.longest_segment()
-    keyframes = run.history.keyframes.items()
-    chosen = sorted(n for n, k in keyframes if k.segment == longest and k.frame >= 0)
-    step = max(1, -(-len(chosen) // _PICTURES))
-    wanted = chosen[::step]
-    seen = seen_by_keyframes(recording, wanted)
-    pictures = [_picture(run, n, seen[n]) for n in wanted if n in seen and seen[n].jpeg]
-    if not pictures:
+def bullets(heading: str, told: list[str]) -> str:
+    """A section of sentences; "" without any."""
+    if not told:
         return ""
-    try:
-        kind, data = "webp", encode_animation(pictures, fps=_FPS, suffix=".webp", quality=60)
-    except ResultError:  # an OpenCV without animations
-        _, encoded = cv2.imencode(".jpg", pictures[len(pictures) // 2][..., ::-1])
-        kind, data = "jpeg", encoded.tobytes()
-    told = "Keyframes with the points of the map that they see: near ones red, far ones blue."
-    source = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
-    return (
-        '<section><h2>What it saw</h2><figure><img alt="Keyframes with the points of the map" '
-        f'src="{source}"><figcaption>{told}</figcaption></figure></section>'
-    )
-
-
-def _picture(run: Run, number: int, seen: SeenKeyframe) -> U8:
-    """(H, W, 3) RGB: a keyframe with its points, coloured by how far they are."""
-    image = np.asarray(
-        cv2.imdecode(np.frombuffer(seen.jpeg, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8
-    )
-    scale = min(1.0, _WIDTH_PX / image.shape[1])
-    size = round(image.shape[1] * scale), round(image.shape[0] * scale)
-    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    rows, points = run.history.points_of(seen.point_ids)
-    if not len(rows):
-        return small  # a run that was cut off: what the keyframe saw is not in its map
-    T_camera_world = inverse(pose_to_matrix(run.history.keyframes[number].pose_world_camera))
-    depth = transform(T_camera_world, points.positions)[:, 2]
-    order = np.argsort(-depth)  # near ones last
-    ranks = np.empty(len(depth))
-    ranks[order] = np.linspace(0.0, 1.0, len(depth))
-    shades = np.round(40.0 + 215.0 * ranks).astype(np.uint8)[:, None]
-    palette = np.asarray(cv2.applyColorMap(shades, cv2.COLORMAP_TURBO), np.uint8)
-    tints = palette.reshape(-1, 3)[:, ::-1].tolist()
-    places = np.round(16.0 * scale * seen.points_px[rows]).astype(np.int64).tolist()
-    radius = round(16.0 * _DOT)
-    for n in order[:: max(1, len(order) // _DOTS)].tolist():
-        cv2.circle(small, places[n], radius, tints[n], cv2.FILLED, cv2.LINE_AA, 4)
-    return small
-
-
-def _figures(run: Run, report: dict[str, Any]) -> list[tuple[str, str]]:
-    camera = run.stream.camera if run.stream else None
-    rows = [
-        ("frames", f"{report['frames']}, {report['frames_with_pose']} with a pose"),
-        ("map", f"{report['keyframes']} keyframes, {report['points']:,} points"),
-        (
-            "median per frame",
-            f"{report['median_tracks_per_frame']:,.0f} tracks, "
-            f"{report['median_inliers_per_frame']:,.0f} of them mapped",
-        ),
-    ]
-    rows += [
-        ("mesh", f"{mesh['triangles']:,} triangles")
-        for mesh in report["mesh"]
-        if (mesh["segment"], mesh["level"]) == (run.history.longest_segment(), "fine")
-    ]
-    if camera is not None:
-        rows.append(("images", f"{camera.width}x{camera.height}"))
-        rows.append(("field of view", f"{_fov_deg(camera.width, camera.fx):.1f} degrees across"))
-    correction = report["calibration_correction"]
-    if correction is not None and camera is not None:
-        found = _fov_deg(camera.width, camera.fx * correction["focal_factor"])
-        rows.append(("as the images have it", f"{found:.1f} degrees"))
-        if abs(correction["readout"]) > _SOME_READOUT:
-            rows.append(("rolling shutter", f"{correction['readout']:.0%} of the frame interval"))
-    rows.append(("scale", "metres" if report["scale_is_metric"] else "arbitrary: of one camera"))
-    return rows
-
-
-def _fov_deg(width: int, fx: float) -> float:
-    return math.degrees(2.0 * math.atan(0.5 * width / fx))
+    lines = "".join(f"<li>{escape(line)}</li>" for line in told)
+    return f"<h2>{heading}</h2><ul>{lines}</ul>"
 
 
 def _times(report: dict[str, Any]) -> list[tuple[str, str]]:
@@ -194,33 +88,3 @@ def _times(report: dict[str, Any]) -> list[tuple[str, str]]:
     for service, spent in report["cpu_milliseconds_per_frame"].items():
         rows.append((service, f"{spent:.1f} ms of CPU a frame"))
     return rows
-
-
-def _chart(run: Run, report: dict[str, Any], final: dict[int, tuple[int, F64]]) -> str:
-    """Tracks and mapped inliers over time; frames without a pose are shaded."""
-    tracks, inliers = report["tracks_per_frame"], report["inliers_per_frame"]
-    frames = sorted(run.tracks)
-    if len(frames) < 2:
-        return ""
-    stamps = run.history.stamps_ns
-    seconds = 1e-9 * (max(stamps.values()) - min(stamps.values())) if stamps else 0.0
-    most = max(*tracks, *inliers, 1)
-    drawn = chart(
-        [Line(frames, tracks, BLUE), Line(sorted(run.inliers), inliers, ORANGE)],
-        span=(frames[0], frames[-1]),
-        top=most,
-        says=("tracks and inliers", f"{most:,}", f"{seconds:.1f} s"),
-        shaded=[frame for frame in frames if frame not in final],
-    )
-    return (
-        f"<figure>{drawn}<figcaption>Tracks (blue), and those of them that the map explains "
-        "(orange). Shaded: frames without a pose.</figcaption></figure>"
-    )
-
-
-def _advice(report: dict[str, Any], run: Run) -> str:
-    told = advice(report, run.history.stamps_ns)
-    if not told:
-        return ""
-    lines = "".join(f"<li>{escape(line)}</li>" for line in told)
-    return f"<h2>What to do better next time</h2><ul>{lines}</ul>"

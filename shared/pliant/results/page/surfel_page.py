@@ -1,0 +1,68 @@
+"""report.html of a run of the deformable profile."""
+
+from collections.abc import Container
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from pliant.results.page.chart import BLUE, ORANGE, Line, chart
+from pliant.results.page.page import bullets, canvas, fill_page, table_rows
+from pliant.results.page.surface import Surface
+from pliant.results.report import counted
+
+_TINTS = (
+    '<p class="soft">The surface as it was in the last frame that was followed. Colours: how far '
+    "each place has moved since it was first seen, from blue (hardly) to red (as far as any).</p>"
+)
+
+
+def write_surfel_page(
+    path: Path, report: dict[str, Any], lines: list[str], surface: Surface | None,
+    names: Container[str],
+) -> None:  # fmt: skip
+    """Write report.html of a run of the deformable profile.
+
+    lines: the report in a few.   surface: as it was in the end; None without any.
+    names: of the other files beside it.
+    """
+    fill_page(
+        path, report, names,
+        verdict="",
+        reason=escape(lines[0]),
+        map="" if surface is None else canvas(surface.scene()) + _TINTS,
+        clip="",
+        figures=table_rows(_surfel_figures(report)),
+        chart=_surfel_chart(report),
+        advice=bullets("What else it said", lines[1:]),
+    )  # fmt: skip
+
+
+def _surfel_figures(report: dict[str, Any]) -> list[tuple[str, str]]:
+    alive = report["alive_per_frame"] or [0]
+    return [
+        ("frames", f"{report['frames']}, {report['frames_with_pose']} followed"),
+        ("surfels", f"{report['median_alive']:.0f} in the median frame, {alive[-1]} in the last"),
+        ("born", f"{report['births']:,}"),
+        ("started", counted(len(report["segments"]), "time")),
+        ("scale", "metres" if report["scale_is_metric"] else "arbitrary: of one camera"),
+    ]
+
+
+def _surfel_chart(report: dict[str, Any]) -> str:
+    """Surfels that are there and that are followed; frames in which all were lost are shaded."""
+    listed, alive = report["surfels_per_frame"], report["alive_per_frame"]
+    frames = list(range(len(listed)))
+    if len(frames) < 2:
+        return ""
+    most = max(*listed, 1)
+    drawn = chart(
+        [Line(frames, listed, BLUE), Line(frames, alive, ORANGE)],
+        span=(0.0, frames[-1]),
+        top=most,
+        says=("surfels", f"{most:,}", f"{len(frames)} frames"),
+        shaded=report["frames_lost"],
+    )
+    return (
+        f"<figure>{drawn}<figcaption>Surfels (blue), and those of them that are followed (orange). "
+        "Shaded: frames in which all were lost.</figcaption></figure>"
+    )
