@@ -37,7 +37,14 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         "ingest",
         "pliant_services.nodes.ingest",
-        outputs=(topics.STREAM, topics.MAP_KNOWN, topics.SOURCE, topics.IMAGE, topics.DEPTH),
+        outputs=(
+            topics.STREAM,
+            topics.CLIP,
+            topics.MAP_KNOWN,
+            topics.SOURCE,
+            topics.IMAGE,
+            topics.DEPTH,
+        ),
     ),
     Process(
         "tracking",
@@ -120,7 +127,7 @@ def inputs_of(name: str, fleet: Sequence[str], *, images: bool = True) -> dict[T
     process = BY_NAME[name]
     senders = {t: sender for sender in fleet for t in outputs_of(sender)}
     if process.observer:
-        left_out = () if images else (topics.SOURCE, topics.DEPTH)
+        left_out = () if images else (topics.CLIP, topics.SOURCE, topics.DEPTH)
         return {t: s for t, s in senders.items() if t.logged and t not in left_out}
     optional = (topic for topic in process.optional if topic in senders)
     return {topic: senders[topic] for topic in (*process.inputs, *optional)}

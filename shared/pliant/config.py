@@ -127,6 +127,12 @@ class RecorderParameters(Parameters):
         default=True,
         description="False: a small recording without camera/source, from the tracks on.",
     )
+    clip: bool = Field(
+        default=True,
+        description="A video is recorded as its file, and its frames as numbers in it with "
+        "checksums, where that is smaller.  False: raw frames, which any decoder leaves as they "
+        "are.",
+    )
     roll_mib: int = Field(
         default=0, ge=0, description="Begin a new file beyond so many MiB; 0 for a single file."
     )

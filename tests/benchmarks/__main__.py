@@ -156,6 +156,19 @@ def codec() -> None:
 
 
 @app.command()
+def clip(
+    video: Annotated[Path | None, typer.Argument(help="A video [the built-in room].")] = None,
+) -> None:
+    """What the images of a video take in a recording, and how quickly they are there again.
+
+    scripts/bench clip
+    """
+    from benchmarks.clip import measure
+
+    _print(measure(video))
+
+
+@app.command()
 def recording(
     seconds: Annotated[int, typer.Option(help="Length of the recording that is made.")] = 600,
 ) -> None:

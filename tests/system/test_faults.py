@@ -7,13 +7,19 @@ from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 
+import cv2
 import pytest
 from hostile import attack, samples
 from running import TINY, assert_one_line, digests, pliant
 
 from pliant.config import config_yaml, load_config
+from pliant.datasets import open_source
+from pliant.datasets.calibration import calibration_yaml
+from pliant.datasets.recorded_images import RecordedImages
+from pliant.datasets.rectifier import decode
+from pliant.datasets.video import quiet_opencv
 from pliant.messages import topics
-from pliant.messages.types import Status
+from pliant.messages.types import ClipPiece, SourceImage, Status
 from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import STATE_FOLDER, prepare
@@ -120,6 +126,49 @@ def test_all_with_the_launcher_and_resume(tmp_path: Path, undisturbed: dict[str,
         run(tmp_path, cut)
     resumed_config(tmp_path, REQUEST)
     assert run(tmp_path, resume=True) == undisturbed
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> RunRequest:
+    """A video of the built-in sequence."""
+    file = tmp_path_factory.mktemp("clip") / "clip.avi"
+    frames = list(open_source(TINY))
+    with quiet_opencv():
+        writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (320, 240))
+    if not writer.isOpened():
+        pytest.skip("OpenCV cannot write a video here")
+    for frame in frames:
+        writer.write(cv2.cvtColor(decode(frame), cv2.COLOR_GRAY2BGR))
+    writer.release()
+    calibration = file.with_suffix(".yaml")
+    calibration.write_text(calibration_yaml(open_source(TINY).calibration))
+    return RunRequest(source=str(file))
+
+
+def test_the_recording_of_a_video_has_all_images_whoever_is_killed(
+    tmp_path: Path, clip: RunRequest
+) -> None:
+    """The ingest and the recorder, early and late, then all with the launcher, and a resume."""
+    kills = once_at((1, ("ingest",)), (7, ("recorder",)), (14, ("recorder", "ingest")))
+
+    def victims(status: Status, fleet: Fleet) -> Sequence[str]:
+        if status.service == "bundle_adjustment" and status.frame == 22:
+            fleet.give_up()
+            return SERVICES
+        return kills(status, fleet)
+
+    whole = run(tmp_path / "whole", request=clip)
+    with pytest.raises(ServiceDiedError):
+        run(tmp_path / "cut", victims, request=clip)
+    resumed_config(tmp_path / "cut", clip)
+    assert run(tmp_path / "cut", resume=True, request=clip) == whole
+    recording = Recording(tmp_path / "cut")
+    stored = [m for m in recording.decoded(topics.SOURCE) if isinstance(m, SourceImage)]
+    assert not any(image.data for image in stored)
+    made = [image.data for image in RecordedImages(recording)]
+    assert made == [frame.data for frame in open_source(clip.source)]
+    pieces = [m for m in recording.decoded(topics.CLIP) if isinstance(m, ClipPiece)]
+    assert b"".join(piece.data for piece in pieces) == Path(clip.source).read_bytes()
 
 
 def test_a_live_run_is_not_resumed_but_its_recording_is_a_source(

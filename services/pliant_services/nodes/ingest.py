@@ -2,6 +2,7 @@
 
 in   an image folder, a video, a camera, a built-in sequence
 out  camera/stream   once: the camera
+     camera/clip     before the first frame: the file of a video, where that is smaller than frames
      map/known       before the first frame: the keyframes of a map of earlier sessions
      camera/source   every frame: its bytes as they came
      camera/image    every frame: rectified; empty where it was dropped or does not decode; over a
@@ -21,6 +22,7 @@ from pliant.bus.base import Bus, resume
 from pliant.config import Config
 from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.calibration import calibration_yaml
+from pliant.datasets.clip import Clip, clip_of
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.datasets.working_size import SmallerImages
 from pliant.errors import DatasetError, SourceLostError
@@ -53,17 +55,24 @@ def run(
     live = plays_live(dataset, config)
     rectifier = Rectifier(dataset.calibration)
     link = Sender(config.bus, dataset.calibration)
+    clip = _clip(dataset, config)
+    checksum = clip.checksum() if clip is not None else -1
 
     def start() -> tuple[Any, ...]:
         bus.publish(topics.STREAM, _stream(dataset, rectifier, known, live=live))
         bus.end(topics.STREAM)  # its readers wait for its end before the first frame
+        for piece in clip.pieces() if clip is not None else ():
+            bus.publish(topics.CLIP, piece)
+        bus.end(topics.CLIP)
         for keyframe in known.keyframes() if known is not None else ():
             bus.publish(topics.MAP_KNOWN, keyframe)
         bus.end(topics.MAP_KNOWN)
         # One less than there is credit for: the tracks of a frame are taken after its image.
-        return 0, 0, 0, (deque[int](maxlen=config.bus.window - 1),), ({},)
+        return 0, 0, 0, (deque[int](maxlen=config.bus.window - 1),), ({},), checksum
 
-    begin, dropped, broken, *kept = resume(bus, start)
+    begin, dropped, broken, *kept, sent = resume(bus, start)
+    if sent != checksum:  # taken up again with another file
+        clip = None
     pace, drops = MappingPace(*kept[0]), Drops(*kept[1])
     image: Image | None = None
     counters: dict[str, float] = {}
@@ -80,14 +89,16 @@ def run(
                 image = replace(image, unmapped=True)
             dropped += source.dropped
             broken += bool(image.missing) and not source.dropped
-            bus.publish(topics.SOURCE, _source_message(source, image.unmapped))
+            if clip is not None and not clip.is_as_it_was():
+                clip = None  # what is read of it now is not what was sent
+            bus.publish(topics.SOURCE, _source_message(source, image.unmapped, clip is not None))
             may_lag = readers_that_may_lag(image)
             bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)
             bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
             counters = {"dropped": dropped, "broken": broken, "unmapped": pace.passed}
             monitor.report(image, note="", **counters, **drops.counters)
             kept = (tuple(vars(pace).values()), (drops.counters,))
-            bus.checkpoint(image.frame, (image.frame + 1, dropped, broken, *kept))
+            bus.checkpoint(image.frame, (image.frame + 1, dropped, broken, *kept, sent))
     except DatasetError as error:
         if image is None:
             raise
@@ -196,7 +207,13 @@ def _stream(
     )
 
 
-def _source_message(source: SourceFrame, unmapped: bool) -> SourceImage:
+def _clip(dataset: Dataset, config: Config) -> Clip | None:
+    """The video whose file is recorded instead of raw frames: of JPEGs for a link it is none."""
+    wanted = config.recorder.images and config.recorder.clip and config.bus.link_images != "jpeg"
+    return clip_of(dataset) if wanted else None
+
+
+def _source_message(source: SourceFrame, unmapped: bool, of_clip: bool) -> SourceImage:
     return SourceImage(
         frame=source.index,
         stamp_ns=source.stamp_ns,
@@ -207,6 +224,7 @@ def _source_message(source: SourceFrame, unmapped: bool) -> SourceImage:
         data=source.data,
         made_from=source.made_from,
         unmapped=unmapped,
+        clip_frame=source.clip_frame if of_clip else -1,
     )
 
 

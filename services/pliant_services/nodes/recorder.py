@@ -7,13 +7,15 @@ A sender gets its credit back only for what is safe on the disk.
 """
 
 import time
+import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from pliant.bus.base import ObserverBus, Received
 from pliant.config import Config, RecorderParameters, config_yaml
 from pliant.messages import codec, topics
-from pliant.messages.types import CameraStream
+from pliant.messages.types import CameraStream, SourceImage
 from pliant.recording.parts import RollingWriter
 from pliant.recording.recover import mend
 
@@ -59,9 +61,13 @@ def _record(recording: RollingWriter, received: Received, now_ns: int) -> None:
     message = received.message or codec.decode(topic.message, received.data)
     if isinstance(message, CameraStream):
         recording.attach("calibration.yaml", "application/yaml", message.calibration.encode())
+    data = received.data
+    if isinstance(message, SourceImage) and message.clip_frame >= 0:  # the clip has the pixels
+        checksum = zlib.crc32(message.data)
+        data = codec.encode(replace(message, data=b"", checksum=checksum))
     recording.write(
         topic,
-        received.data,
+        data,
         sequence=received.sequence,
         log_time_ns=now_ns,
         publish_time_ns=message.stamp_ns,

@@ -6,20 +6,21 @@ and flow control.  Rectified images are not recorded; they are made again from t
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pliant.bus.base import Window
 from pliant.bus.session import Identity
 from pliant.bus.zenoh_bus import ZenohBus
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.own_recording import recorded_frame
+from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.errors import RecordingError
-from pliant.messages import topics
+from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, SourceImage, StreamEnd
 from pliant.recording.playback import Playback
-from pliant.recording.reader import Recorded
+from pliant.recording.reader import Recorded, Recording
 from pliant_services.processes import BY_NAME, PROCESSES, outputs_of
 
 
@@ -55,7 +56,7 @@ def chosen_topics(playback: Playback, what: Played) -> list[Topic]:
     there = set(playback.topics)
     if topics.SOURCE in there:
         there.add(topics.IMAGE)
-    there -= set(what.left_out)
+    there -= {topics.CLIP, *what.left_out}  # images are played with their pixels
     unknown = sorted(set(what.topics) - {topic.key for topic in there})
     if unknown:
         keys = ", ".join(sorted(topic.key for topic in there))
@@ -141,12 +142,19 @@ def _read(playback: Playback, what: Played, chosen: Sequence[Topic]) -> Iterator
     wanted = set(chosen) - {topics.IMAGE}
     if topics.IMAGE in chosen:
         wanted |= {topics.SOURCE, topics.STREAM}
-    return playback.messages(
+    images = RecordedImages(Recording(playback.path))
+    for message in playback.messages(
         wanted & playback.topics,
         start_s=what.start_s,
         end_s=what.end_s,
         lead_frames=what.lead_frames,
-    )
+    ):
+        if message.topic == topics.SOURCE:
+            image = message.decode()
+            assert isinstance(image, SourceImage)
+            if image.clip_frame >= 0:
+                message = replace(message, data=codec.encode(images.whole(image)))
+        yield message
 
 
 def _topic(chosen: Sequence[Topic], key: str) -> Topic:

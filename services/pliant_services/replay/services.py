@@ -16,11 +16,12 @@ from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.own_recording import recorded_frame
+from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.errors import RecordingError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic, by_key
-from pliant.messages.types import CameraStream, Header, Image, SourceImage, StreamEnd
+from pliant.messages.types import CameraStream, Header, Image, StreamEnd
 from pliant.recording.reader import Recorded, Recording
 from pliant.recording.summary import Summary
 from pliant.recording.writer import RecordingWriter
@@ -151,8 +152,7 @@ class Replay:
             rectifier = Rectifier(calibration_from_yaml(stream.calibration))
         if rectifier is None:
             raise RecordingError("the recording has no camera: it stopped before its first frame")
-        for source in self._recorded.decoded(topics.SOURCE):
-            assert isinstance(source, SourceImage)
+        for source in RecordedImages(self._recorded):
             yield rectified(recorded_frame(source), rectifier, unmapped=source.unmapped)
 
     def _copy(self, writer: RecordingWriter, failed: Event) -> None:

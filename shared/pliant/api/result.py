@@ -20,6 +20,7 @@ from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.api.mapped import Mapped
 from pliant.datasets.calibration import Calibration, calibration_from_yaml
 from pliant.datasets.own_recording import recorded_frame
+from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import ResultError
 from pliant.map_history import MapHistory
@@ -158,7 +159,7 @@ class Result(Mapped):
         """
         message = self._message(topics.SOURCE, frame)
         assert isinstance(message, SourceImage)
-        grey, colour = self._rectifier.rectify(recorded_frame(message))
+        grey, colour = self._rectifier.rectify(recorded_frame(self._images.whole(message)))
         return grey if colour is None else colour
 
     def surfels(self) -> Iterator[Surfels]:
@@ -196,6 +197,10 @@ class Result(Mapped):
     @cached_property
     def _rectifier(self) -> Rectifier:
         return Rectifier(calibration_from_yaml(self._stream.calibration))
+
+    @cached_property
+    def _images(self) -> RecordedImages:
+        return RecordedImages(self._recording)
 
     def _message(self, topic: Topic, frame: int) -> Header:
         """The message of a frame; there is one for each."""

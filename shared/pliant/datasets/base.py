@@ -24,6 +24,7 @@ class SourceFrame:
     data: bytes as they are in the file, or the raw pixels.
     width, height: of raw pixels; 0 for file formats, which say it themselves.
     made_from: "" as it came; else what it was before, for people.
+    clip_frame: number of the frame of a video file that it is made from; -1: of none.
     depth: the file of the depth map that belongs to it, as it is; b"" where there is none.
     """
 
@@ -35,6 +36,7 @@ class SourceFrame:
     height: int = 0
     depth: bytes = b""
     made_from: str = ""
+    clip_frame: int = -1
 
     @property
     def dropped(self) -> bool:
@@ -43,7 +45,7 @@ class SourceFrame:
 
     def without_data(self) -> "SourceFrame":
         """This frame passed over: its number and time stay."""
-        return replace(self, encoding="", data=b"", width=0, height=0, depth=b"")
+        return replace(self, encoding="", data=b"", width=0, height=0, depth=b"", clip_frame=-1)
 
 
 class Dataset(Protocol):

@@ -43,8 +43,8 @@ class Excerpt:
             raise DatasetError(
                 f"--end {part.end_s:g}: is not after --start {part.start_s:g}: nothing is left"
             )
-        self._source = source
-        self._part = part
+        self.source = source
+        self.part = part
         self._first_depth_only = first_depth_only
         self.calibration = source.calibration
         self.name = source.name
@@ -55,20 +55,20 @@ class Excerpt:
 
     def __iter__(self) -> Iterator[SourceFrame]:
         index = 0
-        for group in _groups(self._within(), self._part.every):
-            chosen = max(group, key=_sharpness) if self._part.sharpest else group[0]
+        for group in _groups(self._within(), self.part.every):
+            chosen = max(group, key=_sharpness) if self.part.sharpest else group[0]
             # Of equals max takes the first, so that frames without pixels are as without it.
             depth = b"" if index and self._first_depth_only else chosen.depth
             yield replace(chosen, index=index, depth=depth)
             index += 1
         if index == 0:
             raise DatasetError(
-                f"{self.name}: no frame lies between --start {self._part.start_s:g} s and its end"
+                f"{self.name}: no frame lies between --start {self.part.start_s:g} s and its end"
             )
 
     def _within(self) -> Iterator[SourceFrame]:
-        part, first_ns = self._part, 0
-        for frame in self._source:
+        part, first_ns = self.part, 0
+        for frame in self.source:
             first_ns = first_ns if frame.index else frame.stamp_ns
             time_s = 1e-9 * (frame.stamp_ns - first_ns)
             if part.end_s and time_s >= part.end_s:

@@ -13,6 +13,7 @@ from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.images import SourceOptions, choose_calibration
 from pliant.datasets.mcap_file import is_mcap
+from pliant.datasets.recorded_images import RecordedImages
 from pliant.errors import DatasetError
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Depth, SourceImage
@@ -67,16 +68,16 @@ class RecordedFrames:
         depths = self._recording.decoded(topics.DEPTH) if wanted != "none" else iter(())
         # Recordings of earlier versions are without depth.
         for image, depth in zip(
-            self._recording.decoded(topics.SOURCE), chain(depths, repeat(None)), strict=False
+            RecordedImages(self._recording), chain(depths, repeat(None)), strict=False
         ):
-            assert isinstance(image, SourceImage)
             data = depth.data if isinstance(depth, Depth) and wanted != "none" else b""
             wanted = "none" if data and wanted == "first" else wanted
             yield recorded_frame(image, data)
 
 
 def recorded_frame(image: SourceImage, depth: bytes = b"") -> SourceFrame:
-    """The frame that the source gave."""
+    """The frame that the source gave, of an image that has its pixels (``RecordedImages``)."""
+    assert image.data or image.clip_frame < 0, "an image whose pixels are still in its clip"
     return SourceFrame(
         index=image.frame,
         stamp_ns=image.stamp_ns,

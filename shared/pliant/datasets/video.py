@@ -3,11 +3,13 @@
 A file of the same name with the ending .yaml beside it is taken as its calibration.  Times are
 those of the container; where it has none, or they repeat, frames follow each other at its rate.
 A frame that does not decode is one without data, and those behind it come all the same.
-Frames are published as they leave the decoder, as raw BGR pixels.
+Frames are published as they leave the decoder, as raw BGR pixels.  One thread decodes: with several
+FFmpeg makes of a damaged stream what timing says, and other pixels with every run.
 """
 
 import contextlib
 from collections.abc import Generator, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,7 +22,7 @@ from pliant.datasets.images import SourceOptions, choose_calibration
 from pliant.errors import DatasetError
 
 _DEFAULT_FPS = 30.0
-_GIVE_UP = 600
+GIVE_UP = 600
 """Frames that do not decode, one behind the other, before nothing more is expected."""
 
 
@@ -33,12 +35,13 @@ class VideoFile:
     def __init__(self, file: Path, options: SourceOptions) -> None:
         """Raises DatasetError where it holds no video, CalibrationError for its calibration."""
         self.name = file.stem
-        self._file = file
-        with _opened(file) as capture:
+        self.file = file
+        with opened(file) as capture:
             read, first = capture.read()
             if not read:
                 raise DatasetError(f"{file}: a video without frames")
             count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            self.rate_hz = rate_hz(capture)
         self.frame_count = count if count > 0 else None
         height, width = cast(U8, first).shape[:2]
         self.calibration: Calibration = choose_calibration(
@@ -46,15 +49,14 @@ class VideoFile:
         )
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        with _opened(self._file) as capture:
-            fps = capture.get(cv2.CAP_PROP_FPS)
-            step_ns = round(1e9 / (fps if 0.1 < fps < 1e4 else _DEFAULT_FPS))
+        with opened(self.file) as capture:
+            step_ns = round(1e9 / rate_hz(capture))
             index, previous_ns, broken = 0, -step_ns, 0
             while True:
                 read, pixels = capture.read()
                 if not read:  # at its end, or a frame that is damaged: then the next may be whole
                     broken += 1
-                    if broken > _GIVE_UP or index + broken >= (self.frame_count or 0):
+                    if broken > GIVE_UP or index + broken >= (self.frame_count or 0):
                         return
                     continue
                 stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
@@ -64,7 +66,7 @@ class VideoFile:
                 for number in range(broken):
                     yield _damaged(index + number, previous_ns + (number + 1) * between_ns)
                 index, broken = index + broken, 0
-                yield raw_frame(cast(U8, pixels), index, stamp_ns)
+                yield replace(raw_frame(cast(U8, pixels), index, stamp_ns), clip_frame=index)
                 index, previous_ns = index + 1, stamp_ns
 
 
@@ -99,10 +101,19 @@ def quiet_opencv() -> Generator[None, None, None]:
         logging.setLogLevel(before)
 
 
+def rate_hz(capture: cv2.VideoCapture) -> float:
+    """Frames a second, as the container says; a usual rate where it says nothing likely."""
+    stated = capture.get(cv2.CAP_PROP_FPS)
+    return stated if 0.1 < stated < 1e4 else _DEFAULT_FPS
+
+
 @contextlib.contextmanager
-def _opened(file: Path) -> Generator[cv2.VideoCapture, None, None]:
+def opened(file: Path) -> Generator[cv2.VideoCapture, None, None]:
+    """The decoder, at its first frame.  Raises DatasetError for a file that holds no video."""
     with quiet_opencv():
-        capture = cv2.VideoCapture(str(file))
+        capture = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
+        if not capture.isOpened():
+            capture = cv2.VideoCapture(str(file))
     try:
         if not capture.isOpened():
             raise DatasetError(f"{file}: not a video that OpenCV can read; convert it, e.g. to MP4")

@@ -37,7 +37,7 @@ class SmallerImages:
         source_size: (width, height) that they come in.
         """
         whole = source.calibration
-        self._source = source
+        self.source = source
         self._side = side
         self.source_size = (whole.width, whole.height)
         self.calibration = _smaller(whole, side)
@@ -49,7 +49,7 @@ class SmallerImages:
         self.note = f"images of {whole.width}x{whole.height} px are worked on at {to} px"
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        for frame in self._source:
+        for frame in self.source:
             yield frame if frame.dropped else self._made_smaller(frame)
 
     def _made_smaller(self, frame: SourceFrame) -> SourceFrame:
@@ -57,19 +57,24 @@ class SmallerImages:
             pixels = decode(frame)
         except BrokenFrame:
             return frame  # told when it is rectified
-        height, width = pixels.shape[:2]
-        if (width, height) != self.source_size:
+        if pixels.shape[1::-1] != self.source_size:
             return frame
-        pixels = resized(pixels, self._side)
-        height, width = pixels.shape[:2]
-        return replace(
-            frame,
-            encoding="mono8" if pixels.ndim == 2 else "rgb8",
-            data=pixels.tobytes(),
-            width=width,
-            height=height,
-            made_from=f"{frame.encoding} of {self.source_size[0]}x{self.source_size[1]} px",
-        )
+        return smaller(frame, pixels, self._side)
+
+
+def smaller(frame: SourceFrame, pixels: U8, side: int) -> SourceFrame:
+    """A frame, and its pixels (H, W) or (H, W, 3) RGB, with so many along the longer side."""
+    made_from = f"{frame.encoding} of {pixels.shape[1]}x{pixels.shape[0]} px"
+    pixels = resized(pixels, side)
+    height, width = pixels.shape[:2]
+    return replace(
+        frame,
+        encoding="mono8" if pixels.ndim == 2 else "rgb8",
+        data=pixels.tobytes(),
+        width=width,
+        height=height,
+        made_from=made_from,
+    )
 
 
 def at_working_size(source: Dataset, longest_side_px: int = 0) -> Dataset:

@@ -19,6 +19,7 @@ from pliant.datasets.calibration import (
     calibration_yaml,
 )
 from pliant.datasets.own_recording import recorded_frame
+from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import ResultError
 from pliant.formats.text import format_seconds, write_bytes, write_lines
@@ -108,13 +109,14 @@ def rectified_images(
     """
     rectifier = Rectifier(calibration_from_yaml(stream.calibration))
     found = False
+    recorded = RecordedImages(recording)
     for source in recording.decoded(topics.SOURCE):
         assert isinstance(source, SourceImage)
         found = True
         if wanted is not None and source.frame not in wanted:
             continue
         try:
-            grey, colour = rectifier.rectify(recorded_frame(source))
+            grey, colour = rectifier.rectify(recorded_frame(recorded.whole(source)))
         except BrokenFrame:
             continue
         yield source.frame, source.stamp_ns, grey if colour is None else colour

@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.datasets.recorded_images import RecordedImages
 from pliant.errors import ResultError
 from pliant.export.images import camera_of
 from pliant.formats.ply import read_ply, write_ply
 from pliant.map_history import Points
 from pliant.messages import topics
+from pliant.messages.types import SourceImage
 from pliant.recording.reader import Recording
 from pliant.results.run import read_run
 from pliant.viewers.canvas import Canvas
@@ -24,8 +26,11 @@ def draw(recording: Recording, canvas: Canvas, mesh: Path | None = None) -> None
     """Draw a whole recording in file order; memory holds one message and the map."""
     scene = Scene(canvas)
     scene.take(topics.STREAM, camera_of(recording), 0, 0)  # images may have been recorded before it
+    images = RecordedImages(recording)
     for recorded in recording.messages():
         message = recorded.decode()
+        if isinstance(message, SourceImage):
+            message = images.whole(message)
         scene.take(recorded.topic, message, recorded.sequence, recorded.log_time_ns)
     scene.close()
     if mesh is not None and mesh.is_file() and not scene.mesh.is_final:

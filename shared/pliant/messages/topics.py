@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from pliant.messages.types import (
     CameraStream,
+    ClipPiece,
     Depth,
     Extrema,
     Header,
@@ -47,6 +48,8 @@ class Topic:
 STREAM = Topic("camera/stream", CameraStream, per_frame=False, max_bytes=_MIB)
 # Not compressed: most images come compressed, and of raw ones zstd saves a tenth.
 SOURCE = Topic("camera/source", SourceImage, per_frame=True, max_bytes=128 * _MIB, compression="")
+# The file of a video, before the first frame: a recording has it instead of raw frames.
+CLIP = Topic("camera/clip", ClipPiece, per_frame=False, compression="")
 # Not logged: made again from camera/source and the calibration.
 IMAGE = Topic(
     "camera/image", Image, per_frame=True, logged=False, newest_wins=True, max_bytes=128 * _MIB
@@ -77,7 +80,7 @@ def status(service: str) -> Topic:
 
 
 TOPICS = (
-    STREAM, SOURCE, IMAGE, DEPTH, MAP_KNOWN, EXTREMA, MAP_UPDATE, MAP_FINAL, KEYFRAME,
+    STREAM, CLIP, SOURCE, IMAGE, DEPTH, MAP_KNOWN, EXTREMA, MAP_UPDATE, MAP_FINAL, KEYFRAME,
     KEYFRAME_FINAL, MAP_KEPT, MESH_BLOCKS, MESH_FINAL, SURFELS, STREAM_END,
 )  # fmt: skip
 WITH_PIXELS = (IMAGE, SOURCE)

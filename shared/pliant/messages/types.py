@@ -99,6 +99,9 @@ class SourceImage(Header):
 
     made_from: "" as it came; else what it was before it was made smaller, or a JPEG for a link.
     unmapped: as in ``Image``, so that a replay does what the run did.
+    clip_frame: which frame of ``camera/clip`` it is made from; -1: of none.
+    checksum: of a recording that holds the clip instead of ``data``, which is empty then: CRC-32 of
+    these.  ``pliant.datasets.recorded_images`` makes them again.
     """
 
     encoding: str
@@ -107,6 +110,21 @@ class SourceImage(Header):
     data: Annotated[bytes, Rows("height")]
     made_from: str = ""
     unmapped: bool = False
+    clip_frame: int = -1
+    checksum: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipPiece(Header):
+    """A piece of the video file that the source reads.  frame: its number, from 0.
+
+    name: of the file.    size: of the whole file, in bytes.    offset: of ``data`` in it.
+    """
+
+    name: str
+    size: int
+    offset: int
+    data: bytes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ class Playback:
 
     def __init__(self, path: Path) -> None:
         """Raises RecordingError where there is no recording that was closed, with frames in it."""
-        self._path = path
+        self.path = path
         self._index = Index(path)
         framed = [topic for topic in self._index.topics if topic.per_frame]
         if not framed:
@@ -139,7 +139,7 @@ class Playback:
             if message.publish_time_ns >= stamp_ns:
                 return message
         seconds = (stamp_ns - self.first_ns) * 1e-9
-        raise RecordingError(f"{self._path}: ends before {seconds:.3f} s")
+        raise RecordingError(f"{self.path}: ends before {seconds:.3f} s")
 
     def _first_frame(self, chunk: IndexedChunk, topic: Topic) -> int:
         return self._first(chunk, topic).decode().frame
@@ -147,7 +147,5 @@ class Playback:
     def _first(self, chunk: IndexedChunk, topic: Topic | None = None) -> Recorded:
         found = next(self._index.messages([topic or self._clock], chunks=[chunk]), None)
         if found is None:
-            raise RecordingError(
-                f"{self._path}: its index is wrong: `pliant recover` makes another"
-            )
+            raise RecordingError(f"{self.path}: its index is wrong: `pliant recover` makes another")
         return found

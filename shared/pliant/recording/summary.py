@@ -1,6 +1,7 @@
 """What a recording holds, whether it is whole, and what is missing: ``pliant info``."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from mcap.records import Metadata
 
 from pliant.errors import MessageError
 from pliant.messages import topics
-from pliant.messages.types import StreamEnd
+from pliant.messages.types import ClipPiece, StreamEnd
 from pliant.recording.reader import Recorded, Recording
 from pliant.recording.scan import Closed, Damage
 
@@ -51,6 +52,8 @@ class Summary:
     damage: list[Damage] = field(default_factory=list[Damage])
     has_index: bool = False
     unchecked: int = 0
+    clip: str = ""
+    """Name of the video file that it holds, whose frames its images are; "" without."""
 
     @property
     def closed(self) -> bool:
@@ -101,6 +104,11 @@ class Summary:
             self.topics.setdefault(end.topic, TopicSummary()).end = end
             return
         topic = self.topics.setdefault(message.topic.key, TopicSummary())
+        if message.topic == topics.CLIP and not self.clip and message.checked:
+            with suppress(MessageError):
+                piece = message.decode()
+                assert isinstance(piece, ClipPiece)
+                self.clip = piece.name
         if topic.messages == 0:
             topic.first_ns = message.log_time_ns
         skipped = (message.sequence - topic.following) % _SEQUENCES
@@ -143,6 +151,9 @@ def describe(summary: Summary) -> Iterator[str]:
         written = f"pliant {pliant.get('version', '?')} {pliant.get('commit', '')[:12]}".strip()
         yield f"recorded by {written}, Python {pliant.get('python', '?')}"
         yield f"command: {pliant.get('command', '?')}"
+    if summary.clip:
+        size = _size(summary.topics[topics.CLIP.key].size)
+        yield f"images: frames of {summary.clip}, which is in it as it was ({size})"
     packages = summary.metadata.get("packages", {})
     if packages:
         yield "packages: " + ", ".join(f"{name} {number}" for name, number in packages.items())

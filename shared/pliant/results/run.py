@@ -28,6 +28,7 @@ from pliant.results.scale import MetricRecording, Scale
 
 _LEFT_ALONE = (
     *(topics.SOURCE, topics.DEPTH, topics.KEYFRAME, topics.KEYFRAME_FINAL, topics.MESH_BLOCKS),
+    topics.CLIP,
     topics.MAP_KEPT,  # it becomes a file of its own
     topics.MAP_KNOWN,  # see known_keyframes
     topics.SURFELS,  # see surfels.py
