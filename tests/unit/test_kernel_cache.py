@@ -44,6 +44,21 @@ def helped(x):
 """
 
 
+# A kernel whose arguments are of a type of ours.
+_TYPED = """
+from typing import NamedTuple
+from pliant.compiler.kernel import kernel
+
+class Pair(NamedTuple):
+    first: float
+    second: float
+
+@kernel
+def added(pair):
+    return pair.first + pair.second
+"""
+
+
 def _package(root: Path) -> Path:
     package, compiler = (root / "pliant" / name for name in ("algorithms", "compiler"))
     for folder in (package, compiler):
@@ -66,6 +81,14 @@ def _call(
     env = {"PYTHONPATH": str(root), **environment}
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
     return done.stdout.strip()
+
+
+def test_the_type_of_an_argument_may_have_another_name(tmp_path: Path) -> None:
+    package = _package(tmp_path)
+    call = "from pliant.algorithms.typed import added, {0}; print(added({0}(1.0, 2.0)))"
+    for name in ("Pair", "Couple"):
+        (package / "typed.py").write_text(_TYPED.replace("Pair", name))
+        assert _call(tmp_path, call.format(name)) == "3.0"
 
 
 def test_a_constant_of_another_module_changes_the_kernel(tmp_path: Path) -> None:

@@ -41,6 +41,16 @@ class _Place(CompileResultCacheImpl):
     _locator_classes = (UserProvidedCacheLocator, InTreeCacheLocator, _CacheFolder)
 
 
+class _Index(IndexDataCacheFile):
+    """An index that may name, in the types of arguments, classes of ours that are gone by now."""
+
+    def _load_index(self) -> Any:
+        try:
+            return super()._load_index()
+        except (AttributeError, ImportError):
+            return {}
+
+
 class SourcesCache(FunctionCache):
     """The cache of one kernel, stamped with all the sources it is built from."""
 
@@ -58,7 +68,7 @@ class SourcesCache(FunctionCache):
         stamp = hashlib.sha256()
         for path in sources(Path(function.__code__.co_filename)):
             stamp.update(_digest(path))
-        self._cache_file = IndexDataCacheFile(
+        self._cache_file = _Index(
             cache_path=self._cache_path,
             filename_base=self._impl.filename_base,
             source_stamp=stamp.hexdigest(),
