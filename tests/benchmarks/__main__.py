@@ -126,6 +126,19 @@ def exported_models(
     _print(measure(results))
 
 
+@app.command()
+def colmap(
+    sources: Annotated[list[str], typer.Argument(help="Sequences with a ground truth.")],
+) -> None:
+    """The same clip through COLMAP and through Pliant: time, ATE, points.
+
+    scripts/bench colmap path/to/tsukuba150 built-in:room
+    """
+    from benchmarks.colmap import measure
+
+    _print(measure(sources))
+
+
 @app.command("drone-flights")
 def drone_flights(
     motions: Annotated[Path, typer.Argument(help="Folder of TUM files: EuRoC's true motions.")],

@@ -15,6 +15,7 @@ from typing import Any, cast
 import cv2
 import numpy as np
 
+from benchmarks.colmap import map_by_colmap
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
@@ -56,7 +57,7 @@ def measure(results: list[Path]) -> Iterator[str]:
     for result in results:
         with tempfile.TemporaryDirectory() as folder:
             ours = export_result(result, "colmap", Path(folder) / "ours")
-            theirs = _mapped_by_colmap(ours / "images", Path(folder) / "theirs")
+            theirs = map_by_colmap(ours / "images", Path(folder) / "theirs")
             models = {
                 "Pliant": _read(ours / "sparse" / "0"),
                 "COLMAP": _read(theirs),
@@ -75,23 +76,6 @@ def measure(results: list[Path]) -> Iterator[str]:
                     *(f"{100.0 * (found < _CLOSE_PX).mean():.1f} %", f"{common.sum():,}"),
                 )
             )
-
-
-def _mapped_by_colmap(images: Path, folder: Path) -> Path:
-    """COLMAP's model with the most images, by its defaults for a video."""
-    pycolmap: Any = import_module("pycolmap")
-    folder.mkdir()
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "PINHOLE"
-    database = folder / "database.db"
-    pycolmap.extract_features(
-        database, images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader
-    )
-    pycolmap.match_sequential(database)
-    found: dict[int, Any] = pycolmap.incremental_mapping(database, images, folder)
-    best = max(found, key=lambda number: found[number].num_reg_images())
-    return folder / str(best)
 
 
 def _read(folder: Path) -> _Model:
