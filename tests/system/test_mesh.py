@@ -108,13 +108,15 @@ def test_the_service_replays_to_the_same_bytes(result: Path, tmp_path: Path) -> 
     assert "the same bytes as recorded: mesh/blocks, mesh/final" in done.stdout
 
 
-def test_a_run_makes_its_mesh_without_open3d(tmp_path: Path) -> None:
+def test_a_run_needs_neither_open3d_nor_a_viewer(tmp_path: Path) -> None:
     hidden = tmp_path / "hidden" / "open3d"
     hidden.mkdir(parents=True)
     (hidden / "__init__.py").write_text("raise SystemExit('open3d was imported')")
+    (hidden.parent / "sitecustomize.py").write_text("import sys\nsys.modules['rerun'] = None\n")
     environment = {"PYTHONPATH": str(hidden.parent)}
     arguments = ("--output", tmp_path / "result", "--set", "ingest.mode=lossless")
     done = pliant("run", f"{TINY}?frames=12", *arguments, env=environment)
     assert done.returncode == 0, done.stderr
     assert "fine mesh: " in done.stdout
+    assert "pliant view" not in done.stderr
     assert (tmp_path / "result" / "mesh.ply").exists()

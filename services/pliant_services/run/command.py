@@ -36,7 +36,7 @@ from pliant.results.folder import (
 from pliant_services.nodes.ingest import plays_live
 from pliant_services.processes import PROFILES, deformable_fleet, inputs_of, reads_depth
 from pliant_services.run.progress import Progress
-from pliant_services.run.spectators import Viewer, announced, check_viewer
+from pliant_services.run.spectators import Viewer, announced, check_viewer, has_viewer
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.launcher import Fleet
 
@@ -179,7 +179,8 @@ def _go_through(
                 if viewer is not None:
                     viewer.start(fleet)
                 fleet.start(lambda name: service_arguments(name, request, output))
-                progress.say(f"services are up; look on: pliant view {output}")
+                look_on = f"; look on: pliant view {output}" if has_viewer() else ""
+                progress.say(f"services are up{look_on}")
                 interrupted = _wait(fleet, progress)
                 if viewer is not None:
                     viewer.see_the_end(fleet)

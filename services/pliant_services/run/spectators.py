@@ -30,6 +30,11 @@ def announced(output: Path, endpoint: str, session: str) -> Generator[None]:
         file.unlink(missing_ok=True)
 
 
+def has_viewer() -> bool:
+    """Whether what `pliant view` draws with is installed."""
+    return find_spec("rerun") is not None
+
+
 def check_viewer(output: Path, *, web: bool, save: Path | None, force: bool) -> None:
     """Raise ResultError where a run's viewer could not start: before an earlier result is touched.
 
@@ -41,7 +46,7 @@ def check_viewer(output: Path, *, web: bool, save: Path | None, force: bool) -> 
     folder = save.resolve().parent if save is not None else output.resolve()
     if not folder.is_dir() and folder != output.resolve():
         raise ResultError(f"{save}: there is no such folder: choose another --save")
-    if find_spec("rerun") is None:
+    if not has_viewer():
         raise ResultError("Rerun is not installed: pip install 'pliant[view]'")
 
 
