@@ -30,10 +30,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "bus": {"bus", "messages", "state", "algorithms", "errors", "files"},
     "recording": {"recording", "messages", "algorithms", "errors", "files"},
     "rendering": {"rendering", "algorithms", "compiler", "errors"},
-    "viewers": {"viewers", "messages", "datasets", "pictures", "algorithms", "errors"},
+    "ros": {"ros", "errors"},
+    "viewers": {"viewers", "messages", "datasets", "pictures", "ros", "algorithms", "errors"},
     "datasets": {
         *{"datasets", "rendering", "formats", "cache", "algorithms", "errors"},
         *{"messages", "recording", "trajectory"},  # our own recordings are a source, too
+        *{"ros", "bus"},  # a live camera of ROS is reached over Zenoh
     },
     "results": {
         *{"results", "formats", "pictures", "recording", "messages", "algorithms", "errors"},

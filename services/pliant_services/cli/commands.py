@@ -12,6 +12,7 @@ from pliant_services.cli import (
     recover,
     render,
     replay,
+    ros,
     router,
     run,
     scale,
@@ -33,6 +34,7 @@ app.command("calibrate", rich_help_panel=EVERYDAY)(calibrate.calibrate)
 app.command("config", rich_help_panel=EVERYDAY)(config.config)
 app.command("doctor", rich_help_panel=EVERYDAY)(doctor.doctor)
 app.command("view", rich_help_panel=LOOK)(view.view)
+app.command("ros", rich_help_panel=LOOK)(ros.ros)
 app.command("info", rich_help_panel=LOOK)(info.info)
 app.command("eval", rich_help_panel=LOOK)(evaluate_command.evaluate)
 app.command("status", rich_help_panel=LOOK)(status.status)

@@ -20,7 +20,8 @@ def run(
     source: Annotated[
         str,
         typer.Argument(
-            help="Folder, video, bag, MCAP file, camera:0 or built-in:room.", show_default=False
+            help="Folder, video, bag, MCAP file, camera:0, ros:HOST or built-in:room.",
+            show_default=False,
         ),
     ],
     output: Annotated[
@@ -47,7 +48,7 @@ def run(
         Literal["window", "web"] | None, _everyday(help="Look on in Rerun (pliant view).")
     ] = None,
     topic: Annotated[
-        str, _source(help="The images of an MCAP file or ROS bag that has several.")
+        str, _source(help="The images of an MCAP file, bag or ros:HOST that has several.")
     ] = "",
     max_size: Annotated[
         int | None,

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import zenoh
 
@@ -31,6 +31,15 @@ _WAITING = 512  # messages between the network and the drawing; the oldest give 
 _WAITING_BYTES = 256 << 20
 _ASK_S = 0.5
 _GONE_S = 0.2  # what is on the way when the last service has gone
+
+
+class WatchedCanvas(Canvas, Protocol):
+    """A canvas that somebody may stop looking at."""
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether it is of use to go on drawing."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +97,7 @@ def run_view(request: ViewRequest) -> None:
 def follow(
     endpoints: list[str],
     session: str,
-    canvas: RerunCanvas,
+    canvas: WatchedCanvas,
     patience_s: float = 0.0,
     identity: Identity | None = None,
 ) -> None:

@@ -83,6 +83,16 @@ def _open_camera(source: str, options: SourceOptions) -> Dataset:
     return CameraDevice(camera_index(source) or 0, options)
 
 
+def _is_ros(source: str) -> bool:
+    return source.startswith("ros:") and not Path(source).exists()
+
+
+def _open_ros(source: str, options: SourceOptions) -> Dataset:
+    from pliant.datasets.ros_camera import open_ros  # Zenoh, which other sources do without
+
+    return open_ros(source, options)
+
+
 def _open_video(source: str, options: SourceOptions) -> Dataset:
     path = Path(source)
     if path.suffix.lower() in (*SUFFIXES, ".txt", ".csv", ".yaml"):
@@ -98,6 +108,7 @@ FORMATS: dict[str, SourceFormat] = {
         has_depth=True,
     ),
     "camera": SourceFormat("camera:0", _is_camera, _open_camera),
+    "ros": SourceFormat("ros:HOST (ROS 2 over rmw_zenoh)", _is_ros, _open_ros, has_topics=True),
     "recording": SourceFormat(
         "a recording of Pliant's", is_own_recording, open_own_recording, has_depth=True, sized=True
     ),

@@ -1,0 +1,109 @@
+"""A camera of ROS 2 that is publishing: ``ros:localhost``, by rmw_zenoh's keys, without ROS.
+
+The source is the machine of rmw_zenoh's router, ``--topic`` chooses the images.  It is live, and
+ends when nobody publishes the images any more.
+"""
+
+import queue
+import time
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from pliant.bus.session import open_session
+from pliant.datasets.base import Dataset
+from pliant.datasets.image_messages import RecordedImage, capture_time, plain_type
+from pliant.datasets.images import SourceOptions
+from pliant.datasets.message_files import MessageImages, MessageTopic
+from pliant.errors import BusError, DatasetError
+from pliant.ros.definitions import RosError, definitions
+from pliant.ros.graph import Node, RosTopic
+
+_PREFIX = "ros:"
+_PORT = 7447
+_WAITING = 16  # messages between the network and the reader; the oldest give way
+_FIRST_S = 10.0  # for the first message of a topic
+_ASK_S = 0.5
+
+
+def open_ros(source: str, options: SourceOptions) -> Dataset:
+    """The images of a topic.  Raises DatasetError and CalibrationError."""
+    return RosCamera(source, options)
+
+
+class RosCamera(MessageImages):
+    """The images of a topic as they come."""
+
+    is_live = True
+
+    def __init__(self, source: str, options: SourceOptions) -> None:
+        """Raises DatasetError and CalibrationError."""
+        super().__init__(_Graph(source), options)
+        self.name = source
+
+
+class _Graph:
+    def __init__(self, source: str) -> None:
+        host = source.removeprefix(_PREFIX) or "localhost"
+        has_port = host.rpartition(":")[2].isdecimal() and not host.endswith("]")
+        self.path = Path(source)
+        self._endpoint = f"tcp/{host}" if has_port else f"tcp/{host}:{_PORT}"
+
+    @contextmanager
+    def open(self) -> Generator["_OpenGraph"]:
+        try:
+            definitions()  # said now, before the network is asked
+            with open_session([self._endpoint]) as session:
+                yield _OpenGraph(self.path, Node(session, "/pliant_camera"))
+        except (BusError, RosError) as error:
+            raise DatasetError(f"{self.path}: {error}") from None
+
+
+class _OpenGraph:
+    def __init__(self, path: Path, node: Node) -> None:
+        self._path, self._node = path, node
+        self._published = {topic.name: topic for topic in node.published()}
+        self.topics = [
+            MessageTopic(topic.name, plain_type(topic.kind), -1)
+            for topic in self._published.values()
+        ]
+
+    def messages(self, topic: MessageTopic) -> Iterator[RecordedImage]:
+        """The messages of a topic as they come, each later than the one before."""
+        ros = self._published[topic.name]
+        waiting: queue.Queue[tuple[int, bytes]] = queue.Queue(_WAITING)
+
+        def take(data: bytes) -> None:
+            if waiting.full():
+                with suppress(queue.Empty):
+                    waiting.get_nowait()
+            waiting.put((time.time_ns(), data))
+
+        subscriber = self._node.subscribe(ros, take)
+        deadline, last_ns = time.monotonic() + _FIRST_S, -1
+        try:
+            while True:
+                try:
+                    arrived_ns, data = waiting.get(timeout=_ASK_S)
+                except queue.Empty:
+                    if last_ns < 0 and time.monotonic() > deadline:
+                        raise DatasetError(
+                            f"{self._path}: {topic.name}: no message came within {_FIRST_S:.0f} s"
+                        ) from None
+                    if ros.name not in {there.name for there in self._node.published()}:
+                        return
+                    continue
+                image = RecordedImage(arrived_ns, self._read(ros, data))
+                if capture_time(image) > last_ns:  # a driver may tell one twice
+                    last_ns = capture_time(image)
+                    yield image
+        finally:
+            subscriber.undeclare()
+
+    def _read(self, topic: RosTopic, data: bytes) -> object:
+        try:
+            return definitions().deserialize_cdr(data, topic.kind)
+        except Exception as error:  # of a foreign parser on foreign bytes
+            raise DatasetError(
+                f"{self._path}: {topic.name}: a message is no {topic.kind} ({type(error).__name__})"
+            ) from None

@@ -1,0 +1,1 @@
+"""ROS 2 without ROS: the keys and attachments of rmw_zenoh, and messages by rosbags' serialiser."""
