@@ -57,6 +57,7 @@ def wire(images: list[Image]) -> list[bytes]:
     return [codec.encode(image) for image in images]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jpegs", [False, True])
 def test_lossless_is_lossless_also_of_jpegs_which_cross_themselves(jpegs: bool) -> None:
     raw, lossless = ingested("raw", jpegs=jpegs), ingested("lossless", jpegs=jpegs)
@@ -67,6 +68,7 @@ def test_lossless_is_lossless_also_of_jpegs_which_cross_themselves(jpegs: bool) 
     assert crossing == ([sources[0], b"", sources[2]] if jpegs else [b""] * FRAMES)
 
 
+@pytest.mark.slow
 def test_what_is_worked_on_is_the_jpeg_that_is_recorded() -> None:
     sent = ingested("jpeg")
     for source, image in zip(sent[topics.SOURCE], sent[topics.IMAGE], strict=True):

@@ -27,6 +27,7 @@ def test_windows_are_what_they_say():
     assert short.points_px.tobytes() == synthetic_window(8, 300, track_length=3).points_px.tobytes()
 
 
+@pytest.mark.slow
 def test_ceres_and_all_methods_agree(tmp_path):
     problem = small_window(150)
     tight = WINDOW.model_copy(update={"min_relative_decrease": 1e-9})

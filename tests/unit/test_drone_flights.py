@@ -1,6 +1,7 @@
 """A short flight of the kind that ``scripts/bench drone-flights`` measures."""
 
 import numpy as np
+import pytest
 from benchmarks import drone_flights
 from benchmarks.drone_scenes import drone_scene
 
@@ -30,6 +31,7 @@ def test_nothing_is_flown_into():
         assert (reach > 0.5 * min(solid.size)).all()
 
 
+@pytest.mark.slow
 def test_a_flight_is_one_segment(tmp_path, monkeypatch):
     write_tum(tmp_path / "V1.txt", flight(24))
     small = drone_flights.CAMERA.model_copy(update={"width": 376, "height": 240})

@@ -116,6 +116,7 @@ def test_neither_the_window_nor_what_shares_points_is_asked(monkeypatch, segment
     assert asked == [5]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("killed", [False, True])
 def test_the_mapper_closes_a_loop_that_it_sees(killed):
     """Along a wall and back, where lost points are never found: they are mapped twice, until

@@ -163,6 +163,7 @@ def test_a_source_is_opened_at_its_working_size(tmp_path: Path) -> None:
     assert whole.calibration.width == 1280
 
 
+@pytest.mark.slow
 def test_a_run_goes_well_at_every_size() -> None:
     tiny = open_source("built-in:tiny")
     assert tiny.ground_truth_path is not None
