@@ -38,7 +38,7 @@ from pliant_services.run.command import INTERRUPTED, RunRequest, run_pipeline
 
 _LOOKED_AT = 200
 """Frames in which the board is looked for: the sharpest of so many parts of the source."""
-_TRIED = 8
+_TRIED = 5
 """Frames that are searched for other boards where the wanted one is in none."""
 _KNOWN = 0.05
 """Standard deviation of the log focal length above which it counts as unknown."""

@@ -2,6 +2,7 @@
 
 from pliant_services.cli import (
     app,
+    batch,
     calibrate,
     certs,
     config,
@@ -26,6 +27,11 @@ from pliant_services.cli import map as map_commands
 from pliant_services.cli.groups import DEVELOPMENT, EVERYDAY, LOOK, MACHINES, GroupedOptions
 
 app.command("run", cls=GroupedOptions, rich_help_panel=EVERYDAY)(run.run)
+app.command(
+    "batch",
+    rich_help_panel=EVERYDAY,
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+)(batch.batch)
 app.command("export", rich_help_panel=EVERYDAY)(export.export)
 app.command("mesh", rich_help_panel=EVERYDAY)(mesh.mesh)
 app.command("scale", rich_help_panel=EVERYDAY)(scale.scale)

@@ -199,11 +199,14 @@ def resumed_config(output: Path, request: RunRequest) -> Config:
         raise ResultError(
             f"{output} holds no run that can be resumed: start it with --on-crash restart"
         )
-    if request.overrides or request.config_file or request.seed is not None:
+    kept = load_config(output / CONFIG_NAME)
+    said = request.overrides or request.config_file or request.seed is not None
+    if said and kept != load_config(request.config_file, request.overrides, seed=request.seed):
         raise ResultError(
-            "--resume takes the configuration of its run: leave --config, --set, --seed"
+            "--resume takes the configuration of its run, and this is another one: leave --config, "
+            "--set, --seed and what else changes it"
         )
-    return load_config(output / CONFIG_NAME)
+    return kept
 
 
 def _has_ended(output: Path, services: Sequence[str], config: Config) -> bool:

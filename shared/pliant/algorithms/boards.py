@@ -123,22 +123,18 @@ class BoardFinder:
 
 def boards_seen(images: Sequence[U8]) -> list[str]:
     """In words, which boards the images (H, W) show: for a user who named another."""
-    markers = dict.fromkeys(_LARGEST, 0)
-    for name in markers:
-        dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[name])
-        detector = cv2.aruco.ArucoDetector(dictionary)
-        for grey in images:
-            ids: Any = detector.detectMarkers(grey)[1]
-            markers[name] = max(markers[name], 0 if ids is None else len(ids))
-    most = max(markers, key=lambda name: markers[name])
-    if markers[most] >= _SEEN_MARKERS:  # between them there are small chessboards, too
-        return [f"{markers[most]} markers of {most.removesuffix('_1000')}"]
+    for name in _LARGEST:
+        detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[name]))
+        found: list[Any] = [detector.detectMarkers(grey)[1] for grey in images]
+        most = max((0 if ids is None else len(ids) for ids in found), default=0)
+        if most >= _SEEN_MARKERS:  # between them there are small chessboards, too
+            return [f"{most} markers of {name.removesuffix('_1000')}"]
     sizes: list[tuple[int, int]] = []
     for grey in images:
         small = resized(grey, LONGEST_SIDE_PX)
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-        found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
-        if found:
+        seen, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
+        if seen:
             rows, columns = cast(Any, meta).shape[:2]
             sizes.append((max(rows, columns) + 1, min(rows, columns) + 1))
     often = max(sizes, key=lambda size: (sizes.count(size), size), default=(0, 0))

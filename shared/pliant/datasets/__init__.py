@@ -49,6 +49,7 @@ __all__ = [
     "decode",
     "open_source",
     "read_calibration",
+    "sources_in",
 ]
 
 
@@ -182,6 +183,36 @@ def open_source(
         raise DatasetError(f"{source}: neither a file nor a folder; understood are {understood()}")
     what = "holds none of the sources" if any(path.iterdir()) else "is an empty folder"
     raise DatasetError(f"{source}: {what}; understood are {understood()}")
+
+
+_VIDEOS = (
+    *(".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts"),
+    *(".wmv", ".flv", ".ogv", ".3gp", ".mjpeg"),
+)
+"""A file of these endings in a folder is a clip: of one that a user names, OpenCV decides."""
+
+
+def sources_in(folder: Path, *, but: Path) -> list[Path]:
+    """The sources that lie directly in a folder, by name.  but: one that is none, as results are.
+
+    Raises DatasetError where there are none, or the folder is one itself.
+    """
+    if any(kind.recognises(str(folder)) for kind in FORMATS.values()):
+        raise DatasetError(f"{folder}: is a sequence itself: `pliant run {folder}`")
+    try:
+        paths = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError as error:
+        raise DatasetError(f"{folder}: cannot be read: {error.strerror}") from None
+    results = (but.resolve(), *but.resolve().parents)
+    found = [path for path in paths if path.resolve() not in results and _is_clip(path)]
+    if not found:
+        raise DatasetError(f"{folder}: holds none of the sources; understood are {understood()}")
+    return found
+
+
+def _is_clip(path: Path) -> bool:
+    names = [name for name, kind in FORMATS.items() if kind.recognises(str(path))]
+    return bool(names) and (names[0] != "video" or path.suffix.lower() in _VIDEOS)
 
 
 def understood() -> str:

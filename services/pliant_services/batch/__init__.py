@@ -1,0 +1,1 @@
+"""Behind ``pliant batch``: every source of a folder through ``pliant run``."""

@@ -1,0 +1,36 @@
+"""``pliant batch``: the whole pipeline on every source of a folder."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def batch(
+    context: typer.Context,
+    folder: Annotated[
+        Path, typer.Argument(help="Videos, sequences, bags, side by side.", show_default=False)
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder of the result folders [results/<folder>]."),
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time; each takes 2 cores.")] = 1,
+) -> None:
+    """Run every clip of a folder; the same command again goes on after an interruption.
+
+    pliant batch clips --jobs 2
+
+    pliant batch clips --fov 70 --every 2 --set tracking.max_tracks=5000
+
+    Options of `pliant run` come after the folder, and go to each run.
+    """
+    from pliant.results.folder import folder_name
+    from pliant_services.batch import command
+    from pliant_services.cli import app
+
+    command.check_folder(folder)
+    runs = typer.main.get_command(app).commands["run"]  # type: ignore[attr-defined]
+    command.check_options(runs, context.args)
+    where = output or Path("results") / folder_name(str(folder))
+    raise typer.Exit(command.run_batch(folder, where, jobs=jobs, options=context.args))
