@@ -86,10 +86,12 @@ def refine_pose(
     *,
     inlier_px: float = 1.5,
     iterations: int = 10,
+    weights: F32 | None = None,
 ) -> tuple[F64, BoolArray, F64]:
     """Robust Gauss-Newton on one pose, points fixed (Eq. 11 alone).
 
     T_world_camera: (4, 4) start.  points_world: (N, 3).  points_px: (N, 2), NaN where not seen.
+    weights: (N,) of what is seen; None: all alike.
     Returns the pose, (N,) whether the reprojection error is under inlier_px with the point in
     front, and the (6, 6) Hessian in px^2 in the order (translation, rotation) of
     ``T_camera_world = (exp(theta), rho) * T_camera_world``.  Without observations the pose stays.
@@ -98,6 +100,8 @@ def refine_pose(
     layout = _one_camera(
         start, np.asarray(points_world, np.float64), np.asarray(points_px, np.float32), camera
     )
+    if weights is not None:
+        layout.table.w[0, : len(points_px)] *= weights
     before = layout.cameras.motion[0]
     pose = before.copy()
     normal = np.zeros(28)

@@ -190,12 +190,18 @@ class ActiveMap:
 
     def see(self, T_world_camera: F64, points_px: F32, found: Observations) -> None:
         """Put the current frame into the window."""
+        self.window.see(T_world_camera, *self._seen(points_px, found))
+
+    def pass_by(self, frame: int, T_world_camera: F64, points_px: F32, found: Observations) -> None:
+        """The current frame is no keyframe: it hangs on the last one."""
+        seen = self._seen(points_px, found)
+        self.segment.passed.add(frame, self.keyframes[-1], T_world_camera, *seen)
+
+    def _seen(self, points_px: F32, found: Observations) -> tuple[I32, F32]:
+        """Rows and pixels of all points and candidates that the current frame sees."""
         linked = self.links.rows != UNLINKED
-        self.window.see(
-            T_world_camera,
-            np.concatenate([self.links.rows[linked], found.rows]),
-            np.concatenate([points_px[linked], found.points_px]),
-        )
+        rows = np.concatenate([self.links.rows[linked], found.rows])
+        return rows, np.concatenate([points_px[linked], found.points_px])
 
     def join(self, loop: Loop) -> None:
         """Points that a loop has shown to be the same become one, as far as they still exist."""
@@ -297,6 +303,7 @@ class ActiveMap:
     def begin_to_unroll(self, calibration: SelfCalibration) -> None:
         """The readout has become known: the map is bent until its window is adjusted with it."""
         self.segment.unroll(self.keyframes, calibration)
+        self.segment.passed.forget()
         self.window.see_anew()
         self._adjust_window()
 

@@ -63,15 +63,20 @@ class Atlas:
 
     def kept(self) -> Iterator[KeptKeyframe]:
         """The map as it is to be kept, oldest keyframe first.  Once the stream has ended."""
-        segments = self._earlier.everything()
-        if self.active is not None:
-            segments.append((self.active.segment, self.calibration))
+        segments = self.everything()
         session = 1 + max((origin.session for origin in self._origins.values()), default=-1)
         made = (keyframe for segment, _ in segments for keyframe in segment.keyframes)
         origins = {k.id: Origin(session, k.frame) for k in made} | self._origins
         features = self.places.index.features
         each = [keep(*segment, features, origins) for segment in segments]
         yield from heapq.merge(*each, key=lambda keyframe: keyframe.id)
+
+    def everything(self) -> list[tuple[Segment, SelfCalibration]]:
+        """All segments, with the calibration whose pixels each has."""
+        segments = self._earlier.everything()
+        if self.active is not None:
+            segments.append((self.active.segment, self.calibration))
+        return segments
 
     @property
     def point_count(self) -> int:

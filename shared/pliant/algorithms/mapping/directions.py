@@ -38,7 +38,7 @@ _PRIOR_SHARE = 0.5
 _FARTHEST = 0.02
 """Least inverse depth, as a share of the prior's: it stays before the camera."""
 
-_MAPPED_SHARE = 0.25
+MAPPED_SHARE = 0.25
 """Share of what a frame sees under which points of the map alone do not carry its pose."""
 
 _COMMON_PX = 0.1
@@ -70,7 +70,7 @@ def placed_candidates(points: PointRows, rows: I32) -> I64:
 def helping_candidates(points: PointRows, rows: I32) -> I64:
     """As ``placed_candidates``; none where so many of the rows are mapped that they suffice."""
     others, mapped = _placed(rows, points.state, points.spread)
-    return others if mapped < _MAPPED_SHARE * (mapped + len(others)) else others[:0]
+    return others if mapped < MAPPED_SHARE * (mapped + len(others)) else others[:0]
 
 
 @kernel

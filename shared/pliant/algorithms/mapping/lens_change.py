@@ -29,6 +29,7 @@ def see_by(segment: Segment, before: CorrectedView, known: SelfCalibration) -> N
         seen = moved(keyframe.points_px + keyframe.rolled_px, before, known.view)
         keyframe.points_px = moved(keyframe.points_px, before, known.view)
         keyframe.rolled_px = seen - keyframe.points_px
+    segment.passed.seen_by(before, known.view)
     if known.readout:
         segment.unroll(segment.keyframes, known)
 

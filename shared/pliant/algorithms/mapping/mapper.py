@@ -27,6 +27,7 @@ from pliant.algorithms.mapping.frame_pose import (
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe
 from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.passing import EarlierPose, placed_again
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.recovery import Motion
 from pliant.algorithms.mapping.segment import Moved
@@ -158,6 +159,11 @@ class Mapper:
             self._keyframe_ns = stamp_ns
             with self._timer("places"):
                 atlas.remember(hanging, grey)
+            with self._timer("passed frames"):
+                surplus = active.segment.passed.take_surplus()
+                self._correct(placed_again(surplus, active.points, self._camera, self._parameters))
+        else:
+            active.pass_by(frame, T_world_camera, tracks.points_px, found)
         self._place_waiting(active, hanging, T_world_camera)
         self._lost_frames, self._waiting = 0, Waiting()
         self._motion = self._motion.then(frame, stamp_ns, T_world_camera)
@@ -187,6 +193,9 @@ class Mapper:
     def finish(self) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
         self.follow(self.atlas.finish())
+        for segment, seen_by in self.atlas.everything():
+            frames, camera = segment.passed.take_all(), seen_by.view.camera
+            self._correct(placed_again(frames, segment.points, camera, self._parameters))
         if self.atlas.active is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         self._keyframe_changes.settle(self.atlas.active.keyframes)
@@ -195,6 +204,11 @@ class Mapper:
     def _add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
         self._changes.add_pose(frame, keyframe, T_world_camera, inliers)
         self.atlas.add_pose(frame, keyframe, T_world_camera)
+
+    def _correct(self, placed: list[EarlierPose]) -> None:
+        """Frames of before are known better by now."""
+        for each in placed:
+            self._changes.add_pose(each.frame, each.keyframe, each.T_world_camera, each.inliers)
 
     def publish_keyframes(self) -> KeyframeDelta:
         """What is to be published of keyframes after the last frame, or after ``finish``."""

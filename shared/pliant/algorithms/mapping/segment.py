@@ -16,6 +16,7 @@ from pliant.algorithms.mapping.covisibility import focus_of, seen_by_none
 from pliant.algorithms.mapping.final_adjustment import adjust_keyframes
 from pliant.algorithms.mapping.map_store import FREE, MAPPED, UNLINKED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.passing import PassedFrames
 from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 
@@ -37,6 +38,7 @@ class Moved(NamedTuple):
 @dataclass(kw_only=True)
 class Segment:
     """points: rows shared by all segments.    keyframes: oldest first.   path: of its frames.
+    passed: those that are no keyframes.
     since: index of the first keyframe after the camera was last recognised: older ones do not move
     with the window.   culled: keyframes that it has forgotten.   inverse_distance: median of its
     points from the newest keyframe.
@@ -46,6 +48,7 @@ class Segment:
     points: PointRows
     keyframes: list[Keyframe] = field(default_factory=list[Keyframe])
     path: Path = field(default_factory=Path)
+    passed: PassedFrames = field(default_factory=PassedFrames)
     since: int = 0
     culled: int = 0
     inverse_distance: float = 1.0
@@ -151,11 +154,15 @@ class Segment:
         self.since = len(older)
         self.culled += earlier.culled
         self.path.take_in(earlier.path)
+        self.passed.take_in(earlier.passed)
 
     def adjust(self, known: SelfCalibration, parameters: MappingParameters) -> SelfCalibration:
         """Adjust all but the first keyframe and the calibration, from what is known of it."""
         motions = self.path.motions(self.keyframes)
-        known, gone = adjust_keyframes(self.keyframes, self.points, known, parameters, motions)
+        found, gone = adjust_keyframes(self.keyframes, self.points, known, parameters, motions)
         self.points.remove(gone)
-        self.unroll(self.keyframes, known)
-        return known
+        self.unroll(self.keyframes, found)
+        self.passed.seen_by(known.view, found.view)
+        if found.readout and not known.readout:
+            self.passed.forget()
+        return found

@@ -18,6 +18,7 @@ from pliant.algorithms.mapping.lens_change import moved
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.parameters import LocalisationParameters, MappingParameters
+from pliant.algorithms.mapping.passing import EarlierPose
 from pliant.algorithms.mapping.start import Start, WaitingFrame, keep_waiting
 from pliant.algorithms.tracks import FrameTracks
 
@@ -92,16 +93,6 @@ class Waiting:
         """With the pixels of another ideal camera."""
         frames = [replace(f, points_px=moved(f.points_px, before, after)) for f in self.frames]
         return Waiting(frames, self.turns)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EarlierPose:
-    """T_world_camera of a frame, and the keyframe that it hangs on."""
-
-    frame: int
-    keyframe: Keyframe
-    T_world_camera: F64
-    inliers: int
 
 
 def earlier_poses(

@@ -1,0 +1,128 @@
+"""Frames between keyframes are placed once more, by the map as it has become.
+
+A frame is placed as it comes, by what the map is then: young points are uncertain, and after a
+return hardly any is in view.  Every adjustment mends keyframes; a frame between them moves with the
+one on which it hangs, and would keep the error relative to it.  So what frames have seen is kept
+for as long as there is room, and then places them by the points that have been adjusted since.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32
+from pliant.algorithms.bundle.subspace import refine_pose
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import CorrectedView
+from pliant.algorithms.geometry import inverse
+from pliant.algorithms.mapping.directions import MAPPED_SHARE
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.observation_table import weigh
+from pliant.algorithms.mapping.parameters import MappingParameters
+
+_ROOM = 2_000_000
+"""Observations that are kept, 24 MB: some 250 frames of 8000."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EarlierPose:
+    """T_world_camera of a frame, and the keyframe that it hangs on."""
+
+    frame: int
+    keyframe: Keyframe
+    T_world_camera: F64
+    inliers: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Passed:
+    """A frame that hangs on a keyframe, where it was placed (4, 4), and what it saw there: rows
+    (n,) of points and candidates, at points_px (n, 2)."""
+
+    frame: int
+    keyframe: Keyframe
+    T_keyframe_camera: F64
+    rows: I32
+    points_px: F32
+
+
+@dataclass
+class PassedFrames:
+    """Frames of a segment that are no keyframes and are to be placed once more, oldest first."""
+
+    _frames: list[_Passed] = field(default_factory=list[_Passed])
+
+    def add(
+        self, frame: int, keyframe: Keyframe, T_world_camera: F64, rows: I32, points_px: F32
+    ) -> None:
+        """A frame hangs on a keyframe, and saw points and candidates in the rows (n,)."""
+        T_keyframe_camera = inverse(keyframe.T_world_camera) @ T_world_camera
+        self._frames.append(
+            _Passed(
+                frame=frame, keyframe=keyframe, T_keyframe_camera=T_keyframe_camera, rows=rows,
+                points_px=points_px,
+            )
+        )  # fmt: skip
+
+    def forget(self) -> None:
+        """They stay where they are: nobody knows any more where they saw what."""
+        self._frames = []
+
+    def seen_by(self, before: CorrectedView, after: CorrectedView) -> None:
+        """The pixels become those of another ideal camera."""
+        self._frames = [
+            replace(each, points_px=after.pixels(before.seen(each.points_px)))
+            for each in self._frames
+        ]
+
+    def take_in(self, earlier: "PassedFrames") -> None:
+        """Those of an earlier segment are of this one, too."""
+        self._frames = [*earlier._frames, *self._frames]
+
+    def take_surplus(self) -> list[_Passed]:
+        """The oldest, of which there is no more room for what they saw."""
+        seen = np.cumsum([len(each.rows) for each in reversed(self._frames)])
+        return self._take(len(seen) - int(np.searchsorted(seen, _ROOM, side="right")))
+
+    def take_all(self) -> list[_Passed]:
+        """All of them."""
+        return self._take(len(self._frames))
+
+    def _take(self, count: int) -> list[_Passed]:
+        taken, self._frames = self._frames[:count], self._frames[count:]
+        return taken
+
+
+def placed_again(
+    frames: Iterable[_Passed],
+    points: PointRows,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+) -> list[EarlierPose]:
+    """Poses of those of the frames that see enough of the map as it is now."""
+    limits = parameters.localisation
+    placed: list[EarlierPose] = []
+    for each in frames:
+        keyframe = each.keyframe
+        # A row that was given back and used anew begins with a later keyframe.
+        still = points.first_keyframe[each.rows] <= keyframe.id
+        still &= points.segment[each.rows] == keyframe.segment
+        still &= points.state[each.rows] == MAPPED
+        if still.sum() < max(limits.min_inliers, MAPPED_SHARE * len(still)):
+            continue
+        points_px = each.points_px[still]
+        T_world_camera, fits, _ = refine_pose(
+            keyframe.T_world_camera @ each.T_keyframe_camera, points.xyz[each.rows[still]],
+            points_px, camera, parameters.bundle, inlier_px=limits.inlier_px,
+            weights=weigh(points_px, camera, parameters.window.lens_radius),
+        )  # fmt: skip
+        inliers = int(np.count_nonzero(fits))
+        if inliers >= max(limits.min_inliers, limits.min_predicted_share * len(fits)):
+            placed.append(
+                EarlierPose(
+                    frame=each.frame, keyframe=keyframe, T_world_camera=T_world_camera,
+                    inliers=inliers,
+                )
+            )  # fmt: skip
+    return placed
