@@ -149,7 +149,7 @@ def _opencv(content: Keys, wanted: Wanted) -> Keys:
 def _said_model(content: Keys) -> str:
     said = content.get("distortion_model")
     coefficients = _first(content, _COEFFICIENTS)
-    if not said and coefficients and content[coefficients] == []:
+    if not said and coefficients and not _numbers(content, coefficients, None):
         return "none"
     return str(said or "").lower()
 
