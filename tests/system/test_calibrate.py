@@ -1,0 +1,28 @@
+"""``pliant calibrate`` without a board: the run that finds its camera."""
+
+import math
+from pathlib import Path
+
+import pytest
+from running import TINY, assert_one_line, pliant
+
+from pliant.datasets.builtin import builtin_folder
+from pliant.datasets.calibration_files import read_calibration
+
+pytestmark = [pytest.mark.slow, pytest.mark.system]
+
+
+def test_a_camera_is_found_without_a_board(tmp_path: Path) -> None:
+    file = tmp_path / "found.yaml"
+    given = pliant("calibrate", TINY, "--output", file)
+    assert_one_line(given, "has a calibration, which `pliant run` takes: --fov DEGREES")
+    done = pliant("calibrate", TINY, "--fov", "50", "--output", file)
+    assert done.returncode == 0, done.stderr
+    assert "the focal length was found" in done.stdout
+    assert f"written: {file}" in done.stdout
+    found, true = read_calibration(file), read_calibration(builtin_folder(TINY) / "calib.yaml")
+    guess = 0.5 * true.width / math.tan(math.radians(25.0))
+    off = abs(math.log(found.fx / true.fx))
+    assert off < 3.0 * found.focal_sigma
+    assert off < 0.25 * abs(math.log(guess / true.fx))
+    assert [path.name for path in tmp_path.iterdir()] == ["found.yaml"]
