@@ -133,3 +133,9 @@ def test_no_file_names_a_machine() -> None:
 def test_what_calls_no_kernel_loads_none(module: str) -> None:
     code = f"import sys, {module}; sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_no_two_test_files_have_one_name() -> None:
+    """Pytest collects only the first of them, beside the other's folder."""
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert sorted({name for name in names if names.count(name) > 1}) == []
