@@ -216,6 +216,8 @@ class MapHistory(CurrentMap):
         that segment later is not told."""
         self.frames: dict[int, FramePose] = {}
         self.states: dict[int, tuple[int, str]] = {}
+        self.same_places: list[tuple[int, int]] = []
+        """Keyframes that were found to show one place, as ``MapDelta.same_places``."""
 
     def apply(self, delta: MapDelta, *, frame: int, stamp_ns: int, final: bool = False) -> None:
         """Take in one update.  ``final``: the one after the last frame."""
@@ -233,6 +235,8 @@ class MapHistory(CurrentMap):
                 delta.poses_keyframe_camera[row],
                 int(delta.pose_inliers[row]),
             )
+        told = [(old, new) for old, new in delta.same_places.tolist() if new >= 0]
+        self.same_places += [pair for pair in told if pair not in self.same_places]
         if final:
             return
         self.stamps_ns[frame] = stamp_ns

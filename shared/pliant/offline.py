@@ -6,11 +6,12 @@ The same algorithms in the same order as the services run them, so the same numb
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.map_delta import MapDelta
 from pliant.algorithms.mapping.trial import mapper_for
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracking.tracker import ExtremaTracker
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 from pliant.config import Config
 from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.calibration import Calibration
@@ -24,7 +25,7 @@ class Frame:
     """What one frame led to."""
 
     image: Image
-    tracks: FrameTracks
+    tracks: FrameExtrema
     delta: MapDelta
 
 
@@ -60,13 +61,14 @@ class Pipeline:
         """Track and map the next frame."""
         image = rectified(source, self._rectifier)
         if image.missing:
-            tracks = FrameTracks.empty()
+            tracks = FrameExtrema.empty()
             delta = self._mapper.skip(image.frame)
         else:
-            tracks = self._tracker.track(image.grey, self._timers.tracking)
+            clearance = clearance_in(image.mask)
+            tracks = self._tracker.track(image.grey, self._timers.tracking, clearance)
             colour = image.colour if image.colour.size else None
             delta = self._mapper.process(
-                image.frame, image.stamp_ns, tracks, image.grey, colour,
+                image.frame, image.stamp_ns, tracks, filled(image.grey, clearance), colour,
                 self._timers.bundle_adjustment,
             )  # fmt: skip
         self.history.apply(delta, frame=image.frame, stamp_ns=image.stamp_ns)

@@ -48,6 +48,22 @@ def places(sources: Sources, overrides: Overrides = None) -> None:
     _print(measure(sources, load_config(None, overrides or [])))
 
 
+@app.command()
+def deceiving(
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each scene.")] = 5,
+    only: Annotated[str, typer.Option(help="Scenes whose names have this.")] = "",
+    overrides: Overrides = None,
+) -> None:
+    """Rendered scenes that look the same in more than one place: is one ever taken for another?
+
+    scripts/bench deceiving --seeds 5
+    """
+    from benchmarks.deceiving import measure
+    from pliant.config import load_config
+
+    _print(measure(load_config(None, overrides or []), seeds, only))
+
+
 @app.command("kept-maps")
 def kept_maps(sources: Sources, overrides: Overrides = None) -> None:
     """Sources cut in two: the second half localised in the map of the first, and going on in it.
@@ -179,6 +195,26 @@ def clip(
     from benchmarks.clip import measure
 
     _print(measure(video))
+
+
+@app.command("recording-bytes")
+def recording_bytes(
+    source: Annotated[
+        str, typer.Argument(help="A video, a recording, or what becomes a video.")
+    ] = "built-in:room?colour=0",
+    frames: Annotated[int | None, typer.Option(min=2, help="First frames of the video.")] = None,
+    width: Annotated[int | None, typer.Option(min=64, help="Enlarge them to so many px.")] = None,
+    overrides: Overrides = None,
+) -> None:
+    """What the recording of a video takes, by topic and field, and how many times the video.
+
+    scripts/bench recording-bytes clip.mp4
+
+    scripts/bench recording-bytes path/to/tum_fr1_xyz --frames 450 --width 1440
+    """
+    from benchmarks.recording_bytes import measure
+
+    _print(measure(source, frames, width, overrides or []))
 
 
 @app.command()

@@ -7,6 +7,7 @@ import random
 import tempfile
 import time
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -31,20 +32,31 @@ _SEEKS = 20
 def measure(video: Path | None) -> Iterator[str]:
     """Ingest and recorder alone; a video of the built-in room (MPEG-4) where none is given."""
     with tempfile.TemporaryDirectory(prefix="pliant-clip-bench-") as made:
-        file = video or _room(Path(made) / "room.mp4")
+        file = video or clip_of("built-in:room?colour=0", Path(made) / "room.mp4")
         yield f"{file.name}: {1e-6 * file.stat().st_size:.1f} MB\n"
         rows = [_row(file, Path(made) / f"{clip}.mcap", clip) for clip in ("false", "true")]
     yield markdown(["recorder.clip", "MB", "by the clip's", "an image in order", "any image"], rows)
 
 
-def _room(file: Path) -> Path:
-    frames = [decode(frame) for frame in open_source("built-in:room")]
-    height, width = frames[0].shape[:2]
-    with quiet_opencv():
-        writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (width, height))
-    for frame in frames:
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
-    writer.release()
+def clip_of(source: str, file: Path, frames: int | None = None, width: int | None = None) -> Path:
+    """The first frames of a source as MPEG-4, in the quality that OpenCV takes for their size.
+
+    width: to which they are enlarged; None: as they are.
+    """
+    writer = None
+    for frame in islice(open_source(source), frames):
+        pixels = decode(frame)
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR) if pixels.ndim == 2 else pixels[..., ::-1]
+        height = pixels.shape[0] * (width or pixels.shape[1]) // pixels.shape[1]
+        if width:
+            pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_CUBIC)
+        if writer is None:
+            code, size = cv2.VideoWriter.fourcc(*"mp4v"), (pixels.shape[1], height)
+            with quiet_opencv():
+                writer = cv2.VideoWriter(str(file), code, 30.0, size)
+        writer.write(np.ascontiguousarray(pixels))
+    if writer is not None:
+        writer.release()
     return file
 
 

@@ -115,9 +115,11 @@ def _depth(room: Result, keyframe: Keyframe) -> U8:
         for kind in ("none", "nltgv")
     )
     mesh = triangulate(seen.points_px)
-    wire = keyframe.image.copy()
+    image = keyframe.image
+    wire = image.copy()
     lines = [_fixed_all(seen.points_px[mesh.vertices][edge]) for edge in mesh.edges]
     cv2.polylines(wire, lines, False, _ORANGE, 1, cv2.LINE_AA, _FIXED_POINT)
+    wire = cv2.addWeighted(wire, 0.5, image, 0.5, 0.0)
     upper = _beside(wire, _inverse_depths(smoothed))
     lower = _beside(*(_normals(depths, room.camera) for depths in (rough, smoothed)))
     return np.concatenate([upper, np.full((_GAP, upper.shape[1], 3), 255, np.uint8), lower])

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,9 +13,8 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, pose_to_matrix, so3_log, transform
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe
 from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.relocalisation import Place, Recognised, relocalise
+from pliant.algorithms.mapping.relocalisation import Recognised
 from pliant.algorithms.places.features import describe
-from pliant.algorithms.places.index import PlaceIndex
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.config import Config
 from pliant.datasets import open_source
@@ -25,7 +25,6 @@ _EVERY = 10
 _APART_S = 1.0
 _SHARE, _TURN_DEG = 0.5, 30.0
 _OFF_SHARE, _OFF_DEG = 0.1, 5.0
-_PLACES = 5
 
 
 class _Run:
@@ -66,19 +65,15 @@ class _Run:
         """What the map says to an image, and in how many ms the index.
 
         stamp_ns: of one of its own frames."""
-        index: PlaceIndex = self.mapper.atlas.places.index
-        known = {k.id: k for k in self.keyframes if self.is_apart(k, stamp_ns)}
+        atlas = self.mapper.atlas
         begin = time.process_time()
-        seen = describe(grey)
-        chosen = [known[i] for i in index.query(seen) if i in known][:_PLACES]
+        atlas.places.index.query(describe(grey))
         asked = time.process_time() - begin
-        places = [
-            Place(keyframe=k, features=index.features[k.id], segment=self.keyframes) for k in chosen
-        ]
-        points = self.mapper.atlas.points
-        found = relocalise(
-            seen, places, points, maxima, grey, self.camera, self.config.bundle_adjustment,
-            np.random.default_rng(0),
+        apart = [k for k in self.keyframes if self.is_apart(k, stamp_ns)]
+        segments = [] if atlas.active is None else [replace(atlas.active.segment, keyframes=apart)]
+        found = atlas.places.recognise(
+            grey, maxima, segments, atlas.points, self.mapper.calibration,
+            self.config.bundle_adjustment, np.random.default_rng(0),
         )  # fmt: skip
         return found, 1e3 * asked
 

@@ -93,9 +93,10 @@ def _topic(recording: Recording, topic: topics.Topic) -> dict[str, Any]:
     count = 0
     rows: list[float] = []
     for message in recording.messages(topic):
-        digest.update(len(message.data).to_bytes(8, "little") + message.data)
-        count += 1
         decoded = message.decode()
+        data = codec.encode(decoded)  # however the recording holds it
+        digest.update(len(data).to_bytes(8, "little") + data)
+        count += 1
         if isinstance(decoded, Extrema):
             rows.append(len(decoded.ids))
         elif isinstance(decoded, MapUpdate):

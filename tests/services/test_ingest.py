@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pliant.algorithms.image.masks import packed, unpacked
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, IngestParameters
 from pliant.datasets.base import SourceFrame, encoding_of
@@ -18,7 +19,7 @@ from pliant.datasets.calibration import Calibration
 from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import topics
 from pliant.messages.topics import Topic
-from pliant.messages.types import CameraStream, Depth, Header, Image, SourceImage
+from pliant.messages.types import MASKED, CameraStream, Depth, Header, Image, SourceImage
 from pliant_services.nodes import ingest
 from pliant_services.runtime.host import stop_on_signal
 from pliant_services.runtime.monitor import SilentMonitor
@@ -150,6 +151,25 @@ BROKEN = {
     "cut off": (png(1)[:-30], "cut off"),
     "another size": (png(2, WIDTH, HEIGHT + 2), "24x18 px, but the calibration is for 24x16"),
 }
+
+
+class MaskedDataset(FakeDataset):
+    """Each frame has as many white columns in its mask as its number says."""
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        for frame in super().__iter__():
+            used = np.zeros((HEIGHT, WIDTH), np.bool_)
+            used[:, : frame.index] = True
+            yield replace(frame, mask=packed(used))
+
+
+def test_a_frame_that_is_masked_as_a_whole_has_no_pixels_and_is_not_broken() -> None:
+    images, monitor, bus = run(MaskedDataset([png(i) for i in range(3)]))
+    assert [image.missing for image in images] == [MASKED, "", ""]
+    assert monitor.counters == {"dropped": 0, "broken": 0, "unmapped": 0}
+    sources = [s for s in bus.outputs[topics.SOURCE] if isinstance(s, SourceImage)]
+    assert [unpacked(s.mask).sum() for s in sources] == [0, HEIGHT, 2 * HEIGHT]
+    assert [image.mask for image in images[1:]] == [source.mask for source in sources[1:]]
 
 
 @pytest.mark.parametrize("kind", BROKEN)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pliant.algorithms.image.masks import packed, unpacked
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import load_config
 from pliant.datasets import open_source
@@ -17,7 +18,7 @@ from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import Header, Image, SourceImage
 from pliant_services.nodes import ingest
-from pliant_services.runtime.link_images import receive_images, whole
+from pliant_services.runtime.link_images import clearance, receive_images, whole
 from pliant_services.runtime.monitor import SilentMonitor
 
 FRAMES = 3
@@ -40,11 +41,21 @@ class _Jpegs:
             )
 
 
-def ingested(how: str, *, jpegs: bool = False) -> dict[Topic, list[Header]]:
+class _Bonnet(_Jpegs):
+    """The frames with a mask over their lower third."""
+
+    def __iter__(self):
+        used = np.ones((240, 320), np.bool_)
+        used[160:] = False
+        for frame in self._dataset:
+            yield replace(frame, mask=packed(used))
+
+
+def ingested(how: str, *, jpegs: bool = False, masked: bool = False) -> dict[Topic, list[Header]]:
     dataset: Dataset = open_source(f"built-in:tiny?frames={FRAMES}&distortion=-0.2,0.1,0,0")
     bus = ReplayBus({})
     config = load_config(overrides=[f"bus.link_images={how}", "bus.jpeg_quality=70"])
-    source = _Jpegs(dataset) if jpegs else dataset
+    source = _Jpegs(dataset) if jpegs else _Bonnet(dataset) if masked else dataset
     ingest.run(bus, config, SilentMonitor(), source, stopping=lambda: False)
     return bus.outputs
 
@@ -98,6 +109,24 @@ class _Recorded(_Jpegs):
                 index=source.frame, stamp_ns=source.stamp_ns,
                 encoding=source.encoding, data=source.data,
             )  # fmt: skip
+
+
+@pytest.mark.parametrize("how", ["raw", "lossless", "jpeg"])
+def test_a_mask_crosses_with_its_image(how: str) -> None:
+    sent = ingested(how, masked=True)
+    clear = [clearance(image) for image in read(sent)]
+    for source, found in zip(sent[topics.SOURCE], clear, strict=True):
+        assert isinstance(source, SourceImage)
+        assert found is not None
+        # As rectified: what was straight in the source bends.
+        assert (found[-1] == 0.0).all()
+        assert 0.6 < (found > 0.0).mean() < 0.72
+        assert unpacked(source.mask).mean() == pytest.approx(2 / 3)
+    (first, *_), other = read(sent), packed(np.eye(3) > 0)
+    for wrong, words in ((other, "another size"), (b"noise", "no image that can be read")):
+        with pytest.raises(MessageError, match=f"camera/image: frame 0: .*{words}"):
+            clearance(replace(first, mask=wrong))
+    assert clearance(replace(first, mask=b"")) is None
 
 
 def test_a_jpeg_that_is_none_of_the_camera_s_is_refused_before_it_is_decoded() -> None:

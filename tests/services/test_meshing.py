@@ -9,6 +9,7 @@ import pytest
 
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, matrix_to_pose, move_by_similarity, transform
+from pliant.algorithms.image.masks import packed
 from pliant.algorithms.meshing.mesh_blocks import BlockMesh
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import load_config
@@ -291,6 +292,20 @@ def test_bad_input_is_reported_and_passed_over(name: str, given: Inputs, words: 
     assert len(mesh.triangles) > 1000
     assert np.isfinite(mesh.positions).all()
     assert np.isfinite(mesh.normals).all()
+
+
+def test_what_a_mask_covers_is_no_surface() -> None:
+    used = np.ones((120, 160), np.bool_)
+    used[:, :80] = False
+    given = inputs()
+    told = [message for message in given[topics.KEYFRAME] if isinstance(message, Keyframe)]
+    given[topics.KEYFRAME] = [replace(message, mask=packed(used)) for message in told]
+    vertices = final(run(given), "fine").positions
+    assert len(vertices) > 500
+    columns = [CAMERA.project(transform(inverse(pose(f)), vertices))[:, 0] for f in range(FRAMES)]
+    assert np.max(columns, axis=0).min() > 78.0
+    bare = final(run(inputs()), "fine").positions
+    assert CAMERA.project(transform(inverse(pose(FRAMES - 1)), bare))[:, 0].min() < 20.0
 
 
 def test_no_keyframes_no_mesh() -> None:

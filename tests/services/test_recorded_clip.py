@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import pliant
+from pliant.algorithms.image.masks import unpacked
 from pliant.bus.replay_bus import ReplayBus
 from pliant.bus.session import free_endpoint, open_router
 from pliant.bus.zenoh_bus import ZenohBus
@@ -120,6 +121,24 @@ def test_a_part_of_a_video_and_a_smaller_size(
     assert {(m.width, m.height) for m in published} == {(96, 72) if side else (WIDTH, HEIGHT)}
     assert not any(m.data for m in references(tmp_path / "recording.mcap"))
     assert_same_images(tmp_path / "recording.mcap", published)
+
+
+def test_a_masked_video_is_recorded_as_the_video_and_its_masks(clip: Path, tmp_path: Path) -> None:
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for number in range(0, FRAMES, 2):
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[:, : number + 1] = 0
+        cv2.imwrite(str(masks / f"{number}.png"), mask)
+    part = IngestParameters(start_s=0.95, every=5)
+    dataset = open_source(str(clip), fov_deg=60.0, longest_side_px=96, part=part, mask=masks)
+    path = tmp_path / "recording.mcap"
+    published = record(dataset, path)
+    assert not any(m.data for m in references(path))
+    assert_same_images(path, published)
+    black = [int((~unpacked(m.mask)[0]).sum()) if m.mask else 0 for m in published]
+    assert black == [11, 0, 21, 0]
+    assert [frame.mask for frame in open_source(str(path))] == [m.mask for m in published]
 
 
 def test_any_image_by_itself(clip: Path, tmp_path: Path) -> None:

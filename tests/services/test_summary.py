@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from pliant.algorithms.tracks import FrameTracks
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import (
+    MASKED,
     CameraStream,
     Extrema,
     Header,
@@ -95,12 +97,33 @@ def test_dropped_and_broken_images_are_told_apart(tmp_path: Path) -> None:
     told = f"20 broken images: frame 0: empty; the others are frames {others} and 9 more"
     assert told in lines
     assert "1 image dropped to keep up (live mode)" in record(tmp_path, ["", "dropped"])
+    lines = record(tmp_path, ["", "dropped", MASKED, MASKED])
+    assert "2 images passed over: masked as a whole" in lines
+    assert not any("broken" in line for line in lines)
 
 
 def test_the_last_line_says_what_the_run_is_worth(tmp_path: Path) -> None:
     assert record(tmp_path, ["", ""])[-1] == "bad: there is no map"
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["verdict"], report["doubtful_frames"]) == ("bad", [])
+
+
+def test_of_a_clip_that_waited_for_its_map_no_inliers_are_told() -> None:
+    report: dict[str, Any] = {
+        **dict.fromkeys(("frames", "frames_with_pose", "keyframes", "points"), 60),
+        **dict.fromkeys(("ended_early", "verdict", "verdict_reason"), ""),
+        "frames_per_second": 9.0,
+        "success_rate": 1.0,
+        "mesh": [],
+        "segments": [{}],
+        "frames_without_pixels": {},
+        "median_tracks_per_frame": 900.0,
+        "median_inliers_per_frame": 0.0,
+    }
+    waited = "median per frame: 900 tracks, most frames waited for the map to begin"
+    assert waited in summary(report)
+    report["median_inliers_per_frame"] = 700.0
+    assert "median per frame: 900 tracks, 700 mapped inliers" in summary(report)
 
 
 def test_one_is_not_many(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from restarting import Restarted, Stopping
 
 from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.image.masks import packed
 from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, load_config
@@ -95,6 +96,23 @@ def test_surfels_start_on_a_keyframe_of_our_own_map(everything: Messages) -> Non
     shares = true_depth(everything, first.frame)[row, column] / depth
     assert np.median(np.abs(shares / np.median(shares) - 1.0)) < 0.02
     assert np.count_nonzero(followed[-1].state == SurfelState.TRACKED) > 0.5 * len(first.ids)
+
+
+def test_no_surfel_lies_under_a_mask(everything: Messages) -> None:
+    images = [m for m in everything[topics.IMAGE] if isinstance(m, Image)]
+    used = np.ones(images[0].grey.shape, np.bool_)
+    middle = used.shape[1] // 2
+    used[:, :middle] = False
+    covered = list[Header](
+        replace(m, mask=packed(used if m.frame < 5 else used[:, ::-1])) for m in images[:8]
+    )
+    made = {topic: messages[:8] for topic, messages in everything.items()}
+    followed = follow(load_config(), {**made, topics.IMAGE: covered})
+    for message in followed:
+        right = message.points_px[:, 0] >= middle
+        seen = message.state == SurfelState.TRACKED
+        assert not seen[~right if message.frame < 5 else right].any()
+    assert len(followed[0].ids) > 20
 
 
 def born_later(followed: list[Surfels]) -> dict[int, Surfels]:

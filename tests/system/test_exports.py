@@ -237,6 +237,31 @@ def test_poses_are_those_of_the_result(kind: str, result: Path, tmp_path: Path) 
         assert path.read_text() == (result / "trajectory.txt").read_text()
 
 
+def test_the_overview_goes_from_tracks_to_points_to_the_mesh(result: Path, tmp_path: Path) -> None:
+    path = export_result(result, "overview", tmp_path / "o.webp")
+    good, animation = cv2.imreadanimation(str(path))
+    assert good
+    frames = [frame[:, :, :3].astype(int) for frame in animation.frames]
+    assert frames[0].shape[1] == 960
+    # At the end the mesh alone, where the image was: dark ground is seen.
+    dark = [(frame.max(axis=2) < 40).mean() for frame in (frames[0][:360, :400], frames[-1])]
+    assert dark[0] < 0.2 < dark[1]
+    assert np.abs(frames[-1] - frames[-10]).max() > 100
+
+
+def test_a_picture_needs_no_images(result: Path, tmp_path: Path) -> None:
+    shapes: list[tuple[int, ...]] = []
+    recording = Recording(result / "recording.mcap")
+    for left_out in (None, topics.SOURCE):
+        kept = [t for t in topics.TOPICS if t.logged and t != left_out]
+        messages = {topic: list(recording.decoded(topic)) for topic in kept}
+        path = tmp_path / f"{len(shapes)}.mcap"
+        recorder.run(ReplayBus(messages), Config(), path, {})
+        picture: Any = cv2.imread(str(export_result(path, "picture", None)))
+        shapes.append(picture.shape)
+    assert shapes[0][1] - shapes[1][1] == 644  # an image and the gap beside it
+
+
 def test_open3d_reads_the_points(result: Path, tmp_path: Path) -> None:
     open3d: Any = open3d_or_skip()
     path = export_result(result, "ply", tmp_path / "points.ply")
@@ -354,7 +379,7 @@ def test_a_textured_mesh_has_the_colours_that_its_keyframes_show(
     assert run.stream is not None
     images = list(keyframe_images(recording, run, run.history.longest_segment()))
     assert len(images) > 4
-    for T_world_camera, image in images[:: len(images) // 3]:
+    for T_world_camera, image, _ in images[:: len(images) // 3]:
         seen = view_mesh(mesh.positions, mesh.triangles, run.stream.camera, T_world_camera)
         at = seen.interpolate(mesh.triangles, mesh.uvs) * np.float32(len(mesh.texture)) - 0.5
         drawn = cv2.remap(mesh.texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR)

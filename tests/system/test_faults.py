@@ -25,7 +25,12 @@ from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import STATE_FOLDER, prepare
 from pliant.results.write import write_results
 from pliant_services.processes import PROFILES
-from pliant_services.run.command import RunRequest, resumed_config, service_arguments
+from pliant_services.run.command import (
+    RunRequest,
+    resumed_config,
+    resumed_map,
+    service_arguments,
+)
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime import launcher
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
@@ -126,6 +131,47 @@ def test_all_with_the_launcher_and_resume(tmp_path: Path, undisturbed: dict[str,
         run(tmp_path, cut)
     resumed_config(tmp_path, REQUEST)
     assert run(tmp_path, resume=True) == undisturbed
+
+
+def in_map(known: Path) -> RunRequest:
+    """A run that goes on in a map."""
+    return RunRequest(source=TINY, known=known)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("localise", [False, True])
+def test_all_with_the_launcher_and_resume_in_a_map(
+    localise: bool, tmp_path: Path, tiny_run: Path
+) -> None:
+    """Also where the frames are only localised."""
+    settings = ["bundle_adjustment.only_localise=true"] if localise else []
+
+    def cut(status: Status, fleet: Fleet) -> Sequence[str]:
+        if status.service == "bundle_adjustment" and status.frame == 22:
+            fleet.give_up()
+            return SERVICES
+        return ()
+
+    request = in_map(tiny_run)
+    whole = run(tmp_path / "whole", request=request, settings=settings)
+    with pytest.raises(ServiceDiedError):
+        run(tmp_path / "cut", cut, request=request, settings=settings)
+    again = run(tmp_path / "cut", resume=True, request=request, settings=settings)
+    assert again == whole
+
+
+def test_a_run_is_taken_up_in_its_own_map(tmp_path: Path, tiny_run: Path) -> None:
+    (tmp_path / "cut" / STATE_FOLDER).mkdir(parents=True)
+    (tmp_path / "cut" / "config.yaml").write_text(config_yaml(load_config()))
+    refused = pliant("run", TINY, "--resume", "--map", tiny_run, "--output", tmp_path / "cut")
+    assert_one_line(refused, "which has none")
+    note = tmp_path / "cut" / STATE_FOLDER / "known_map"
+    note.write_text(str(tiny_run / "map.pliant"))
+    assert resumed_map(tmp_path / "cut", RunRequest(source=TINY)) == tiny_run / "map.pliant"
+    assert resumed_map(tmp_path / "cut", in_map(tiny_run)) == tiny_run / "map.pliant"
+    note.write_text(str(tmp_path / "gone" / "map.pliant"))
+    refused = pliant("run", TINY, "--resume", "--output", tmp_path / "cut")
+    assert_one_line(refused, "no map there")
 
 
 @pytest.fixture(scope="module")

@@ -267,6 +267,8 @@ STAMPS = {frame: 10**9 + frame * 33_000_000 for frame in range(100)}
 
 def test_of_a_good_run_there_is_nothing_to_say() -> None:
     assert advice(report(), STAMPS) == []
+    # A clip so short that most of its frames waited for the map to begin.
+    assert advice(report(median_inliers_per_frame=0.0), STAMPS) == []
 
 
 @pytest.mark.parametrize(
@@ -289,6 +291,7 @@ def test_of_a_good_run_there_is_nothing_to_say() -> None:
         ({"calibration_verdict": "the focal length is wrong"}, "The focal length is wrong."),
         ({"frames_passed_over": [5]}, "did not keep up"),
         ({"frames_without_pixels": {"5": "dropped"}}, "did not keep up"),
+        ({"frames_without_pixels": {str(n): "broken: cut off" for n in range(9)}}, "9 images are"),
     ],
 )
 def test_what_went_wrong_is_told(changes: dict[str, Any], said: str) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_exp, transform
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 CAMERA = PinholeCamera(width=640, height=480, fx=520.0, fy=520.0, cx=319.5, cy=239.5)
 
@@ -51,7 +51,7 @@ class Scene:
         return CAMERA.project(np.where(camera_points[:, 2:] > 0.1, camera_points, 1.0))
 
     def frames(self, poses, *, later=None, readout=0.0):
-        """FrameTracks of every pose.
+        """FrameExtrema of every pose.
 
         later(t): the pose after t frames, where the readout takes that share of the interval.
         """
@@ -82,7 +82,7 @@ class Scene:
             next_id += len(new)
             alive = np.flatnonzero(track_of >= 0)
             alive = alive[np.argsort(track_of[alive])]
-            yield FrameTracks(
+            yield FrameExtrema(
                 ids=track_of[alive].copy(),
                 points_px=px[alive].astype(np.float32),
                 ages=(frame - born[alive]).astype(np.int32),

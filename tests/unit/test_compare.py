@@ -45,6 +45,18 @@ def test_the_same_is_the_same(tmp_path: Path) -> None:
     assert differences(tmp_path, messages, messages) == []
 
 
+def test_how_a_recording_holds_a_message_is_no_difference(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Recordings of earlier releases have no planes."""
+    messages = [status(0, *range(1000)), status(1, 1.0)]
+    a = recording(tmp_path / "a.mcap", messages)
+    monkeypatch.setattr("pliant.recording.writer.in_planes", lambda _, data: data)
+    b = recording(tmp_path / "b.mcap", messages)
+    assert [m.data for m in a.messages()] != [m.data for m in b.messages()]
+    assert compare(a, b, [STATUS]) == []
+
+
 def test_counts_come_before_order_before_fields(tmp_path: Path) -> None:
     was = [status(n, 1.0) for n in range(5)]
     now = [status(0, 2.0), *(status(n + 7, 1.0) for n in range(1, 3))]

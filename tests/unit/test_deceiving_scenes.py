@@ -9,10 +9,10 @@ from test_recovery import dark, textures
 from test_relocalisation import Film
 
 from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 _END = 16.0
-_NIGHT = [dark(FrameTracks.empty())] * 40
+_NIGHT = [dark(FrameExtrema.empty())] * 40
 
 
 def wall(seed: int, count: int) -> np.ndarray:

@@ -41,7 +41,6 @@ def tracks_at(ids: list[int], points: np.ndarray, age: int) -> FrameTracks:
         ages=np.full(n, age, np.int32),
         kappas=np.ones(n, np.float32),
         states=np.zeros(n, np.uint8),
-        maxima=np.zeros((0, 3), np.float32),
         dominant_flow=np.eye(2, 3),
     )
 

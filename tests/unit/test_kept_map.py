@@ -10,6 +10,7 @@ from test_mapper import Published, trajectory_error
 from test_recovery import dark, textures
 from test_relocalisation import Film, film, run
 
+from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.kept_keyframe import MAP_VERSION, KeptKeyframe
@@ -20,7 +21,7 @@ from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 from pliant.errors import MapError
 from pliant.map_history import MapHistory
 from pliant.messages import codec
@@ -84,13 +85,16 @@ def test_another_session_goes_on_in_the_map(
         history.know(each)
     known_points = set(history.points().ids.tolist())
     told: list[int] = []
+    places: list[list[int]] = []
     for k, (tracks, grey) in enumerate(shots):
         delta = mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
+        places += delta.same_places.tolist()
         history.apply(delta, frame=k, stamp_ns=k)
         published.apply(delta)
         told += mapper.publish_keyframes().keyframe_ids.tolist()
     history.apply(mapper.finish(), frame=0, stamp_ns=0, final=True)
     assert published.states == [TRACKING] * len(shots)
+    assert places[0][0] <= kept[-1].id < places[0][1]  # where it was recognised
     assert sorted(history.final()) == list(range(len(shots)))
     assert {segment for segment, _ in history.final().values()} == {0}
     # The world is that of the first session: its first keyframe.
@@ -148,17 +152,49 @@ def test_frames_are_localised_and_nothing_is_mapped(
     place: tuple[Scene, list[np.ndarray]], kept: list[MapKeyframe]
 ) -> None:
     poses, shots = again(place)
-    shots = [dark(FrameTracks.empty()), *shots]
+    shots = [dark(FrameExtrema.empty()), *shots]
     published, localiser = Published(), Localiser(CAMERA, PARAMETERS, 0, known=kept)
     for k, (tracks, grey) in enumerate(shots):
         if k == 10:  # it may be started again
             localiser = load_state(save_state(localiser))
-        published.apply(localiser.process(k, k * INTERVAL_NS, tracks, grey, None))
+        delta = localiser.process(k, k * INTERVAL_NS, tracks, grey, None)
+        assert len(delta.same_places) == (k == 1)
+        published.apply(delta)
         assert not len(localiser.publish_keyframes().keyframe_ids)
     assert published.states == [WAITING] + [TRACKING] * len(poses)
     error, _ = trajectory_error(published, [np.eye(4), *poses])
     assert error < 3e-3
     assert list(localiser.kept()) == []
+
+
+def test_frames_of_a_rolling_shutter_are_localised_as_if_taken_at_once(
+    place: tuple[Scene, list[np.ndarray]], kept: list[MapKeyframe]
+) -> None:
+    readout = 0.6
+
+    def at(t: float) -> F64:
+        """Still at first, then ever faster."""
+        moved = max(t - 1.0, 0.0) ** 2 / 20.0
+        turn = 0.05 * np.sin(0.4 * moved), 0.06 * np.sin(0.3 * moved), 0.0
+        return looking((0.3 + 0.03 * moved, 0.05 * np.sin(0.3 * moved), 0.0), turn)
+
+    poses = [at(k) for k in range(30)]
+    (_, grey), *_ = film(place[0], poses[:1], place[1])
+    frames = list(place[0].frames(poses, later=at, readout=readout))
+    errors: list[float] = []
+    for known in (0.0, readout):
+        published = Published()
+        correction = np.array([0.0, 0.0, 0.0, known, 0.0, 0.0])
+        of_camera = [replace(k, correction=correction, sigmas=np.full(6, 1e-3)) for k in kept]
+        localiser = Localiser(CAMERA, PARAMETERS, 0, known=of_camera)
+        assert localiser.calibration.readout == known
+        for k, tracks in enumerate(frames):
+            image = grey if k == 0 else None
+            published.apply(localiser.process(k, k * INTERVAL_NS, tracks, image, None))
+        assert published.states == [TRACKING] * len(poses)
+        errors.append(trajectory_error(published, poses)[0])
+    assert errors[1] < 0.3 * errors[0]
+    assert errors[1] < 6e-3
 
 
 def test_another_camera_sees_the_map_with_its_own_calibration(kept: list[MapKeyframe]) -> None:

@@ -10,7 +10,8 @@ from test_whole_map import error_of, similarity
 
 from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.map_delta import TRACKING, MapMoves
-from pliant.algorithms.mapping.loops import Loop
+from pliant.algorithms.mapping.final_adjustment import ListedMap
+from pliant.algorithms.mapping.loops import Loop, close_loops
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
@@ -121,12 +122,16 @@ def test_a_loop_takes_out_the_drift_and_joins_the_points(drifted):
 
 def test_the_map_goes_on_and_readers_have_it(drifted):
     scene, frames, mapper, published = drifted
-    mapper.whole_map.loops.append(recognised(scene, mapper))
+    loop, told = recognised(scene, mapper), []
+    mapper.whole_map.loops.append(loop)
     mapper.atlas.ask(2 * AWAY - 1)
     for k in range(2 * AWAY, 2 * AWAY + 10):
         mapper = load_state(save_state(mapper))
-        published.apply(mapper.process(k, k * INTERVAL_NS, frames[k], None, None))
+        delta = mapper.process(k, k * INTERVAL_NS, frames[k], None, None)
+        published.apply(delta)
         mapper.publish_keyframes()
+        told += delta.same_places.tolist()
+    assert told == [[loop.old, loop.new]]
     assert published.states[-1] == TRACKING
     active = mapper.atlas.active
     for keyframe in active.keyframes:
@@ -209,3 +214,34 @@ def test_a_place_that_looks_alike_is_too_far_for_drift(world):
     answer = close(mapper)
     assert answer.loops == []
     assert error_of(active, there_and_back()) < max(1.2 * before, 0.01)
+
+
+def test_a_camera_that_was_recognised_stands_where_it_was_whatever_looks_alike():
+    """Back in the first of two rooms that are alike, it sees little of what it saw there before."""
+    cameras = [looking((x, 0.0, 0.0)) for x in (0.0, 0.2, 6.0, 12.0, 12.2, 0.1, 0.3)]
+    generator = np.random.default_rng(0)
+    groups = [(0, 1), (1, 2), (2, 3), (3, 4), (5, 6)]
+    seen = [(group, 100) for group in groups] + [((0, 1, 5, 6), 8)]
+    xyz, camera, point = [], [], []
+    for group, count in seen:
+        for _ in range(count):
+            middle = np.mean([cameras[k][0, 3] for k in group])
+            camera += group
+            point += [len(xyz)] * len(group)
+            xyz.append(generator.uniform((middle - 1, -1, 3), (middle + 1, 1, 5)))
+    order = np.argsort(camera, kind="stable")
+    listed = ListedMap(
+        rows=np.arange(len(xyz), dtype=np.int32), xyz=np.array(xyz),
+        T_world_camera=np.array(cameras), camera=np.array(camera, np.int32)[order],
+        point=np.array(point, np.int32)[order], px=np.zeros((len(order), 2), np.float32),
+        weights=np.ones(len(order), np.float32), fixed=np.arange(len(cameras)) == 0,
+    )  # fmt: skip
+    no_rows = np.zeros((0, 2), np.int32)
+    loops = [
+        Loop(old, new, looking((12.0, 0.0, 0.0)), no_rows, no_rows.astype(np.int64))
+        for old, new in ((3, 5), (4, 6))
+    ]
+    ids, hosts = np.arange(len(cameras)), np.zeros(len(xyz), np.int64)
+    closed, _, accepted = close_loops(listed, ids, hosts, np.full(len(xyz), 0.01), loops, 500.0)
+    assert accepted == []
+    np.testing.assert_allclose(closed.T_world_camera[5:], cameras[5:], atol=1e-3)

@@ -13,7 +13,7 @@ from pliant.algorithms.mapping.parameters import (
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 PARAMETERS = MappingParameters()
 
@@ -78,6 +78,18 @@ def flight():
     poses = sideways(60)
     scene = Scene.box(death=0.02)
     return scene, poses, *run(scene.frames(poses))
+
+
+def test_points_are_told_as_files_have_them():
+    """What is below is noise, which no compression makes smaller."""
+    _, deltas = run(Scene.box().frames(sideways(12)))
+    told = np.concatenate([delta.points_world for delta in deltas])
+    assert len(told) > 100
+    assert (told == told.astype(np.float32)).all()
+    for name in ("point_sigmas", "point_parallax_rad"):
+        told = np.concatenate([getattr(delta, name) for delta in deltas])
+        assert np.unique(told).size > 100
+        assert not (told.view(np.uint32) & 0xFFF).any()
 
 
 def test_every_frame_gets_a_pose_also_before_the_start(flight):
@@ -176,7 +188,7 @@ def noise_frames(count):
     generator = np.random.default_rng(0)
     for k in range(count):
         n = 2000
-        yield FrameTracks(
+        yield FrameExtrema(
             ids=np.arange(1000 * k, 1000 * k + n),
             points_px=generator.uniform((0, 0), (640, 480), (n, 2)).astype(np.float32),
             ages=np.zeros(n, np.int32),
@@ -191,7 +203,7 @@ def test_noise_and_empty_frames_start_no_map():
     published, _ = run(noise_frames(15))
     assert set(published.states) == {WAITING}
     assert all(published.reasons)
-    published, _ = run([FrameTracks.empty()] * 5)
+    published, _ = run([FrameExtrema.empty()] * 5)
     assert set(published.states) == {WAITING}
     assert "too few tracks: 0 of 100" in published.reasons
 
@@ -199,10 +211,10 @@ def test_noise_and_empty_frames_start_no_map():
 def cut(poses, at):
     """Every track is cut at a frame, and nothing is seen for longer than the mapper waits."""
     frames = list(Scene.box().frames(poses))
-    dark = [FrameTracks.empty()] * 40
+    dark = [FrameExtrema.empty()] * 40
     offset = 1_000_000
     after = [
-        FrameTracks(
+        FrameExtrema(
             ids=f.ids + offset, points_px=f.points_px, ages=f.ages, kappas=f.kappas,
             states=f.states, maxima=np.zeros((0, 3), np.float32), dominant_flow=f.dominant_flow,
         )
@@ -253,7 +265,7 @@ def test_segments_are_given_back_beyond_the_most_keyframes():
 def test_a_short_gap_is_bridged():
     poses = sideways(40)
     frames = list(Scene.box().frames(poses))
-    frames[25] = FrameTracks.empty()
+    frames[25] = FrameExtrema.empty()
     published, _ = run(frames)
     assert published.states[25] == LOST
     assert 25 not in published.poses
@@ -285,5 +297,5 @@ def test_a_frame_without_pixels_leaves_the_state_as_it_was():
         state = mapper.process(k, k * INTERVAL_NS, tracks, None, None).state
     assert state == TRACKING
     assert mapper.skip(20).state == TRACKING
-    assert mapper.process(21, 21 * INTERVAL_NS, FrameTracks.empty(), None, None).state == LOST
+    assert mapper.process(21, 21 * INTERVAL_NS, FrameExtrema.empty(), None, None).state == LOST
     assert mapper.skip(22).state == LOST

@@ -19,7 +19,7 @@ from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.merging import Merged, merge
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 from pliant.errors import PliantError
 from pliant.messages import codec
 from pliant.messages.types import MapKeyframe
@@ -30,7 +30,7 @@ from pliant.results.merged_map import merge_maps
 WALL, SQUARES = wall(), textures(1150)
 FIRST, SECOND = along(0, 6), along(9, 3)
 Two = tuple[list[MapKeyframe], list[MapKeyframe]]
-NIGHT = [dark(FrameTracks.empty())] * 40
+NIGHT = [dark(FrameExtrema.empty())] * 40
 
 
 def mapped(shots: Film) -> list[MapKeyframe]:

@@ -12,7 +12,7 @@ from pliant.algorithms.map_delta import LOST, TRACKING
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, RecoveryParameters
 from pliant.algorithms.mapping.recovery import Motion, search_radius_px
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 _SIDE = 13
 
@@ -40,19 +40,19 @@ def picture(scene: Scene, squares: list[np.ndarray], T_world_camera: F64) -> U8:
     return image.astype(np.uint8)
 
 
-def dark(_: FrameTracks) -> tuple[FrameTracks, U8]:
+def dark(_: FrameExtrema) -> tuple[FrameExtrema, U8]:
     """Nothing to be seen."""
-    return FrameTracks.empty(), np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    return FrameExtrema.empty(), np.zeros((CAMERA.height, CAMERA.width), np.uint8)
 
 
-def covered(tracks: FrameTracks) -> tuple[FrameTracks, U8]:
+def covered(tracks: FrameExtrema) -> tuple[FrameExtrema, U8]:
     """Something else, full of texture, and no track of before."""
     generator = np.random.default_rng(len(tracks.ids))
     noise = generator.uniform(0, 255, (CAMERA.height, CAMERA.width)).astype(np.float32)
     n = 4000
     places = generator.uniform((10, 10), (CAMERA.width - 10, CAMERA.height - 10), (n, 2))
     maxima = np.column_stack([places, generator.uniform(5.0, 500.0, n)]).astype(np.float32)
-    seen = FrameTracks(
+    seen = FrameExtrema(
         ids=10_000_000 + np.arange(n), points_px=maxima[:, :2].copy(), ages=np.zeros(n, np.int32),
         kappas=maxima[:, 2].copy(), states=np.zeros(n, np.uint8), maxima=maxima,
         dominant_flow=np.eye(2, 3),
@@ -60,10 +60,10 @@ def covered(tracks: FrameTracks) -> tuple[FrameTracks, U8]:
     return seen, cv2.GaussianBlur(noise, (0, 0), 1.2).astype(np.uint8)
 
 
-def anew(tracks: FrameTracks) -> FrameTracks:
+def anew(tracks: FrameExtrema) -> FrameExtrema:
     """The same tracks as others: a tracker ends all of them in a frame that shows nothing."""
     kept = {name: getattr(tracks, name) for name in vars(tracks)}
-    return FrameTracks(**{**kept, "ids": tracks.ids + 1_000_000})
+    return FrameExtrema(**{**kept, "ids": tracks.ids + 1_000_000})
 
 
 @pytest.fixture(scope="module")

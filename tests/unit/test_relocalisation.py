@@ -15,13 +15,13 @@ from pliant.algorithms.mapping.parameters import MappingParameters, WholeMapPara
 from pliant.algorithms.mapping.relocalisation import Place
 from pliant.algorithms.mapping.same_place import SamePlace, same_place
 from pliant.algorithms.mapping.whole_map import held
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 from pliant.state import load_state, save_state
 
 _DARK = 40
 """Frames in the dark: the map is given up before it is light again."""
 
-Film = list[tuple[FrameTracks, np.ndarray]]
+Film = list[tuple[FrameExtrema, np.ndarray]]
 
 
 def film(scene: Scene, poses: list[F64], squares: list[np.ndarray], cut: int = 0) -> Film:
@@ -54,7 +54,7 @@ def test_a_camera_that_was_carried_off_goes_on_in_its_map(known):
         T @ looking((0.05, 0.15 - 0.01 * k, 0.1), (0.02, -0.05, 0.12))
         for k, T in enumerate(there[6:26])
     ]
-    shots = film(scene, there, squares) + [dark(FrameTracks.empty())] * _DARK
+    shots = film(scene, there, squares) + [dark(FrameExtrema.empty())] * _DARK
     published, mapper = run(shots + film(scene, back, squares, cut=1))
     published.apply(mapper.finish())
     assert {segment for _, _, segment in published.poses.values()} == {0}
@@ -70,7 +70,7 @@ def test_a_young_map_ends_where_the_older_one_is_seen_again(known):
     scene, squares = known
     elsewhere = Scene.box(500, seed=9, noise_px=0.1)
     there = sideways(36, step=0.04)
-    night = [dark(FrameTracks.empty())] * _DARK
+    night = [dark(FrameExtrema.empty())] * _DARK
     shots = film(scene, there, squares) + night
     shots += film(elsewhere, there[:20], squares[::-1], cut=1)
     again = film(scene, there[5:25], squares, cut=2)
@@ -87,7 +87,7 @@ def test_a_young_map_ends_where_the_older_one_is_seen_again(known):
 def test_the_same_frames_give_the_same_bytes_from_a_checkpoint(known):
     scene, squares = known
     there = sideways(30, step=0.04)
-    shots = film(scene, there, squares) + [dark(FrameTracks.empty())] * _DARK
+    shots = film(scene, there, squares) + [dark(FrameExtrema.empty())] * _DARK
     shots += film(scene, there[5:15], squares, cut=1)
     whole, _ = run(shots)
     cut = 30 + _DARK - 3

@@ -1,5 +1,6 @@
 """The renderer's images: they agree with depth and poses, and effects do what they say."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +12,7 @@ from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.lens import lens, pixel_rays
 from pliant.rendering.paths import CameraPath, SampledPath
 from pliant.rendering.photometry import exposure_gain, sensor_image
-from pliant.rendering.render import Renderer, SceneGeometry, paint_faces
+from pliant.rendering.render import Renderer, SceneGeometry, paint_colours, paint_faces
 from pliant.rendering.scenes import SCENES
 from pliant.rendering.textures import make_texture, shrink
 
@@ -147,13 +148,18 @@ def test_the_sensor_saturates_and_rounds():
 
 
 def test_the_grey_image_of_a_colour_image_is_the_grey_one(painted):
-    colour = CLEAN.model_copy(update={"colour": True})
-    grey, rgb = (film(painted, camera, 0.2)[0].image for camera in (CLEAN, colour))
-    mixed = rgb.astype(float) @ (0.299, 0.587, 0.114)
-    unsaturated = rgb.max(axis=2) < 255
-    assert rgb.shape == (*grey.shape, 3)
-    assert np.abs(mixed - grey)[unsaturated].max() <= 1.01
+    camera = CameraOptions(width=320, height=240)  # with noise, blur and exposure
+    colours = paint_colours(painted[0])
+    grey, rgb = (
+        Renderer(*painted, TINY.path, camera, given).frame(6, 0.2).image
+        for given in (None, colours)
+    )
+    np.testing.assert_array_equal(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), grey)
     assert np.ptp(rgb.astype(int), axis=2).mean() > 10.0
+    # The globe is green, the ball on the book is red.
+    red, green, _ = np.moveaxis(rgb.astype(int), 2, 0)
+    assert (green - red > 30).mean() > 0.01
+    assert (red - green > 40).mean() > 0.003
 
 
 def test_frames_do_not_depend_on_their_order(painted):

@@ -50,7 +50,7 @@ def drift(shift, scale=1.0):
     return S
 
 
-def look(own, monkeypatch, segment, newest, proves, alike=None):
+def look(own, monkeypatch, segment, newest, proves, alike=None, elsewhere=()):
     """What the newest of the keyframes tells.  proves: the drift by id of the old one.  Also who
     was asked."""
     points, keyframes = segment
@@ -68,7 +68,9 @@ def look(own, monkeypatch, segment, newest, proves, alike=None):
     known = keyframes[: newest + 1]
     places = [Place(keyframe=k, features=None, segment=known) for k in known]
     some = [places[k] for k in alike or proves if k < newest]
-    return own.look(places[-1], some, points, CAMERA, PARAMETERS), asked
+    others = (places[k] for k in elsewhere)
+    told = own.look(places[-1], some, points, CAMERA, PARAMETERS, elsewhere=others)
+    return told, asked
 
 
 def test_two_keyframes_must_tell_the_same(monkeypatch, segment):
@@ -92,6 +94,17 @@ def test_keyframes_that_contradict_each_other_prove_nothing(monkeypatch, segment
     # Whichever of them a third one agrees with.
     loops, _ = look(own, monkeypatch, segment, 12, {2: drift(-3.0)})
     assert [(loop.old, loop.new) for loop in loops] == [(1, 10), (2, 12)]
+
+
+def test_what_looks_the_same_elsewhere_proves_neither(monkeypatch, segment):
+    own, proves = Revisits(), {1: drift(-3.0), 6: drift(2.0)}
+    for newest in (10, 11):
+        loops, asked = look(own, monkeypatch, segment, newest, proves, [1], elsewhere=[6])
+        assert loops == []
+        assert asked == [1, 6]
+    assert own.waiting == []
+    loops, asked = look(own, monkeypatch, segment, 12, {}, [1], elsewhere=[6])
+    assert asked == [1]  # nothing is proved: nobody else is asked
 
 
 def test_one_keyframe_is_no_witness_for_itself(monkeypatch, segment):

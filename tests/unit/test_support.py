@@ -8,14 +8,14 @@ from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, SupportParameters
 from pliant.algorithms.mapping.support import doubt, support_of
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 from pliant.results.judgement import BAD, DOUBTFUL, GOOD, judge
 
 
 def doubt_of(points, inliers, settled):
     """settled: where tracks are that had time to become points."""
     n, parameters = len(settled), SupportParameters()
-    tracks = FrameTracks(
+    tracks = FrameExtrema(
         ids=np.arange(n), points_px=settled, ages=np.full(n, 30, np.int32),
         kappas=np.ones(n, np.float32), states=np.zeros(n, np.uint8),
         maxima=np.zeros((0, 3), np.float32), dominant_flow=np.eye(2, 3),
@@ -65,7 +65,7 @@ def test_a_large_moving_thing_is_told_of():
                 points_px[moves] += np.array([0.0, step], np.float32)
             kept = {name: getattr(tracks, name) for name in vars(tracks)}
             maxima = np.column_stack([points_px, tracks.kappas])
-            now = FrameTracks(**{**kept, "points_px": points_px, "maxima": maxima})
+            now = FrameExtrema(**{**kept, "points_px": points_px, "maxima": maxima})
             delta = mapper.process(k, k * INTERVAL_NS, now, None, None)
             if delta.state == TRACKING:
                 reasons.setdefault(other, []).append(delta.reason)
@@ -90,3 +90,15 @@ def test_a_run_is_judged_with_a_reason(frames, in_segments, doubtful, word):
     found, reason = judge(frames=frames, in_segments=in_segments, doubtful=doubtful)
     assert found == word
     assert reason
+
+
+def test_of_frames_that_were_not_used_no_verdict_speaks() -> None:
+    for unused, which in ((0, "frames"), (40, "frames that were used")):
+        judged = judge(frames=100, in_segments=[100], doubtful=0, unused=unused)
+        assert judged == (GOOD, f"all {which} have a pose in one segment")
+
+
+def test_a_run_of_which_many_images_are_broken_is_doubtful() -> None:
+    few = judge(frames=95, in_segments=[95], doubtful=0, unused=5, broken=5)
+    many = judge(frames=60, in_segments=[60], doubtful=0, unused=40, broken=40)
+    assert (few[0], many) == (GOOD, (DOUBTFUL, "40% of the images are broken"))

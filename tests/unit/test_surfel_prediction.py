@@ -16,7 +16,6 @@ def tracks(ids: np.ndarray, points: np.ndarray, flow: np.ndarray) -> FrameTracks
         ages=np.zeros(n, np.int32),
         kappas=np.zeros(n, np.float32),
         states=np.zeros(n, np.uint8),
-        maxima=np.zeros((0, 3), np.float32),
         dominant_flow=flow,
     )
 

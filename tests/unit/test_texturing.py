@@ -63,6 +63,17 @@ def test_what_hides_a_texel_gives_it_no_colour() -> None:
     assert (colours.texture(np.full((SIZE**2, 3), GREY, np.uint8)) == GREY).all()
 
 
+def test_what_a_mask_covers_gives_a_texel_no_colour() -> None:
+    texels = find_texels(UVS[TRIANGLES], SIZE)
+    colours = TexelColours(texels, CORNERS, TRIANGLES)
+    used = np.ones((CAMERA.height, CAMERA.width), np.bool_)
+    used[:, : CAMERA.width // 2] = False
+    colours.add(np.full((160, 200, 3), 9, np.uint8), CAMERA, np.eye(4), used)
+    texture = colours.texture(np.full((SIZE**2, 3), GREY, np.uint8))
+    assert (texture[:, : SIZE // 2 - 2] == GREY).all()
+    assert (texture[2:-2, SIZE // 2 + 2 : -2] == 9).all()
+
+
 def test_texels_off_the_mesh_have_the_colour_of_the_nearest_on_it() -> None:
     uvs = (UVS[TRIANGLES] * 0.5 + 0.25).astype(np.float32)
     texels = find_texels(uvs, SIZE)

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F64, U8, check_arrays
+from pliant.algorithms.tracking.maxima import maxima_of
 from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.algorithms.tracking.tracker import ExtremaTracker
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 HEIGHT, WIDTH = 240, 320
 
@@ -42,7 +43,7 @@ def render(frame: int, *, gain: float = 1.0, noise: float = 2.0) -> U8:
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
-def follow(images: list[U8], parameters: TrackingParameters, seed: int = 0) -> list[FrameTracks]:
+def follow(images: list[U8], parameters: TrackingParameters, seed: int = 0) -> list[FrameExtrema]:
     """Track a list of images."""
     tracker = ExtremaTracker(images[0].shape[1], images[0].shape[0], parameters, seed)
     return [tracker.track(image) for image in images]
@@ -138,3 +139,25 @@ def test_an_image_of_another_size_is_refused() -> None:
     tracker = ExtremaTracker(WIDTH, HEIGHT, TrackingParameters())
     with pytest.raises(ValueError, match="uint8 image of shape"):
         tracker.track(np.zeros((HEIGHT, WIDTH + 1), np.uint8))
+
+
+@pytest.mark.parametrize("both_signs", [True, False])
+def test_who_has_an_image_finds_the_maxima_that_the_tracker_found(
+    sequence: list[U8], both_signs: bool
+) -> None:
+    """They are in no message: bundle adjustment makes them anew."""
+    parameters = TrackingParameters(max_tracks=500, both_signs=both_signs)
+    for image, tracks in zip(sequence[:3], follow(sequence[:3], parameters), strict=True):
+        assert len(tracks.maxima) > 500
+        assert maxima_of(image, parameters).tobytes() == tracks.maxima.tobytes()
+
+
+def test_kappas_are_told_to_eight_bits(sequence: list[U8]) -> None:
+    tracks = follow(sequence[:1], TrackingParameters(max_tracks=500))[0]
+    assert not (tracks.kappas.view(np.uint32) & 0xFFFF).any()
+    at = np.rint(tracks.points_px).astype(int)  # of tracks that begin: the maximum is theirs
+    maxima = {(round(float(u)), round(float(v))): kappa for u, v, kappa in tracks.maxima}
+    exact = np.array([maxima.get((u, v), np.nan) for u, v in at.tolist()])
+    there = np.isfinite(exact)
+    assert there.sum() > 0.9 * len(at)
+    np.testing.assert_allclose(tracks.kappas[there], exact[there], rtol=2.0**-8)

@@ -34,6 +34,10 @@ def run(
     fov: Annotated[
         float | None, _everyday(help="Horizontal field of view in degrees, for a first try.")
     ] = None,
+    mask: Annotated[
+        Path | None,
+        _everyday(help="Image whose black parts are ignored in all frames, or a folder of them."),
+    ] = None,
     start: Annotated[
         float | None, _everyday(min=0.0, help="Begin so many seconds after the first frame.")
     ] = None,
@@ -122,6 +126,8 @@ def run(
 
     pliant run video.mp4 --start 10 --end 40 --every 5 --sharpest
 
+    pliant run dashcam.mp4 --mask bonnet.png
+
     pliant run today.mp4 --calibration calib.yaml --map results/yesterday
 
     pliant run camera:0 --calibration calib.yaml --map results/office --localise
@@ -161,6 +167,7 @@ def run(
         seed=seed,
         calibration=calibration,
         fov_deg=fov,
+        mask=mask,
         known=known,
         topic=topic,
         view=view,

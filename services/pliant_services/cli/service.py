@@ -34,6 +34,9 @@ def service(
     fov: Annotated[
         float | None, typer.Option(help="ingest: horizontal field of view in degrees.")
     ] = None,
+    mask: Annotated[
+        Path | None, typer.Option(help="ingest: what of the images is ignored, as in `pliant run`.")
+    ] = None,
     known: Annotated[
         Path | None, typer.Option("--map", help="ingest: a map of earlier sessions to go on in.")
     ] = None,
@@ -102,6 +105,7 @@ def service(
             depth=config.ingest.depth if reads_depth(names, config) else "none",
             longest_side_px=config.ingest.longest_side_px,
             part=config.ingest,
+            mask=mask,
         )
         arguments["known"] = None if known is None else MapFile(known)
     elif name == "recorder":

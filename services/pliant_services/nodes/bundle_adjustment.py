@@ -2,8 +2,8 @@
 
 in   camera/stream    once
      map/known        before the first frame: a map of earlier sessions, to go on in
-     camera/image     every frame: colours, and patches for re-acquisition; in live mode, whether
-                      to pass over the frame
+     camera/image     every frame: colours, and for re-acquisition patches and maxima of curvature;
+                      in live mode, whether to pass over the frame
      tracks/extrema   every frame
 out  map/update       one per frame: pose, points, keyframes, corrections of earlier poses
      map/final        one, after the last frame: the last corrections
@@ -17,14 +17,18 @@ The whole map is adjusted in a thread beside the frames, see ``whole_map.py``.
 """
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeAlias
 
 import cv2
 
+from pliant.algorithms.image.masks import filled
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
 from pliant.algorithms.mapping.whole_map import Answer, Question, WholeMap, find_moves
+from pliant.algorithms.tracking.maxima import maxima_of
+from pliant.algorithms.tracks import FrameExtrema
 from pliant.bus.base import Bus, join, receive, receive_one, resume
 from pliant.config import Config
 from pliant.messages import topics
@@ -39,8 +43,11 @@ from pliant.messages.types import (
     MapKeyframe,
     MapUpdate,
 )
-from pliant_services.runtime.link_images import receive_images
+from pliant_services.runtime.link_images import clearance, receive_images
 from pliant_services.runtime.monitor import Monitor
+
+_Kept: TypeAlias = tuple[bytes, bytes]
+"""Of a frame: its image as a JPEG, and its mask."""
 
 _JPEG_QUALITY = 95
 """The image gives the mesh its colours alone: a tenth of the bytes, in 2 ms."""
@@ -49,7 +56,7 @@ _JPEG_QUALITY = 95
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     """Map until the tracks end."""
 
-    def start() -> tuple[Header, Mapper | TrialMapper | Localiser, dict[int, bytes]]:
+    def start() -> tuple[Header, Mapper | TrialMapper | Localiser, dict[int, _Kept]]:
         stream = receive_one(bus, topics.STREAM, CameraStream)
         known: list[MapKeyframe] = []
         if bus.reads(topics.MAP_KNOWN):
@@ -57,7 +64,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         parameters, sigma = config.bundle_adjustment, stream.focal_sigma
         return stream, mapper_for(stream.camera, parameters, config.seed, sigma, known), {}
 
-    # waiting: images of the frames from which a map may yet start, by frame number.
+    # waiting: images and masks of the frames from which a map may yet start, by frame number.
     last, mapper, waiting = resume(bus, start)
     extrema = receive(bus, topics.EXTREMA, Extrema)
     beside = Beside()
@@ -69,17 +76,19 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
             delta = mapper.skip(tracks.frame, PASSED_OVER)
         else:
             colour = image.colour if image.colour.size else None
-            delta = mapper.process(
-                tracks.frame, tracks.stamp_ns, tracks, image.grey, colour, monitor.stage
-            )
+            covered = clearance(image)
+            grey = filled(image.grey, covered)
+            with monitor.stage("maxima"):
+                seen = FrameExtrema.of(tracks, maxima_of(grey, config.tracking, covered))
+            delta = mapper.process(tracks.frame, tracks.stamp_ns, seen, grey, colour, monitor.stage)
         bus.publish(topics.MAP_UPDATE, _update(tracks, delta))
         keyframes = mapper.publish_keyframes()
         if tracks.frame in delta.keyframe_frames:
-            waiting[tracks.frame] = _jpeg(image)
+            waiting[tracks.frame] = _jpeg(image), image.mask
         bus.publish(topics.KEYFRAME, _keyframe(image, keyframes, delta, waiting))
         needed = mapper.waiting_frames
         if tracks.frame in needed:
-            waiting[tracks.frame] = _jpeg(image)
+            waiting[tracks.frame] = _jpeg(image), image.mask
         waiting = {frame: waiting[frame] for frame in needed}
         monitor.report(
             tracks,
@@ -129,7 +138,7 @@ class Beside:
 
 
 def _keyframe(
-    header: Header, delta: KeyframeDelta, update: MapDelta, waiting: dict[int, bytes]
+    header: Header, delta: KeyframeDelta, update: MapDelta, waiting: dict[int, _Kept]
 ) -> Keyframe:
     """What changed in keyframes.  Images that wait are done with once a map starts."""
     if delta.new < 0:
@@ -137,12 +146,16 @@ def _keyframe(
     moved = zip(update.keyframe_ids.tolist(), update.keyframe_frames.tolist(), strict=True)
     images = {keyframe: waiting[frame] for keyframe, frame in moved if frame in waiting}
     waiting.clear()
+    jpeg, mask = images.pop(delta.new, (b"", b""))
+    masked = any(earlier for _, earlier in images.values())
     return Keyframe.of(
         header,
         delta,
-        jpeg=images.pop(delta.new, b""),
+        jpeg=jpeg,
         earlier_ids=tuple(images),
-        earlier_jpegs=tuple(images.values()),
+        earlier_jpegs=tuple(earlier for earlier, _ in images.values()),
+        mask=mask,
+        earlier_masks=tuple(earlier for _, earlier in images.values()) if masked else (),
     )
 
 

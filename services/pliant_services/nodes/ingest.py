@@ -27,7 +27,14 @@ from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.datasets.working_size import SmallerImages
 from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import topics
-from pliant.messages.types import CAMERA_FRAME_ID, CameraStream, Depth, Image, SourceImage
+from pliant.messages.types import (
+    BROKEN,
+    CAMERA_FRAME_ID,
+    CameraStream,
+    Depth,
+    Image,
+    SourceImage,
+)
 from pliant.recording.map_file import MapFile
 from pliant_services.runtime.keeping_up import (
     Drops,
@@ -88,7 +95,7 @@ def run(
             if live and pace.passes_over(image, images_that_wait(bus), config.ingest.mapping_lag_s):
                 image = replace(image, unmapped=True)
             dropped += source.dropped
-            broken += bool(image.missing) and not source.dropped
+            broken += image.missing.startswith(BROKEN)
             if clip is not None and not clip.is_as_it_was():
                 clip = None  # what is read of it now is not what was sent
             bus.publish(topics.SOURCE, _source_message(source, image.unmapped, clip is not None))
@@ -225,6 +232,7 @@ def _source_message(source: SourceFrame, unmapped: bool, of_clip: bool) -> Sourc
         made_from=source.made_from,
         unmapped=unmapped,
         clip_frame=source.clip_frame if of_clip else -1,
+        mask=source.mask,
     )
 
 

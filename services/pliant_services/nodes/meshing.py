@@ -36,7 +36,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         updates = receive(bus, topics.MAP_UPDATE, MapUpdate)
         keyframes = receive(bus, topics.KEYFRAME, Keyframe)
         for update, keyframe in join(updates, keyframes):
-            mesher.take(update, keyframe, keyframe.images(), update.frame)
+            mesher.take(update, keyframe, keyframe.images(), update.frame, keyframe.masks())
             # Live: first all that has come is taken, so that nobody waits for the mesh.
             if not (is_live and bus.is_waiting(topics.KEYFRAME)):
                 changes = mesher.fuse(newest_only=is_live, timer=monitor.stage)
@@ -44,7 +44,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
             monitor.report(keyframe, note=mesher.note, **mesher.counts, **mesher.memory)
         last = receive_one(bus, topics.MAP_FINAL, MapUpdate)
         rest = receive_one(bus, topics.KEYFRAME_FINAL, Keyframe)
-        mesher.take(last, rest, rest.images(), last.frame)
+        mesher.take(last, rest, rest.images(), last.frame, rest.masks())
         for final in mesher.finish(timer=monitor.stage):
             for piece in split(
                 last, final.mesh, segment=final.segment, level=final.level,

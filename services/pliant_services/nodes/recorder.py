@@ -58,7 +58,7 @@ def run(
 
 def _record(recording: RollingWriter, received: Received, now_ns: int) -> None:
     topic = topics.STREAM_END if received.is_end else received.topic
-    message = received.message or codec.decode(topic.message, received.data)
+    message = received.message or codec.decode(topic.message, received.data, views=True)
     if isinstance(message, CameraStream):
         recording.attach("calibration.yaml", "application/yaml", message.calibration.encode())
     data = received.data

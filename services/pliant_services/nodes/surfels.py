@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.image.masks import glaring
 from pliant.algorithms.surfels.depth_maps import agree
 from pliant.algorithms.surfels.prediction import predict
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
@@ -39,7 +40,7 @@ from pliant.messages.types import (
     MapUpdate,
     Surfels,
 )
-from pliant_services.runtime.link_images import receive_images
+from pliant_services.runtime.link_images import clearance, receive_images
 from pliant_services.runtime.monitor import Monitor
 
 _FLAT_DEPTH = 1.0
@@ -133,7 +134,7 @@ def _check(bus: Bus, config: Config) -> None:
 
 def _hear(bus: Bus) -> Iterator[_Heard]:
     """Everything for each frame, whatever the fleet makes."""
-    pairs = join(receive_images(bus), receive(bus, topics.DEPTH, Depth))
+    pairs = join(map(_unmasked, receive_images(bus)), receive(bus, topics.DEPTH, Depth))
     heard = (_Heard(image, depth) for image, depth in pairs)
     if bus.reads(topics.EXTREMA):
         extrema = receive(bus, topics.EXTREMA, Extrema)
@@ -144,6 +145,11 @@ def _hear(bus: Bus) -> Iterator[_Heard]:
         keyframes = receive(bus, topics.KEYFRAME, Keyframe)
         heard = (replace(h, keyframe=keyframe) for h, keyframe in join(heard, keyframes))
     return heard
+
+
+def _unmasked(image: Image) -> Image:
+    """The image with what its mask covers as surfels leave it out."""
+    return image if image.missing else replace(image, grey=glaring(image.grey, clearance(image)))
 
 
 def _prediction(state: _State, heard: _Heard, config: Config) -> F64 | None:

@@ -2,17 +2,17 @@
 
 in   camera/stream    once
      camera/image     every frame
-out  tracks/extrema   one per frame: tracks and all maxima; empty where the frame has no pixels
+out  tracks/extrema   one per frame, empty where the frame has no pixels
 """
 
 from pliant.algorithms.tracking.tracker import ExtremaTracker
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 from pliant.bus.base import Bus, receive_one, resume
 from pliant.config import Config
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Extrema
 from pliant_services.runtime.keeping_up import readers_that_may_lag
-from pliant_services.runtime.link_images import receive_images
+from pliant_services.runtime.link_images import clearance, receive_images
 from pliant_services.runtime.monitor import Monitor
 
 
@@ -26,9 +26,9 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     tracker = resume(bus, start)
     for image in receive_images(bus):
         if image.missing:
-            tracks = FrameTracks.empty()
+            tracks = FrameExtrema.empty()
         else:
-            tracks = tracker.track(image.grey, monitor.stage)
+            tracks = tracker.track(image.grey, monitor.stage, clearance(image))
         extrema = Extrema.of(image, tracks, missing=image.missing)
         bus.publish(topics.EXTREMA, extrema, may_lag=readers_that_may_lag(image))
         monitor.report(image, tracks=len(tracks.ids), maxima=len(tracks.maxima))

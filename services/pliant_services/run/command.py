@@ -6,18 +6,18 @@ import shutil
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from pliant.config import Config, config_yaml, load_config
-from pliant.datasets import open_source
+from pliant.datasets import notes_on, open_source
 from pliant.datasets.base import is_builtin
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_formats import UNDERSTOOD
 from pliant.datasets.rectifier import Rectifier
-from pliant.datasets.working_size import SmallerImages
 from pliant.errors import CalibrationError, PliantError, ResultError
+from pliant.files import make_folder, write_whole
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.recording import parts
 from pliant.recording.map_file import MapFile
@@ -42,6 +42,8 @@ from pliant_services.runtime.launcher import Fleet
 
 INTERRUPTED = 130
 _DEFORMABLE = "deformable"
+_KNOWN_MAP = "known_map"
+"""In the folder of checkpoints: where the map is in which a run goes on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +59,7 @@ class RunRequest:
     seed: int | None = None
     calibration: Path | None = None
     fov_deg: float | None = None
+    mask: Path | None = None
     known: Path | None = None
     topic: str = ""
     port: int | None = None
@@ -74,9 +77,12 @@ def run_pipeline(request: RunRequest) -> int:
     output = request.output or Path("results") / folder_name(request.source)
     source = Path(request.source)
     read = [source, *parts.parts_of(source)] if os.path.exists(request.source) else []
+    if request.resume:
+        request = replace(request, known=resumed_map(output, request))
     known = None if request.known is None else MapFile(request.known)
     if known is not None:
         read.append(known.path)
+    read += [request.mask] if request.mask is not None else []
     keep_apart(output, read)
     if request.save is not None:
         keep_apart(request.save, [*read, *files_read(output)], option="--save")
@@ -113,10 +119,11 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
         depth=config.ingest.depth if reads_depth(PROFILES[profile], config) else "none",
         longest_side_px=config.ingest.longest_side_px,
         part=config.ingest,
+        mask=request.mask,
     )
     progress = Progress(dataset.frame_count)
-    if isinstance(dataset, SmallerImages):
-        progress.say(dataset.note)
+    for note in notes_on(dataset):
+        progress.say(note)
     if request.calibration is None and request.fov_deg is None:
         _say_guess(dataset.calibration, profile, progress)
     if profile == _DEFORMABLE:
@@ -174,6 +181,10 @@ def _go_through(
         warm_up.compile_kernels(progress.say)  # whatever ends it, an earlier result is as it was
         if not request.resume:
             prepare(output, config_yaml(config))
+            if request.on_crash == "restart" and request.known is not None:
+                make_folder(output / STATE_FOLDER)
+                map_file = MapFile(request.known).path.resolve()
+                write_whole(output / STATE_FOLDER / _KNOWN_MAP, str(map_file))
         try:
             with announced(output, fleet.endpoint, fleet.session), progress:
                 if viewer is not None:
@@ -209,6 +220,18 @@ def resumed_config(output: Path, request: RunRequest) -> Config:
     return kept
 
 
+def resumed_map(output: Path, request: RunRequest) -> Path | None:
+    """The map in which the run goes on that is taken up again.  Raises ResultError for another."""
+    note = output / STATE_FOLDER / _KNOWN_MAP
+    begun_in = Path(note.read_text()) if note.is_file() else None
+    if request.known is not None and MapFile(request.known).path.resolve() != begun_in:
+        raise ResultError(
+            f"--resume goes on in the map of its run, {begun_in or 'which has none'}, and "
+            f"{request.known} is another one: leave --map"
+        )
+    return begun_in
+
+
 def _has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
     """Whether all that the services had to say was recorded, and nobody is to be started again."""
     _, ended = mend(output / RECORDING_NAME)
@@ -235,6 +258,7 @@ def service_arguments(name: str, request: RunRequest, output: Path) -> list[str]
         extra += ["--source", request.source]
         extra += ["--calibration", str(request.calibration)] if request.calibration else []
         extra += ["--fov", str(request.fov_deg)] if request.fov_deg is not None else []
+        extra += ["--mask", str(request.mask)] if request.mask is not None else []
         extra += ["--topic", request.topic] if request.topic else []
         extra += ["--map", str(request.known)] if request.known is not None else []
     if name == "recorder":

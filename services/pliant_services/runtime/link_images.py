@@ -15,6 +15,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from pliant.algorithms.arrays import F32
+from pliant.algorithms.image.masks import clearance_in
 from pliant.bus.base import Bus, receive
 from pliant.config import BusParameters
 from pliant.datasets.base import BrokenFrame, SourceFrame
@@ -90,6 +92,18 @@ def whole(image: Image) -> Image:
     return replace(
         image, grey=grey, colour=none if colour is None else colour, jpeg=b"", calibration=""
     )
+
+
+def clearance(image: Image) -> F32 | None:
+    """Of the mask of an image with pixels.  Raises MessageError where it has another size."""
+    where = f"{topics.IMAGE.key}: frame {image.frame}"
+    try:
+        found = clearance_in(image.mask)
+    except ValueError as error:
+        raise MessageError(f"{where}: {error}") from None
+    if found is not None and found.shape != image.grey.shape:
+        raise MessageError(f"{where}: a mask of another size than the image")
+    return found
 
 
 @lru_cache(maxsize=2)

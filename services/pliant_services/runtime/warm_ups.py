@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 
 
 def _track() -> None:
@@ -35,6 +35,8 @@ def _map() -> None:
     from pliant.algorithms.mapping.self_calibration import SelfCalibration
     from pliant.algorithms.places.features import describe, match
     from pliant.algorithms.places.index import PlaceIndex
+    from pliant.algorithms.tracking.maxima import maxima_of
+    from pliant.algorithms.tracking.parameters import TrackingParameters
 
     frames, n = 11, 400
     camera = PinholeCamera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
@@ -51,7 +53,7 @@ def _map() -> None:
         turned = points @ so3_exp(np.array([0.0, 0.01 * step, 0.0])).T
         px = camera.project(turned - (0.1 * step, 0.02 * step, 0.0)).astype(np.float32)
         tracked = (np.arange(n) % frames != frame) & (frame < frames - 1)
-        tracks = FrameTracks(
+        tracks = FrameExtrema(
             ids=np.flatnonzero(tracked),
             points_px=px[tracked],
             ages=np.full(int(tracked.sum()), frame, np.int32),
@@ -73,6 +75,7 @@ def _map() -> None:
         points_px=px[:1], rolled_px=px[:1],
     )  # fmt: skip
     keyframe.follow_aliases(PointRows())
+    maxima_of(grey, TrackingParameters())
     seen, places = describe(grey), PlaceIndex()
     places.add(0, seen)
     places.query(seen)

@@ -60,6 +60,14 @@ def _scalar_type(array_type: Any) -> Any:
     return get_args(last)[0] if get_args(last) else last
 
 
+def with_bits(values: F32, bits: int) -> F32:
+    """Finite numbers to so many significant bits, 1 to 23: what is left of them takes little room
+    where it is compressed."""
+    dropped = 24 - bits
+    whole = np.ascontiguousarray(values).view(np.uint32) + np.uint32(1 << (dropped - 1))
+    return (whole >> np.uint32(dropped) << np.uint32(dropped)).view(np.float32)
+
+
 def check_arrays(record: Any) -> None:
     """Raise ValueError, naming the field, where an array is not what its annotation says."""
     sizes: dict[str, tuple[int, str]] = {}

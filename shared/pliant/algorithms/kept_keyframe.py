@@ -6,8 +6,9 @@ from typing import Annotated
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
 
-MAP_VERSION = 1
-"""Of what its fields mean: a map of a newer version is refused."""
+MAP_VERSION = 2
+"""Of what its fields mean, and of how the file has them; a map of a newer version is refused.
+2: arrays are in planes, see ``pliant.messages.planes``."""
 
 
 @dataclass(frozen=True, kw_only=True)

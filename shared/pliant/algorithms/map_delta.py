@@ -70,16 +70,19 @@ class MapDelta:
         for those that an earlier session made.
     keyframe_poses: T_world_camera for each.
     point_ids: points that are new or have changed.      point_segments: theirs.
-    points_world: positions.      point_colours: RGB (grey is repeated).
+    points_world: positions, as float32 has them.    point_colours: RGB (grey is repeated).
     point_keyframes: keyframes that observe the point.
     point_parallax_rad: largest angle between two of the rays that observe it.
-    point_sigmas: standard deviation along the ray, as a share of the depth.
+    point_sigmas: standard deviation along the ray, as a share of the depth; both to 12 bits.
     point_hosts: keyframe on which each of them hangs.
     removed_point_ids: points that no longer exist (wrong, or merged into another).
     moved_keyframes, moves: how the whole map moved before all else of this update: ``MapMoves``.
         Keyframes and points move; of poses that hang on a keyframe, the distance to it scales.
     joined: segments that have become one, after ``moves`` and before all else: what belongs to the
         first of each row belongs to the second from now on, where ``moves`` has brought it.
+    same_places: keyframes that were found to show one place, the older one first: by which a loop
+        was closed, or segments were joined, or a camera that was lost was recognised.   -1 for a
+        frame that is no keyframe.
     calibration_correction: (s, k1, k2, readout, a, b), what the last adjustment found wrong with
         the calibration: a point of the map at (x, y) on the plane z = 1 is seen in the rectified
         image at ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx``, likewise v with b, and a rolling
@@ -118,6 +121,9 @@ class MapDelta:
     moves: Annotated[F64, Shape("C", 8)] = field(default_factory=lambda: np.zeros((0, 8)))
     joined: Annotated[I32, Shape("J", 2)] = field(
         default_factory=lambda: np.zeros((0, 2), np.int32)
+    )
+    same_places: Annotated[I64, Shape("L", 2)] = field(
+        default_factory=lambda: np.zeros((0, 2), np.int64)
     )
 
     def hosts(self) -> I64:

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.arrays import F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.mapping.localiser import Localiser
-from pliant.algorithms.tracking.maxima import curvature_and_maxima
+from pliant.algorithms.tracking.maxima import maxima_of
 from pliant.api.images import calibration_of, source_frame
 from pliant.config import load_config
 from pliant.datasets.calibration import Calibration, calibration_from_yaml
@@ -52,23 +53,23 @@ class KnownMap:
         self._finder: tuple[Calibration, Rectifier, Localiser] | None = None
 
     def localise(
-        self, image: U8, camera: Calibration | PinholeCamera | None = None
+        self,
+        image: U8,
+        camera: Calibration | PinholeCamera | None = None,
+        mask: U8 | BoolArray | None = None,
     ) -> Located | None:
         """Where an image was taken; None where the map is not recognised in it.
 
         image: (H, W) grey or (H, W, 3) RGB, uint8, as the camera took it.    camera: its own, where
-        it is not that of the map's last session.  Raises DatasetError for an image that is none of
-        the camera's.
+        it is not that of the map's last session.    mask: (H, W), 0 where the image is ignored.
+        Raises DatasetError for an image that is none of the camera's.
         """
         calibration, rectifier, localiser = self._finder_for(camera)
-        grey, _ = rectifier.rectify(source_frame(image, calibration))
+        frame = source_frame(image, calibration, mask=mask)
+        grey, _ = rectifier.rectify(frame)
+        grey = filled(grey, clearance_in(rectifier.mask(frame)))
         ideal = localiser.calibration.view.image(grey)
-        parameters = self._tracking
-        *_, maxima = curvature_and_maxima(
-            ideal, parameters.blur_sigma_px, parameters.min_curvature,
-            both_signs=parameters.both_signs,
-        )  # fmt: skip
-        found = localiser.recognise(maxima, ideal)
+        found = localiser.recognise(maxima_of(ideal, self._tracking), ideal)
         if found is None:
             return None
         return Located(

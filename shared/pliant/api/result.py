@@ -147,7 +147,7 @@ class Result(Mapped):
         return sorted(found, key=lambda keyframe: keyframe.frame)
 
     def tracks(self, frame: int) -> Extrema:
-        """The tracks of a frame: ``ids``, ``points_px``, ``ages``, ``maxima``."""
+        """The tracks of a frame: ``ids``, ``points_px``, ``ages``."""
         message = self._message(topics.EXTREMA, frame)
         assert isinstance(message, Extrema)
         return message

@@ -22,6 +22,7 @@ def run(
     force: bool = False,
     calibration: str | Path | None = None,
     fov: float | None = None,
+    mask: str | Path | None = None,
     profile: Literal["rigid", "deformable"] = "rigid",
     settings: Mapping[str, Any] | None = None,
     seed: int | None = None,
@@ -31,7 +32,8 @@ def run(
 
         result = pliant.run("clip.mp4", fov=70)
 
-    output: result folder [results/<source>]; force: write into an existing one.    settings: as
+    output: result folder [results/<source>]; force: write into an existing one.    mask: an image
+    whose black parts are ignored in all frames, or a folder of them.    settings: as
     ``{"tracking.max_tracks": 5000}``.    quiet: print nothing.    ``result.report["verdict"]``
     says whether it went well.    Raises ResultError with what the command says.
     """
@@ -41,6 +43,7 @@ def run(
     command += ["--force"] if force else []
     command += ["--calibration", str(calibration)] if calibration is not None else []
     command += ["--fov", str(fov)] if fov is not None else []
+    command += ["--mask", str(mask)] if mask is not None else []
     command += ["--seed", str(seed)] if seed is not None else []
     for setting in settings_of(settings or {}):
         command += ["--set", setting]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pliant.algorithms.arrays import F32, F64, I64, U8
+from pliant.algorithms.arrays import F32, F64, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.api.images import calibration_of, source_frame
@@ -68,18 +68,23 @@ class Slam(Mapped):
         """Of all images until now."""
         return self._history
 
-    def track(self, image: U8, stamp: float | None = None) -> F64 | None:
+    def track(
+        self, image: U8, stamp: float | None = None, mask: U8 | BoolArray | None = None
+    ) -> F64 | None:
         """T_world_camera (4, 4) of the next image; None where it has none, or none yet.
 
         image: (H, W) grey or (H, W, 3) RGB, of one size.    stamp: when it was taken, in seconds,
-        increasing; without any, 30 images are a second.
+        increasing; without any, 30 images are a second.    mask: (H, W), 0 where the image is
+        ignored.
 
         A map begins once the camera has moved: the images until then get their poses later, see
         ``trajectory``.  Raises DatasetError for an image or a time that cannot be.
         """
-        return self.take(image, stamp).T_world_camera
+        return self.take(image, stamp, mask).T_world_camera
 
-    def take(self, image: U8, stamp: float | None = None) -> "Tracked":
+    def take(
+        self, image: U8, stamp: float | None = None, mask: U8 | BoolArray | None = None
+    ) -> "Tracked":
         """As ``track``, with all that is known of the image."""
         number, last_ns = self._next.index, self._next.stamp_ns
         stamp_ns = round(1e9 * (number / _FPS if stamp is None else stamp))
@@ -88,7 +93,7 @@ class Slam(Mapped):
                 f"image {number}: its time, {1e-9 * stamp_ns:.6f} s, is not after that of the one "
                 f"before, {1e-9 * last_ns:.6f} s"
             )
-        source = source_frame(image, self._camera, number=number, stamp_ns=stamp_ns)
+        source = source_frame(image, self._camera, number=number, stamp_ns=stamp_ns, mask=mask)
         if self._camera is None:
             known = (UNSAID_FOV_DEG, UNSAID_SIGMA) if self._fov is None else (self._fov, SAID_SIGMA)
             self._camera = calibration_from_fov(source.width, source.height, *known)
@@ -155,6 +160,7 @@ def follow(
     *,
     calibration: str | Path | None = None,
     fov: float | None = None,
+    mask: str | Path | None = None,
     settings: Mapping[str, Any] | None = None,
     seed: int | None = None,
 ) -> Iterator[Tracked]:
@@ -173,6 +179,7 @@ def follow(
         fov_deg=fov,
         longest_side_px=config.ingest.longest_side_px,
         part=config.ingest,
+        mask=None if mask is None else Path(mask),
     )
     slam = Slam(dataset.calibration, settings=settings, seed=seed)
     for frame in dataset:

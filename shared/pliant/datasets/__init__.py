@@ -23,13 +23,14 @@ from pliant.datasets.folder import (
 )
 from pliant.datasets.images import SUFFIXES, SourceOptions
 from pliant.datasets.kitti import is_kitti, open_kitti
+from pliant.datasets.masks import Masked
 from pliant.datasets.mcap_file import is_mcap, open_mcap
 from pliant.datasets.own_recording import is_own_recording, open_own_recording
 from pliant.datasets.rectifier import Rectifier, decode
 from pliant.datasets.ros_bag import is_ros_bag, open_ros_bag
 from pliant.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from pliant.datasets.video import VideoFile
-from pliant.datasets.working_size import at_working_size
+from pliant.datasets.working_size import SmallerImages, at_working_size
 from pliant.errors import DatasetError
 
 __all__ = [
@@ -47,6 +48,7 @@ __all__ = [
     "calibration_from_yaml",
     "calibration_yaml",
     "decode",
+    "notes_on",
     "open_source",
     "read_calibration",
     "sources_in",
@@ -141,6 +143,7 @@ def open_source(
     depth: Literal["none", "first", "all"] = "none",
     longest_side_px: int = 0,
     part: Part | None = None,
+    mask: Path | None = None,
 ) -> Dataset:
     """Open a source of frames of any of the ``FORMATS``, and check it as far as can be seen.
 
@@ -150,6 +153,7 @@ def open_source(
     depth: which depth maps the frames bring along; a source without any is refused then.
     longest_side_px: to which larger images are made smaller; 0: as large as their details need.
     part: which frames are taken; None: all.
+    mask: an image, or a folder of them, that says which part of frames is used: see ``masks``.
 
     Raises DatasetError or CalibrationError: one line with what is wrong, where, and what to do.
     """
@@ -166,10 +170,10 @@ def open_source(
                     raise DatasetError(f"{source}: has no topics to choose from: leave out --topic")
                 if depth != "none" and not kind.has_depth:
                     raise DatasetError(
-                        f"{source}: brings no depth along, and surfels need it to start: use "
-                        "a folder with rgb.txt and depth.txt"
+                        f"{source}: brings no depth along: use a folder with rgb.txt and depth.txt"
                     )
                 opened = kind.open(source, options)
+                opened = opened if mask is None else Masked(opened, mask)
                 if part is not None and not is_all(part):
                     opened = Excerpt(opened, part, first_depth_only=first_depth)
                 if kind.sized and not longest_side_px:
@@ -183,6 +187,14 @@ def open_source(
         raise DatasetError(f"{source}: neither a file nor a folder; understood are {understood()}")
     what = "holds none of the sources" if any(path.iterdir()) else "is an empty folder"
     raise DatasetError(f"{source}: {what}; understood are {understood()}")
+
+
+def notes_on(dataset: Dataset) -> list[str]:
+    """What is done to the images of a source, in lines for people."""
+    if not isinstance(dataset, Excerpt | Masked | SmallerImages):
+        return []
+    own = [] if isinstance(dataset, Excerpt) else [dataset.note]
+    return notes_on(dataset.source) + own
 
 
 _VIDEOS = (

@@ -1,7 +1,7 @@
 """What every source of frames has in common: the frame as it came, and the protocol of a source."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -26,6 +26,8 @@ class SourceFrame:
     made_from: "" as it came; else what it was before, for people.
     clip_frame: number of the frame of a video file that it is made from; -1: of none.
     depth: the file of the depth map that belongs to it, as it is; b"" where there is none.
+    mask: an image file that says which part of it is used; b"": all of it.
+    name: of the file that it comes from; "" where it has none; tells no frames apart.
     """
 
     index: int
@@ -37,6 +39,8 @@ class SourceFrame:
     depth: bytes = b""
     made_from: str = ""
     clip_frame: int = -1
+    mask: bytes = b""
+    name: str = field(default="", compare=False)
 
     @property
     def dropped(self) -> bool:
@@ -45,7 +49,8 @@ class SourceFrame:
 
     def without_data(self) -> "SourceFrame":
         """This frame passed over: its number and time stay."""
-        return replace(self, encoding="", data=b"", width=0, height=0, depth=b"", clip_frame=-1)
+        nothing = {"encoding": "", "width": 0, "height": 0, "clip_frame": -1}
+        return replace(self, **nothing, data=b"", depth=b"", mask=b"")
 
 
 class Dataset(Protocol):

@@ -21,11 +21,11 @@ from pliant.rendering.paths import CameraPath, SampledPath, TurnedPath
 from pliant.rendering.scenes import SCENES, BuiltinScene
 
 if TYPE_CHECKING:  # they have kernels, and a folder that is there needs none
-    from pliant.rendering.atlas import FaceTexture
+    from pliant.rendering.atlas import FaceColours, FaceTexture
     from pliant.rendering.render import SceneGeometry
 
 # Raise it with every change that alters a single pixel: old caches are then passed over.
-RENDERER_VERSION = 2
+RENDERER_VERSION = 3
 
 _LOOK_STRIDE = 8  # pixels
 _UNSEEN_DETAIL = 0.1
@@ -42,7 +42,9 @@ class SequenceOptions(FilmOptions):
     """What may be said after the name of a rigid built-in sequence."""
 
     distortion: Distortion = Field(default=NO_DISTORTION, description="k1,k2,p1,p2 of the lens.")
-    colour: bool = Field(default=False, description="Colour images.")
+    colour: bool | None = Field(
+        default=None, description="Images in colour, or grey; as the scene is where not given."
+    )
     path: str | None = Field(
         default=None, description="TUM file with the camera path, at its own times."
     )
@@ -78,22 +80,26 @@ class RigidPlan:
 
     def render(self, folder: Path, progress: Progress) -> None:
         """Fill an empty folder, but for ``scene.json``."""
-        from pliant.rendering.atlas import make_face
+        from pliant.rendering.atlas import make_face, make_face_colours
         from pliant.rendering.render import Renderer, SceneGeometry
 
         geometry = SceneGeometry(self.builtin.scene)
         with render_threads() as executor:
             seen = _seen_faces(self, geometry)
 
-            def paint(number: int) -> "FaceTexture":
+            def paint(number: int) -> "tuple[FaceTexture, FaceColours | None]":
                 detail = 1.0 if number in seen else _UNSEEN_DETAIL
-                return make_face(geometry.scene, geometry.solids, number, detail=detail)
+                what = (geometry.scene, geometry.solids, number)
+                colours = make_face_colours(*what, detail=detail) if self.camera.colour else None
+                return make_face(*what, detail=detail), colours
 
             textures: list[FaceTexture] = []
-            for texture in executor.map(paint, range(geometry.n_faces)):
+            colours: list[FaceColours] = []
+            for texture, face_colours in executor.map(paint, range(geometry.n_faces)):
                 textures.append(texture)
+                colours += [face_colours] if face_colours is not None else []
                 progress("painting textures", len(textures), geometry.n_faces)
-            renderer = Renderer(geometry, textures, self.path, self.camera)
+            renderer = Renderer(geometry, textures, self.path, self.camera, colours or None)
             write_sequence(
                 folder,
                 f"built-in:{self.name}",
@@ -110,8 +116,9 @@ class RigidPlan:
 def rigid_plan(name: str, options: SequenceOptions) -> RigidPlan:
     """Check the options against the scene.  Raises DatasetError."""
     builtin = SCENES[name]()
+    colour = builtin.colour if options.colour is None else options.colour
     camera = options.camera(builtin.width).model_copy(
-        update={"distortion": options.distortion, "colour": options.colour}
+        update={"distortion": options.distortion, "colour": colour}
     )
     try:
         pixel_rays(camera.pinhole(), camera.distortion)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pliant.datasets.base import Dataset
 from pliant.datasets.excerpt import Excerpt, Part
+from pliant.datasets.masks import Masked
 from pliant.datasets.video import VideoFile
 from pliant.datasets.working_size import SmallerImages
 from pliant.errors import DatasetError
@@ -80,7 +81,7 @@ def clip_of(source: Dataset) -> Clip | None:
     Raises DatasetError where it cannot be read.
     """
     origin, parts = source, list[Part]()
-    while isinstance(origin, SmallerImages | Excerpt):
+    while isinstance(origin, SmallerImages | Excerpt | Masked):
         parts += [origin.part] if isinstance(origin, Excerpt) else []
         origin = origin.source
     if not isinstance(origin, VideoFile):

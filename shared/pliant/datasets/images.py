@@ -76,6 +76,11 @@ class ImageFiles:
         """The number of images."""
         return len(self._images)
 
+    @property
+    def names(self) -> list[str]:
+        """Of the files."""
+        return [image.path.name for image in self._images]
+
     def __len__(self) -> int:
         return len(self._images)
 
@@ -102,6 +107,7 @@ def _read(index: int, image: ListedImage) -> SourceFrame:
         encoding=encoding_of(data),
         data=data,
         depth=depth,
+        name=image.path.name,
     )
 
 

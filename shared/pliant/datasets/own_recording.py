@@ -86,4 +86,5 @@ def recorded_frame(image: SourceImage, depth: bytes = b"") -> SourceFrame:
         width=image.width,
         height=image.height,
         depth=depth,
+        mask=image.mask,
     )

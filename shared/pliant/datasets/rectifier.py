@@ -11,10 +11,11 @@ import numpy as np
 
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.image.masks import packed, scaled, unpacked
 from pliant.algorithms.rectification import rectification_maps, rectified_camera, resample
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.calibration import Calibration
-from pliant.messages.types import CAMERA_FRAME_ID, DROPPED, Image
+from pliant.messages.types import BROKEN, CAMERA_FRAME_ID, DROPPED, MASKED, Image
 
 _BAYER = {
     "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
@@ -69,6 +70,7 @@ class Rectifier:
         lens = calibration.lens
         self._camera = rectified_camera(lens)  # Calibration has seen to it that there is one
         self._maps = rectification_maps(lens, self._camera) if lens.distorts else None
+        self._last_mask = b"", b""
 
     @property
     def camera(self) -> PinholeCamera:
@@ -98,6 +100,28 @@ class Rectifier:
         if pixels.ndim == 2:
             return pixels, None
         return cast(U8, cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)), pixels
+
+    def mask(self, frame: SourceFrame) -> bytes:
+        """The mask of the frame's rectified image, packed; b"" where all of it is used.
+
+        A pixel is used where all that it is made of is.  Raises BrokenFrame for a mask that does
+        not decode, or has another aspect.
+        """
+        if not frame.mask:
+            return b""
+        if frame.mask != self._last_mask[0]:
+            self._last_mask = frame.mask, self._rectified_mask(frame)
+        return self._last_mask[1]
+
+    def _rectified_mask(self, frame: SourceFrame) -> bytes:
+        try:
+            pixels = 255 * scaled(unpacked(frame.mask), self._size).astype(np.uint8)
+        except ValueError as error:
+            raise BrokenFrame(f"frame {frame.index}: its mask is {error}") from None
+        if self._maps is not None:
+            pixels = resample(pixels, self._maps)
+        used = pixels == 255
+        return b"" if used.all() else packed(used)
 
 
 def _decode_raw(frame: SourceFrame) -> U8:
@@ -152,8 +176,11 @@ def rectified(source: SourceFrame, rectifier: Rectifier, *, unmapped: bool = Fal
         return _without_pixels(source, DROPPED)
     try:
         grey, colour = rectifier.rectify(source)
+        mask = rectifier.mask(source)
     except BrokenFrame as error:
-        return _without_pixels(source, f"broken: {error}")
+        return _without_pixels(source, f"{BROKEN}{error}")
+    if mask and not unpacked(mask).any():
+        return _without_pixels(source, MASKED)
     return Image(
         frame=source.index,
         stamp_ns=source.stamp_ns,
@@ -161,6 +188,7 @@ def rectified(source: SourceFrame, rectifier: Rectifier, *, unmapped: bool = Fal
         grey=grey,
         colour=colour if colour is not None else np.zeros((0, 0, 3), np.uint8),
         unmapped=unmapped,
+        mask=mask,
     )
 
 

@@ -25,10 +25,13 @@ _SAME_PX = 0.1  # of a track that was observed, but for rounding
 
 
 def colmap(recording: Recording, path: Path, folder: Path | None) -> None:
-    """``sparse/0`` with the text model, ``images`` as its camera sees them."""
+    """``sparse/0`` with the text model, ``images`` as its camera sees them, and where there are
+    masks ``masks`` as COLMAP names them."""
     run = read_run(recording.path)
     ideal = IdealCamera(run)
-    images = write_posed_images(recording, camera_of(recording), ideal, path / "images")
+    images = write_posed_images(
+        recording, camera_of(recording), ideal, path / "images", mask_name="{}.png".format
+    )
     points = run.history.points_in(ideal.segment)
     seen = seen_by_keyframes(recording, set(ideal.keyframes.values()))
     sights = _sights(recording, ideal, images, seen, points.ids, points.positions)

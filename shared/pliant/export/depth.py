@@ -1,6 +1,7 @@
 """The depth and the normals of a run's keyframes, beside their images.
 
     images/000012.png     the keyframe, as ``IdealCamera`` sees it
+    masks/000012.png      black where the keyframe's mask has it ignored; depth is unknown there
     depth/000012.png      16 bits, along the optical axis; 0: unknown
     normals/000012.png    RGB, 127.5 (n + 1) with n in the camera (x right, y down, z forward) and
                           towards it; black: unknown
@@ -13,6 +14,7 @@ is a metre only where something has told the scale; ``depth_scale`` is the power
 which the deepest fit: 0.001 where they are 6.6 to 65.5 units away, 0.0001 where they are nearer.
 """
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,7 @@ from pliant.export.images import (
     camera_of,
     image_name,
     make_folder,
+    mask_image,
     pinhole_yaml,
     rectified_images,
     write_list,
@@ -54,12 +57,17 @@ def depth(recording: Recording, path: Path, folder: Path | None) -> None:
     for kind in ("images", "depth", "normals"):
         make_folder(path / kind)
     stamps, with_depth = dict[int, str](), dict[int, str]()
-    for frame, stamp_ns, pixels in rectified_images(recording, camera_of(recording), seen):
+    for frame, stamp_ns, pixels, used in rectified_images(recording, camera_of(recording), seen):
         name = stamps[stamp_ns] = image_name(frame)
         write_png(path / "images" / name, ideal.image(frame, pixels))
         found = surfaces.surface(ideal.poses[frame], seen[frame]).depth_map
         if found is None:
             continue
+        if used is not None:
+            mask = mask_image(used, partial(ideal.image, frame))
+            make_folder(path / "masks")
+            write_png(path / "masks" / name, mask)
+            found = found.within(mask > 0)
         with_depth[stamp_ns] = name
         write_png(path / "depth" / name, _in_units(found.depths, scale))
         write_png(path / "normals" / name, _coloured(normals_of(found.depths, ideal.camera)))

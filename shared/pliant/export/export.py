@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.arrays import U8
+from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.errors import ResultError
 from pliant.export.colmap import colmap
@@ -16,30 +17,38 @@ from pliant.export.depth import depth
 from pliant.export.images import camera_of, images, rectified_images
 from pliant.export.models import foxglove, ply, rerun
 from pliant.export.nerfstudio import nerfstudio
+from pliant.export.overview import (
+    FPS,
+    FRAMES,
+    Layout,
+    Made,
+    ShownFrame,
+    longest_segment,
+    overview_pictures,
+    still_picture,
+)
 from pliant.export.surface import overlay_pictures, surfaces
 from pliant.export.textured import glb, obj
 from pliant.formats.euroc import write_euroc
 from pliant.formats.kitti import write_kitti
 from pliant.formats.tum import write_tum
-from pliant.map_history import MapHistory, Points
 from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Extrema, MapUpdate
-from pliant.pictures.map import choose_view, render_map, write_map_picture
-from pliant.pictures.movie import beside, write_animation, write_movie
-from pliant.pictures.overlay import OverlayFrame, TrackPainter, write_overlay_video
+from pliant.pictures.map import choose_view
+from pliant.pictures.movie import write_animation, write_image, write_movie
+from pliant.pictures.overlay import OverlayFrame, write_overlay_video
 from pliant.recording.parts import parts_in
 from pliant.recording.reader import Recorded, Recording
 from pliant.results.folder import RECORDING_NAME, files_read, keep_apart
-from pliant.results.run import read_run
+from pliant.results.mesh import mesh_of
+from pliant.results.run import Run, read_run
 from pliant.results.scale import MetricRecording
 from pliant.results.surfels import has_surfels, surfel_trajectory
 from pliant.trajectory import Trajectory
 
-_OVERVIEW_FRAMES = 40
-_OVERVIEW_WIDTH = 960
-_OVERVIEW_FPS = 10.0
-
+_QUALITY = 60
+"""Of the overview: 300 frames stay below 3 MB."""
 
 Export = Callable[..., None]
 """Writes to a path what a recording holds: the recording, the path, the folder if it is that of a
@@ -144,7 +153,7 @@ def recorded_frames(
         assert isinstance(tracks, Extrema)
         assert isinstance(update, MapUpdate)
         while at < tracks.frame:
-            at, _, pixels = next(images, (tracks.frame, 0, None))
+            at, _, pixels, _ = next(images, (tracks.frame, 0, None, None))
         yield RecordedFrame(pixels if at == tracks.frame else None, tracks, update)
 
 
@@ -160,40 +169,51 @@ def _overlay(recording: Recording, path: Path, folder: Path | None) -> None:
 
 
 def _picture(recording: Recording, path: Path, folder: Path | None) -> None:
-    points, T_world_camera = _longest_segment(read_run(recording.path).history)
-    if not len(T_world_camera):
-        raise ResultError(f"{recording.path}: the run has no map to draw")
-    write_map_picture(path, points.positions, points.colours, T_world_camera)
+    """One frame with its tracks, where images were recorded, the points and the mesh."""
+    run, stream, what = _made(recording)
+    has_images = next(recording.messages(topics.SOURCE), None) is not None
+    wanted = (_telling_frame(run, what),)
+    frames = _shown_frames(recording, stream, wanted) if has_images else iter(())
+    write_image(path, still_picture(frames, stream.camera, what))
 
 
 def _overview(recording: Recording, path: Path, folder: Path | None) -> None:
-    """Tracks on the image beside the map that grows: the moving picture of the README."""
+    """The moving picture of the README."""
+    run, stream, what = _made(recording)
+    wanted = range(0, len(run.tracks), -(-len(run.tracks) // FRAMES))
+    layout = Layout(stream.camera.width, stream.camera.height)
+    frames = _shown_frames(recording, stream, wanted)
+    write_animation(path, list(overview_pictures(frames, layout, what)), fps=FPS, quality=_QUALITY)
+
+
+def _telling_frame(run: Run, what: Made) -> int:
+    """Of the frames that the map explains well, the one that looks at the middle of it."""
+    final, longest = run.history.final(), run.history.longest_segment()
+    frames = [frame for frame, (segment, _) in sorted(final.items()) if segment == longest]
+    T_world_camera = pose_to_matrix(np.array([final[frame][1] for frame in frames]))
+    to_centre = choose_view(what.points.positions, what.poses).centre - T_world_camera[:, :3, 3]
+    cosines = (T_world_camera[:, :3, 2] * to_centre).sum(axis=1)
+    cosines /= np.maximum(np.linalg.norm(to_centre, axis=1), 1e-9)
+    inliers = np.array([run.inliers.get(frame, 0) for frame in frames])
+    return frames[int(np.argmax(np.where(inliers >= np.median(inliers), cosines, -np.inf)))]
+
+
+def _made(recording: Recording) -> tuple[Run, CameraStream, Made]:
+    """Raises ResultError for a run without a map."""
     run = read_run(recording.path)
-    stream = run.stream
-    last, final = _longest_segment(run.history)
-    if stream is None or not len(final):
+    points, poses = longest_segment(run.history)
+    if run.stream is None or not len(poses):
         raise ResultError(f"{recording.path}: the run has no map to draw")
-    view = choose_view(last.positions, final)
-    every = max(1, len(run.tracks) // _OVERVIEW_FRAMES)
-    painter, history, pictures = TrackPainter(scale=2), MapHistory(), list[U8]()
-    for frame in recorded_frames(recording, range(0, len(run.tracks), every)):
-        update = frame.update
-        history.apply(update, frame=update.frame, stamp_ns=update.stamp_ns)
-        shown = _overlay_frame(frame, stream)
-        if shown is None:
-            painter.follow(frame.tracks)
-            continue
-        points, poses = _longest_segment(history)
-        right = render_map(points.positions, points.colours, poses, view=view)
-        pictures.append(beside(painter.draw(shown), right))
-    write_animation(path, pictures, fps=_OVERVIEW_FPS, width=_OVERVIEW_WIDTH)
+    mesh = mesh_of(run.mesh, run.history.longest_segment())
+    mesh = mesh if mesh is not None and len(mesh.triangles) else None
+    return run, run.stream, Made(run.stream.source, points, poses, mesh)
 
 
-def _longest_segment(history: MapHistory) -> tuple[Points, F64]:
-    """Points and (N, 4, 4) poses of one map segment: those of others lie in worlds of their own."""
-    longest = history.longest_segment()
-    path = history.trajectory_in(longest, history.final())
-    return history.points_in(longest), path.T_world_camera
+def _shown_frames(
+    recording: Recording, stream: CameraStream, wanted: Container[int]
+) -> Iterator[ShownFrame]:
+    for frame in recorded_frames(recording, wanted):
+        yield ShownFrame(frame.update, frame.tracks, _overlay_frame(frame, stream))
 
 
 def _overlay_frame(frame: RecordedFrame, stream: CameraStream) -> OverlayFrame | None:

@@ -1,8 +1,9 @@
 """The images of a recording, made again from their source bytes, and as a folder of their own."""
 
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, U8, U16, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view
+from pliant.algorithms.image.masks import unpacked
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import (
@@ -69,7 +71,8 @@ def _all_shown(shows: BoolArray) -> tuple[slice, slice]:
 
 
 def images(recording: Recording, path: Path, folder: Path | None) -> None:
-    """A folder that ``pliant run`` opens: rectified PNG, ``rgb.txt`` and ``calib.yaml``.
+    """A folder that ``pliant run`` opens: rectified PNG, ``rgb.txt`` and ``calib.yaml``, and where
+    there are masks ``masks`` for its ``--mask``.
 
     As the camera sees that the last adjustment found, if there was one.
     """
@@ -77,8 +80,11 @@ def images(recording: Recording, path: Path, folder: Path | None) -> None:
     view = ShownView(corrected_view(stream.camera, _correction(recording)))
     make_folder(path / "images")
     names: dict[int, str] = {}
-    for frame, stamp_ns, pixels in rectified_images(recording, stream):
+    for frame, stamp_ns, pixels, used in rectified_images(recording, stream):
         write_png(path / "images" / image_name(frame), view.image(pixels))
+        if used is not None:
+            make_folder(path / "masks")
+            write_png(path / "masks" / image_name(frame), mask_image(used, view.image))
         names[stamp_ns] = image_name(frame)
     write_bytes(path / "calib.yaml", pinhole_yaml(view.camera).encode())
     write_list(path / "rgb.txt", "images", names)
@@ -99,10 +105,24 @@ def camera_of(recording: Recording) -> CameraStream:
     raise ResultError("the recording has no camera: it stopped before its first frame")
 
 
+def mask_image(used: BoolArray, view: Callable[[U8], U8]) -> U8:
+    """A mask (H, W) as an image, white where all is used that a view of images makes a pixel of."""
+    return np.where(view(255 * used.astype(np.uint8)) == 255, np.uint8(255), np.uint8(0))
+
+
+class RectifiedImage(NamedTuple):
+    """number: of its frame.    pixels: (H, W) or (H, W, 3) RGB.    used: (H, W); None: all."""
+
+    number: int
+    stamp_ns: int
+    pixels: U8
+    used: BoolArray | None
+
+
 def rectified_images(
     recording: Recording, stream: CameraStream, wanted: Container[int] | None = None
-) -> Iterator[tuple[int, int, U8]]:
-    """Number, time and pixels (grey or RGB) of each frame that has some, one after the other.
+) -> Iterator[RectifiedImage]:
+    """Those of all frames that have pixels, one after the other.
 
     wanted: the numbers of those that are; None: all.
     Raises ResultError where the recording has no images.
@@ -115,11 +135,15 @@ def rectified_images(
         found = True
         if wanted is not None and source.frame not in wanted:
             continue
+        frame = recorded_frame(recorded.whole(source))
         try:
-            grey, colour = rectifier.rectify(recorded_frame(recorded.whole(source)))
+            grey, colour = rectifier.rectify(frame)
+            mask = rectifier.mask(frame)
         except BrokenFrame:
             continue
-        yield source.frame, source.stamp_ns, grey if colour is None else colour
+        used = unpacked(mask) if mask else None
+        pixels = grey if colour is None else colour
+        yield RectifiedImage(source.frame, source.stamp_ns, pixels, used)
     if not found:
         raise ResultError("the recording has no images (--no-images): run its source again")
 

@@ -2,6 +2,7 @@
 
     transforms.json    the camera, and for each image its file and camera-to-world
     images/            see ``posed_images``
+    masks/             black where trainers are to ignore them, of those that have a mask
     points.ply         the map, for splats to start from
 
 The camera's axes are OpenGL's, x right, y up, z back; the world is the map's.  Pixels have (0.5,
@@ -46,6 +47,7 @@ def nerfstudio(recording: Recording, path: Path, folder: Path | None) -> None:
         "frames": [
             {
                 "file_path": f"images/{image.name}",
+                **({"mask_path": f"masks/{image.name}"} if image.masked else {}),
                 "transform_matrix": (image.T_world_camera @ _OPENCV_OPENGL).tolist(),
             }
             for image in images

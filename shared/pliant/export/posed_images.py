@@ -7,9 +7,9 @@ it at once: the lens as it was given and as the images told of it is taken out, 
 too, and of the image there is what the lens has shown of it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import cast
 
@@ -22,7 +22,15 @@ from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.sharpness import sharpness
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame, motion_between
 from pliant.errors import ResultError
-from pliant.export.images import ShownView, image_name, make_folder, rectified_images, write_png
+from pliant.export.images import (
+    RectifiedImage,
+    ShownView,
+    image_name,
+    make_folder,
+    mask_image,
+    rectified_images,
+    write_png,
+)
 from pliant.messages.types import CameraStream
 from pliant.recording.reader import Recording
 from pliant.results.run import Run
@@ -33,10 +41,11 @@ _KEYFRAME = 1.1
 
 @dataclass(frozen=True)
 class PosedImage:
-    """A frame whose image was written.  T_world_camera: (4, 4)."""
+    """A frame whose image was written.  T_world_camera: (4, 4).  masked: it has a mask, too."""
 
     frame: int
     T_world_camera: F64
+    masked: bool = False
 
     @property
     def name(self) -> str:
@@ -97,36 +106,48 @@ class IdealCamera:
 
 
 def write_posed_images(
-    recording: Recording, stream: CameraStream, ideal: IdealCamera, folder: Path
+    recording: Recording,
+    stream: CameraStream,
+    ideal: IdealCamera,
+    folder: Path,
+    mask_name: Callable[[str], str] = str,
 ) -> list[PosedImage]:
-    """Write the sharpest image around each keyframe into a folder.
+    """Write the sharpest image around each keyframe into a folder, and where it has a mask that
+    into ``masks`` beside it: black where it is ignored.
 
-    Raises ResultError where there are no images, and where the disk fails.
+    mask_name: of its file, by the name of the image.    Raises ResultError where there are no
+    images, and where the disk fails.
     """
     make_folder(folder)
     written: list[PosedImage] = []
-    for frame, pixels in _sharpest(recording, stream, ideal):
-        image = PosedImage(frame, ideal.poses[frame])
+    for frame, _, pixels, used in _sharpest(recording, stream, ideal):
+        image = PosedImage(frame, ideal.poses[frame], used is not None)
         write_png(folder / image.name, ideal.image(frame, pixels))
+        if used is not None:
+            masks = folder.with_name("masks")
+            make_folder(masks)
+            mask = mask_image(used, partial(ideal.image, frame))
+            write_png(masks / mask_name(image.name), mask)
         written.append(image)
     return written
 
 
 def _sharpest(
     recording: Recording, stream: CameraStream, ideal: IdealCamera
-) -> Iterator[tuple[int, U8]]:
-    """Number and rectified pixels of the frames that are taken."""
+) -> Iterator[RectifiedImage]:
+    """Of the frames that are taken."""
     keyframes = np.array(list(ideal.keyframes))
     between = 0.5 * (keyframes[1:] + keyframes[:-1])
     group, best, chosen = -1, 0.0, None
-    for frame, _, pixels in rectified_images(recording, stream, ideal.poses):
+    for image in rectified_images(recording, stream, ideal.poses):
+        frame = image.number
         here = int(np.searchsorted(between, frame))
         if here != group and chosen is not None:
             yield chosen
             chosen = None
-        found = sharpness(_grey(pixels)) * (_KEYFRAME if frame in ideal.keyframes else 1.0)
+        found = sharpness(_grey(image.pixels)) * (_KEYFRAME if frame in ideal.keyframes else 1.0)
         if chosen is None or found > best:
-            group, best, chosen = here, found, (frame, pixels)
+            group, best, chosen = here, found, image
     if chosen is not None:
         yield chosen
 

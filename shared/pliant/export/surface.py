@@ -36,7 +36,7 @@ def surfaces(recording: Recording, path: Path, folder: Path | None, every: int =
         if surfels.missing or surfels.frame % every:
             continue
         while seen < surfels.frame:
-            seen, _, pixels = next(images, (surfels.frame, 0, None))
+            seen, _, pixels, _ = next(images, (surfels.frame, 0, None, None))
         here = pixels if seen == surfels.frame else None
         _write(path / f"{surfels.frame:06d}.ply", surfels, here)
 
@@ -54,7 +54,7 @@ def overlay_pictures(recording: Recording) -> Iterator[U8]:
     for surfels in recorded_surfels(recording.path):
         if surfels.missing:
             continue
-        pixels = next(image for frame, _, image in images if frame == surfels.frame)
+        pixels = next(each.pixels for each in images if each.number == surfels.frame)
         seen = surfel_picture(surfels, stream.camera)
         counts = [f"{np.count_nonzero(surfels.state == s)} {name}" for s, name in states.items()]
         words = "   ".join([f"frame {surfels.frame}", *counts])

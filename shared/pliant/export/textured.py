@@ -7,9 +7,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
 from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.image.masks import unpacked
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.texturing import (
     TexelColours,
@@ -19,7 +20,7 @@ from pliant.algorithms.meshing.texturing import (
     patches,
 )
 from pliant.errors import ResultError
-from pliant.export.images import make_folder
+from pliant.export.images import make_folder, mask_image
 from pliant.export.open3d_import import require_open3d
 from pliant.formats.textured import TexturedMesh, write_glb, write_obj
 from pliant.messages import topics
@@ -67,8 +68,9 @@ def textured_mesh(recording: Recording, triangles: int) -> TexturedMesh:
     texels = find_texels(uvs, _TEXELS)
     shown = TexelColours(texels, points, faces)
     view = corrected_view(run.stream.camera, run.correction_of(segment))
-    for T_world_camera, image in keyframe_images(recording, run, segment):
-        shown.add(view.image(image), view.camera, T_world_camera)
+    for T_world_camera, image, used in keyframe_images(recording, run, segment):
+        seen = None if used is None else mask_image(used, view.image) > 0
+        shown.add(view.image(image), view.camera, T_world_camera, seen)
     unseen = np.rint(texels.interpolate(colours[faces])).astype(np.uint8)
     return _with_texture(points, faces, uvs, shown.texture(unseen))
 
@@ -92,18 +94,23 @@ def _decimated(open3d: Any, mesh: TriangleMesh, triangles: int) -> tuple[F32, I3
     )
 
 
-def keyframe_images(recording: Recording, run: Run, segment: int) -> Iterator[tuple[F64, U8]]:
-    """Final pose and (H, W, 3) image of each keyframe of a segment that has one."""
+def keyframe_images(
+    recording: Recording, run: Run, segment: int
+) -> Iterator[tuple[F64, U8, BoolArray | None]]:
+    """Final pose, (H, W, 3) image and mask (H, W) of each keyframe of a segment that has one."""
     for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
         for message in recording.decoded(topic):
             assert isinstance(message, Keyframe)
+            masks = message.masks()
             for number, jpeg in message.images().items():
                 known = run.history.keyframes.get(number)
                 if known is None or known.segment != segment or not jpeg:
                     continue
                 image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
                 if image is not None:
-                    yield pose_to_matrix(known.pose_world_camera), np.asarray(image, np.uint8)
+                    used = unpacked(masks[number]) if number in masks else None
+                    pose = pose_to_matrix(known.pose_world_camera)
+                    yield pose, np.asarray(image, np.uint8), used
 
 
 def _with_texture(points: F32, faces: I32, uvs: F32, texture: U8) -> TexturedMesh:

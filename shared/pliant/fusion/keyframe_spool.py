@@ -24,6 +24,7 @@ class KeyframeSpool:
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile(prefix="pliant-keyframes-")  # noqa: SIM115
         self._images: dict[int, _Place] = {}
+        self._masks: dict[int, _Place] = {}
         self._observations: dict[int, _Place] = {}
 
     def __enter__(self) -> "KeyframeSpool":
@@ -46,6 +47,10 @@ class KeyframeSpool:
         """Keep the image of a keyframe."""
         self._images[keyframe] = self._append(jpeg)
 
+    def put_mask(self, keyframe: int, mask: bytes) -> None:
+        """Keep the mask of that image."""
+        self._masks[keyframe] = self._append(mask)
+
     def put_observations(self, keyframe: int, point_ids: I64, points_px: F32) -> None:
         """Keep what a keyframe observes: (N,) and (N, 2)."""
         self._observations[keyframe] = self._append(point_ids.tobytes() + points_px.tobytes())
@@ -57,6 +62,11 @@ class KeyframeSpool:
     def image(self, keyframe: int) -> bytes:
         """The image of a keyframe; empty where none was told."""
         place = self._images.get(keyframe)
+        return self._read(place) if place is not None else b""
+
+    def mask(self, keyframe: int) -> bytes:
+        """The mask of that image; empty where it has none."""
+        place = self._masks.get(keyframe)
         return self._read(place) if place is not None else b""
 
     def observations(self, keyframe: int) -> tuple[I64, F32]:

@@ -7,7 +7,7 @@ images and observations wait on disk.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view, parts_of
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.image.masks import unpacked
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints, Surface
 from pliant.algorithms.meshing.mesh_blocks import BLOCK_BYTES, MeshBlocks, TriangleMesh, sorted_keys
@@ -118,17 +119,25 @@ class Mesher:
         )
 
     def take(
-        self, update: MapDelta, keyframes: KeyframeDelta, images: Mapping[int, bytes], frame: int
+        self,
+        update: MapDelta,
+        keyframes: KeyframeDelta,
+        images: Mapping[int, bytes],
+        frame: int,
+        masks: Mapping[int, bytes] | None = None,
     ) -> None:
         """Take in what a frame tells; cheap.  What is to be fused waits for ``fuse``.
 
-        images: JPEG files of keyframes by their ids, each told once.
+        images: JPEG files of keyframes by their ids, each told once.    masks: of those that have
+        one, as of ``algorithms.image.masks``: what they cover is no surface.
         """
         self._map.take(update, frame)
         if update.calibration_correction:
             self._see(update.segment, update.calibration_correction)
         for keyframe, jpeg in images.items():
             self._spool.put_image(keyframe, jpeg)
+        for keyframe, mask in (masks or {}).items():
+            self._spool.put_mask(keyframe, mask)
         bounds = np.concatenate([[0], np.cumsum(keyframes.counts)])
         for row, keyframe in enumerate(keyframes.keyframe_ids.tolist()):
             told = slice(int(bounds[row]), int(bounds[row + 1]))
@@ -287,7 +296,12 @@ class Mesher:
         return float(np.median(medians)) if medians else 1.0
 
     def _surface(self, keyframe: int, timer: StageTimer) -> Surface:
-        return self._surfaces.surface(self._pose(keyframe), self._seen(keyframe), timer)
+        found = self._surfaces.surface(self._pose(keyframe), self._seen(keyframe), timer)
+        mask = self._spool.mask(keyframe)
+        if found.depth_map is None or not mask:
+            return found
+        used = self._view(keyframe).image(np.uint8(255) * unpacked(mask).astype(np.uint8)) == 255
+        return replace(found, depth_map=found.depth_map.within(used))
 
     def _view(self, keyframe: int) -> CorrectedView:
         """As the calibration has it with which the segment of the keyframe was made."""

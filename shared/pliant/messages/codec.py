@@ -5,8 +5,8 @@ the dtype that its type declares.  Nothing is done per element, so that an image
 Decoding checks names, types, shapes and sizes; what does not fit raises ``MessageError``.
 Unknown fields are passed over: they come from a newer writer.
 
-For a link between machines images can be packed (``pliant.messages.packing``): what comes out of
-``decode`` is the same.
+For a link between machines images can be packed (``pliant.messages.packing``), and recordings have
+arrays in planes (``pliant.messages.planes``): what comes out of ``decode`` is the same.
 """
 
 import hashlib
@@ -23,10 +23,11 @@ import numpy as np
 
 from pliant.algorithms.arrays import ArrayField, array_fields
 from pliant.errors import MessageError
-from pliant.messages import packing
+from pliant.messages import packing, planes
 from pliant.messages.types import Header, Rows
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""1: ``tracks/extrema`` has maxima of curvature, too.  2: arrays of recordings are in planes."""
 
 _UNPACKED_LIMIT = 1 << 30  # of what no topic limits
 
@@ -162,7 +163,7 @@ def _scalar(message: type, name: str, expected: Any, value: Any) -> Any:
 
 def _array(message: type, spec: ArrayField, value: Any, sizes: dict[str, int], limit: int) -> Any:
     where = f"{message.__name__}.{spec.name}"
-    kinds = (bytes, msgpack.ExtType) if spec.dtype == np.uint8 else (bytes,)
+    kinds = (bytes, msgpack.ExtType)
     if not (isinstance(value, list) and len(value) == 2 and isinstance(value[1], kinds)):
         raise MessageError(f"{where}: expected an array")
     shape, raw = value
@@ -172,6 +173,8 @@ def _array(message: type, spec: ArrayField, value: Any, sizes: dict[str, int], l
         _check_shape(spec, tuple(shape), sizes)
     except ValueError as error:
         raise MessageError(f"{message.__name__}.{error}") from None
+    if isinstance(raw, msgpack.ExtType) and spec.dtype.itemsize > 1:
+        raw = planes.whole(where, raw, spec.dtype.itemsize)
     if isinstance(raw, msgpack.ExtType):
         pixels = packing.unpack(where, raw, min(limit, math.prod(shape)))
         if pixels.size != math.prod(shape):

@@ -18,6 +18,10 @@ from pliant.algorithms.tracks import FrameTracks
 CAMERA_FRAME_ID = "camera"
 DROPPED = "dropped"
 """Why an image is missing that live mode left out."""
+BROKEN = "broken: "
+"""How it begins why an image is missing that does not decode."""
+MASKED = "masked: none of it is used"
+"""Why an image is missing all of which a mask covers."""
 PASSED_OVER = "passed over to keep up"
 """Why a frame that has pixels has no pose."""
 WAITING_FOR_DEPTH = "waiting for depth"
@@ -37,10 +41,10 @@ class Header:
 
     @classmethod
     def of(cls: type[_M], header: "Header", content: Any, **more: Any) -> _M:
-        """This message with the time of ``header`` and the fields of ``content``, not copied."""
+        """This message with the time of ``header`` and what it has of ``content``, not copied."""
         own = {field.name for field in fields(Header)} - {"frame_id"}
-        names = (field.name for field in fields(content) if field.name not in own)
-        values = {name: getattr(content, name) for name in names}
+        names = {field.name for field in fields(content)} & {field.name for field in fields(cls)}
+        values = {name: getattr(content, name) for name in sorted(names - own)}
         values.update(more)
         return cls(
             frame=header.frame,
@@ -102,6 +106,7 @@ class SourceImage(Header):
     clip_frame: which frame of ``camera/clip`` it is made from; -1: of none.
     checksum: of a recording that holds the clip instead of ``data``, which is empty then: CRC-32 of
     these.  ``pliant.datasets.recorded_images`` makes them again.
+    mask: which part of it is used, an image file of its own, of any size; b"": all of it.
     """
 
     encoding: str
@@ -112,6 +117,7 @@ class SourceImage(Header):
     unmapped: bool = False
     clip_frame: int = -1
     checksum: int = 0
+    mask: bytes = b""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,6 +152,7 @@ class Image(Header):
     jpeg, calibration: over a link, instead of pixels, what they are made from: the source's JPEG
     and its camera as YAML; ``pliant_services.runtime.link_images`` makes them.
     unmapped: bundle adjustment passes over this frame, as it is behind (live mode).
+    mask: which pixels are used, as of ``pliant.algorithms.image.masks``; b"": all of them.
     """
 
     grey: Annotated[U8, Shape("H", "W")]
@@ -154,11 +161,12 @@ class Image(Header):
     jpeg: bytes = b""
     calibration: str = ""
     unmapped: bool = False
+    mask: bytes = b""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Extrema(Header, FrameTracks):
-    """Tracks and all maxima of a frame."""
+    """Tracks of a frame.  Its maxima are a function of its image: who needs them has that, too."""
 
     missing: str = ""
 
@@ -175,16 +183,24 @@ class Keyframe(Header, KeyframeDelta):
     jpeg: the rectified image of the new keyframe, colour where the source has it; empty without.
     earlier_ids, earlier_jpegs: keyframes that earlier frames became now that a map starts from
     them, and their images.
+    mask, earlier_masks: theirs, as of ``Image``.
     """
 
     jpeg: bytes = b""
     earlier_ids: tuple[int, ...] = ()
     earlier_jpegs: tuple[bytes, ...] = ()
+    mask: bytes = b""
+    earlier_masks: tuple[bytes, ...] = ()
 
     def images(self) -> dict[int, bytes]:
         """All images of this message by the id of the keyframe."""
         found = dict(zip(self.earlier_ids, self.earlier_jpegs, strict=False))
         return {**found, self.new: self.jpeg} if self.new >= 0 else found
+
+    def masks(self) -> dict[int, bytes]:
+        """The masks of these images that have one, by the id of the keyframe."""
+        found = dict(zip(self.earlier_ids, self.earlier_masks, strict=False))
+        return {number: mask for number, mask in (*found.items(), (self.new, self.mask)) if mask}
 
 
 @dataclass(frozen=True, kw_only=True)

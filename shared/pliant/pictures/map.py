@@ -1,19 +1,25 @@
 """A picture of a map: points as shaded splats and the camera's path, without any GUI library."""
 
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.image.splats import draw_discs
-from pliant.pictures.movie import write_image
 
 BACKGROUND = (16, 19, 24)
 PATH_COLOUR = (255, 150, 40)
+PLACES_COLOUR = (90, 220, 110)
+"""Of lines between what shows one place."""
 
 FOCAL = 1.2  # of the height of the picture
+_ASPECT = 4.0 / 3.0
+_FILLED = 0.92  # of the picture, by what it is framed on
+_FRAMED_BY, _STOPS = 20_000, 40  # so many points and places of the path are enough
+_MOST_UP_DEG, _MOST_DOWN_DEG = 15, 60  # that cameras look, all the time
+_HEIGHT_BIN = 0.01  # of the whole extent
+_NEAR = 2.0  # medians of the points' distances from the path
 _SUPERSAMPLE = 2
 # Eye-dome lighting (Boucheny 2009): a pixel is as dark as its neighbours stand before it.
 _SHADE = 6.0
@@ -42,41 +48,105 @@ def choose_view(
     azimuth_deg: float = 25.0,
     elevation_deg: float = 35.0,
     distance: float = 1.0,
+    aspect: float = _ASPECT,
+    swing_deg: float = 0.0,
 ) -> MapView:
-    """A view from above and behind the camera on most of the map.
+    """A view from above and behind the camera on most of the map, framed on what there is.
 
-    points: (P, 3).      T_world_camera: (N, 4, 4), N >= 1: up is the mean of the cameras' up.
+    points: (P, 3).      T_world_camera: (N, 4, 4), N >= 1: up is the mean of the cameras' up, but
+    for the angle by which they look down.
     azimuth_deg, elevation_deg: turn about up away from the mean viewing direction, and height.
-    distance: 1 shows nine tenths of the points; less is closer.
+    distance: 1 fills the picture with most of the points and the path; less is closer.
+    aspect: columns over rows.      swing_deg: they stay in it when it is ``turned`` so far.
     """
     up = -T_world_camera[:, :3, 1].mean(axis=0)
     up = _unit(up, np.array([0.0, -1.0, 0.0]))
     forward = T_world_camera[:, :3, 2].mean(axis=0)
     forward = _unit(forward - (forward @ up) * up, _any_normal(up))
     positions = T_world_camera[:, :3, 3]
+    up, forward = _levelled(_body(points, positions)[0], up, forward)
     _, radius = _body(points, positions)
     ceiling = float((positions @ up).max()) + 0.25 * radius
-    centre, radius = _body(points[points @ up <= ceiling], positions)
-    turned = np.cos(np.radians(azimuth_deg)) * forward
-    turned += np.sin(np.radians(azimuth_deg)) * np.cross(up, forward)
+    body, radius = _body(points[points @ up <= ceiling], positions)
+    centre = 0.5 * (body.min(axis=0) + body.max(axis=0))
+    turned_by = np.radians(azimuth_deg)
+    level = np.cos(turned_by) * forward + np.sin(turned_by) * np.cross(up, forward)
     elevation = np.radians(elevation_deg)
-    direction = np.cos(elevation) * turned - np.sin(elevation) * up
-    eye = centre - direction * (2.2 * distance * radius)
+    direction = np.cos(elevation) * level - np.sin(elevation) * up
     right = _unit(np.asarray(np.cross(direction, up), np.float64), _any_normal(up))
     T = np.eye(4)
-    T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = right, np.cross(direction, right), direction, eye
-    return MapView(T_world_view=T, centre=centre, up=up, ceiling=ceiling, reach=5.0 * radius)
+    T[:3, 0], T[:3, 1], T[:3, 2] = right, np.cross(direction, right), direction
+    angles = np.radians(np.linspace(-swing_deg, swing_deg, 5 if swing_deg else 1))
+    body = np.concatenate([(body - centre) @ _about(up, angle).T + centre for angle in angles])
+    eye = _eye(body, T[:3, :3], aspect)
+    away = max(float((centre - eye) @ direction), radius)
+    centre = eye + away * direction
+    T[:3, 3] = centre - distance * away * direction
+    return MapView(T_world_view=T, centre=centre, up=up, ceiling=ceiling, reach=2.3 * away)
+
+
+def turned(view: MapView, angle_deg: float) -> MapView:
+    """The view after the eye has gone round what it looks at."""
+    T = view.T_world_view.copy()
+    R = _about(view.up, np.radians(angle_deg))
+    T[:3, :3], T[:3, 3] = R @ T[:3, :3], R @ (T[:3, 3] - view.centre) + view.centre
+    return replace(view, T_world_view=T)
+
+
+def _levelled(body: F64, up: F64, forward: F64) -> tuple[F64, F64]:
+    """Up and forward, turned by the angle that the cameras looked down or up: floors and tables
+    are level, so that upright most points share a few heights."""
+    best, least = 0.0, -np.inf
+    for angle in np.radians(np.arange(-_MOST_UP_DEG, _MOST_DOWN_DEG + 1)):
+        heights = body @ (np.cos(angle) * up - np.sin(angle) * forward)
+        low, high = np.percentile(heights, (2.0, 98.0))
+        # In bins of one size at every angle, or a flatter scene would have finer ones.
+        extent = _HEIGHT_BIN * max(float(np.linalg.norm(np.ptp(body, axis=0))), 1e-9)
+        counts = np.bincount(((np.clip(heights, low, high) - low) / extent).astype(np.int64))
+        score = float((counts / len(body)) @ (counts / len(body)))
+        if score > least + 1e-9:
+            best, least = float(angle), score
+    c, s = np.cos(best), np.sin(best)
+    return c * up - s * forward, s * up + c * forward
+
+
+def _about(axis: F64, angle: float) -> F64:
+    return np.asarray(cv2.Rodrigues(axis * angle)[0], np.float64)
 
 
 def _body(points: F64, positions: F64) -> tuple[F64, float]:
-    """Middle and radius of the path and most of the points; outliers have no say."""
+    """(N, 3) what the camera has looked at and its path, and their radius; outliers have no say.
+
+    What is far from the whole path, a wall behind the things on a table, is their surroundings.
+    """
     cloud = points if len(points) else positions
-    low, high = np.percentile(cloud, (5.0, 95.0), axis=0)
+    cloud = cloud[:: -(-len(cloud) // _FRAMED_BY)]
+    low, high = np.percentile(cloud, (2.0, 98.0), axis=0)
     inner = cloud[np.all((cloud >= low) & (cloud <= high), axis=1)]
-    body = np.concatenate([inner, positions])
+    stops = positions[:: -(-len(positions) // _STOPS)]
+    distances = np.sqrt(((inner[:, None] - stops) ** 2).sum(axis=2).min(axis=1))
+    near = inner[distances <= _NEAR * np.median(distances)] if len(inner) else inner
+    body = np.concatenate([near, positions])
     centre = 0.5 * (body.min(axis=0) + body.max(axis=0))
     radius = float(np.percentile(np.linalg.norm(body - centre, axis=1), 90.0))
-    return centre, max(radius, float(np.linalg.norm(positions - centre, axis=1).max()), 1e-6)
+    return body, max(radius, float(np.linalg.norm(positions - centre, axis=1).max()), 1e-6)
+
+
+def _eye(points: F64, R_world_view: F64, aspect: float) -> F64:
+    """The nearest place from which an eye that looks so has all points in the picture.
+
+    Each side of the picture is a plane through the eye; the points push the four outwards.
+    """
+    local = points @ R_world_view
+    middle, depth = np.zeros(3), np.inf
+    for axis, share in ((0, aspect), (1, 1.0)):
+        slope = _FILLED * 0.5 * share / FOCAL
+        least = float((local[:, axis] - slope * local[:, 2]).max())
+        most = float((local[:, axis] + slope * local[:, 2]).min())
+        middle[axis] = 0.5 * (least + most)
+        depth = min(depth, (most - least) / (2.0 * slope))
+    middle[2] = depth
+    return R_world_view @ middle
 
 
 def render_map(
@@ -86,51 +156,23 @@ def render_map(
     *,
     view: MapView,
     size: tuple[int, int] = (960, 720),
-    splat: float = 2.0,
+    splat: float = 0.003,
 ) -> U8:
     """Draw points and the camera's path; returns (height, width, 3) RGB.
 
-    points: (P, 3).      colours: (P, 3) RGB.      T_world_camera: (N, 4, 4), drawn as a line with
-    the last camera's pyramid.      size: columns and rows.      splat: radius of a point at the
-    middle distance, pixels.
+    points: (P, 3); those of surfaces that turn away from the eye are left out, so that one looks
+    into a room through its walls.      colours: (P, 3) RGB.      T_world_camera: (N, 4, 4), drawn
+    as a line with the last camera's pyramid.      size: columns and rows.      splat: radius of a
+    point at the middle distance, as a share of the rows.
     """
     width, height = size[0] * _SUPERSAMPLE, size[1] * _SUPERSAMPLE
-    shown = points @ view.up <= view.ceiling
+    shown = (points @ view.up <= view.ceiling) & _towards(points, T_world_camera, view)
     px, z = _project(points[shown], view, width, height)
-    image, depth = _splat(px, z, colours[shown], (width, height), splat * _SUPERSAMPLE, view.reach)
+    image, depth = _splat(px, z, colours[shown], (width, height), splat * height, view.reach)
     image = _shade(image, depth, view.reach)
     _draw_path(image, T_world_camera, view)
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8)
-
-
-def height_colours(points: F64, colours: U8, up: F64) -> U8:
-    """(P, 3) RGB: the colours' own brightness, tinted by height, for maps of grey cameras."""
-    if not len(points):
-        return colours
-    heights = points @ up
-    low, high = np.percentile(heights, (2.0, 98.0))
-    share = np.clip((heights - low) / max(float(high - low), 1e-12), 0.0, 1.0)
-    steps = np.round(255.0 * share).astype(np.uint8)[:, None]
-    bgr = np.asarray(cv2.applyColorMap(steps, cv2.COLORMAP_VIRIDIS), np.uint8)[:, 0]
-    brightness = (0.5 + 0.8 * colours.mean(axis=1) / 255.0)[:, None]
-    # Towards white, so that the dark end of the map stays visible on a dark ground.
-    tint = 0.75 * bgr[:, ::-1].astype(np.float64) + 0.25 * 255.0
-    return np.clip(np.round(tint * brightness), 0, 255).astype(np.uint8)
-
-
-def write_map_picture(
-    path: Path,
-    points: F64,
-    colours: U8,
-    T_world_camera: F64,
-    *,
-    view: MapView | None = None,
-    size: tuple[int, int] = (960, 720),
-) -> None:
-    """Write a picture of a map; see ``render_map`` and ``choose_view``."""
-    view = view or choose_view(points, T_world_camera)
-    write_image(path, render_map(points, colours, T_world_camera, view=view, size=size))
 
 
 def _unit(vector: F64, otherwise: F64) -> F64:
@@ -142,6 +184,20 @@ def _any_normal(vector: F64) -> F64:
     axis = np.eye(3)[int(np.argmin(np.abs(vector)))]
     normal: F64 = np.asarray(np.cross(vector, axis), np.float64)
     return normal / np.linalg.norm(normal)
+
+
+def _towards(points: F64, T_world_camera: F64, view: MapView) -> BoolArray:
+    """(P,) points that the eye sees from the side from which the nearest camera has."""
+    positions = T_world_camera[:: -(-len(T_world_camera) // _STOPS) or 1, :3, 3]
+    if not len(positions):
+        return np.ones(len(points), bool)
+    nearest, away = np.full(len(points), np.inf), np.zeros_like(points)
+    for position in positions:
+        rays = points - position
+        square = (rays**2).sum(axis=1)
+        closer = square < nearest
+        nearest[closer], away[closer] = square[closer], rays[closer]
+    return ((points - view.T_world_view[:3, 3]) * away).sum(axis=1) > 0.0
 
 
 def _project(points: F64, view: MapView, width: int, height: int) -> tuple[F64, F64]:
@@ -163,20 +219,29 @@ def _splat(
     near = 0.02 * reach
     front = z > near
     px, z, colours = px[front], z[front], colours[front]
-    radii = np.clip(radius * 0.55 * reach / np.maximum(z, near), 0.8, 3.0 * radius)
+    radii = np.clip(radius * 0.55 * reach / np.maximum(z, near), 0.8, 2.0 * radius)
     image = np.empty((height, width, 3), np.float32)
     image[:] = BACKGROUND
     return image, draw_discs(px, z, radii, colours, image)
 
 
-def _shade(image: F32, depth: F32, reach: float) -> U8:
+def dimmed_behind(depth: F32, reach: float) -> F32:
+    """(H, W) light that is left where neighbours stand before a pixel.
+
+    depth: (H, W), inf where nothing is.      reach: as of a MapView.
+    """
     covered = np.isfinite(depth)
     log_depth = np.log(np.where(covered, depth, 1e3 * reach)).astype(np.float32)
     hidden = np.zeros_like(log_depth)
     for du, dv in ((2, 0), (-2, 0), (0, 2), (0, -2), (1, 1), (-1, 1), (1, -1), (-1, -1)):
         neighbour = np.roll(log_depth, (dv, du), axis=(0, 1))
         hidden += np.clip(log_depth - neighbour, 0.0, 0.1)
-    light = np.exp(-_SHADE / 8.0 * hidden / 0.1)
+    return np.exp(-_SHADE / 8.0 * hidden / 0.1)
+
+
+def _shade(image: F32, depth: F32, reach: float) -> U8:
+    covered = np.isfinite(depth)
+    light = dimmed_behind(depth, reach)
     fade = np.where(covered, np.exp2(-((depth / reach) ** 2)), 0.0)
     background = np.array(BACKGROUND, np.float32)
     # Grey maps are dim on a dark ground: lift the middle tones.

@@ -9,18 +9,24 @@ from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.rendering import view_mesh
-from pliant.pictures.map import BACKGROUND, FOCAL, MapView, choose_view
+from pliant.pictures.map import BACKGROUND, FOCAL, MapView, choose_view, dimmed_behind
 
 _SUPERSAMPLE = 2
-_CLAY = 225.0
-_AMBIENT = 0.35
+_CLAY = 235.0
+# A lamp above the left shoulder shows form, one at the eye leaves nothing black.
+_LAMP = np.array([-0.43, -0.72, -0.55])
+_AMBIENT, _FROM_EYE, _FROM_LAMP = 0.28, 0.3, 0.55
+_OWN_LIGHT = 0.5
+"""Of the colours, which have seen the scene's own light: so much of them needs no lamp."""
+_BRIGHT = 1.1
+"""What the lamps make of the rest: what is white stays so, and no more."""
 
 
 @dataclass(frozen=True)
 class MeshPictures:
     """(H, W, 3) RGB pictures from one place.
 
-    colours: as the camera saw them.    shaded: of clay, lit from the eye.    normals: (x, y, z) of
+    colours: as the camera saw them.    shaded: of clay, under a lamp.    normals: (x, y, z) of
     the eye's frame as red, green and blue (VITAMIN-E, Fig. 3d).
     """
 
@@ -50,13 +56,17 @@ def draw_mesh(
     seen = view_mesh(mesh.positions, faces, camera, view.T_world_view)
     covered = seen.triangles >= 0
     normals = _unit(seen.interpolate(faces, mesh.normals) @ view.T_world_view[:3, :3])
-    # Where the eye looks from: the light is there, too.
-    light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(-normals[..., 2:3], 0.0, 1.0)
+    from_eye = np.clip(-normals[..., 2:3], 0.0, 1.0)
+    from_lamp = np.clip(normals @ (_LAMP / np.linalg.norm(_LAMP)), 0.0, 1.0)[..., None]
+    depths = np.where(covered, seen.depths, np.float32(np.inf))
+    edges = dimmed_behind(depths, view.reach)[..., None]
+    light = edges * (_AMBIENT + _FROM_EYE * from_eye + _FROM_LAMP * from_lamp)
     colours = seen.interpolate(faces, mesh.colours.astype(np.float32))
+    lit = colours * (_OWN_LIGHT * edges + (1.0 - _OWN_LIGHT) * _BRIGHT * light)
     # Right, up and towards the eye are positive, as normal maps are usually shown.
     mapped = 127.5 * (1.0 + normals * np.array([1.0, -1.0, -1.0]))
     return MeshPictures(
-        colours=_finish(colours * (0.5 + 0.5 * light), covered, size),
+        colours=_finish(lit, covered, size),
         shaded=_finish(_CLAY * light * np.ones(3), covered, size),
         normals=_finish(mapped, covered, size),
     )

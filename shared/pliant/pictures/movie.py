@@ -13,13 +13,18 @@ from pliant.formats.text import write_bytes
 
 # What the headless wheels of OpenCV can encode without codecs of the system.
 _VIDEO_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
+_WEBP_QUALITY = 85
+GROUND = 18
+"""Grey value between pictures."""
+
 _ANIMATIONS = (".webp", ".gif", ".avif")
 
 
 def write_image(path: Path, picture: U8) -> None:
     """Write (H, W, 3) RGB in the format of the suffix.  ResultError where that is unknown."""
     try:
-        good, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[:, :, ::-1]))
+        options = [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY] if path.suffix == ".webp" else []
+        good, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[:, :, ::-1]), options)
     except cv2.error:
         good, data = False, np.zeros(0, np.uint8)
     if not good:
@@ -62,13 +67,10 @@ def write_movie(path: Path, pictures: Iterable[U8], *, fps: float) -> int:
     return count
 
 
-def write_animation(
-    path: Path, pictures: Sequence[U8], *, fps: float, width: int | None = None, quality: int = 55
-) -> None:
+def write_animation(path: Path, pictures: Sequence[U8], *, fps: float, quality: int = 55) -> None:
     """Write a looping animation that a README can show.
 
-    pictures: (H, W, 3) RGB of one size.      width: columns to shrink them to.
-    quality: of .webp and .avif, 1 to 100.
+    pictures: (H, W, 3) RGB of one size.      quality: of .webp and .avif, 1 to 100.
     Raises ResultError for a suffix other than .webp, .gif and .avif, no pictures, an OpenCV older
     than 4.11, and a file that cannot be written.
     """
@@ -77,19 +79,19 @@ def write_animation(
         raise ResultError(f"{path}: unknown kind of animation; use {', '.join(_ANIMATIONS)}")
     if not pictures:
         raise ResultError(f"{path}: there are no frames to write")
-    data = encode_animation(pictures, fps=fps, suffix=suffix, width=width, quality=quality)
+    data = encode_animation(pictures, fps=fps, suffix=suffix, quality=quality)
     write_bytes(path, data)
 
 
 def encode_animation(
-    pictures: Sequence[U8], *, fps: float, suffix: str, width: int | None = None, quality: int = 55
+    pictures: Sequence[U8], *, fps: float, suffix: str, quality: int = 55
 ) -> bytes:
     """The bytes of an animation; see ``write_animation``.  Raises ResultError."""
     module: Any = cv2
     if not hasattr(module, "imencodeanimation"):
         raise ResultError("animations need OpenCV 4.11: pip install 'opencv-python-headless>=4.11'")
     animation = module.Animation()
-    animation.frames = [_bgr(picture, width) for picture in pictures]
+    animation.frames = [np.ascontiguousarray(picture[:, :, ::-1]) for picture in pictures]
     animation.durations = np.full(len(pictures), round(1000.0 / fps), np.int32)
     animation.loop_count = 0
     options = {
@@ -103,19 +105,8 @@ def encode_animation(
     return data.tobytes()
 
 
-def _bgr(picture: U8, width: int | None) -> U8:
-    bgr = np.ascontiguousarray(picture[:, :, ::-1])
-    if width is None or width == bgr.shape[1]:
-        return bgr
-    height = round(bgr.shape[0] * width / bgr.shape[1])
-    return np.asarray(cv2.resize(bgr, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def beside(left: U8, right: U8, *, gap: int = 6) -> U8:
-    """Two RGB pictures next to each other; the right one is scaled to the left one's height."""
-    height = left.shape[0]
-    width = 2 * round(right.shape[1] * height / right.shape[0] / 2)
-    if right.shape[:2] != (height, width):
-        resized = cv2.resize(right, (width, height), interpolation=cv2.INTER_AREA)
-        right = np.asarray(resized, np.uint8)
-    return np.concatenate([left, np.full((height, gap, 3), 18, np.uint8), right], axis=1)
+def beside(*pictures: U8, gap: int = 4) -> U8:
+    """RGB pictures of one height next to each other."""
+    between = np.full((len(pictures[0]), gap, 3), GROUND, np.uint8)
+    parts = [part for picture in pictures for part in (between, picture)]
+    return np.concatenate(parts[1:], axis=1)

@@ -7,8 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, I64, U8, BoolArray
+from pliant.algorithms.arrays import F32, I64, U8
 from pliant.algorithms.tracks import COASTING, FrameTracks
+from pliant.pictures.caption import with_caption
 from pliant.pictures.movie import write_image, write_movie
 
 TAIL = 10
@@ -18,8 +19,18 @@ OLDEST = 300
 
 _COLOURS = 24
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
-_BAR_PX = 30
-_TEXT = (235, 235, 235)
+_FINER = 2  # pictures are drawn so much larger, and shrunk: soft edges, and lines below a pixel
+_SHARPEST_PX = 1000  # images with fewer columns are shown twice as large
+
+# What the marks of all tracks may cover of the picture, whatever their number.
+_TRAILS, _DOTS = 0.05, 0.05
+_TRAIL_OPACITY = 0.6
+_LARGEST_DOT = 0.003
+"""Radius, as a share of the width: of few tracks, too, the image stays visible."""
+_TRAIL_WIDTH = 0.0009
+_BRIGHTNESS, _SATURATION = 0.85, 0.75
+"""Of the image under the marks, so that their colours stand out."""
+_GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,19 +62,27 @@ class TrackPainter:
     def draw(self, frame: OverlayFrame) -> U8:
         """The picture of a frame, (H', W', 3) RGB, with a bar of words under the image.
 
-        Colour is age: blue is new, orange is old.  Filled: on a curvature extremum of this frame;
-        hollow: carried by its patch.  Tracks that are not in the map (where that is known) are
-        drawn small.
+        Colour is age: blue is new, orange is old.  Tracks that coast, carried by their patch, and
+        those that are not in the map (where that is known) are drawn smaller.
+        """
+        words = [f"frame {frame.number}", f"{len(frame.tracks.ids):,} tracks"]
+        if frame.mapped_ids is not None:
+            words.append(f"{np.isin(frame.tracks.ids, frame.mapped_ids).sum():,} in the map")
+        words += [frame.status] if frame.status else []
+        return with_caption(self.paint(frame), "   ".join(words))
+
+    def paint(self, frame: OverlayFrame) -> U8:
+        """The picture without words.
+
+        As many tails as leave the image visible, always of the same tracks; all dots, small.
         """
         self.follow(frame.tracks)
-        scale = self._scale or (2 if frame.image.shape[1] < 1000 else 1)
-        canvas = _enlarge(frame.image, scale)
-        mapped = None
-        if frame.mapped_ids is not None:
-            mapped = np.isin(frame.tracks.ids, frame.mapped_ids)
-        self._draw_tails(canvas, frame.tracks, scale)
-        self._draw_points(canvas, frame.tracks, mapped, scale)
-        return self._with_bar(canvas, frame, mapped)
+        scale = self._scale or (2 if frame.image.shape[1] < _SHARPEST_PX else 1)
+        canvas = _enlarge(_muted(frame.image), scale * _FINER)
+        self._draw_tails(canvas, frame.tracks, scale * _FINER)
+        self._draw_dots(canvas, frame, scale * _FINER)
+        size = (frame.image.shape[1] * scale, frame.image.shape[0] * scale)
+        return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def follow(self, tracks: FrameTracks) -> None:
         """Take in the tracks of a frame that is not drawn."""
@@ -79,50 +98,38 @@ class TrackPainter:
         return np.minimum(share * _COLOURS, _COLOURS - 1).astype(np.int64)
 
     def _draw_tails(self, canvas: U8, tracks: FrameTracks, scale: int) -> None:
-        corners = _fixed_point(self._tails, scale)
-        buckets = self._buckets(tracks)
         # Every second position is enough for the eye, and halves the time.
-        corners = corners[:, ::2]
+        tails = self._tails[:, ::2]
+        height, width = canvas.shape[:2]
+        thickness = max(1, round(_TRAIL_WIDTH * width))
+        lengths = scale * np.linalg.norm(np.diff(tails, axis=1), axis=2).sum(axis=1)
+        allowed = _TRAILS * height * width / max(thickness * float(lengths.sum()), 1.0)
+        # Spread evenly over the numbers of tracks, so that a track has its tail in every frame.
+        chosen = (tracks.ids * _GOLDEN % 1.0 < allowed) & (lengths >= 1.0)
+        corners, buckets = _fixed_point(tails[chosen], scale), self._buckets(tracks)[chosen]
         layer = canvas.copy()
-        moving = np.abs(corners - corners[:, :1]).max(axis=(1, 2)) >= 1 << _SHIFT
         for bucket, colour in enumerate(self._palette):
-            chosen = corners[moving & (buckets == bucket)]
-            cv2.polylines(layer, list(chosen), False, colour, 1, cv2.LINE_AA, _SHIFT)
-        # Half transparent: thousands of tails would hide the image.
-        cv2.addWeighted(layer, 0.45, canvas, 0.55, 0.0, dst=canvas)
+            lines = list(corners[buckets == bucket])
+            cv2.polylines(layer, lines, False, colour, thickness, cv2.LINE_AA, _SHIFT)
+        cv2.addWeighted(layer, _TRAIL_OPACITY, canvas, 1.0 - _TRAIL_OPACITY, 0.0, dst=canvas)
 
-    def _draw_points(
-        self, canvas: U8, tracks: FrameTracks, mapped: BoolArray | None, scale: int
-    ) -> None:
+    def _draw_dots(self, canvas: U8, frame: OverlayFrame, scale: int) -> None:
+        tracks = frame.tracks
+        height, width = canvas.shape[:2]
+        radius = np.sqrt(_DOTS * height * width / (np.pi * max(len(tracks.ids), 1)))
+        radius = min(float(radius), _LARGEST_DOT * width)
+        small = tracks.states == COASTING
+        if frame.mapped_ids is not None:
+            small |= ~np.isin(tracks.ids, frame.mapped_ids)
+        # OpenCV's smooth discs have a soft rim of half a pixel.
+        full, less = (round(max(r - 0.5, 0.3) * (1 << _SHIFT)) for r in (radius, 0.7 * radius))
         centres = _fixed_point(tracks.points_px, scale).tolist()
         buckets = self._buckets(tracks).tolist()
-        hollow = (tracks.states == COASTING).tolist()
-        large = ([True] * len(centres)) if mapped is None else mapped.tolist()
-        # OpenCV's smooth discs have a soft rim of a pixel, which counts for more on a small image.
-        full, small = (round((a * scale - b) * (1 << _SHIFT)) for a, b in ((1.4, 0.8), (0.7, 0.3)))
-        for centre, bucket, ring, big in zip(centres, buckets, hollow, large, strict=True):
-            radius = full if big else small
-            thickness = 1 if ring else cv2.FILLED
-            colour = self._palette[bucket]
-            cv2.circle(canvas, centre, radius, colour, thickness, cv2.LINE_AA, _SHIFT)
-
-    def _with_bar(self, canvas: U8, frame: OverlayFrame, mapped: BoolArray | None) -> U8:
-        ages = frame.tracks.ages
-        words = [f"frame {frame.number}", f"{len(ages)} tracks"]
-        if mapped is not None:
-            words.append(f"{int(mapped.sum())} in the map")
-        words += [frame.status] if frame.status else []
-        picture = _with_words(canvas, "   ".join(words))
-        bar, width = picture[-_BAR_PX:], picture.shape[1]
-        if width >= 600:
-            font = cv2.FONT_HERSHEY_SIMPLEX
-            ramp = np.repeat(np.array(self._palette, np.uint8)[None], 8, axis=0)
-            left = width - 4 * _COLOURS - 44
-            bar[11:19, left : left + 4 * _COLOURS] = np.repeat(ramp, 4, axis=1)
-            cv2.putText(bar, "age 0", (left - 46, 20), font, 0.42, _TEXT, 1, cv2.LINE_AA)
-            end = (left + 4 * _COLOURS + 6, 20)
-            cv2.putText(bar, f"{OLDEST}", end, font, 0.42, _TEXT, 1, cv2.LINE_AA)
-        return picture
+        for centre, bucket, is_small in zip(centres, buckets, small.tolist(), strict=True):
+            cv2.circle(
+                canvas, centre, less if is_small else full, self._palette[bucket], cv2.FILLED,
+                cv2.LINE_AA, _SHIFT,
+            )  # fmt: skip
 
 
 def palette(size: int) -> list[tuple[int, int, int]]:
@@ -140,31 +147,30 @@ def draw_marks(
 
     image: (H, W) grey or (H, W, 3) RGB.    points_px: (N, 2).    colours: (N, 3) RGB.
     """
-    scale = scale or (2 if image.shape[1] < 1000 else 1)
-    canvas = _enlarge(image, scale)
+    scale = scale or (2 if image.shape[1] < _SHARPEST_PX else 1)
+    canvas = _enlarge(_muted(image), scale)
     centres = _fixed_point(points_px, scale).tolist()
+    radius = round(_LARGEST_DOT * canvas.shape[1] * (1 << _SHIFT))
     for centre, colour in zip(centres, colours.tolist(), strict=True):
-        cv2.circle(canvas, centre, (2 * scale) << _SHIFT, colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
-    return _with_words(canvas, words)
+        cv2.circle(canvas, centre, radius, colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+    return with_caption(canvas, words)
 
 
-def _with_words(canvas: U8, words: str) -> U8:
-    """The picture with a bar of words under it, of even sizes, as video codecs want them."""
-    height, width = canvas.shape[:2]
-    bar = np.full((_BAR_PX, width, 3), 18, np.uint8)
-    cv2.putText(bar, words, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT, 1, cv2.LINE_AA)
-    picture = np.concatenate([canvas, bar])
-    return np.ascontiguousarray(picture[: height + _BAR_PX - height % 2, : width - width % 2])
+def _muted(image: U8) -> U8:
+    """(H, W, 3) RGB of a grey or RGB image, darker and less colourful than it is."""
+    if image.ndim == 2:
+        dark = np.round(image * np.float32(_BRIGHTNESS)).astype(np.uint8)
+        return np.repeat(dark[:, :, None], 3, axis=2)
+    own, grey = _BRIGHTNESS * _SATURATION, _BRIGHTNESS * (1.0 - _SATURATION)
+    mix = own * np.eye(3) + grey * np.array([0.299, 0.587, 0.114])
+    return np.asarray(cv2.transform(image, mix), np.uint8)
 
 
 def _enlarge(image: U8, scale: int) -> U8:
-    rgb = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
-    # Darker than it is, so that the tracks stand out.
-    dim = np.round(rgb * np.float32(0.75)).astype(np.uint8)
     if scale == 1:
-        return dim
-    size = (dim.shape[1] * scale, dim.shape[0] * scale)
-    return np.asarray(cv2.resize(dim, size, interpolation=cv2.INTER_CUBIC), np.uint8)
+        return image
+    size = (image.shape[1] * scale, image.shape[0] * scale)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 def _fixed_point(points_px: F32, scale: int) -> "np.ndarray[tuple[int, ...], np.dtype[np.int32]]":

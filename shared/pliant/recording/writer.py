@@ -24,6 +24,7 @@ from pliant import __version__
 from pliant.errors import RecordingError
 from pliant.files import sync
 from pliant.messages import codec
+from pliant.messages.planes import in_planes
 from pliant.messages.topics import Topic
 from pliant.recording import layout
 from pliant.recording.layout import CHUNK_BYTES
@@ -79,7 +80,11 @@ class RecordingWriter:
     def write(
         self, topic: Topic, data: bytes, *, sequence: int, log_time_ns: int, publish_time_ns: int
     ) -> None:
-        """Append one encoded message.  Raises RecordingError when the disk is full."""
+        """Append one encoded message, its arrays in planes.
+
+        Raises RecordingError when the disk is full.
+        """
+        data = in_planes(topic.message, data)
         channel = self._channels.get(topic.key)
         if channel is None:
             channel = self._channels[topic.key] = self._register(topic)

@@ -7,14 +7,17 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
 from pliant.compiler.kernel import kernel
+from pliant.rendering.colours import LEAST
 from pliant.rendering.light import light_at
-from pliant.rendering.raycast import Atlas
+from pliant.rendering.raycast import SHARE, Atlas, ColourAtlas
 from pliant.rendering.scene import Scene, SolidArrays, face_sizes
-from pliant.rendering.textures import make_texture, shrink
+from pliant.rendering.textures import make_colours, make_texture, shrink
 
 LEVELS = 6
 _BLOCK = 1 << (LEVELS - 1)  # sizes at level 0 are multiples of this
 _LIGHT_CELL_M = 0.06
+_COARSER = 3
+"""Texels of light, each way, that share a colour: eyes see these less sharply, too."""
 
 
 class FaceTexture(NamedTuple):
@@ -24,6 +27,13 @@ class FaceTexture(NamedTuple):
     height: int
     density: float  # texels per metre at level 0
     texels: U8  # LEVELS levels, finest first, row by row
+
+
+class FaceColours(NamedTuple):
+    """The colours of one face, less fine than its texture: ``raycast.ColourAtlas`` has them."""
+
+    red: FaceTexture
+    blue: FaceTexture
 
 
 def face_frame(kind: int, face: int, half: F64, u: F64, v: F64) -> tuple[F64, F64]:
@@ -117,14 +127,46 @@ def make_face(
     return mip_pyramid(width_m, height_m, density, paint)
 
 
-def mip_pyramid(
-    width_m: float, height_m: float, density: float, paint: Callable[[int, int], F32]
-) -> FaceTexture:
-    """A texture of so many metres.  paint: makes (height, width) texels, float32."""
+def make_face_colours(
+    scene: Scene, solids: SolidArrays, number: int, *, detail: float = 1.0
+) -> FaceColours:
+    """The colours of the face that ``make_face`` paints with the same arguments."""
+    solid, width_m, height_m = face_sizes(scene)[number]
+    density = detail * solid.texels_per_metre
+    owner = int(np.searchsorted(solids.first_face, number, side="right")) - 1
+    images = make_colours(
+        np.random.default_rng([scene.seed, number]),
+        np.random.default_rng([scene.seed, owner, 1]),
+        *_texels(width_m, height_m, density),
+        solid.material,
+        _COARSER,
+    )
+    steps = (images - LEAST) * SHARE
+
+    def pyramid(image: F32) -> FaceTexture:
+        def paint(height: int, width: int) -> F32:
+            more = ((0, max(height - len(image), 0)), (0, max(width - image.shape[1], 0)))
+            return np.ascontiguousarray(np.pad(image, more, mode="edge")[:height, :width])
+
+        return mip_pyramid(width_m, height_m, density / _COARSER, paint)
+
+    return FaceColours(*(pyramid(image) for image in steps))
+
+
+def _texels(width_m: float, height_m: float, density: float) -> tuple[int, int]:
+    """Rows and columns of a texture of so many metres."""
     # One block more than the surface needs, so that its far edge never meets the texture's end.
     width, height = (
         int(np.ceil((size * density + 1.0) / _BLOCK)) * _BLOCK for size in (width_m, height_m)
     )
+    return height, width
+
+
+def mip_pyramid(
+    width_m: float, height_m: float, density: float, paint: Callable[[int, int], F32]
+) -> FaceTexture:
+    """A texture of so many metres.  paint: makes (height, width) texels, float32."""
+    height, width = _texels(width_m, height_m, density)
     levels = [paint(height, width)]
     while len(levels) < LEVELS:
         levels.append(shrink(levels[-1]))
@@ -139,9 +181,15 @@ def pack_atlas(faces: list[FaceTexture]) -> Atlas:
     of_level = sizes[:, None] >> (2 * np.arange(LEVELS))
     ends = np.cumsum(of_level).reshape(of_level.shape)
     return Atlas(
-        texels=np.concatenate([face.texels for face in faces]),
+        texels=np.concatenate([np.zeros(0, np.uint8), *(face.texels for face in faces)]),
         offset=ends - of_level,
         width=np.array([face.width for face in faces], np.int32),
         height=np.array([face.height for face in faces], np.int32),
         density=np.array([face.density for face in faces], np.float64),
     )
+
+
+def pack_colours(faces: list[FaceColours]) -> ColourAtlas:
+    """Lay the colours of all faces, in their order, side by side."""
+    red, blue = (pack_atlas([face[i] for face in faces]) for i in range(2))
+    return ColourAtlas(red, blue.texels)

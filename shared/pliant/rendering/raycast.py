@@ -7,6 +7,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8
 from pliant.compiler.kernel import fast_kernel, kernel
+from pliant.rendering.colours import LEAST
 from pliant.rendering.intersect import Scalar, face_point, load_tile, meet_tile
 from pliant.rendering.scene import SolidArrays
 from pliant.rendering.view import TILE_PX, TILE_RAYS, Tiles, View
@@ -20,6 +21,17 @@ class Atlas(NamedTuple):
     width: I32  # (F,) texels of a row at level 0, a multiple of 2**(L - 1)
     height: I32  # (F,) rows at level 0, likewise
     density: F64  # (F,) texels per metre
+
+
+class ColourAtlas(NamedTuple):
+    """The colours of F faces: shares of red and blue, as in ``colours``, in steps of 1 / SHARE."""
+
+    red: Atlas
+    blue: U8  # texels that lie as the red ones do
+
+
+SHARE = 140.0
+"""Steps of a share."""
 
 
 @fast_kernel
@@ -43,16 +55,16 @@ def accumulate(
     view: View,
     tiles: Tiles,
     atlas: Atlas,
-    tints: F32,
+    colours: ColourAtlas,
     pixel: float,
     weight: float,
     out: F32,
 ) -> None:
     """Add ``weight`` times the textured view to ``out``.
 
-    rays: (H, W, 2) float32 on the plane z = 1.  tints: (F, C) factors of the C channels.  pixel:
-    size of a pixel on that plane.  out: (H, W, C) float32, changed in place.  Rays that meet
-    nothing add 0.
+    rays: (H, W, 2) float32 on the plane z = 1.  pixel: size of a pixel on that plane.  out: (H, W,
+    C) float32, changed in place: light, and where C is 3 light times the shares of red and blue.
+    Rays that meet nothing add 0.
     """
     kind, half, first_face = solids.kind, solids.half, solids.first_face
     o, R = view.origin, view.rotation
@@ -61,7 +73,8 @@ def accumulate(
     start, listed, bound = tiles.start, tiles.solids, tiles.nearest
     texels, offset, density = atlas.texels, atlas.offset, atlas.density
     texture_width, texture_height = atlas.width, atlas.height
-    last_level, channels = offset.shape[1] - 1, out.shape[2]
+    last_level, in_colour = offset.shape[1] - 1, out.shape[2] == 3
+    red, blue = colours.red, colours.blue
     xs, ys = np.empty(TILE_RAYS, np.float32), np.empty(TILE_RAYS, np.float32)
     depths, seen = np.empty(TILE_RAYS, np.float32), np.empty(TILE_RAYS, np.int32)
     for tile in range(len(start) - 1):
@@ -99,8 +112,20 @@ def accumulate(
                     texels, offset[face, level + 1], w >> 1, h >> 1, 0.5 * a - 0.5, 0.5 * b - 0.5
                 )
                 value += min(footprint - 1.0, 1.0) * (coarse - value)
-            for channel in range(channels):
-                out[row, col, channel] += weight * value * tints[face, channel]
+            out[row, col, 0] += weight * value
+            if in_colour:
+                # Where the light's texels are as fine, or finer than any.
+                coarser = density[face] / red.density[face]
+                while level > 0 and coarser >= 2.0:
+                    level -= 1
+                    coarser *= 0.5
+                a, b = (u * red.density[face] / (1 << level), v * red.density[face] / (1 << level))
+                w, h = red.width[face] >> level, red.height[face] >> level
+                i = red.offset[face, level]
+                share = bilinear(red.texels, i, w, h, a - 0.5, b - 0.5) / SHARE + LEAST
+                out[row, col, 1] += weight * value * share
+                share = bilinear(blue, i, w, h, a - 0.5, b - 0.5) / SHARE + LEAST
+                out[row, col, 2] += weight * value * share
 
 
 @kernel

@@ -4,9 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32
+from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.geometry import so3_exp
-from pliant.rendering.atlas import FaceTexture, make_face, pack_atlas
+from pliant.rendering.atlas import (
+    FaceColours,
+    FaceTexture,
+    make_face,
+    make_face_colours,
+    pack_atlas,
+    pack_colours,
+)
+from pliant.rendering.colours import colour_image
 from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.lens import NO_DISTORTION, pixel_rays
 from pliant.rendering.paths import CameraPath
@@ -78,14 +86,19 @@ class Renderer:
         textures: list[FaceTexture],
         path: CameraPath,
         camera: CameraOptions,
+        colours: list[FaceColours] | None = None,
     ) -> None:
-        """textures: one for each face of the scene, from ``make_face``."""
+        """textures: one for each face of the scene, from ``make_face``.
+
+        colours: likewise, from ``make_face_colours``; without them images are grey.
+        """
         self._geometry = geometry
         self._atlas: Atlas = pack_atlas(textures)
         self._path = path
         self._options = camera
         self._camera = camera.pinhole()
-        self._tints = _tints(geometry.scene, colour=camera.colour)
+        self._colours = pack_colours(colours or [])
+        self._channels = 1 if colours is None else 3
         self._rays = [
             pixel_rays(self._camera, camera.distortion, (x / 6.0, y / 6.0)).astype(np.float32)
             for x, y in SUB_PIXELS
@@ -101,20 +114,20 @@ class Renderer:
         light = self._expose(time_s)
         rng = np.random.default_rng([options.seed, number])
         gain = exposure_gain(time_s, options.exposure)
-        image = sensor_image(light, gain=gain, noise=options.noise, rng=rng)
+        grey = sensor_image(light[:, :, :1], gain=gain, noise=options.noise, rng=rng)[:, :, 0]
         return RenderedFrame(
             time_s=time_s,
             T_world_camera=T_world_camera,
-            image=image if options.colour else np.ascontiguousarray(image[:, :, 0]),
+            image=np.ascontiguousarray(grey) if self._channels == 1 else _coloured(grey, light),
             depth_m=self._geometry.depth(
                 T_world_camera, self._rectified_rays, self._rectified_bounds
             ),
         )
 
     def _expose(self, time_s: float) -> F32:
-        """(H, W, C) light, mean of the sub-exposures while the shutter is open."""
+        """(H, W, C) as ``accumulate`` says, mean of the sub-exposures while the shutter is open."""
         camera, n = self._camera, len(SUB_PIXELS)
-        light = np.zeros((camera.height, camera.width, self._tints.shape[1]), np.float32)
+        light = np.zeros((camera.height, camera.width, self._channels), np.float32)
         for i, (rays, bounds) in enumerate(zip(self._rays, self._bounds, strict=True)):
             # Sub-exposures lie evenly about the middle, so that the blur does not shift the image.
             delay = ((i + 0.5) / n - 0.5) * self._options.blur / self._options.fps
@@ -127,7 +140,7 @@ class Renderer:
                 view,
                 tiles,
                 self._atlas,
-                self._tints,
+                self._colours,
                 FOOTPRINT / camera.fx,
                 1.0 / n,
                 light,
@@ -140,10 +153,12 @@ def paint_faces(geometry: SceneGeometry) -> list[FaceTexture]:
     return [make_face(geometry.scene, geometry.solids, i) for i in range(geometry.n_faces)]
 
 
-def _tints(scene: Scene, *, colour: bool) -> F32:
-    """(F, C) factors; those of a colour have the grey image of the colour image at 1."""
-    faces = face_sizes(scene)
-    if not colour:
-        return np.ones((len(faces), 1), np.float32)
-    tints = np.array([solid.material.tint for solid, _, _ in faces], np.float64)
-    return (tints / (tints @ (0.299, 0.587, 0.114))[:, None]).astype(np.float32)
+def paint_colours(geometry: SceneGeometry) -> list[FaceColours]:
+    """The colours of all faces, one after the other."""
+    return [make_face_colours(geometry.scene, geometry.solids, i) for i in range(geometry.n_faces)]
+
+
+def _coloured(grey: U8, light: F32) -> U8:
+    """(H, W, 3) RGB of which (H, W) is the grey image; light: (H, W, 3) as of ``accumulate``."""
+    whole = np.maximum(light[:, :, 0], np.float32(1e-6))
+    return colour_image(grey, light[:, :, 1] / whole, light[:, :, 2] / whole)

@@ -30,6 +30,9 @@ class Material(Parameters):
     tint: Vector = Field(
         default=(1.0, 1.0, 1.0), description="Red, green and blue for colour images."
     )
+    hues: tuple[Vector, ...] = Field(
+        default=(), description="Red, green and blue that marks may have instead."
+    )
 
 
 class Solid(Parameters):

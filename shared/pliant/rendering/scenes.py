@@ -1,7 +1,7 @@
 """The built-in scenes and the paths through them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,12 +11,16 @@ from pliant.rendering.scene import Kind, Material, Scene, Solid, Vector
 
 @dataclass(frozen=True)
 class BuiltinScene:
-    """A scene, its path, and how many frames the path has at 30 frames per second."""
+    """A scene, its path, and how many frames the path has at 30 frames per second.
+
+    colour: whether it is filmed in colour where nobody says.
+    """
 
     scene: Scene
     path: CameraPath
     frames: int
     width: int = 640
+    colour: bool = True
 
 
 def _solid(
@@ -40,27 +44,55 @@ def _solid(
     )
 
 
-_PLASTER = Material(brightness=150, contrast=22, noise=4, coverage=0.12, tint=(1.05, 1.0, 0.9))
+# Red, green and blue: of their brightness only the grey values decide.
+_ORANGE, _YELLOW, _RED = (1.7, 0.8, 0.4), (1.3, 1.05, 0.4), (1.8, 0.7, 0.65)
+_BLUE, _TEAL, _LEAF = (0.5, 0.95, 1.8), (0.5, 1.15, 1.15), (0.75, 1.2, 0.5)
+_VIOLET, _WHITE = (1.15, 0.8, 1.5), (1.02, 1.0, 0.94)
+
+_PLASTER = Material(
+    brightness=150, contrast=22, noise=4, coverage=0.12, tint=(1.13, 1.0, 0.76),
+    hues=((1.2, 0.98, 0.66), (1.03, 1.01, 0.9)),
+)  # fmt: skip
 _WOOD = Material(
-    brightness=115, contrast=24, noise=6, coverage=0.1, stretch=6, tint=(1.25, 0.95, 0.7)
-)
+    brightness=115, contrast=24, noise=6, coverage=0.1, stretch=6, tint=(1.36, 0.92, 0.58),
+    hues=((1.45, 0.88, 0.5), (1.25, 0.95, 0.7)),
+)  # fmt: skip
 _PALE_WOOD = Material(
-    brightness=150, contrast=26, noise=6, coverage=0.12, stretch=5, tint=(1.15, 0.98, 0.75)
-)
-_CLOTH = Material(brightness=105, contrast=28, noise=6, coverage=0.22, tint=(0.75, 0.95, 1.35))
-_RUG = Material(brightness=120, contrast=38, noise=5, coverage=0.25, tint=(1.35, 0.85, 0.75))
+    brightness=150, contrast=26, noise=6, coverage=0.12, stretch=5, tint=(1.24, 0.98, 0.62),
+    hues=((1.3, 0.96, 0.5), (1.15, 1.0, 0.75)),
+)  # fmt: skip
+_CLOTH = Material(
+    brightness=105, contrast=28, noise=6, coverage=0.22, tint=(0.6, 0.98, 1.55),
+    hues=(_BLUE, _TEAL, (0.8, 1.0, 1.3)),
+)  # fmt: skip
+_RUG = Material(
+    brightness=120, contrast=38, noise=5, coverage=0.25, tint=(1.7, 0.75, 0.65),
+    hues=(_ORANGE, _YELLOW, _RED, _VIOLET),
+)  # fmt: skip
 _POSTER = Material(
-    brightness=165, contrast=48, noise=4, coverage=0.2, writing=0.5, tint=(0.9, 1.02, 1.12)
-)
+    brightness=165, contrast=48, noise=4, coverage=0.2, writing=0.5, tint=(0.92, 1.01, 1.12),
+    hues=(_ORANGE, _YELLOW, _RED, _BLUE, _TEAL, _LEAF),
+)  # fmt: skip
 _PAPER = Material(
-    brightness=195, contrast=25, noise=3, coverage=0.06, writing=0.9, tint=(1.02, 1.0, 0.95)
-)
+    brightness=195, contrast=25, noise=3, coverage=0.06, writing=0.9, tint=_WHITE,
+    hues=(_BLUE, _ORANGE),
+)  # fmt: skip
 _PRINT = Material(
-    brightness=120, contrast=45, noise=5, coverage=0.2, writing=0.4, tint=(1.2, 0.9, 0.9)
-)
-_GREEN = Material(brightness=110, contrast=35, noise=7, coverage=0.25, tint=(0.75, 1.15, 0.7))
-_STONE = Material(brightness=135, contrast=32, noise=8, coverage=0.22, tint=(1.0, 1.0, 1.0))
-_METAL = Material(brightness=95, contrast=30, noise=5, coverage=0.2, tint=(0.95, 1.0, 1.1))
+    brightness=120, contrast=45, noise=5, coverage=0.2, writing=0.4, tint=(1.45, 0.88, 0.62),
+    hues=(_YELLOW, _TEAL, _BLUE, _WHITE, _RED),
+)  # fmt: skip
+_GREEN = Material(
+    brightness=110, contrast=35, noise=7, coverage=0.25, tint=(0.7, 1.22, 0.5),
+    hues=(_LEAF, _TEAL, _YELLOW),
+)  # fmt: skip
+_STONE = Material(
+    brightness=135, contrast=32, noise=8, coverage=0.22, tint=(1.02, 1.0, 0.95),
+    hues=((1.1, 0.98, 0.85), (0.92, 1.01, 1.1)),
+)  # fmt: skip
+_METAL = Material(
+    brightness=95, contrast=30, noise=5, coverage=0.2, tint=(0.62, 1.08, 1.2),
+    hues=(_TEAL, (0.8, 1.05, 1.1), _BLUE),
+)  # fmt: skip
 
 
 def _room() -> BuiltinScene:
@@ -277,7 +309,7 @@ def _tabletop_full() -> BuiltinScene:
 
 def _tiny() -> BuiltinScene:
     """A small and short table top, for tests."""
-    return _tabletop("tiny", frames=40, width=320, texels=400.0)
+    return replace(_tabletop("tiny", frames=40, width=320, texels=400.0), colour=False)
 
 
 SCENES: dict[str, Callable[[], BuiltinScene]] = {

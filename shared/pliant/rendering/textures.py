@@ -11,6 +11,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
 from pliant.compiler.kernel import kernel
+from pliant.rendering.colours import shares
 from pliant.rendering.scene import Material
 
 # Smallest radius of a mark, texels: smaller ones would vanish at the texture's own resolution.
@@ -174,13 +175,49 @@ def _writing(rng: np.random.Generator, height: int, width: int, material: Materi
 def make_texture(rng: np.random.Generator, height: int, width: int, material: Material) -> F32:
     """Paint a texture of (height, width) texels: grey values in full light, float32."""
     image = np.full((height, width), material.brightness, np.float32)
+    noise, marks, writing = _drawn(rng, height, width, material)
+    for grid, cell_x, cell_y in noise:
+        add_noise(image, grid, cell_x, cell_y, material.noise)
+    paint(image, marks)
+    paint(image, writing)
+    return np.clip(image, 4.0, 250.0, out=image)
+
+
+def make_colours(
+    rng: np.random.Generator, hue_rng: np.random.Generator, height: int, width: int,
+    material: Material, coarser: int,
+) -> F32:  # fmt: skip
+    """The colours of what ``make_texture`` paints with the same ``rng``, height and width.
+
+    hue_rng: chooses the colours of the marks.    coarser: texels that share a colour, each way.
+    Returns (2, height / coarser, width / coarser): shares of red and blue, as in ``colours``.
+    """
+    _, marks, _ = _drawn(rng, height, width, material)
+    shown = marks[np.minimum(marks[:, 2], marks[:, 3]) > 0.5 * coarser]
+    shown[:, :4] /= coarser
+    base = shares(material.tint)
+    hues = np.array([base, *(shares(hue) for hue in material.hues)])
+    chosen = hue_rng.integers(0, len(hues), len(shown))
+    images = np.empty((2, height // coarser, width // coarser), np.float32)
+    for image, share, choices in zip(images, base, hues.T, strict=True):
+        image[:] = share
+        shown[:, 5] = choices[chosen]
+        paint(image, shown)
+    return images
+
+
+def _drawn(
+    rng: np.random.Generator, height: int, width: int, material: Material
+) -> tuple[list[tuple[F64, float, float]], F64, F64]:
+    """What chance decides of a texture: octaves of noise (grid, width and height of a cell), marks,
+    and the strokes of its writing."""
+    noise: list[tuple[F64, float, float]] = []
     cell = max(height, width) / 2.0
     while cell >= 3.0:
         cell_x, cell_y = max(cell * material.stretch, 3.0), cell
         shape = (int(height / cell_y) + 2, int(width / cell_x) + 2)
-        add_noise(image, rng.standard_normal(shape), cell_x, cell_y, material.noise)
+        noise.append((rng.standard_normal(shape), cell_x, cell_y))
         cell /= 2.0
-    paint(image, _marks(rng, height, width, material))
-    if material.writing > 0.0:
-        paint(image, _writing(rng, height, width, material))
-    return np.clip(image, 4.0, 250.0, out=image)
+    marks = _marks(rng, height, width, material)
+    written = material.writing > 0.0
+    return noise, marks, _writing(rng, height, width, material) if written else marks[:0]

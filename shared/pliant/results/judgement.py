@@ -22,21 +22,27 @@ def doubtful_frames(history: MapHistory) -> list[int]:
     ]
 
 
-def judge(*, frames: int, in_segments: list[int], doubtful: int) -> tuple[str, str]:
+def judge(
+    *, frames: int, in_segments: list[int], doubtful: int, unused: int = 0, broken: int = 0
+) -> tuple[str, str]:
     """Good, doubtful or bad, and why.
 
-    frames: of the sequence.   in_segments: poses in each segment of the map.   doubtful: poses told
-    as such.
+    frames: of the sequence that were used.   in_segments: poses in each segment of the map.
+    doubtful: poses told as such.   unused: frames that were broken, dropped or passed over.
+    broken: those of them that no frame could be made of, as nobody wanted it.
     """
     longest, posed = max(in_segments, default=0), sum(in_segments)
     if not longest:
         return BAD, "there is no map"
     share = longest / max(frames, 1)
-    told = f"{share:.0%} of the frames have a pose in the largest segment"
+    which = "frames that were used" if unused else "frames"
+    told = f"{share:.0%} of the {which} have a pose in the largest segment"
     if share < _LITTLE:
         return BAD, told
     if doubtful > _DOUBTS * posed:
         return DOUBTFUL, f"{doubtful / posed:.0%} of the poses are doubtful: something large moves?"
     if share < _WHOLE:
         return DOUBTFUL, told
-    return GOOD, told if longest < frames else "all frames have a pose in one segment"
+    if broken > (1.0 - _WHOLE) * (frames + broken):
+        return DOUBTFUL, f"{broken / (frames + broken):.0%} of the images are broken"
+    return GOOD, told if longest < frames else f"all {which} have a pose in one segment"

@@ -1,19 +1,22 @@
 """What report.json says of a run, the same in a few lines, and the exit code that follows."""
 
 from collections import defaultdict
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 
 from pliant.algorithms.corrected_view import parts_of
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_density import count_distinct, well_observed
+from pliant.messages.types import DROPPED, MASKED
 from pliant.results.calibration import calibration_verdict
 from pliant.results.judgement import doubtful_frames, judge
 from pliant.results.mesh import mesh_report
 from pliant.results.run import Run
 
 _ROUGHLY = 0.02
+_Frame = TypeVar("_Frame", int, str)
 
 
 def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
@@ -33,8 +36,11 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
     telling = [reason for frame, reason in reasons.items() if frame not in silent]
     telling = telling or list(reasons.values())
     doubtful = doubtful_frames(history)
+    unused = len(run.missing) + len(run.passed_over)
     word, why = judge(
-        frames=frames - len(run.missing) - len(run.passed_over),
+        frames=frames - unused,
+        unused=unused,
+        broken=len(broken_images(run.missing)),
         in_segments=[len(members) for members in by_segment.values()],
         doubtful=len(doubtful),
     )
@@ -70,6 +76,12 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "map_points_per_frame": [run.map_points[f] for f in sorted(run.map_points)],
         "scale_is_metric": run.scale_is_metric,
     }
+
+
+def broken_images(missing: Mapping[_Frame, str]) -> dict[_Frame, str]:
+    """What is wrong with each broken image, by frame: what live mode drops and a mask covers is
+    none."""
+    return {frame: why for frame, why in missing.items() if why not in (DROPPED, MASKED)}
 
 
 def process_figures(run: Run, frames: int) -> dict[str, Any]:

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from pliant.messages.types import DROPPED
-from pliant.results.report import counted
+from pliant.messages.types import DROPPED, MASKED
+from pliant.results.report import broken_images, counted
 from pliant.results.surfels import surfel_summary
 
 DONE, INCOMPLETE = 0, 3
@@ -13,7 +13,8 @@ _NAMED = 10  # broken images beside the first
 
 def grade(report: dict[str, Any]) -> int:
     """The exit code of a run with this report."""
-    whole = report["complete"] and not (_broken(report) or report["ended_early"])
+    broken = broken_images(report["frames_without_pixels"])
+    whole = report["complete"] and not (broken or report["ended_early"])
     return DONE if report["segments"] and whole else INCOMPLETE
 
 
@@ -29,8 +30,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         f"{frames} at {report['frames_per_second']:.1f} frames/s, "
         f"{report['frames_with_pose']} with a pose ({100.0 * report['success_rate']:.1f} %), "
         f"{counted(report['keyframes'], 'keyframe')}, {counted(report['points'], 'point')}",
-        f"median per frame: {report['median_tracks_per_frame']:.0f} tracks, "
-        f"{report['median_inliers_per_frame']:.0f} mapped inliers",
+        f"median per frame: {report['median_tracks_per_frame']:.0f} tracks, {_mapped(report)}",
     ]
     lines += _told_of_map(report.get("known_map"), report["frames"])
     lines += [
@@ -46,6 +46,13 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
     elif len(report["segments"]) > 1:
         lines.append(f"the map was lost and restarted: {len(report['segments'])} segments")
     return [*lines, f"{report['verdict']}: {report['verdict_reason']}"]
+
+
+def _mapped(report: dict[str, Any]) -> str:
+    """How many tracks were mapped in the median frame as it came."""
+    if report["segments"] and not report["median_inliers_per_frame"]:
+        return "most frames waited for the map to begin"
+    return f"{report['median_inliers_per_frame']:.0f} mapped inliers"
 
 
 def _told_of_map(known: dict[str, Any] | None, frames: int) -> list[str]:
@@ -65,17 +72,14 @@ def _told_of_map(known: dict[str, Any] | None, frames: int) -> list[str]:
     ]
 
 
-def _broken(report: dict[str, Any]) -> dict[str, str]:
-    """What is wrong with each broken image, by frame.  Those that live mode drops are no fault."""
-    missing: dict[str, str] = report["frames_without_pixels"]
-    return {frame: why for frame, why in missing.items() if why != DROPPED}
-
-
 def _faults(report: dict[str, Any]) -> list[str]:
     """What was wrong with the frames."""
     lines: list[str] = []
-    broken = _broken(report)
-    dropped = len(report["frames_without_pixels"]) - len(broken)
+    broken = broken_images(report["frames_without_pixels"])
+    reasons = list(report["frames_without_pixels"].values())
+    dropped, masked = (reasons.count(why) for why in (DROPPED, MASKED))
+    if masked:
+        lines.append(f"{counted(masked, 'image')} passed over: masked as a whole")
     if dropped:
         why = _why_dropped(report.get("counters", {}).get("ingest", {}))
         lines.append(

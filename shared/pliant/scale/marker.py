@@ -66,7 +66,7 @@ def _markers(recording: Recording, ideal: IdealCamera) -> dict[_Marker, dict[int
         for name in _DICTIONARIES
     }
     found: dict[_Marker, dict[int, F32]] = defaultdict(dict)
-    for frame, _, pixels in rectified_images(recording, camera_of(recording), ideal.keyframes):
+    for frame, _, pixels, _ in rectified_images(recording, camera_of(recording), ideal.keyframes):
         image = ideal.image(frame, pixels)
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         for name, detector in detectors.items():

@@ -46,6 +46,10 @@ class Canvas(Protocol):
         """(N, 3) positions of the keyframes in order of time."""
         ...
 
+    def places(self, at: Moment, segment: int, lines: F64) -> None:
+        """(L, 2, 3) lines between keyframes that show one place, in place of those before."""
+        ...
+
     def points(self, at: Moment, segment: int, points: PointBlocks, changed: list[int]) -> None:
         """The map's points; ``changed`` names the blocks that differ from the last time."""
         ...

@@ -4,6 +4,7 @@
     /tf              map -> world -> camera, every frame with a pose
     /map/points      the points that changed, every ten frames
     /map/path        positions of the keyframes
+    /map/places      lines between keyframes that show one place
     /map/mesh        surface: the live mesh as it grew, then the final one in its place
     /map/all_points  the whole map, once, at the end of a segment
     /surfels/quads, /surfels/points, /surfels/image   every frame of the deformable profile
@@ -25,6 +26,7 @@ from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.errors import ResultError
+from pliant.pictures.map import PLACES_COLOUR
 from pliant.viewers.age_colours import age_buckets
 from pliant.viewers.canvas import Moment
 from pliant.viewers.point_blocks import PointBlocks
@@ -33,7 +35,7 @@ from pliant.viewers.surfel_quads import SurfelPicture
 
 _ROW = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
 _FLOAT32, _UINT8 = 7, 1  # foxglove.PackedElementField.NumericType
-_POINTS, _LINE_STRIP = 1, 0  # foxglove.PointsAnnotation.Type, foxglove.LinePrimitive.Type
+_POINTS, _LINE_STRIP, _LINE_LIST = 1, 0, 2  # foxglove.PointsAnnotation.Type, LinePrimitive.Type
 _THIS_ENTITY, _ALL_ENTITIES = 0, 1  # foxglove.SceneEntityDeletion.Type, of the topic
 _ENTITY_FACES = 50_000
 Z_UP_XYZW = (-0.5, 0.5, -0.5, 0.5)
@@ -130,6 +132,16 @@ class FoxgloveFile:
             _fill(line.points.add(), "xyz", position)
         self._write("/map/path", at, update, stamped=False)
 
+    def places(self, at: Moment, segment: int, lines: F64) -> None:
+        """A line for each pair."""
+        update, entity = self._entity(at, segment, "places")
+        line = entity.lines.add(type=_LINE_LIST, thickness=2.0, scale_invariant=True)
+        line.pose.orientation.w = 1.0
+        line.color.CopyFrom(self._colour(*PLACES_COLOUR))
+        for position in lines.reshape(-1, 3).tolist():
+            _fill(line.points.add(), "xyz", position)
+        self._write("/map/places", at, update, stamped=False)
+
     def points(self, at: Moment, segment: int, points: PointBlocks, changed: list[int]) -> None:
         """The region that changes."""
         self._write("/map/points", at, self._cloud(segment, *points.blocks(changed)))
@@ -178,7 +190,7 @@ class FoxgloveFile:
         deletion = update.deletions.add(type=_ALL_ENTITIES)
         deletion.timestamp.FromNanoseconds(at.stamp_ns)
         self._parts.clear()
-        for topic in ("/map/path", "/map/mesh", "/surfels/quads"):
+        for topic in ("/map/path", "/map/places", "/map/mesh", "/surfels/quads"):
             if topic in self._channels:
                 self._write(topic, at, update, stamped=False)
 

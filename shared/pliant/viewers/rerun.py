@@ -2,6 +2,7 @@
 
     map/camera/image, .../tracks, .../surfels   the image and what is seen in it, at the camera
     map/world/points/N, path                    the map; each block by itself: little is sent
+    map/world/places                            lines between keyframes that show one place
     map/world/mesh/live/X_Y_Z, mesh/final/N     the mesh, in groups of blocks while it grows
     map/world/surfels                           small quads
     curves/lag, milliseconds, rate, stages      how the services fare
@@ -26,6 +27,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import matrix_to_pose, pose_to_matrix
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.errors import ResultError
+from pliant.pictures.map import PLACES_COLOUR
 from pliant.viewers.age_colours import track_colours
 from pliant.viewers.canvas import Moment
 from pliant.viewers.foxglove import Z_UP_XYZW, world_name
@@ -183,6 +185,11 @@ class RerunCanvas:
         """One line through the keyframes."""
         line = self._rr.LineStrips3D([positions], colors=[_PATH_COLOUR])
         self._log(at, f"{_world(segment)}/path", line)
+
+    def places(self, at: Moment, segment: int, lines: F64) -> None:
+        """A line for each pair."""
+        strips = self._rr.LineStrips3D(lines, colors=[PLACES_COLOUR])
+        self._log(at, f"{_world(segment)}/places", strips)
 
     def points(self, at: Moment, segment: int, points: PointBlocks, changed: list[int]) -> None:
         """The blocks that changed."""

@@ -106,6 +106,9 @@ class RosCanvas:
         """The keyframes; where they look is not told."""
         self._tell("path", partial(_path, at, world_name(segment), positions), keep="")
 
+    def places(self, at: Moment, segment: int, lines: F64) -> None:
+        """Not told: the path tells where the camera was."""
+
     def points(self, at: Moment, segment: int, points: PointBlocks, changed: list[int]) -> None:
         """The cloud."""
         self._tell("points", partial(_cloud, at, world_name(segment), points), keep="")

@@ -50,6 +50,7 @@ class _World:
     segment: int = -1
     points: PointBlocks = field(default_factory=PointBlocks)
     keyframes: dict[int, tuple[int, F64]] = field(default_factory=dict[int, tuple[int, F64]])
+    same_places: set[tuple[int, int]] = field(default_factory=set[tuple[int, int]])
     moved: bool = False
 
 
@@ -148,6 +149,7 @@ class Scene:
             frame, pose = int(update.keyframe_frames[row]), update.keyframe_poses[row]
             world.keyframes[int(update.keyframe_ids[row])] = (frame, pose)
         world.moved = world.moved or bool(mine.any())
+        self._take_places(at, update, final=final)
         here = update.point_segments == world.segment
         world.points.tell(
             update.point_ids[here],
@@ -183,6 +185,7 @@ class Scene:
         old = self._worlds.pop(gone, _World())
         world = self._worlds.setdefault(segment, _World(segment=segment))
         world.keyframes |= old.keyframes
+        world.same_places |= old.same_places
         world.points.take_in(old.points)
         world.moved = True
         if self._world is old:
@@ -214,6 +217,26 @@ class Scene:
                 "next snapshot of the window",
             )
 
+    def _take_places(self, at: Moment, update: MapUpdate, *, final: bool) -> None:
+        """Say what was recognised; lines between the keyframes are drawn with the map."""
+        world = self._world
+        new = set(update.keyframe_ids[update.keyframe_frames == at.frame].tolist())
+        for pair in update.same_places.tolist():
+            before, now = pair
+            if (before, now) in world.same_places:
+                continue  # what joined two segments is a loop of the one that they are
+            here = f"frame {at.frame}"
+            if now >= 0:
+                world.same_places.add((before, now))
+                world.moved = True
+                here = _named(world, now)
+            what = "loop closed"
+            if now < 0 or (now in new and not final):
+                what = "recognised"
+            if len(update.joined):
+                what = f"segment {update.joined[0, 0]} joined to {update.joined[0, 1]}"
+            self._canvas.note(at, f"{what}: {here} shows the place of {_named(world, before)}")
+
     def _draw_pose(self, at: Moment, update: MapUpdate) -> None:
         rows = np.flatnonzero(update.pose_frames == at.frame)
         if not rows.size:
@@ -239,6 +262,12 @@ class Scene:
             ordered = sorted(world.keyframes.values(), key=lambda keyframe: keyframe[0])
             positions = np.array([pose[:3] for _, pose in ordered])
             self._canvas.path(at, world.segment, positions)
+            known, of = world.keyframes, world.same_places
+            lines = [
+                [known[a][1][:3], known[b][1][:3]] for a, b in sorted(of) if {a, b} <= known.keys()
+            ]
+            if lines:
+                self._canvas.places(at, world.segment, np.array(lines))
 
     def _take_status(self, at: Moment, status: Status, arrived_ns: int) -> None:
         is_new = status.frame > self._reported.get(status.service, -1)
@@ -257,6 +286,12 @@ class Scene:
             self._canvas.measure(at, f"rate/{status.service}", rate)
         if status.note:
             self._canvas.note(at, f"{status.service}: {status.note}")
+
+
+def _named(world: _World, keyframe: int) -> str:
+    """A keyframe by its frame, where that is known and of this session."""
+    frame = world.keyframes.get(keyframe, (-1, None))[0]
+    return f"frame {frame}" if frame >= 0 else f"keyframe {keyframe}"
 
 
 def _shows_as_it_is(frame: SourceFrame) -> bool:

@@ -30,7 +30,7 @@ from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.window import Window
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 _TRACK_AT_MAXIMUM_PX = 1.5
 """A track this close to a maximum is the track of that maximum."""
@@ -145,7 +145,7 @@ class ActiveMap:
         self.points.strikes[rows[lost]] = 0
         self.links.rows[tracks[lost]] = UNLINKED
 
-    def take_over(self, reacquired: Reacquired, tracks: FrameTracks) -> Observations:
+    def take_over(self, reacquired: Reacquired, tracks: FrameExtrema) -> Observations:
         """Let tracks at the maxima of points found again belong to those points.
 
         What such a track belonged to merges into the point, where both can be the same.  Returns

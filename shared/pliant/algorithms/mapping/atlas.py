@@ -215,7 +215,9 @@ class Atlas:
         assert self.active is not None
         moved: list[Moved] = []
         if answer.moves is not None:
-            moved = [self.move(held(answer.moves, self._spans, self.segment))]
+            told = tuple((loop.old, loop.new) for loop in answer.loops)
+            at_end = self.move(held(answer.moves, self._spans, self.segment))
+            moved = [at_end._replace(same_places=told)]
             for loop in answer.loops:
                 self.active.join(loop)
         before, self.calibration = self.calibration, answer.calibration

@@ -15,8 +15,13 @@ from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import readout_flow
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_guess
 from pliant.algorithms.triangulation import spread_of_rays
+
+_FREE_LENS = 2.0
+"""Times the lens radius where focal length and k1 are adjusted, too: what these explain is no error
+of the calibration any more.  Not under a guess: far from the truth the lens is no small error
+that the images explain step by step, and the border would lead it astray."""
 
 _CHUNK = 4096
 """Points whose rays are compared at a time: bounds a dense table of keyframes x points."""
@@ -62,7 +67,7 @@ def adjust_keyframes(
     ``Path``.    Returns what is known now, and the rows of points that too few keyframes see.
     """
     before = known.view
-    seen = list_map(keyframes, points, before.camera, parameters.window.lens_radius)
+    seen = list_map(keyframes, points, before.camera, parameters)
     seen.px = before.seen(seen.px)
     if parameters.calibration.sigmas.any():
         seen.flow = readout_flow(
@@ -112,9 +117,12 @@ def adjust_listed(
 
 
 def list_map(
-    keyframes: list[Keyframe], points: PointRows, camera: PinholeCamera, lens_radius: float
+    keyframes: list[Keyframe],
+    points: PointRows,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
 ) -> ListedMap:
-    """px: as the rolling shutter saw them."""
+    """px: as the rolling shutter saw them.   parameters: of the adjustment that follows."""
     mapped = [points.state[keyframe.rows] == MAPPED for keyframe in keyframes]
     pairs = list(zip(keyframes, mapped, strict=True))
     listed = [k.rows[each] for k, each in pairs]
@@ -133,9 +141,15 @@ def list_map(
         camera=np.repeat(np.arange(len(keyframes), dtype=np.int32), sizes),
         point=rank[point],
         px=px,
-        weights=weigh(px, camera, lens_radius),
+        weights=weigh(px, camera, _lens_radius(parameters)),
         fixed=np.array([k.turned for k in keyframes]) | (np.arange(len(keyframes)) == 0),
     )
+
+
+def _lens_radius(parameters: MappingParameters) -> float:
+    uncertain = parameters.calibration
+    free = uncertain.focal > 0.0 and uncertain.k1 > 0.0 and not is_guess(uncertain)
+    return parameters.window.lens_radius * (_FREE_LENS if free else 1.0)
 
 
 def _problem(seen: ListedMap, chosen: BoolArray, camera: PinholeCamera) -> BundleProblem:

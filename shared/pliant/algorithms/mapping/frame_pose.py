@@ -21,7 +21,7 @@ from pliant.algorithms.mapping.recovery import Motion, recover
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.support import Support, support_of
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 
 _TELLING = 500
 """Points at the least that tell whether a camera stands where it stood."""
@@ -68,8 +68,8 @@ def at_once(
     calibration: SelfCalibration,
     T_world_camera: F64,
     motion: F64,
-    seen: FrameTracks,
-) -> tuple[FrameTracks, RolledFrame]:
+    seen: FrameExtrema,
+) -> tuple[FrameExtrema, RolledFrame]:
     """The tracks of a frame with this pose and motion (6,), had it been taken at once."""
     rolled = active.segment.rolled(calibration, motion)
     depths = active.segment.inverse_depths(active.links.rows, T_world_camera)
@@ -83,7 +83,7 @@ def find_again(
     active: ActiveMap,
     frame: int,
     T_world_camera: F64,
-    tracks: FrameTracks,
+    tracks: FrameExtrema,
     grey: U8 | None,
     rolled: RolledFrame | None,
 ) -> tuple[F64, Observations]:

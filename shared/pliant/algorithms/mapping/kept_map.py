@@ -137,9 +137,11 @@ def take_in(
         for keyframe in keyframes:
             keyframe.focus = focus_of(keyframe, points)
         path = Path({each.id: each.motion for each in mine if each.motion.any()})
-        segments.append(
-            Segment(id=number, points=points, keyframes=keyframes, path=path, since=len(keyframes))
+        segment = Segment(
+            id=number, points=points, keyframes=keyframes, path=path, since=len(keyframes)
         )
+        segment.inverse_distance = _inverse_distance(keyframes)
+        segments.append(segment)
     return segments
 
 
@@ -208,6 +210,15 @@ def known_camera(kept: Sequence[KeptKeyframe], camera: PinholeCamera) -> SelfCal
             found = SelfCalibration(camera, each.correction.copy(), np.diag(each.sigmas**2))
             return replace(found, next_keyframes=np.iinfo(np.int32).max)
     return None
+
+
+def _inverse_distance(keyframes: list[Keyframe]) -> float:
+    """Of the points from the newest keyframe that sees some, as of ``Segment``."""
+    for keyframe in reversed(keyframes):
+        if keyframe.focus is not None and np.isfinite(keyframe.focus).all():
+            distance = np.linalg.norm(keyframe.focus - keyframe.T_world_camera[:3, 3])
+            return 1.0 / max(float(distance), 1e-9)
+    return 1.0
 
 
 def _put(points: PointRows, rows: I32, kept: KeptKeyframe, calibration: SelfCalibration) -> None:

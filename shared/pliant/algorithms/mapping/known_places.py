@@ -24,6 +24,9 @@ from pliant.algorithms.places.index import PlaceIndex
 _PLACES = 5
 """That look most like a frame are looked at more closely."""
 
+_ELSEWHERE = 2
+"""Places more where one of these is proved: what looks the same is often seen by many keyframes."""
+
 
 @dataclass(kw_only=True)
 class KnownPlaces:
@@ -59,10 +62,13 @@ class KnownPlaces:
         where no single one is proved.   grey: (H, W).   maxima: (M, 3) of its curvature.
         """
         seen, view = describe(grey), calibration.view
+        ranked = self._like(seen, segments, view)
+        places = list(islice(ranked, _PLACES))
+        least = parameters.localisation.min_inliers
+        elsewhere = islice(_showing_else(ranked, places, points, least), _ELSEWHERE)
         return relocalise(
-            seen, list(islice(self._like(seen, segments, view), _PLACES)), points, maxima, grey,
-            view.camera, parameters, generator,
-        )  # fmt: skip
+            seen, places, elsewhere, points, maxima, grey, view.camera, parameters, generator
+        )
 
     def compare(
         self,
@@ -82,7 +88,15 @@ class KnownPlaces:
         rest = segment.points, view.camera, parameters
         found = self.revisits.look(new, self._like(seen, [segment], view), *rest) if loops else []
         if earlier:
-            self.meetings.look(new, islice(self._like(seen, earlier, view), _PLACES), *rest)
+            least = parameters.localisation.min_inliers
+            near = list(islice(self._like(seen, earlier, view), _PLACES))
+
+            def elsewhere(number: int) -> Iterator[Place]:
+                of = [each for each in earlier if each.id == number]
+                others = _showing_else(self._like(seen, of, view), near, segment.points, least)
+                yield from islice(others, _ELSEWHERE)
+
+            self.meetings.look(new, near, elsewhere, *rest)
         return found
 
     def remember(
@@ -102,3 +116,16 @@ class KnownPlaces:
             features = self.index.features[keyframe.id]
             there = replace(features, points_px=view.pixels(features.points_px))
             yield Place(keyframe=keyframe, features=there, segment=segment)
+
+
+def _showing_else(
+    ranked: Iterable[Place], places: list[Place], points: PointRows, least: int
+) -> Iterator[Place]:
+    """The next places that show hardly a point, fewer than ``least``, of those before."""
+    shown = np.zeros(len(points.state), np.bool_)
+    for place in places:
+        shown[place.keyframe.rows] = True
+    for place in ranked:
+        if np.count_nonzero(shown[place.keyframe.rows]) < least:
+            shown[place.keyframe.rows] = True
+            yield place

@@ -15,7 +15,7 @@ from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
-from pliant.algorithms.mapping.frame_pose import find_again, localise
+from pliant.algorithms.mapping.frame_pose import at_once, find_again, localise
 from pliant.algorithms.mapping.kept_map import known_camera, take_in
 from pliant.algorithms.mapping.known_places import KnownPlaces
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
@@ -28,7 +28,7 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.support import Support, doubt, support_of
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 _LOOK_TURN_RAD = np.radians(5.0)
 _LOOK_SHIFT = 0.05
@@ -69,7 +69,7 @@ class Localiser:
         self,
         frame: int,
         stamp_ns: int,
-        tracks: FrameTracks,
+        tracks: FrameExtrema,
         grey: U8 | None,
         colour: U8 | None,
         timer: StageTimer = no_stages,
@@ -88,6 +88,7 @@ class Localiser:
             return self._publish(LOST, f"lost: {support.inliers} points of the map are seen", 0)
         if self._motion is None:
             self._motion = Motion.at(frame, stamp_ns, located)
+            self._changes.see_again([(self._hanging.id, -1)])
         else:
             self._motion = self._motion.then(frame, stamp_ns, located)
         self._changes.add_pose(frame, self._hanging, located, support.inliers)
@@ -129,12 +130,17 @@ class Localiser:
         return KeyframeChanges(self._points).publish(None)
 
     def _locate(
-        self, stamp_ns: int, tracks: FrameTracks, grey: U8 | None, timer: StageTimer
+        self, stamp_ns: int, tracks: FrameExtrema, grey: U8 | None, timer: StageTimer
     ) -> F64 | None:
         if self._map is not None and self._motion is not None:
             with timer("localisation"):
+                taken = tracks
+                if self.calibration.readout:
+                    predicted = self._motion.predictions(stamp_ns)[0]
+                    velocity = self._motion.velocity()
+                    taken, _ = at_once(self._map, self.calibration, predicted, velocity, tracks)
                 located = localise(
-                    self._map, self._motion, stamp_ns, tracks, tracks.maxima, grey,
+                    self._map, self._motion, stamp_ns, taken, tracks.maxima, grey,
                     self._generator,
                 )  # fmt: skip
             if located is not None:
@@ -164,6 +170,8 @@ class Localiser:
             depth = float(np.median(seen[:, 2]))
         if turn < _LOOK_TURN_RAD and shift < _LOOK_SHIFT * depth:
             return False
+        if depth > 0.0:
+            active.segment.inverse_distance = 1.0 / depth
         active.look_around(T_world_camera)
         self._looked_from = T_world_camera
         return True
@@ -173,12 +181,16 @@ class Localiser:
         active: ActiveMap,
         frame: int,
         T_world_camera: F64,
-        tracks: FrameTracks,
+        tracks: FrameExtrema,
         grey: U8 | None,
     ) -> tuple[F64, Support]:
         """The pose by all points that are found again, and what there is for it."""
-        parameters, camera = self._parameters, active.camera
-        T_world_camera, found = find_again(active, frame, T_world_camera, tracks, grey, None)
+        parameters, camera, rolled = self._parameters, active.camera, None
+        if self.calibration.readout and self._motion is not None:
+            velocity = self._motion.velocity_at(frame, T_world_camera)
+            tracks, rolled = at_once(active, self.calibration, T_world_camera, velocity, tracks)
+            grey = grey if grey is None else rolled.image(grey)
+        T_world_camera, found = find_again(active, frame, T_world_camera, tracks, grey, rolled)
         linked = active.linked(MAPPED)
         rows, points_px = active.observed(tracks.points_px, found, np.zeros(0, np.int64))
         errors = reprojection_errors(T_world_camera, self._points.xyz[rows], points_px, camera)

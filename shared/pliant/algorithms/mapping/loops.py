@@ -125,6 +125,12 @@ def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px:
     enough[following, following - 1] = told
     jumps = following[~told]
     if len(jumps):
+        # A camera that was recognised stands where it was, whatever a loop says.
+        before = np.tril(shared, -1)[jumps]
+        best = before.argmax(axis=1)
+        enough[jumps, best] |= before.max(axis=1) >= _FOLLOWING_SHARE * np.minimum(
+            own[jumps], own[best]
+        )
         enough[jumps, jumps - 1] = _apart(np.tril(enough, -1), ends, jumps)
     j, i = np.nonzero(np.tril(enough, -1))
     S = seen.T_world_camera

@@ -37,7 +37,7 @@ from pliant.algorithms.mapping.support import doubt
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses, returned_poses
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 _LEAST_LOST = 3
 """Frames without a pose before a map is given up, however long that takes: of a time lapse."""
@@ -77,6 +77,7 @@ class Mapper:
         self._lost_frames = 0
         self._keyframe_ns = 0
         self._keyframe_is_new = False
+        self._recognised: int | None = None  # by which keyframe, until the frame is one
         self._published_frames = 0
 
     @property
@@ -107,7 +108,7 @@ class Mapper:
         self,
         frame: int,
         stamp_ns: int,
-        tracks: FrameTracks,
+        tracks: FrameExtrema,
         grey: U8 | None,
         colour: U8 | None,
         timer: StageTimer = no_stages,
@@ -157,6 +158,9 @@ class Mapper:
             self.follow(atlas.calibrate())
             T_world_camera = hanging.T_world_camera
             self._keyframe_ns = stamp_ns
+            if self._recognised is not None:
+                self._changes.see_again([(self._recognised, hanging.id)])
+                self._recognised = None
             with self._timer("places"):
                 atlas.remember(hanging, grey)
             with self._timer("passed frames"):
@@ -180,6 +184,7 @@ class Mapper:
                 self._changes.move(each.moves)
             if each.gone is not None:
                 self._changes.join(each.gone, self.atlas.segment)
+            self._changes.see_again(each.same_places)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
         """Pass over a frame, without pixels (dropped or broken) or without time: it gets no pose.
@@ -229,7 +234,7 @@ class Mapper:
         self,
         frame: int,
         stamp_ns: int,
-        tracks: FrameTracks,
+        tracks: FrameExtrema,
         grey: U8 | None,
         colour: U8 | None,
     ) -> MapDelta:
@@ -268,7 +273,7 @@ class Mapper:
         return newest.inliers
 
     def _locate(
-        self, frame: int, stamp_ns: int, tracks: FrameTracks, grey: U8 | None
+        self, frame: int, stamp_ns: int, tracks: FrameExtrema, grey: U8 | None
     ) -> F64 | None:
         """T_world_camera of the frame where it goes on, or else where it was seen before."""
         active = self.atlas.active
@@ -288,7 +293,7 @@ class Mapper:
             return self._recognise(frame, stamp_ns, tracks, grey)
 
     def _recognise(
-        self, frame: int, stamp_ns: int, tracks: FrameTracks, grey: U8 | None
+        self, frame: int, stamp_ns: int, tracks: FrameExtrema, grey: U8 | None
     ) -> F64 | None:
         """T_world_camera in the segment that the image shows, which then goes on."""
         if grey is None:
@@ -300,6 +305,7 @@ class Mapper:
             self._keyframe_changes.settle(self.atlas.active.keyframes)
         self.atlas.go_on(found.keyframe, tracks.ids)
         self._motion = Motion.at(frame, stamp_ns, found.T_world_camera)
+        self._recognised = found.keyframe.id
         return found.T_world_camera
 
     def _place_waiting(self, active: ActiveMap, keyframe: Keyframe, T_world_camera: F64) -> None:
@@ -316,7 +322,7 @@ class Mapper:
         for each in placed:
             self._add_pose(each.frame, keyframe, each.T_world_camera, each.inliers)
 
-    def _lost(self, active: ActiveMap, frame: int, stamp_ns: int, tracks: FrameTracks) -> MapDelta:
+    def _lost(self, active: ActiveMap, frame: int, stamp_ns: int, tracks: FrameExtrema) -> MapDelta:
         """The frame has no pose.  After some time without one the segment is closed.
 
         Frames are kept meanwhile, so that a new segment has the poses of those that are its own.

@@ -5,7 +5,7 @@ keyframes tell how the two worlds lie to each other; one is moved into the other
 between them the loops take out that told so.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,17 +42,23 @@ class Meetings:
         self,
         new: Place,
         places: Iterable[Place],
+        elsewhere: Callable[[int], Iterable[Place]],
         points: PointRows,
         camera: PinholeCamera,
         parameters: MappingParameters,
     ) -> None:
-        """Compare a new keyframe with places of earlier segments, the most alike first."""
+        """Compare a new keyframe with places of earlier segments, the most alike first.
+
+        elsewhere: others of a segment, which must not tell otherwise.
+        """
         by_segment: dict[int, list[Place]] = {}
         for place in places:
             by_segment.setdefault(place.keyframe.segment, []).append(place)
         for segment, some in by_segment.items():
             told = self.told.setdefault(segment, Revisits())
-            self.proved += told.look(new, some, points, camera, parameters, tries=_TRIES)
+            self.proved += told.look(
+                new, some, points, camera, parameters, tries=_TRIES, elsewhere=elsewhere(segment)
+            )
 
 
 def join(
@@ -87,4 +93,5 @@ def join(
     goes_on.take_in(earlier, id)
     if calibration.readout:
         goes_on.unroll(earlier.keyframes, calibration)
-    return Moved(S if active_moves else np.eye(4), moves, gone)
+    told = tuple((loop.old, loop.new) for loop in loops)
+    return Moved(S if active_moves else np.eye(4), moves, gone, told)

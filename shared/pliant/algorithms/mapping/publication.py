@@ -1,11 +1,11 @@
 """What has been published of the map, and so what the next MapDelta and KeyframeDelta say."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, I64, U8
+from pliant.algorithms.arrays import F64, I32, I64, U8, with_bits
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta, MapMoves
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
@@ -13,6 +13,9 @@ from pliant.compiler.kernel import kernel
 
 _MOVED_SHARE = 2e-3
 """Points are published again when they moved by this share of their distance to the camera."""
+
+_BITS = 12
+"""Significant ones of how well a point is known."""
 
 
 class MapChanges:
@@ -23,6 +26,7 @@ class MapChanges:
         self._removed: list[I64] = []
         self._moves: MapMoves | None = None
         self._joined: list[tuple[int, int]] = []
+        self._same_places: list[tuple[int, int]] = []
 
     def move(self, moves: MapMoves) -> None:
         """The whole map moves, before anything else of the frame."""
@@ -31,6 +35,10 @@ class MapChanges:
     def join(self, gone: int, segment: int) -> None:
         """What belongs to a segment that is gone belongs to another one, after all moves."""
         self._joined.append((gone, segment))
+
+    def see_again(self, pairs: Iterable[tuple[int, int]]) -> None:
+        """Keyframes show one place, the older one first; -1: this frame, which is none."""
+        self._same_places += pairs
 
     def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
         """The pose of a frame is new, and hangs on a keyframe."""
@@ -63,6 +71,7 @@ class MapChanges:
         removed, self._removed = self._removed, []
         moves, self._moves = self._moves, None
         joined, self._joined = self._joined, []
+        same_places, self._same_places = self._same_places, []
         moved = [k for k in keyframes if snapshot or _differs(k)]
         for keyframe in moved:
             keyframe.published_pose = keyframe.T_world_camera.copy()
@@ -88,15 +97,17 @@ class MapChanges:
             else np.zeros((0, 7)),
             point_ids=points.ids[rows],
             point_segments=points.segment[rows],
-            points_world=points.xyz[rows],
+            # To a ten-millionth, far below what is known: as files and viewers have it.
+            points_world=points.xyz[rows].astype(np.float32).astype(np.float64),
             point_colours=points.colours[rows],
             point_keyframes=points.keyframes[rows],
-            point_parallax_rad=points.parallax_rad[rows],
-            point_sigmas=points.sigmas[rows],
+            point_parallax_rad=with_bits(points.parallax_rad[rows], _BITS),
+            point_sigmas=with_bits(points.sigmas[rows], _BITS),
             point_hosts=points.first_keyframe[rows].astype(np.int64),
             snapshot=snapshot,
             removed_point_ids=np.sort(np.concatenate([*removed, np.zeros(0, np.int64)])),
             joined=np.array(joined, np.int32).reshape(-1, 2),
+            same_places=np.array(same_places, np.int64).reshape(-1, 2),
         )
         if moves is None:
             return delta

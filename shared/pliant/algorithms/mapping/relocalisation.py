@@ -5,7 +5,9 @@ over corners that look alike; it counts only where the map's own points prove it
 and where no other place is proved nearly as well: what looks the same in two places shows neither.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +35,7 @@ _SAME_SHIFT = 0.1
 """Poses closer than this, as a share of the depth, are one."""
 
 _AS_GOOD = 0.5
-"""A place with this share of the inliers of another one is as good."""
+"""A place with this share of the inliers of another one, or of its corners, is as good."""
 
 _MOST = 0.5
 """Of the corners that look alike: in another place a tenth agrees on a pose."""
@@ -60,16 +62,19 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class Recognised:
-    """T_world_camera of a frame that sees what a keyframe saw, and how many points prove it."""
+    """T_world_camera of a frame that sees what a keyframe saw, and how many points of the map and
+    corners of that keyframe prove it."""
 
     keyframe: Keyframe
     T_world_camera: F64
     inliers: int
+    corners: int
 
 
 def relocalise(
     seen: Features,
-    places: list[Place],
+    places: Sequence[Place],
+    elsewhere: Iterable[Place],
     points: PointRows,
     maxima: F32,
     grey: U8,
@@ -79,12 +84,15 @@ def relocalise(
 ) -> Recognised | None:
     """The pose of a frame from the places that look like it, None where no single one is proved.
 
-    seen, maxima (M, 3), grey (H, W): of the frame.
+    seen, maxima (M, 3), grey (H, W): of the frame.   elsewhere: places that are asked as well
+    where one of the others is proved.
     """
     own = parameters.recovery
     best: Recognised | None = None
     rivals: list[Recognised] = []
-    for place in places:
+    for number, place in enumerate(chain(places, elsewhere)):
+        if number >= len(places) and best is None:
+            break
         proposed = _propose(seen, place, points, camera, parameters, generator)
         if proposed is None:
             continue
@@ -101,6 +109,7 @@ def relocalise(
             keyframe=place.keyframe,
             T_world_camera=proved.T_world_camera,
             inliers=int(proved.inliers.sum()),
+            corners=len(proposed.corners_px),
         )
         if best is not None and _is_same(best, found, place, points):
             best = max(best, found, key=lambda each: each.inliers)
@@ -109,9 +118,9 @@ def relocalise(
             rivals.append(min(best, found, key=lambda each: each.inliers))
             found = max(best, found, key=lambda each: each.inliers)
         best = found
-    if best is None:
+    if best is None or any(_is_as_good(rival, best, points, parameters) for rival in rivals):
         return None
-    return None if any(rival.inliers > _AS_GOOD * best.inliers for rival in rivals) else best
+    return best
 
 
 def corners_in_map(
@@ -175,6 +184,22 @@ def _speaks_for_itself(
         and proposed.share >= _MOST
         and spread >= parameters.support.min_spread
     )
+
+
+def _is_as_good(
+    rival: Recognised, best: Recognised, points: PointRows, parameters: MappingParameters
+) -> bool:
+    """Whether as much speaks for another pose.
+
+    Of points some places have far more than others: those that were mapped from nearby, and slowly.
+    Of corners each has as many, so that they tell, too, what is the same in two places.
+    """
+    if rival.inliers > _AS_GOOD * best.inliers:
+        return True
+    shared = np.intersect1d(rival.keyframe.rows, best.keyframe.rows)
+    shared = int(np.count_nonzero(points.state[shared] == MAPPED))
+    elsewhere = shared < parameters.localisation.min_inliers
+    return elsewhere and rival.corners > _AS_GOOD * best.corners
 
 
 def _is_same(a: Recognised, b: Recognised, place: Place, points: PointRows) -> bool:

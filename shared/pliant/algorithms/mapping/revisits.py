@@ -8,6 +8,7 @@ each other must tell of the same drift.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
@@ -42,11 +43,13 @@ class Revisits:
         camera: PinholeCamera,
         parameters: MappingParameters,
         tries: int = 1,
+        elsewhere: Iterable[Place] = (),
     ) -> list[Loop]:
         """The loops that a new keyframe proves: with a place that looks like it, if any.
 
         places: of one segment that look like it, the most alike first.   tries: how many of them
         are asked; if they contradict each other, what is alike in both proves neither.
+        elsewhere: others, which are asked as well where one of these is proved.
         """
         keyframe = new.keyframe
         mine = np.zeros(len(points.state), np.bool_)
@@ -56,23 +59,29 @@ class Revisits:
         window = {k.id for k in new.segment[-parameters.window.keyframes :]}
         # Its own, so that no frame is located otherwise because something was looked at here.
         generator = np.random.default_rng(keyframe.id)
-        told: list[Loop] = []
-        for old in places:
-            shares = int(mine[old.keyframe.rows].sum())
-            if old.keyframe.id in window or shares >= parameters.localisation.min_inliers:
-                continue
-            found = same_place(old, new, points, camera, parameters, generator)
-            if not isinstance(found, str):
-                rows = found.rows[found.rows[:, 0] != found.rows[:, 1]]
-                told.append(
-                    Loop(
-                        old=old.keyframe.id, new=keyframe.id, S_old_new=found.S_old_new, rows=rows,
-                        ids=points.ids[rows],
-                    )
-                )  # fmt: skip
-            tries -= 1
-            if tries == 0:
-                break
+        least, told = parameters.localisation.min_inliers, list[Loop]()
+
+        def ask(some: Iterable[Place]) -> None:
+            for old in some:
+                found = same_place(old, new, points, camera, parameters, generator)
+                if isinstance(found, str):
+                    continue
+                rows, S_old_new = found.rows[found.rows[:, 0] != found.rows[:, 1]], found.S_old_new
+                ids = points.ids[rows]
+                told.append(Loop(old.keyframe.id, keyframe.id, S_old_new, rows, ids))
+
+        ask(
+            islice(
+                (
+                    old
+                    for old in places
+                    if old.keyframe.id not in window and mine[old.keyframe.rows].sum() < least
+                ),
+                tries,
+            )
+        )
+        if told:
+            ask(elsewhere)
         loop = max(told, key=lambda each: len(each.rows), default=None)
         if loop is None or not all(_agree(each, loop, new, points) for each in told):
             return []

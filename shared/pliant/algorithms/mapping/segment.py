@@ -27,12 +27,14 @@ class Moved(NamedTuple):
     """What has moved the end of a segment, by a similarity S (4, 4).
 
     moves: of all that readers have; None where they learn of it by what is published anyway.
-    gone: the segment that has become a part of this one.
+    gone: the segment that has become a part of this one.   same_places: pairs of keyframes, the
+    older one first, that told so.
     """
 
     S: F64
     moves: MapMoves | None = None
     gone: int | None = None
+    same_places: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(kw_only=True)

@@ -23,7 +23,7 @@ from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.map_delta import MapDelta
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.start import Start, WaitingFrame, find_start, why_no_start
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 _GUESS = 0.05
 """Standard deviation of the log focal length from which on a calibration is a guess."""
@@ -146,8 +146,8 @@ class SelfCalibration:
         return corrected_view(self.given, tuple(self.correction.tolist()))
 
     def ideal(
-        self, tracks: FrameTracks, grey: U8 | None, colour: U8 | None
-    ) -> tuple[FrameTracks, U8 | None, U8 | None]:
+        self, tracks: FrameExtrema, grey: U8 | None, colour: U8 | None
+    ) -> tuple[FrameExtrema, U8 | None, U8 | None]:
         """Tracks and images of the camera found so far."""
         view = self.view
         if view.lens == (0.0, 0.0):

@@ -24,7 +24,7 @@ from pliant.algorithms.mapping.self_calibration import is_guess, widened
 from pliant.algorithms.mapping.start import keep_waiting
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 _KNOWN = 0.01
 """Standard deviation of the log focal length under which a map can begin for good."""
@@ -35,7 +35,7 @@ class _Taken(NamedTuple):
 
     frame: int
     stamp_ns: int
-    tracks: FrameTracks
+    tracks: FrameExtrema
     grey: U8 | None
     colour: U8 | None
 
@@ -66,7 +66,7 @@ class TrialMapper:
         self,
         frame: int,
         stamp_ns: int,
-        tracks: FrameTracks,
+        tracks: FrameExtrema,
         grey: U8 | None,
         colour: U8 | None,
         timer: StageTimer = no_stages,

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, Shape
+from pliant.algorithms.arrays import F32, F64, I32, BoolArray, Shape
 from pliant.algorithms.camera import PinholeCamera
 from pliant.compiler.kernel import kernel
 
@@ -24,6 +24,12 @@ class DepthMap:
 
     depths: Annotated[F32, Shape("H", "W")]
     weights: Annotated[F32, Shape("H", "W")]
+
+    def within(self, used: BoolArray) -> "DepthMap":
+        """Only where a mask (H, W) says so."""
+        nothing = np.float32(0.0)
+        depths, weights = (np.where(used, each, nothing) for each in (self.depths, self.weights))
+        return DepthMap(depths=depths, weights=weights)
 
 
 def render_depth(

@@ -175,9 +175,17 @@ class TexelColours:
         self._triangles = triangles
         self._sums = np.zeros((len(texels.triangles), 4))
 
-    def add(self, image: U8, camera: PinholeCamera, T_world_camera: F64) -> None:
-        """A view.  image: (H, W, 3)."""
+    def add(
+        self,
+        image: U8,
+        camera: PinholeCamera,
+        T_world_camera: F64,
+        used: BoolArray | None = None,
+    ) -> None:
+        """A view.  image: (H, W, 3).  used: (H, W) which of it shows the mesh; None: all."""
         depths = view_mesh(self._points, self._triangles, camera, T_world_camera).depths
+        if used is not None:
+            depths = np.where(used, depths, np.float32(0.0))
         _add_view(
             self._positions, self._normals, np.ascontiguousarray(image), depths,
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), inverse(T_world_camera),

@@ -22,6 +22,8 @@ BRIEF_RADIUS = 7
 """Half-width in pixels of the window that BRIEF compares points in."""
 BRIEF_WORDS = 4
 """64-bit words of a descriptor: 256 comparisons."""
+_CLEAR_PX = 2 * SHRINK
+"""Nearer than this to what a mask covers, its edge is in the curvature of the small image."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +44,11 @@ class BriefExtractor:
         self._tests = np.clip(np.rint(tests), -limit, limit).astype(np.int32)
         self._max_points = max_points
 
-    def extract(self, grey: NDArray[Any]) -> BriefFeatures:
-        """Describe the strongest curvature maxima of a (H, W) image."""
+    def extract(self, grey: NDArray[Any], clearance: F32 | None = None) -> BriefFeatures:
+        """Describe the strongest curvature maxima of a (H, W) image.
+
+        clearance: (H, W) of its mask, whose unused parts are filled in; None: without one.
+        """
         small = shrink(grey, SHRINK)
         if min(small.shape) <= 2 * BRIEF_RADIUS + 1:
             return _no_features()
@@ -52,6 +57,9 @@ class BriefExtractor:
         height, width = small.shape
         limit_u, limit_v = width - 1 - BRIEF_RADIUS, height - 1 - BRIEF_RADIUS
         inside = (u >= BRIEF_RADIUS) & (u <= limit_u) & (v >= BRIEF_RADIUS) & (v <= limit_v)
+        if clearance is not None:
+            seen = np.ascontiguousarray(clearance[SHRINK // 2 :: SHRINK, SHRINK // 2 :: SHRINK])
+            inside &= seen[np.rint(v).astype(np.int32), np.rint(u).astype(np.int32)] > _CLEAR_PX
         kept = np.flatnonzero(inside)
         strongest = np.argsort(-strength[kept], kind="stable")[: self._max_points]
         points = maxima[kept[np.sort(strongest)], :2]

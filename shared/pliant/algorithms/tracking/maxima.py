@@ -8,7 +8,9 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from pliant.algorithms.arrays import F32, I32
+from pliant.algorithms.arrays import F32, I32, U8
+from pliant.algorithms.image.masks import EDGE_PX
+from pliant.algorithms.image.patch_sums import PATCH_SIZE
 from pliant.algorithms.image.vector_code import count_bits, first_bit, load, splat, vector_type
 from pliant.algorithms.tracking.curvature import (
     CURVATURE_BORDER,
@@ -19,7 +21,11 @@ from pliant.algorithms.tracking.curvature import (
     gaussian_taps,
     row_scratch,
 )
+from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.compiler.kernel import fast_kernel
+
+REACH_PX = PATCH_SIZE // 2 + EDGE_PX
+"""Nearer than this to what a mask covers, a patch of the full size has some of it."""
 
 RUN = 32
 """Pixels that one word speaks of."""
@@ -64,6 +70,27 @@ def curvature_and_maxima(
         image, gaussian_taps(sigma_px), lowest, highest, scratch, smooth, kappa, pixels, maxima
     )
     return smooth, kappa, pixels[:count].copy(), maxima[:count].copy()
+
+
+def maxima_of(image: U8, parameters: TrackingParameters, clearance: F32 | None = None) -> F32:
+    """The maxima (M, 3) of an image, as the tracker finds them.
+
+    image: (H, W), filled where its mask covers it.    clearance: (H, W) of the mask, see
+    ``image.masks``; None: without one.
+    """
+    _, _, pixels, maxima = curvature_and_maxima(
+        image, parameters.blur_sigma_px, parameters.min_curvature, both_signs=parameters.both_signs
+    )
+    return uncovered(pixels, maxima, clearance)[1]
+
+
+def uncovered(pixels: I32, maxima: F32, clearance: F32 | None) -> tuple[I32, F32]:
+    """Those maxima of a frame, as of ``find_maxima``, at which a patch has nothing of what its mask
+    covers."""
+    if clearance is None:
+        return pixels, maxima
+    kept = np.flatnonzero(clearance.reshape(-1)[pixels] > REACH_PX)
+    return pixels[kept], maxima[kept]
 
 
 def find_maxima(kappa: F32, min_curvature: float, *, both_signs: bool) -> tuple[I32, F32]:

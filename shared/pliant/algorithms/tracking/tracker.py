@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.arrays import F32, F64, I32, U8, with_bits
+from pliant.algorithms.image.masks import filled
 from pliant.algorithms.image.patch_sums import TEMPLATE_FLOATS
 from pliant.algorithms.image.pixels import halve, pixels_of
 from pliant.algorithms.stages import StageTimer, no_stages
@@ -15,14 +16,17 @@ from pliant.algorithms.tracking.dominant_flow import (
     match_features,
 )
 from pliant.algorithms.tracking.local_flow import Flow, grid_shape, local_flow
-from pliant.algorithms.tracking.maxima import curvature_and_maxima
+from pliant.algorithms.tracking.maxima import REACH_PX, curvature_and_maxima, uncovered
 from pliant.algorithms.tracking.parameters import TrackingParameters
-from pliant.algorithms.tracking.track_table import TrackTable
+from pliant.algorithms.tracking.track_table import Tracks, TrackTable
 from pliant.algorithms.tracking.upkeep import BirthLimits, compact, remove_doubles, start_tracks
-from pliant.algorithms.tracks import FrameTracks
+from pliant.algorithms.tracks import FrameExtrema
 
 MAX_BRIEF_DISTANCE_BITS = 64
 """Of 256: beyond this a pair is as likely chance as not."""
+
+_KAPPA_BITS = 8
+"""Significant ones that are told: of a cube of the contrast the sign and the size count."""
 
 
 class ExtremaTracker:
@@ -56,17 +60,20 @@ class ExtremaTracker:
         self._features: BriefFeatures | None = None
         self._local: F32 = np.zeros((*grid_shape(width, height), 2), np.float32)
 
-    def track(self, grey: U8, timer: StageTimer = no_stages) -> FrameTracks:
+    def track(
+        self, grey: U8, timer: StageTimer = no_stages, clearance: F32 | None = None
+    ) -> FrameExtrema:
         """Follow all tracks into the next frame and start new ones.
 
-        grey: (H, W) uint8, of the size given at the start.  timer: told of each stage.  Raises
-        ValueError for an image of another size or type.
+        grey: (H, W) uint8, of the size given at the start.  timer: told of each stage.  clearance:
+        (H, W) of its mask, see ``image.masks``; None: all of it is used.  No maximum and no patch
+        of a track touches what is not.  Raises ValueError for an image of another size or type.
         """
         if grey.shape != self._shape or grey.dtype != np.uint8:
             raise ValueError(
                 f"expected a uint8 image of shape {self._shape}, got {grey.dtype} {grey.shape}"
             )
-        p = self._parameters
+        p, grey = self._parameters, filled(grey, clearance)
         with timer("curvature and maxima"):
             smooth, kappa, pixels, maxima = curvature_and_maxima(
                 grey,
@@ -76,8 +83,9 @@ class ExtremaTracker:
                 smooth=self._spare_smooth,
                 kappa=self._spare_kappa,
             )
+            pixels, maxima = uncovered(pixels, maxima, clearance)
         with timer("dominant flow"):
-            features = self._brief.extract(grey)
+            features = self._brief.extract(grey, clearance)
             dominant = self._dominant_flow(features)
         with timer("local flow"):
             pyramid = _pyramid(smooth)
@@ -85,9 +93,9 @@ class ExtremaTracker:
         now = FrameImages(pixels_of(smooth), pixels_of(pyramid[0]), pixels_of(kappa))
         if self._has_previous:
             with timer("tracks"):
-                self._advance(now, flow)
+                self._advance(now, flow, clearance)
         with timer("upkeep"):
-            self._start_tracks(now, pixels, maxima)
+            self._start_tracks(now, pixels, maxima, clearance)
         self._spare_smooth, self._smooth = self._smooth, smooth
         self._spare_kappa, self._kappa = self._kappa, kappa
         self._pyramid, self._maxima, self._features = pyramid, maxima, features
@@ -111,7 +119,7 @@ class ExtremaTracker:
             return Flow(np.zeros_like(self._local), affine)
         return local_flow(self._pyramid, pyramid, self._maxima, affine, self._local)
 
-    def _advance(self, now: FrameImages, flow: Flow) -> None:
+    def _advance(self, now: FrameImages, flow: Flow, clearance: F32 | None) -> None:
         table, p = self._table, self._parameters
         before = FrameImages(
             pixels_of(self._smooth), pixels_of(self._pyramid[0]), pixels_of(self._kappa)
@@ -127,17 +135,18 @@ class ExtremaTracker:
             table.patches.templates,
             self._scratch,
         )
+        _end_covered(table.tracks, clearance)
         if p.deduplicate:
             remove_doubles(table.tracks, self._owners)
-        table.count, table.free_count = compact(
-            table.rows, table.count, table.free_slots, table.free_count
-        )
+        self._compact()
         if p.patch_refinement and p.turn_patches:
             slopes = slopes_of_motion(table.tracks, flow.affine, *self._shape)
             window = pixels_of(self._window)
             turn_templates(table.tracks, slopes, flow.affine, table.patches, window, self._rows)
 
-    def _start_tracks(self, now: FrameImages, pixels: I32, maxima: F32) -> None:
+    def _start_tracks(
+        self, now: FrameImages, pixels: I32, maxima: F32, clearance: F32 | None
+    ) -> None:
         table = self._table
         before = table.count
         table.count, table.free_count = start_tracks(
@@ -153,18 +162,37 @@ class ExtremaTracker:
             table.free_count,
         )
         self._next_id += table.count - before
+        if clearance is not None:  # patches of half the size reach farther than their maxima keep
+            _end_covered(table.tracks, clearance)
+            self._compact()
 
-    def _frame_tracks(self, maxima: F32, flow: F64) -> FrameTracks:
+    def _compact(self) -> None:
+        table = self._table
+        table.count, table.free_count = compact(
+            table.rows, table.count, table.free_slots, table.free_count
+        )
+
+    def _frame_tracks(self, maxima: F32, flow: F64) -> FrameExtrema:
         tracks = self._table.tracks
-        return FrameTracks(
+        return FrameExtrema(
             ids=tracks["id"].copy(),
             points_px=np.column_stack([tracks["u"], tracks["v"]]),
             ages=tracks["age"].copy(),
-            kappas=tracks["kappa"].copy(),
+            kappas=with_bits(tracks["kappa"], _KAPPA_BITS),
             states=tracks["state"].astype(np.uint8),
             maxima=maxima,
             dominant_flow=flow,
         )
+
+
+def _end_covered(tracks: Tracks, clearance: F32 | None) -> None:
+    """Tracks end whose patch has come to touch what a mask covers."""
+    if clearance is None:
+        return
+    living = np.flatnonzero(tracks["alive"])
+    u, v = (np.rint(tracks[name][living]).astype(np.int32) for name in ("u", "v"))
+    reach = np.left_shift(REACH_PX, tracks["octave"][living])
+    tracks["alive"][living[clearance[v, u] <= reach]] = 0
 
 
 def _pyramid(image: F32) -> list[F32]:

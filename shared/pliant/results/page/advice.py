@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pliant.messages.types import DROPPED
+from pliant.results.report import broken_images
 
 _FEW_TRACKS = 600
 _FEW_MAPPED = 0.25
@@ -36,13 +37,20 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
             f"{missing} frames have no pose: dark, blurred or covered images, or a camera that was "
             "carried off. More light makes exposures shorter and images sharper."
         )
+    broken = len(broken_images(report["frames_without_pixels"]))
+    if broken > _LONG * frames:
+        told.append(
+            f"{broken} images are broken: copy the video again from where it was taken, or convert "
+            "it once."
+        )
+    # Frames that waited for the map to begin were not mapped as they came: that says nothing.
     tracks, mapped = report["median_tracks_per_frame"], report["median_inliers_per_frame"]
     if segments and tracks < _FEW_TRACKS:
         told.append(
             f"Only {tracks:.0f} tracks a frame: blank walls, little light or defocus. Keep "
             "something with detail in view, and the focus fixed."
         )
-    elif segments and mapped < _FEW_MAPPED * tracks:
+    elif segments and 0 < mapped < _FEW_MAPPED * tracks:
         told.append(
             "Few of the tracks became points of the map: the camera turned more than it moved, or "
             "much of what it sees moves by itself. Walk round things instead of turning to them."

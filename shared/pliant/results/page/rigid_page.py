@@ -54,11 +54,16 @@ def _map(run: Run, final: dict[int, tuple[int, F64]]) -> str:
     if not len(poses):
         return ""
     points = run.history.points_in(longest)
+    at = {
+        n: k.pose_world_camera[:3] for n, k in run.history.keyframes.items() if k.segment == longest
+    }
+    lines = [(at[a], at[b]) for a, b in run.history.same_places if {a, b} <= at.keys()]
     return canvas(
         make_scene(
-            points.positions, points.colours, pose_to_matrix(poses), mesh_of(run.mesh, longest)
+            points.positions, points.colours, pose_to_matrix(poses), mesh_of(run.mesh, longest),
+            np.array(lines),
         )
-    )
+    )  # fmt: skip
 
 
 def _clip(run: Run, recording: Recording) -> str:
@@ -113,13 +118,15 @@ def _picture(run: Run, number: int, seen: SeenKeyframe) -> U8:
 
 def _figures(run: Run, report: dict[str, Any]) -> list[tuple[str, str]]:
     camera = run.stream.camera if run.stream else None
+    mapped = report["median_inliers_per_frame"]
+    waited = "most frames waited for the map to begin"
     rows = [
         ("frames", f"{report['frames']}, {report['frames_with_pose']} with a pose"),
         ("map", f"{report['keyframes']} keyframes, {report['points']:,} points"),
         (
             "median per frame",
             f"{report['median_tracks_per_frame']:,.0f} tracks, "
-            f"{report['median_inliers_per_frame']:,.0f} of them mapped",
+            + (f"{mapped:,.0f} of them mapped" if mapped or not report["segments"] else waited),
         ),
     ]
     rows += [

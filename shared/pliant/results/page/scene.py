@@ -9,7 +9,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
-from pliant.pictures.map import PATH_COLOUR, choose_view
+from pliant.pictures.map import PATH_COLOUR, PLACES_COLOUR, choose_view
 
 MAX_POINTS = 40_000
 MAX_TRIANGLES = 60_000
@@ -28,8 +28,16 @@ class Scene:
     bytes: str
 
 
-def make_scene(points: F64, colours: U8, T_world_camera: F64, mesh: TriangleMesh | None) -> Scene:
+def make_scene(
+    points: F64,
+    colours: U8,
+    T_world_camera: F64,
+    mesh: TriangleMesh | None,
+    places: F64 | None = None,
+) -> Scene:
     """Points (P, 3), the camera's path (N, 4, 4), N >= 1, and the mesh, as many as a page carries.
+
+    places: (L, 2, 3) lines between what shows one place.
 
     Places are 16-bit shares of the box that holds all but stray points.
     """
@@ -48,6 +56,9 @@ def make_scene(points: F64, colours: U8, T_world_camera: F64, mesh: TriangleMesh
     step = max(1, -(-int(inside.sum()) // MAX_POINTS))
     block.add("points", points[inside][::step], colours[inside][::step])
     block.add("path", path, np.tile(np.array(PATH_COLOUR, np.uint8), (len(path), 1)), line=True)
+    if places is not None and len(places):
+        tints = np.tile(np.array(PLACES_COLOUR, np.uint8), (2 * len(places), 1))
+        block.add("places", places.reshape(-1, 3), tints, line=True, pairs=True)
     view = choose_view(points, T_world_camera)
     direction = view.T_world_view[:3, 2]
     up = view.up / np.linalg.norm(view.up)
@@ -76,10 +87,11 @@ class _Block:
 
     def add(
         self, name: str, places: F64 | F32, colours: U8, triangles: I32 | None = None,
-        line: bool = False,
+        line: bool = False, pairs: bool = False,
     ) -> None:  # fmt: skip
         shares = np.clip((places - self._low) / self._size, 0.0, 1.0)
         layer: dict[str, Any] = {"name": name, "count": len(places), "line": line}
+        layer |= {"pairs": True} if pairs else {}
         layer["places"] = self._put(np.round(_LEVELS * shares).astype("<u2").tobytes())
         layer["colours"] = self._put(np.ascontiguousarray(colours, np.uint8).tobytes())
         if triangles is not None:

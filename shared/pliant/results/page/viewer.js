@@ -147,7 +147,7 @@ function begin() {
       gl.bindVertexArray(layer.array);
       gl.uniform1f(places.lit, layer.triangles ? 1 : 0);
       if (layer.triangles) gl.drawElements(gl.TRIANGLES, 3 * layer.triangles, gl.UNSIGNED_INT, 0);
-      else gl.drawArrays(layer.line ? gl.LINE_STRIP : gl.POINTS, 0, layer.count);
+      else gl.drawArrays(layer.pairs ? gl.LINES : layer.line ? gl.LINE_STRIP : gl.POINTS, 0, layer.count);
     }
     gl.bindVertexArray(marks.array);
     gl.disable(gl.DEPTH_TEST);

@@ -1,0 +1,140 @@
+"""``--mask``: a run on what is left of the images, its replay, and its exports."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from running import TINY, assert_one_line, pliant
+
+import pliant as pliant_api
+from pliant.algorithms.image.masks import clearance_of, unpacked
+from pliant.datasets import open_source
+from pliant.datasets.builtin import builtin_folder
+from pliant.messages import topics
+from pliant.messages.types import Extrema, Keyframe, SourceImage
+from pliant.recording.reader import Recording
+
+pytestmark = pytest.mark.system
+HIDDEN = 160
+"""First row of the image, 320x240, that a bonnet hides."""
+
+
+@pytest.fixture(scope="module")
+def bonnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sequence whose lower third is a pattern, and its mask at half the size."""
+    folder = tmp_path_factory.mktemp("bonnet")
+    shutil.copytree(builtin_folder(TINY), folder / "drive")
+    pattern = np.random.default_rng(1).integers(0, 256, (240 - HIDDEN, 320), np.uint8)
+    for path in sorted((folder / "drive" / "images").iterdir()):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        image[HIDDEN:] = cv2.GaussianBlur(pattern, (0, 0), 1.5)
+        cv2.imwrite(str(path), image)
+    mask = np.full((120, 160), 255, np.uint8)
+    mask[HIDDEN // 2 :] = 0
+    cv2.imwrite(str(folder / "mask.png"), mask)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(bonnet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "drive"
+    done = pliant("run", bonnet / "drive", "--mask", bonnet / "mask.png", "--output", folder)
+    assert done.returncode == 0, done.stderr
+    assert "33 % of each image are ignored (mask.png)" in done.stderr
+    return folder
+
+
+def test_nothing_of_a_run_lies_under_its_mask(result: Path) -> None:
+    recording = Recording(result / "recording.mcap")
+    for source, tracks in zip(
+        recording.decoded(topics.SOURCE), recording.decoded(topics.EXTREMA), strict=True
+    ):
+        assert isinstance(source, SourceImage)
+        assert isinstance(tracks, Extrema)
+        assert unpacked(source.mask).shape == (120, 160)
+        assert len(source.mask) < 200
+        assert len(tracks.ids) > 500
+        assert tracks.points_px[:, 1].max() < HIDDEN - 4
+    shown = [m for m in recording.decoded(topics.KEYFRAME) if isinstance(m, Keyframe)]
+    for message in shown:
+        assert message.images().keys() == message.masks().keys()
+        for mask in message.masks().values():
+            assert not unpacked(mask)[HIDDEN:].any()
+    assert sum(len(message.masks()) for message in shown) > 3
+    assert json.loads((result / "report.json").read_text())["verdict"] == "good"
+
+
+def test_its_replay_gives_the_same_bytes(result: Path, tmp_path: Path) -> None:
+    done = pliant("replay", result, "--check", "--output", tmp_path / "again")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_its_recording_is_a_source_with_the_mask(result: Path, bonnet: Path) -> None:
+    first = next(iter(open_source(str(result))))
+    assert unpacked(first.mask).shape == (120, 160)
+    anew = bonnet / "other.png"
+    cv2.imwrite(str(anew), np.eye(240, 320, dtype=np.uint8))
+    masked = next(iter(open_source(str(result), mask=anew)))
+    assert unpacked(masked.mask).shape == (240, 320)
+
+
+def test_an_image_is_found_in_its_map_by_what_is_left(result: Path, bonnet: Path) -> None:
+    known = pliant_api.load_map(result)
+    path = sorted((bonnet / "drive" / "images").iterdir())[20]
+    image = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+    other = image.copy()
+    other[HIDDEN:] = np.random.default_rng(2).integers(0, 256, other[HIDDEN:].shape, np.uint8)
+    mask = np.ones(image.shape, np.uint8)
+    mask[HIDDEN:] = 0
+    first, second = (known.localise(each, mask=mask) for each in (image, other))
+    assert first is not None
+    assert second is not None
+    assert first.inliers == second.inliers > 100
+    np.testing.assert_allclose(first.T_world_camera, second.T_world_camera, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "masks"),
+    [("nerfstudio", "{}"), ("colmap", "{}.png"), ("images", "{}"), ("depth", "{}")],
+)
+def test_exports_have_masks_beside_images(
+    result: Path, tmp_path: Path, kind: str, masks: str
+) -> None:
+    done = pliant("export", result, "--to", kind, "--output", tmp_path / "export")
+    assert done.returncode == 0, done.stderr
+    folder = tmp_path / "export"
+    names = {path.name for path in (folder / "images").iterdir()}
+    assert names
+    assert {path.name for path in (folder / "masks").iterdir()} == {masks.format(n) for n in names}
+    for name in sorted(names):
+        mask = cv2.imread(str(folder / "masks" / masks.format(name)), cv2.IMREAD_UNCHANGED)
+        image = cv2.imread(str(folder / "images" / name), cv2.IMREAD_GRAYSCALE)
+        assert mask is not None
+        assert image is not None
+        assert mask.shape == image.shape
+        assert set(np.unique(mask)) == {0, 255}
+        bound = round(HIDDEN * mask.shape[0] / 240)
+        assert (clearance_of(mask[: bound - 8] > 0) > 0).all()
+        assert not mask[bound + 8 :].any()
+        if kind == "depth":
+            depth = cv2.imread(str(folder / "depth" / name), cv2.IMREAD_UNCHANGED)
+            assert depth is not None
+            assert not depth[mask == 0].any()
+    if kind == "nerfstudio":
+        frames = json.loads((folder / "transforms.json").read_text())["frames"]
+        assert [f["mask_path"] for f in frames] == [
+            f["file_path"].replace("images", "masks") for f in frames
+        ]
+
+
+def test_a_mask_that_is_none_is_one_line(bonnet: Path, tmp_path: Path) -> None:
+    for mask, words in (("nothing.png", "cannot be read"), ("drive", "holds no images")):
+        done = pliant(
+            "run", bonnet / "drive", "--mask", bonnet / mask, "--output", tmp_path / "result"
+        )
+        assert_one_line(done, words)
+        assert not (tmp_path / "result").exists()

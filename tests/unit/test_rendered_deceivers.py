@@ -1,0 +1,19 @@
+"""One of the scenes that ``scripts/bench deceiving`` renders: none is taken for another place."""
+
+import pytest
+from benchmarks.deceiving import run
+from benchmarks.deceiving_scenes import rooms
+
+from pliant.config import load_config
+
+
+@pytest.mark.slow
+def test_of_two_rendered_rooms_neither_is_taken_for_the_other() -> None:
+    """Alike but for a picture, each seen again from the dark."""
+    came = dict(run(rooms(0, both=True), load_config(), 0))
+    assert len(came) == 3
+    for one in came.values():
+        assert one.told >= 2  # it does deceive
+        assert one.joined == 0
+        assert one.wrong == []
+    assert came["the second"].found == came["the second"].frames

@@ -1,0 +1,116 @@
+"""A place that looks like a frame counts only if no other place does, and others are asked."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, looking
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.mapping import known_places, relocalisation
+from pliant.algorithms.mapping.known_places import KnownPlaces
+from pliant.algorithms.mapping.map_store import Keyframe, PointRows
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.relocalisation import Place, Recognised, relocalise
+from pliant.algorithms.mapping.segment import Segment
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.places.features import Features
+
+PARAMETERS = MappingParameters()
+NOTHING = Features(points_px=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), "u1"))
+NO_MAXIMA, DARK = np.zeros((0, 3), np.float32), np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+EACH = 50
+
+
+def keyframes(points: PointRows, count: int) -> list[Keyframe]:
+    """Every second one sees what the one before saw; their points lie 4 units ahead."""
+    made: list[Keyframe] = []
+    for number in range(count):
+        rows = made[-1].rows if number % 2 else points.allocate(EACH)
+        if number % 2 == 0:
+            points.promote(rows)
+            points.xyz[rows] = (float(number), 0.0, 4.0)
+        px = np.zeros((EACH, 2), np.float32)
+        pose = looking((float(number), 0.0, 0.0))
+        made.append(
+            Keyframe(
+                id=number, frame=number, segment=0, T_world_camera=pose, rows=rows, points_px=px,
+                rolled_px=px,
+            )
+        )  # fmt: skip
+    return made
+
+
+def ask(
+    monkeypatch: pytest.MonkeyPatch, said: dict[int, tuple[int, int]], first: int = 1
+) -> Recognised | None:
+    """What is recognised where keyframes have so many corners and points for them, each at a pose
+    of its own.   first: places that look most like the frame; the others are elsewhere."""
+    points = PointRows()
+    places = [
+        Place(keyframe=k, features=NOTHING, segment=[k])
+        for k in keyframes(points, 1 + max(said))
+        if k.id in said
+    ]
+
+    def propose(_: Features, place: Place, *__: object) -> SimpleNamespace:
+        corners = np.random.default_rng(0).uniform(0, 600, (said[place.keyframe.id][0], 2))
+        return SimpleNamespace(
+            T_world_camera=looking((3.0 * place.keyframe.id, 0.0, 0.0)),
+            corners_px=corners.astype(np.float32),
+            share=0.9,
+        )
+
+    def prove(T_world_camera: F64, *_: object) -> SimpleNamespace:
+        count = said[round(T_world_camera[0, 3] / 3.0)][1]
+        return SimpleNamespace(T_world_camera=T_world_camera, inliers=np.ones(count, np.bool_))
+
+    monkeypatch.setattr(relocalisation, "_propose", propose)
+    monkeypatch.setattr(relocalisation, "prove", prove)
+    return relocalise(
+        NOTHING, places[:first], places[first:], points, NO_MAXIMA, DARK, CAMERA, PARAMETERS,
+        np.random.default_rng(0),
+    )  # fmt: skip
+
+
+def test_a_place_that_is_mapped_more_densely_is_not_more_right(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two rooms: one was mapped from nearby, and has far more points; corners tell of both."""
+    assert ask(monkeypatch, {0: (170, 2400), 2: (420, 690)}) is None
+    found = ask(monkeypatch, {0: (170, 2400), 2: (60, 690)})
+    assert found is not None
+    assert found.keyframe.id == 0
+
+
+def test_poses_by_keyframes_that_see_the_same_points_are_of_one_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = ask(monkeypatch, {0: (170, 2400), 1: (420, 690)})
+    assert found is not None
+    assert found.keyframe.id == 0
+
+
+def test_places_elsewhere_are_asked_where_one_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
+    own, points, asked = KnownPlaces(), PointRows(), list[int]()
+    known = keyframes(points, 12)
+
+    def query(*_: object) -> list[int]:
+        return [k.id for k in known]
+
+    monkeypatch.setattr(type(own.index), "query", query)
+    own.index.features = {k.id: NOTHING for k in known}
+
+    def relocalised(_: Features, places: list[Place], elsewhere: list[Place], *__: object) -> None:
+        asked.extend(place.keyframe.id for place in places)
+        asked.append(-1)
+        asked.extend(place.keyframe.id for place in elsewhere)
+
+    monkeypatch.setattr(known_places, "relocalise", relocalised)
+    calibration = SelfCalibration.of(CAMERA, PARAMETERS.calibration)
+    segment = Segment(id=0, points=points, keyframes=known)
+    own.recognise(
+        DARK, NO_MAXIMA, [segment], points, calibration, PARAMETERS, np.random.default_rng(0)
+    )
+    # 5 sees what 4 saw, which has been asked, 7 what 6 saw.
+    assert asked == [0, 1, 2, 3, 4, -1, 6, 8]
