@@ -3,6 +3,7 @@
 import fcntl
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,3 +24,21 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             (folder / "logs" / "stdout").write_text(done.stdout)
             folder.rename(shared)
     return Path(shutil.copytree(shared, folder))
+
+
+@pytest.fixture(autouse=True)
+def tiny_run_stays_as_it_is(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A test that writes into the folder fails here: later ones would depend on the order."""
+    if "tiny_run" not in request.fixturenames:
+        yield
+        return
+    folder = request.getfixturevalue("tiny_run")
+    before = _state(folder)
+    yield
+    assert _state(folder) == before, "this test changed the run of all tests: let it take a copy"
+
+
+def _state(folder: Path) -> dict[str, tuple[int, int]]:
+    """Size in bytes and time of change of each file, by its path in the folder."""
+    files = {str(path.relative_to(folder)): path.stat() for path in folder.rglob("*")}
+    return {name: (file.st_size, file.st_mtime_ns) for name, file in files.items()}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -39,7 +40,8 @@ def test_a_run_leaves_meshes_pictures_and_figures(result: Path) -> None:
 
 def test_the_mesh_against_the_truth(result: Path, tmp_path: Path) -> None:
     figures = tmp_path / "figures.json"
-    done = pliant("eval", result, "--groundtruth", TINY, "--mesh", "--json", figures)
+    folder = shutil.copytree(result, tmp_path / "result")
+    done = pliant("eval", folder, "--groundtruth", TINY, "--mesh", "--json", figures)
     assert done.returncode == 0, done.stderr
     found = json.loads(figures.read_text())["mesh"]
     assert found["median_error"] < 0.01

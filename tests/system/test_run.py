@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -69,10 +70,11 @@ def test_an_existing_result_is_not_overwritten(result: Path) -> None:
     assert_one_line(done, "--force")
 
 
-def test_evaluation_of_a_run(result: Path) -> None:
-    done = pliant("eval", result, "--groundtruth", TINY, "--json", result / "evaluation.json")
+def test_evaluation_of_a_run(result: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(result, tmp_path / "result")
+    done = pliant("eval", folder, "--groundtruth", TINY, "--json", folder / "evaluation.json")
     assert done.returncode == 0, done.stderr
-    figures = json.loads((result / "evaluation.json").read_text())
+    figures = json.loads((folder / "evaluation.json").read_text())
     assert figures["final"]["success"]
 
 
