@@ -25,7 +25,7 @@ from pliant.datasets.base import Dataset
 from pliant.datasets.clip import clip_of
 from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.video import quiet_opencv
-from pliant.errors import RecordingError
+from pliant.errors import RecordingError, SourceLostError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import ClipPiece, Header, SourceImage
@@ -66,9 +66,16 @@ def record(
     """Record a source; what the run had is returned."""
     config = load_config(overrides=settings)
     bus = bus or ReplayBus({})
-    ingest.run(bus, config, SilentMonitor(), dataset, stopping=lambda: False)
-    logged = {t: m for t, m in bus.outputs.items() if t.logged}
-    recorder.run(ReplayBus(logged), config, path, {"packages": {"opencv-python-headless": "4.5"}})
+    try:
+        ingest.run(bus, config, SilentMonitor(), dataset, stopping=lambda: False)
+    finally:
+        logged = {t: m for t, m in bus.outputs.items() if t.logged}
+        packages = {"packages": {"opencv-python-headless": "4.5"}}
+        recorder.run(ReplayBus(logged), config, path, packages)
+    return published_on(bus)
+
+
+def published_on(bus: ReplayBus) -> list[SourceImage]:
     return [m for m in bus.outputs[topics.SOURCE] if isinstance(m, SourceImage)]
 
 
@@ -189,13 +196,16 @@ class WritingBus(ReplayBus):
                 file.write(b"more")
 
 
-def test_a_clip_that_is_written_to_during_the_run_costs_no_image(
+def test_a_clip_that_is_written_to_during_the_run_costs_no_image_and_is_told(
     clip: Path, tmp_path: Path
 ) -> None:
     own = tmp_path / "own.mp4"
     own.write_bytes(clip.read_bytes())
     path = tmp_path / "recording.mcap"
-    published = record(opened(own), path, bus=WritingBus(own, 9))
+    bus = WritingBus(own, 9)
+    with pytest.raises(SourceLostError, match=r"own.mp4: was written to while it was read"):
+        record(opened(own), path, bus=bus)
+    published = published_on(bus)
     stored = references(path)
     assert [m.frame for m in stored if m.data] == list(range(10, FRAMES))
     assert_same_images(path, published)

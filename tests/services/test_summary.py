@@ -92,6 +92,9 @@ def test_dropped_and_broken_images_are_told_apart(tmp_path: Path) -> None:
     lines = record(tmp_path, [*why, *("broken: frame 4: empty", "broken: frame 5: empty")])
     told = "3 broken images: frame 2: the png image is cut off; the others are frames 4, 5"
     assert told in lines
+    why = [f"broken: frame {3 * n} of the source: empty" if n else "" for n in range(4)]
+    told = "3 broken images: frame 3 of the source: empty; the others are frames 6, 9"
+    assert told in record(tmp_path, why)
     lines = record(tmp_path, ["broken: frame 0: empty"] * 20)
     others = ", ".join(map(str, range(1, 11)))
     told = f"20 broken images: frame 0: empty; the others are frames {others} and 9 more"

@@ -99,6 +99,7 @@ MISTAKES: list[tuple[Sequence[str], int, Sequence[str]]] = [
     (["run", TINY, "--config", "broken.yaml"], 1, ["broken.yaml: not YAML", "line 1"]),
     (["run", TINY, "--config", "nowhere.yaml"], 1, ["nowhere.yaml", "No such file"]),
     (["run", TINY, "--config", "empty"], 1, ["empty", "directory"]),
+    (["run", TINY, "--start", "99"], 1, ["built-in:tiny: is 1.30 s long", "--start 99 s"]),
     (["run", TINY, "--mode", "nonsense"], 2, ["--mode", "lossless", "live", "--help"]),
     (["run", TINY, "--port", "99999"], 2, ["--port", "65535"]),
     (["run", TINY, "--no-such-option"], 2, ["--no-such-option", "run --help"]),
@@ -129,6 +130,15 @@ def test_a_mistake_is_one_line(
     assert all(text in errors for text in texts), errors
     assert output == ""
     assert sorted(here.rglob("*")) == before, "a mistake leaves nothing behind"
+
+
+def test_a_source_that_fails_before_its_first_frame_leaves_no_result(here: Path) -> None:
+    part = ("--start", "1.01", "--end", "1.02")
+    done = pliant("run", TINY, *part, "--output", "part", cwd=here)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("pliant: ingest: built-in:tiny: no frame lies")
+    assert done.stdout == ""
+    assert not (here / "part").exists()
 
 
 def test_an_earlier_result_survives_a_mistake_with_force(here: Path) -> None:

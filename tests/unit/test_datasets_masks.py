@@ -13,6 +13,7 @@ from pliant.algorithms.arrays import U8, BoolArray
 from pliant.algorithms.image.masks import packed, unpacked
 from pliant.config import IngestParameters
 from pliant.datasets import notes_on, open_source
+from pliant.datasets import rectifier as datasets_rectifier
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.errors import DatasetError
@@ -182,3 +183,11 @@ def test_a_mask_is_rectified_with_its_image() -> None:
         assert made.mask == mask
         covered = rectified(with_mask(np.zeros_like(USED)), rectifier)
         assert (covered.missing, covered.mask) == (MASKED, b"")
+
+
+def test_a_mask_that_stays_is_unpacked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[bytes] = []
+    monkeypatch.setattr(datasets_rectifier, "unpacked", lambda m: asked.append(m) or unpacked(m))
+    rectifier, frame = Rectifier(DISTORTED), with_mask(USED)
+    made = [rectified(replace(frame, index=index), rectifier) for index in range(3)]
+    assert len({image.mask for image in made}) == len(asked) == 1

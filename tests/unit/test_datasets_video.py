@@ -192,3 +192,30 @@ def test_names_of_cameras() -> None:
         None,
         None,
     ]
+
+
+def test_a_video_that_is_replaced_after_it_was_opened_is_not_read_as_what_it_was(
+    tmp_path: Path,
+) -> None:
+    file, other = video(tmp_path), video(tmp_path, 9, "other.avi")
+    dataset = open_source(str(file), fov_deg=60.0)
+    other.replace(file)
+    with pytest.raises(DatasetError, match=r"clip.avi: was replaced after it was opened"):
+        next(iter(dataset))
+
+
+def test_a_video_that_is_written_to_while_it_is_read_is_told_and_one_without_a_name_is_none(
+    tmp_path: Path,
+) -> None:
+    file = video(tmp_path)
+    content = file.read_bytes()
+    frames = iter(open_source(str(file), fov_deg=60.0))
+    next(frames)
+    file.write_bytes(content[: len(content) // 2])
+    with pytest.raises(DatasetError, match=r"clip.avi: was written to while it was read"):
+        list(frames)
+    file.write_bytes(content)
+    frames = iter(open_source(str(file), fov_deg=60.0))
+    next(frames)
+    file.unlink()
+    assert len(list(frames)) == 5

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from pliant.config import IngestParameters
-from pliant.datasets import open_source
+from pliant.datasets import check_start, open_source
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration, calibration_from_fov
 from pliant.datasets.excerpt import Excerpt
+from pliant.datasets.rectifier import Rectifier, rectified
+from pliant.datasets.video import quiet_opencv
 from pliant.errors import DatasetError
 
 START_NS = 5_000_000_000
@@ -79,13 +81,53 @@ def test_a_first_depth_map_is_that_of_the_first_frame_taken() -> None:
 def test_nothing_left_is_one_line() -> None:
     with pytest.raises(DatasetError, match="--end 1: is not after --start 2"):
         Excerpt(Frames(), IngestParameters(start_s=2.0, end_s=1.0))
-    with pytest.raises(DatasetError, match="no frame lies between"):
-        list(Excerpt(Frames(), IngestParameters(start_s=99.0)))
+    with pytest.raises(DatasetError, match=r"no frame lies between --start 1.01 s and --end 1.09"):
+        list(Excerpt(Frames(), IngestParameters(start_s=1.01, end_s=1.09)))
+    beyond = Excerpt(Frames(), IngestParameters(start_s=99.0))
+    for ask in (beyond.check_start, lambda: list(beyond)):
+        with pytest.raises(DatasetError, match=r"is 2.90 s long: no frame comes at --start 99 s"):
+            ask()
+    Excerpt(Frames(), IngestParameters(start_s=2.9)).check_start()
+
+
+def test_where_a_source_ends_is_known_without_reading_it_all(tmp_path: Path) -> None:
+    images = Excerpt(open_source("built-in:tiny"), IngestParameters(start_s=99.0))
+    with pytest.raises(DatasetError, match=r"is 1.30 s long"):
+        images.check_start()
+    images = Excerpt(open_source("built-in:tiny"), IngestParameters(start_s=1.3))
+    images.check_start()
+    file = tmp_path / "clip.avi"
+    with quiet_opencv():
+        writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
+    for number in range(50):
+        writer.write(np.full((48, 64, 3), number, np.uint8))
+    writer.release()
+    open_source(str(file), fov_deg=60.0, part=IngestParameters(start_s=1.9))
+    for start_s, ends in ((1.9, False), (1.99, True), (2.5, True), (1e6, True)):
+        video = open_source(str(file), fov_deg=60.0, part=IngestParameters(start_s=start_s))
+        if not ends:
+            check_start(video)
+            continue
+        with pytest.raises(DatasetError, match=r"clip: is 1.96 s long: no frame comes at --start"):
+            check_start(video)
+
+
+def test_a_broken_frame_is_called_as_the_source_counts_it() -> None:
+    """And a part of that part, of a recording that has it, still is."""
+    part = Excerpt(Frames(), IngestParameters(every=4))
+    frame = list(part)[1]
+    rectified_frame = rectified(replace(frame, data=b""), Rectifier(part.calibration))
+    assert rectified_frame.missing.startswith("broken: frame 4 of the source: ")
+    again = list(Excerpt(part, IngestParameters(every=2)))
+    assert [(f.index, f.number) for f in again] == [(0, 0), (1, 8), (2, 16), (3, 24)]
 
 
 def test_a_source_is_opened_in_part() -> None:
     whole = list(open_source("built-in:tiny"))
     part = IngestParameters(every=4)
     some = list(open_source("built-in:tiny", part=part))
-    assert [replace(f, index=0) for f in some] == [replace(f, index=0) for f in whole[::4]]
+    assert [f.number for f in some] == list(range(0, len(whole), 4))
+    assert [replace(f, index=0, number=-1) for f in some] == [
+        replace(f, index=0) for f in whole[::4]
+    ]
     assert open_source("built-in:tiny", part=IngestParameters()).frame_count == len(whole)

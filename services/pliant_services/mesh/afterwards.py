@@ -54,7 +54,7 @@ def add_mesh(output: Path) -> None:
         if not child.failed:
             return
         if not child.crashed or attempt == MOST_DEATHS:
-            raise ServiceDiedError(child.obituary())
+            raise ServiceDiedError(child.obituary(), crashed=child.crashed)
 
 
 def mesh_into_recording(output: Path) -> None:

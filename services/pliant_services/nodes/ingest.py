@@ -233,6 +233,7 @@ def _source_message(source: SourceFrame, unmapped: bool, of_clip: bool) -> Sourc
         unmapped=unmapped,
         clip_frame=source.clip_frame if of_clip else -1,
         mask=source.mask,
+        source_frame=source.number,
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from pliant.config import Config, config_yaml, load_config
-from pliant.datasets import notes_on, open_source
+from pliant.datasets import check_start, notes_on, open_source
 from pliant.datasets.base import is_builtin
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_formats import UNDERSTOOD
@@ -26,6 +26,7 @@ from pliant.results.folder import (
     CONFIG_NAME,
     RECORDING_NAME,
     STATE_FOLDER,
+    discard,
     files_of,
     files_read,
     folder_name,
@@ -38,7 +39,7 @@ from pliant_services.processes import PROFILES, deformable_fleet, inputs_of, rea
 from pliant_services.run.progress import Progress
 from pliant_services.run.spectators import Viewer, announced, check_viewer, has_viewer
 from pliant_services.runtime import kernels as warm_up
-from pliant_services.runtime.launcher import Fleet
+from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
 INTERRUPTED = 130
 _DEFORMABLE = "deformable"
@@ -121,6 +122,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
         part=config.ingest,
         mask=request.mask,
     )
+    check_start(dataset)
     progress = Progress(dataset.frame_count)
     for note in notes_on(dataset):
         progress.say(note)
@@ -283,6 +285,9 @@ def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> 
         if failure is not None:  # it came first, and says why this one followed
             raise failure from None
         raise
+    if isinstance(failure, ServiceDiedError) and not (failure.crashed or report["frames"]):
+        discard(output)  # its line says it all
+        raise failure
     with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
         files = ", ".join(files_of(output, report))
         print(f"results in {output}/: {files}, {_recording_in(output)}")

@@ -33,7 +33,14 @@ MOST_DEATHS = 3  # of one service at the same frame
 
 
 class ServiceDiedError(PliantError):
-    """A service ended with an error; the text has its name and last words."""
+    """A service ended with an error; the text has its name and last words.
+
+    crashed: of a fault of its own, or a signal, which its log says more of.
+    """
+
+    def __init__(self, text: str, *, crashed: bool) -> None:
+        super().__init__(text)
+        self.crashed = crashed
 
 
 class Fleet:
@@ -204,14 +211,15 @@ class Fleet:
 
     def _restart_or_raise(self, index: int, child: Child) -> None:
         if not child.crashed:
-            raise ServiceDiedError(child.obituary())
+            raise ServiceDiedError(child.obituary(), crashed=False)
         frame = self._frames.get(child.name, max(self._frames.values(), default=-1)) + 1
         last, times = self._deaths.get(child.name, (-1, 0))
         times = times + 1 if frame == last else 1
         self._deaths[child.name] = (frame, times)
         if times >= MOST_DEATHS:
             raise ServiceDiedError(
-                f"frame {frame} killed {child.name} {times} times: {child.obituary()}"
+                f"frame {frame} killed {child.name} {times} times: {child.obituary()}",
+                crashed=True,
             )
         child.close()
         self._children[index] = self._spawn(child.name)
@@ -224,7 +232,7 @@ class Fleet:
         time.sleep(4 * _POLL_S)
         failed = [child for child in self._children if child.failed]
         first = next((c for c in failed if "went away" not in " ".join(c.last_words())), failed[0])
-        raise ServiceDiedError(first.obituary())
+        raise ServiceDiedError(first.obituary(), crashed=first.crashed)
 
 
 @contextmanager

@@ -47,6 +47,7 @@ __all__ = [
     "VideoFile",
     "calibration_from_yaml",
     "calibration_yaml",
+    "check_start",
     "decode",
     "notes_on",
     "open_source",
@@ -195,6 +196,13 @@ def notes_on(dataset: Dataset) -> list[str]:
         return []
     own = [] if isinstance(dataset, Excerpt) else [dataset.note]
     return notes_on(dataset.source) + own
+
+
+def check_start(dataset: Dataset) -> None:
+    """Raise DatasetError where a source that is opened in part ends before the part begins."""
+    whole = dataset.source if isinstance(dataset, SmallerImages) else dataset
+    if isinstance(whole, Excerpt) and not whole.is_live:
+        whole.check_start()
 
 
 _VIDEOS = (

@@ -27,6 +27,7 @@ class SourceFrame:
     clip_frame: number of the frame of a video file that it is made from; -1: of none.
     depth: the file of the depth map that belongs to it, as it is; b"" where there is none.
     mask: an image file that says which part of it is used; b"": all of it.
+    number: in the source, where only a part of that is taken; -1: ``index``.
     name: of the file that it comes from; "" where it has none; tells no frames apart.
     """
 
@@ -40,12 +41,18 @@ class SourceFrame:
     made_from: str = ""
     clip_frame: int = -1
     mask: bytes = b""
+    number: int = -1
     name: str = field(default="", compare=False)
 
     @property
     def dropped(self) -> bool:
         """Whether it was passed over on purpose (an empty file is not: that one is broken)."""
         return self.encoding == ""
+
+    @property
+    def called(self) -> str:
+        """How it is found by people."""
+        return f"frame {self.index}" if self.number < 0 else f"frame {self.number} of the source"
 
     def without_data(self) -> "SourceFrame":
         """This frame passed over: its number and time stay."""

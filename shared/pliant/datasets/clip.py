@@ -1,7 +1,6 @@
 """The file of a video, as a recording keeps it instead of raw frames."""
 
 import math
-import os
 import zlib
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
@@ -10,7 +9,7 @@ from pathlib import Path
 from pliant.datasets.base import Dataset
 from pliant.datasets.excerpt import Excerpt, Part
 from pliant.datasets.masks import Masked
-from pliant.datasets.video import VideoFile
+from pliant.datasets.video import VideoFile, file_version
 from pliant.datasets.working_size import SmallerImages
 from pliant.errors import DatasetError
 from pliant.messages.types import ClipPiece
@@ -26,8 +25,8 @@ class Clip:
         """Raises DatasetError where it cannot be read."""
         self._path = file
         with self._reading():
-            self._before = file.stat()
-        self.size = self._before.st_size
+            self.size = file.stat().st_size
+        self._before = file_version(file)
 
     def pieces(self) -> Iterator[ClipPiece]:
         """The whole file, in order.  Memory: one piece.  Raises DatasetError."""
@@ -53,10 +52,7 @@ class Clip:
 
     def is_as_it_was(self) -> bool:
         """Whether its name still leads to it, and nobody has written to it since it was opened."""
-        try:
-            return _version(self._path.stat()) == _version(self._before)
-        except OSError:
-            return False
+        return file_version(self._path) == self._before
 
     def _blocks(self) -> Iterator[bytes]:
         with self._reading(), self._path.open("rb") as file:
@@ -69,10 +65,6 @@ class Clip:
             yield
         except OSError as error:
             raise DatasetError(f"{self._path}: cannot be read: {error.strerror}") from None
-
-
-def _version(status: os.stat_result) -> tuple[int, ...]:
-    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def clip_of(source: Dataset) -> Clip | None:

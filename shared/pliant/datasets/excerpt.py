@@ -10,7 +10,10 @@ import cv2
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.image.sharpness import LONGEST_SIDE_PX, resized, sharpness
 from pliant.datasets.base import BrokenFrame, Dataset, SourceFrame
+from pliant.datasets.images import ImageFiles
+from pliant.datasets.masks import Masked
 from pliant.datasets.rectifier import decode
+from pliant.datasets.video import VideoFile
 from pliant.errors import DatasetError
 
 
@@ -54,27 +57,46 @@ class Excerpt:
         self.ground_truth_path: Path | None = source.ground_truth_path
 
     def __iter__(self) -> Iterator[SourceFrame]:
-        index = 0
-        for group in _groups(self._within(), self.part.every):
+        for index, group in enumerate(_groups(self._within(), self.part.every)):
             chosen = max(group, key=_sharpness) if self.part.sharpest else group[0]
             # Of equals max takes the first, so that frames without pixels are as without it.
             depth = b"" if index and self._first_depth_only else chosen.depth
-            yield replace(chosen, index=index, depth=depth)
-            index += 1
-        if index == 0:
-            raise DatasetError(
-                f"{self.name}: no frame lies between --start {self.part.start_s:g} s and its end"
-            )
+            number = chosen.index if chosen.number < 0 else chosen.number
+            yield replace(chosen, index=index, number=number, depth=depth)
 
     def _within(self) -> Iterator[SourceFrame]:
-        part, first_ns = self.part, 0
+        """Raises DatasetError where there is none."""
+        part, first_ns, time_s, count = self.part, 0, 0.0, 0
         for frame in self.source:
             first_ns = first_ns if frame.index else frame.stamp_ns
             time_s = 1e-9 * (frame.stamp_ns - first_ns)
             if part.end_s and time_s >= part.end_s:
-                return
+                break
             if time_s >= part.start_s:
+                count += 1
                 yield frame
+        if count == 0:
+            if time_s < part.start_s:
+                raise self._too_short(time_s)
+            raise DatasetError(
+                f"{self.name}: no frame lies between --start {part.start_s:g} s and "
+                f"--end {part.end_s:g} s"
+            )
+
+    def check_start(self) -> None:
+        """Raise DatasetError where the source ends before the start, in no time if it can tell."""
+        origin = self.source.source if isinstance(self.source, Masked) else self.source
+        if isinstance(origin, ImageFiles):
+            if origin.length_s < self.part.start_s:
+                raise self._too_short(origin.length_s)
+        elif not (isinstance(origin, VideoFile) and origin.reaches(self.part.start_s)):
+            next(iter(self))
+
+    def _too_short(self, length_s: float) -> DatasetError:
+        return DatasetError(
+            f"{self.name}: is {length_s:.2f} s long: no frame comes at --start "
+            f"{self.part.start_s:g} s or later"
+        )
 
 
 def is_all(part: Part | None) -> bool:

@@ -77,6 +77,11 @@ class ImageFiles:
         return len(self._images)
 
     @property
+    def length_s(self) -> float:
+        """From the first image to the last."""
+        return 1e-9 * (self._images[-1].stamp_ns - self._images[0].stamp_ns)
+
+    @property
     def names(self) -> list[str]:
         """Of the files."""
         return [image.path.name for image in self._images]

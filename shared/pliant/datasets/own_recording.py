@@ -87,4 +87,5 @@ def recorded_frame(image: SourceImage, depth: bytes = b"") -> SourceFrame:
         height=image.height,
         depth=depth,
         mask=image.mask,
+        number=image.source_frame,
     )

@@ -44,20 +44,20 @@ def decode(frame: SourceFrame) -> U8:
     Raises BrokenFrame, naming the frame, where the bytes are no whole image.
     """
     if frame.dropped:
-        raise BrokenFrame(f"frame {frame.index}: it was dropped, there is nothing to decode")
+        raise BrokenFrame(f"{frame.called}: it was dropped, there is nothing to decode")
     if frame.encoding in RAW_BYTES:
         return _decode_raw(frame)
     if not frame.data:
-        raise BrokenFrame(f"frame {frame.index}: empty: its file is gone, or the video is damaged")
+        raise BrokenFrame(f"{frame.called}: empty: its file is gone, or the video is damaged")
     if not _whole(frame):
-        raise BrokenFrame(f"frame {frame.index}: the {frame.encoding} image is cut off")
+        raise BrokenFrame(f"{frame.called}: the {frame.encoding} image is cut off")
     try:
         pixels = cv2.imdecode(np.frombuffer(frame.data, np.uint8), cv2.IMREAD_ANYCOLOR)
     except cv2.error:
         pixels = None
     if pixels is None:
         kind = "image" if frame.encoding == "unknown" else f"{frame.encoding} image"
-        raise BrokenFrame(f"frame {frame.index}: the {kind} does not decode")
+        raise BrokenFrame(f"{frame.called}: the {kind} does not decode")
     decoded = cast(U8, pixels)
     return _rgb(decoded) if decoded.ndim == 3 else decoded
 
@@ -70,7 +70,7 @@ class Rectifier:
         lens = calibration.lens
         self._camera = rectified_camera(lens)  # Calibration has seen to it that there is one
         self._maps = rectification_maps(lens, self._camera) if lens.distorts else None
-        self._last_mask = b"", b""
+        self._last_mask = b"", (b"", False)
 
     @property
     def camera(self) -> PinholeCamera:
@@ -92,7 +92,7 @@ class Rectifier:
         height, width = pixels.shape[:2]
         if (width, height) != self._size:
             raise BrokenFrame(
-                f"frame {frame.index}: {width}x{height} px, but the calibration is for "
+                f"{frame.called}: {width}x{height} px, but the calibration is for "
                 f"{self._size[0]}x{self._size[1]}"
             )
         if self._maps is not None:
@@ -107,28 +107,36 @@ class Rectifier:
         A pixel is used where all that it is made of is.  Raises BrokenFrame for a mask that does
         not decode, or has another aspect.
         """
-        if not frame.mask:
-            return b""
+        return self._masking(frame)[0]
+
+    def is_hidden(self, frame: SourceFrame) -> bool:
+        """Whether its mask leaves nothing of the frame's rectified image.  Raises as ``mask``."""
+        return self._masking(frame)[1]
+
+    def _masking(self, frame: SourceFrame) -> tuple[bytes, bool]:
+        """A mask that stays is unpacked once."""
         if frame.mask != self._last_mask[0]:
             self._last_mask = frame.mask, self._rectified_mask(frame)
         return self._last_mask[1]
 
-    def _rectified_mask(self, frame: SourceFrame) -> bytes:
+    def _rectified_mask(self, frame: SourceFrame) -> tuple[bytes, bool]:
+        if not frame.mask:
+            return b"", False
         try:
             pixels = 255 * scaled(unpacked(frame.mask), self._size).astype(np.uint8)
         except ValueError as error:
-            raise BrokenFrame(f"frame {frame.index}: its mask is {error}") from None
+            raise BrokenFrame(f"{frame.called}: its mask is {error}") from None
         if self._maps is not None:
             pixels = resample(pixels, self._maps)
         used = pixels == 255
-        return b"" if used.all() else packed(used)
+        return b"" if used.all() else packed(used), not used.any()
 
 
 def _decode_raw(frame: SourceFrame) -> U8:
     size = RAW_BYTES[frame.encoding]
     if min(frame.width, frame.height) <= 0 or len(frame.data) != frame.width * frame.height * size:
         raise BrokenFrame(
-            f"frame {frame.index}: {len(frame.data)} bytes are no {frame.encoding} image of "
+            f"{frame.called}: {len(frame.data)} bytes are no {frame.encoding} image of "
             f"{frame.width}x{frame.height} px"
         )
     pixels = np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width, size)
@@ -176,10 +184,10 @@ def rectified(source: SourceFrame, rectifier: Rectifier, *, unmapped: bool = Fal
         return _without_pixels(source, DROPPED)
     try:
         grey, colour = rectifier.rectify(source)
-        mask = rectifier.mask(source)
+        mask, hidden = rectifier.mask(source), rectifier.is_hidden(source)
     except BrokenFrame as error:
         return _without_pixels(source, f"{BROKEN}{error}")
-    if mask and not unpacked(mask).any():
+    if hidden:
         return _without_pixels(source, MASKED)
     return Image(
         frame=source.index,

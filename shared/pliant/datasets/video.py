@@ -36,6 +36,7 @@ class VideoFile:
         """Raises DatasetError where it holds no video, CalibrationError for its calibration."""
         self.name = file.stem
         self.file = file
+        self._version = file_version(file)
         with opened(file) as capture:
             read, first = capture.read()
             if not read:
@@ -48,8 +49,30 @@ class VideoFile:
             options, (width, height), found=file.with_suffix(".yaml"), where=str(file)
         )
 
-    def __iter__(self) -> Iterator[SourceFrame]:
+    def reaches(self, time_s: float) -> bool:
+        """Whether a frame is found there by seeking; where none is, only reading tells."""
         with opened(self.file) as capture:
+            capture.set(cv2.CAP_PROP_POS_MSEC, 1e3 * time_s)
+            read, _ = capture.read()
+            return read and 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC) >= time_s - 1.0 / self.rate_hz
+
+    def __iter__(self) -> Iterator[SourceFrame]:
+        """Raises DatasetError where it is another file by now, or was written to meanwhile.
+
+        A file that has lost its name while it is read is there until its end.
+        """
+        yield from self._frames()
+        now = file_version(self.file)
+        if now != self._version and now[:2] == self._version[:2]:
+            raise DatasetError(
+                f"{self.file}: was written to while it was read, and its frames may be of two "
+                "videos: run it again"
+            )
+
+    def _frames(self) -> Iterator[SourceFrame]:
+        with opened(self.file) as capture:
+            if file_version(self.file) != self._version:
+                raise DatasetError(f"{self.file}: was replaced after it was opened: run it again")
             step_ns = round(1e9 / rate_hz(capture))
             index, previous_ns, broken = 0, -step_ns, 0
             while True:
@@ -68,6 +91,16 @@ class VideoFile:
                 index, broken = index + broken, 0
                 yield replace(raw_frame(cast(U8, pixels), index, stamp_ns), clip_frame=index)
                 index, previous_ns = index + 1, stamp_ns
+
+
+def file_version(file: Path) -> tuple[int, ...]:
+    """What tells a file from another of its name, or from what it was before it was written to;
+    () where there is none."""
+    try:
+        status = file.stat()
+    except OSError:
+        return ()
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def raw_frame(pixels: U8, index: int, stamp_ns: int) -> SourceFrame:

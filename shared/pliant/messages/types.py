@@ -107,6 +107,7 @@ class SourceImage(Header):
     checksum: of a recording that holds the clip instead of ``data``, which is empty then: CRC-32 of
     these.  ``pliant.datasets.recorded_images`` makes them again.
     mask: which part of it is used, an image file of its own, of any size; b"": all of it.
+    source_frame: its number in the source, where only a part of that is taken; -1: ``frame``.
     """
 
     encoding: str
@@ -118,6 +119,7 @@ class SourceImage(Header):
     clip_frame: int = -1
     checksum: int = 0
     mask: bytes = b""
+    source_frame: int = -1
 
 
 @dataclass(frozen=True, kw_only=True)

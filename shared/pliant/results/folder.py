@@ -180,16 +180,28 @@ def prepare(output: Path, config: str) -> None:
     """Make the folder, free of earlier results, with what the services read."""
     try:
         make_folder(output / "logs")
-        parts.remove(output / RECORDING_NAME)
-        shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
-        for name in (*_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME):
-            (output / name).unlink(missing_ok=True)
-        for path in output.glob("*_segment_*"):
-            path.unlink()
+        _clear(output)
         write_whole(output / CONFIG_NAME, config)
         write_whole(output / "logs" / "metadata.json", json.dumps(run_metadata(config)))
     except OSError as error:
         raise _unwritable(output, error) from None
+
+
+def _clear(output: Path) -> None:
+    parts.remove(output / RECORDING_NAME)
+    shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
+    for name in (*_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME):
+        (output / name).unlink(missing_ok=True)
+    for path in output.glob("*_segment_*"):
+        path.unlink()
+
+
+def discard(output: Path) -> None:
+    """Take away all that a run has left, of one that came to nothing."""
+    with suppress(OSError):
+        _clear(output)
+        (output / CONFIG_NAME).unlink(missing_ok=True)
+        shutil.rmtree(output / "logs", ignore_errors=True)
 
 
 def _unwritable(output: Path, error: OSError) -> ResultError:

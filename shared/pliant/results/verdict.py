@@ -1,14 +1,16 @@
 """What a run came to: its report in a few lines, and the exit code that follows."""
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
-from pliant.messages.types import DROPPED, MASKED
+from pliant.messages.types import BROKEN, DROPPED, MASKED
 from pliant.results.report import broken_images, counted
 from pliant.results.surfels import surfel_summary
 
 DONE, INCOMPLETE = 0, 3
 _NAMED = 10  # broken images beside the first
+_OF_SOURCE = re.compile(r"frame (\d+) of the source: ")
 
 
 def grade(report: dict[str, Any]) -> int:
@@ -91,15 +93,23 @@ def _faults(report: dict[str, Any]) -> list[str]:
             f"{counted(passed_over, 'image')} tracked, but not mapped, to keep up (live mode)"
         )
     if broken:
-        first, *others = broken
-        told = f"{counted(len(broken), 'broken image')}: {broken[first].removeprefix('broken: ')}"
-        if others:
-            more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
-            told += f"; the others are frames {', '.join(others[:_NAMED])}{more}"
-        lines.append(told)
+        lines.append(f"{counted(len(broken), 'broken image')}: {_told_of_broken(broken)}")
     if report["ended_early"]:
         lines.append(f"the source ended early: {report['ended_early']}")
     return lines
+
+
+def _told_of_broken(broken: Mapping[str, str]) -> str:
+    """What is wrong with the first, and which the others are, as the source counts them."""
+    first, *others = (why.removeprefix(BROKEN) for why in broken.values())
+    if not others:
+        return first
+    numbers = list(broken)[1:]
+    of_source = [found for why in others if (found := _OF_SOURCE.match(why))]
+    if len(of_source) == len(others):
+        numbers = [found[1] for found in of_source]
+    more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+    return f"{first}; the others are frames {', '.join(numbers[:_NAMED])}{more}"
 
 
 def _why_dropped(counters: Mapping[str, float]) -> str:
