@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameTracks
@@ -25,6 +26,8 @@ from pliant.messages.types import (
     StreamEnd,
 )
 from pliant.recording.writer import RecordingWriter
+from pliant.results.report import rigid_report
+from pliant.results.run import Run
 from pliant.results.verdict import DONE, INCOMPLETE, summary
 from pliant.results.write import write_results
 from pliant_services.run import command as pipeline
@@ -123,7 +126,7 @@ def test_of_a_clip_that_waited_for_its_map_no_inliers_are_told() -> None:
         "median_tracks_per_frame": 900.0,
         "median_inliers_per_frame": 0.0,
     }
-    waited = "median per frame: 900 tracks, most frames waited for the map to begin"
+    waited = "median per frame: 900 tracks, every frame waited for the map to begin"
     assert waited in summary(report)
     report["median_inliers_per_frame"] = 700.0
     assert "median per frame: 900 tracks, 700 mapped inliers" in summary(report)
@@ -191,3 +194,27 @@ def test_a_run_that_was_interrupted_before_it_recorded_has_nothing_to_mesh(
     source = "built-in:tiny?frames=8"
     with pytest.raises(KeyboardInterrupt):
         run_pipeline(RunRequest(source=source, output=tmp_path / "run", on_crash="restart"))
+
+
+def test_frames_that_waited_for_the_map_count_no_inliers(tmp_path: Path) -> None:
+    """Six of eight waited and got their poses when the map began: those say nothing of tracks."""
+    run = Run()
+    mapper = Mapper(stream(0).camera, MappingParameters(), 0)
+    for frame in range(8):
+        delta = mapper.skip(frame)
+        if frame >= 6:
+            begun = np.arange(frame + 1 if frame == 6 else 1) + (0 if frame == 6 else frame)
+            delta = replace(
+                delta, state=TRACKING, segment=0, inliers=100 * frame, pose_frames=begun,
+                pose_segments=np.zeros(len(begun), np.int32),
+                pose_keyframes=np.zeros(len(begun), np.int64),
+                poses_keyframe_camera=np.tile(np.eye(7)[6], (len(begun), 1)),
+                pose_inliers=np.full(len(begun), 500, np.int32), keyframe_ids=np.array([0]),
+                keyframe_frames=np.array([0]), keyframe_segments=np.zeros(1, np.int32),
+                keyframe_poses=np.eye(7)[6:],
+            )  # fmt: skip
+        run.history.apply(delta, frame=frame, stamp_ns=frame)
+        run.inliers[frame], run.tracks[frame] = delta.inliers, 900
+    report = rigid_report(run, run.history.final())
+    assert report["frames_with_pose"] == 8
+    assert report["median_inliers_per_frame"] == 650.0

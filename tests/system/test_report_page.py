@@ -267,7 +267,7 @@ STAMPS = {frame: 10**9 + frame * 33_000_000 for frame in range(100)}
 
 def test_of_a_good_run_there_is_nothing_to_say() -> None:
     assert advice(report(), STAMPS) == []
-    # A clip so short that most of its frames waited for the map to begin.
+    # A clip so short that all of its frames waited for the map to begin.
     assert advice(report(median_inliers_per_frame=0.0), STAMPS) == []
 
 

@@ -68,7 +68,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "calibration_correction": _correction(run),
         "calibration_verdict": calibration_verdict(run, final),
         "median_tracks_per_frame": _median(run.tracks.values()),
-        "median_inliers_per_frame": _median(run.inliers[f] for f in final if f in run.inliers),
+        "median_inliers_per_frame": _median(run.inliers[f] for f in history.causal),
         "mesh": mesh_report(run.mesh),
         **process_figures(run, frames),
         "tracks_per_frame": [run.tracks[f] for f in sorted(run.tracks)],

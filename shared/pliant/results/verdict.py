@@ -51,9 +51,9 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
 
 
 def _mapped(report: dict[str, Any]) -> str:
-    """How many tracks were mapped in the median frame as it came."""
+    """How many tracks were mapped in the median of the frames that had a pose as they came."""
     if report["segments"] and not report["median_inliers_per_frame"]:
-        return "most frames waited for the map to begin"
+        return "every frame waited for the map to begin"
     return f"{report['median_inliers_per_frame']:.0f} mapped inliers"
 
 

@@ -43,7 +43,7 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
             f"{broken} images are broken: copy the video again from where it was taken, or convert "
             "it once."
         )
-    # Frames that waited for the map to begin were not mapped as they came: that says nothing.
+    # None were mapped as they came where every frame waited for the map: that says nothing.
     tracks, mapped = report["median_tracks_per_frame"], report["median_inliers_per_frame"]
     if segments and tracks < _FEW_TRACKS:
         told.append(

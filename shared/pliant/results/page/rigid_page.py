@@ -119,7 +119,7 @@ def _picture(run: Run, number: int, seen: SeenKeyframe) -> U8:
 def _figures(run: Run, report: dict[str, Any]) -> list[tuple[str, str]]:
     camera = run.stream.camera if run.stream else None
     mapped = report["median_inliers_per_frame"]
-    waited = "most frames waited for the map to begin"
+    waited = "every frame waited for the map to begin"
     rows = [
         ("frames", f"{report['frames']}, {report['frames_with_pose']} with a pose"),
         ("map", f"{report['keyframes']} keyframes, {report['points']:,} points"),
