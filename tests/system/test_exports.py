@@ -76,6 +76,38 @@ def test_foxglove_messages_are_read_with_their_own_definitions(result: Path) -> 
     assert sorted(map(tuple, whole.tolist())) == sorted(map(tuple, points.tolist()))
 
 
+@pytest.mark.parametrize(
+    ("to", "name", "says"),
+    [
+        ("glb", "x.txt", "x.txt: --to glb writes a file of the ending .glb"),
+        ("glb", "x", "x: --to glb writes a file of the ending .glb"),
+        ("ply", "x.pcd", "writes a file of the ending .ply"),
+        ("foxglove", "x.bag", "writes a file of the ending .mcap"),
+        ("rerun", "x.mcap", "writes a file of the ending .rrd"),
+        ("obj", "x.obj", "x.obj: --to obj writes a folder: leave out the ending .obj"),
+        ("colmap", "x.txt", "writes a folder: leave out the ending .txt"),
+        ("picture", "x.txt", "x.txt"),
+        ("overlay", "x.txt", "x.txt"),
+        ("overview", "x.txt", "x.txt"),
+    ],
+)
+def test_an_ending_that_contradicts_the_format_is_one_line(
+    result: Path, tmp_path: Path, to: str, name: str, says: str
+) -> None:
+    with pytest.raises(ResultError) as refused:
+        export_result(result, to, tmp_path / name)
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_name_in_capitals_a_folder_with_a_dot_and_text_under_any_ending_are_taken(
+    result: Path, tmp_path: Path
+) -> None:
+    for to, name in (("ply", "X.PLY"), ("colmap", "model.v2"), ("tum", "poses.tum")):
+        assert export_result(result, to, tmp_path / name).exists()
+
+
 def test_foxglove_gives_the_same_bytes_again(result: Path, tmp_path: Path) -> None:
     pytest.importorskip("foxglove_schemas_protobuf")
     a = export_result(result, "foxglove", tmp_path / "a.mcap")
@@ -294,9 +326,14 @@ def test_wrong_requests_are_one_line(result: Path, tmp_path: Path) -> None:
     assert there.read_text() == "mine"
     with pytest.raises(ResultError, match="is read from there"):
         export_result(result, "foxglove", result / "recording.mcap", force=True)
-    for kind in ("foxglove", "rerun", "colmap", "images"):
+    for kind, below in (
+        ("foxglove", "x.mcap"),
+        ("rerun", "x.rrd"),
+        ("colmap", "x"),
+        ("images", "x"),
+    ):
         with pytest.raises(ResultError, match="cannot be"):
-            export_result(result, kind, there / "below")
+            export_result(result, kind, there / below)
     parts = tmp_path / "recording"
     parts.mkdir()
     (parts / "part_00000.mcap").symlink_to(result / "recording.mcap")
@@ -311,9 +348,10 @@ def test_what_is_not_there_is_one_line_and_no_file(kind: str, tmp_path: Path) ->
         calibration=camera, width=4, height=2, fx=1.0, fy=1.0, cx=0.0, cy=0.0,
     )  # fmt: skip
     recorder.run(ReplayBus({topics.STREAM: [stream]}), Config(), tmp_path / "recording.mcap", {})
+    made = tmp_path / ("made.ply" if kind == "ply" else "made")
     with pytest.raises(ResultError, match=r"has no|to export"):
-        export_result(tmp_path, kind, tmp_path / "made")
-    assert not (tmp_path / "made").exists()
+        export_result(tmp_path, kind, made)
+    assert not made.exists()
 
 
 def test_points_that_were_missed_are_right_after_the_next_snapshot() -> None:

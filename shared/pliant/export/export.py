@@ -36,7 +36,7 @@ from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Extrema, MapUpdate
 from pliant.pictures.map import choose_view
-from pliant.pictures.movie import write_animation, write_image, write_movie
+from pliant.pictures.movie import animation_suffix, write_animation, write_image, write_movie
 from pliant.pictures.overlay import OverlayFrame, write_overlay_video
 from pliant.recording.parts import parts_in
 from pliant.recording.reader import Recorded, Recording
@@ -92,6 +92,7 @@ def export_result(
     recording = _Followed(result / RECORDING_NAME if folder is not None else result, progress)
     name, write = EXPORTS[to]
     path = output or (result / name if folder is not None else _beside(result, name))
+    _check_ending(path, to, name)
     keep_apart(path, files_read(result))
     if path.exists() and not force:
         raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
@@ -103,6 +104,19 @@ def export_result(
             _remove(path)
         raise
     return path
+
+
+def _check_ending(path: Path, to: str, name: str) -> None:
+    """Raise ResultError where others would take a file for another kind than it is.
+
+    name: the default.  Pictures and videos have several, and are made in the format of theirs.
+    """
+    given, own = path.suffix.lower(), Path(name).suffix
+    if to in _NAMED and given != own:
+        raise ResultError(f"{path}: --to {to} writes a file of the ending {own}: name it so")
+    files = {Path(each).suffix for each, _ in EXPORTS.values()} | {".obj", ".zip"}
+    if not own and given and given in files:
+        raise ResultError(f"{path}: --to {to} writes a folder: leave out the ending {given}")
 
 
 class _Followed(MetricRecording):
@@ -179,6 +193,7 @@ def _picture(recording: Recording, path: Path, folder: Path | None) -> None:
 
 def _overview(recording: Recording, path: Path, folder: Path | None) -> None:
     """The moving picture of the README."""
+    animation_suffix(path)  # said before the work
     run, stream, what = _made(recording)
     wanted = range(0, len(run.tracks), -(-len(run.tracks) // FRAMES))
     layout = Layout(stream.camera.width, stream.camera.height)
@@ -275,5 +290,7 @@ EXPORTS: dict[str, tuple[str, Export]] = {
     "overview": ("overview.webp", _overview),
 }
 """Kind of export: its default name, and who writes it."""
+_NAMED = ("foxglove", "rerun", "ply", "glb")
+"""Kinds that other programs know by the ending; trajectories are text under any."""
 _OPTIONS = {"every": ("surface",), "triangles": ("glb", "obj")}
 """Which kinds have an option."""

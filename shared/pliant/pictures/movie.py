@@ -67,6 +67,14 @@ def write_movie(path: Path, pictures: Iterable[U8], *, fps: float) -> int:
     return count
 
 
+def animation_suffix(path: Path) -> str:
+    """That of an animation; ResultError for another one."""
+    suffix = path.suffix.lower()
+    if suffix not in _ANIMATIONS:
+        raise ResultError(f"{path}: unknown kind of animation; use {', '.join(_ANIMATIONS)}")
+    return suffix
+
+
 def write_animation(path: Path, pictures: Sequence[U8], *, fps: float, quality: int = 55) -> None:
     """Write a looping animation that a README can show.
 
@@ -74,9 +82,7 @@ def write_animation(path: Path, pictures: Sequence[U8], *, fps: float, quality: 
     Raises ResultError for a suffix other than .webp, .gif and .avif, no pictures, an OpenCV older
     than 4.11, and a file that cannot be written.
     """
-    suffix = path.suffix.lower()
-    if suffix not in _ANIMATIONS:
-        raise ResultError(f"{path}: unknown kind of animation; use {', '.join(_ANIMATIONS)}")
+    suffix = animation_suffix(path)
     if not pictures:
         raise ResultError(f"{path}: there are no frames to write")
     data = encode_animation(pictures, fps=fps, suffix=suffix, quality=quality)
