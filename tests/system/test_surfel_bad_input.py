@@ -87,6 +87,8 @@ def test_a_film_in_which_everything_goes_wrong(tmp_path: Path) -> None:
     assert "tracking was lost" in done.stdout
     report = json.loads((output / "report.json").read_text())
     assert report["frames"] == film.frames
+    assert report["verdict"] in ("doubtful", "bad")
+    assert done.stdout.splitlines()[-1] == f"{report['verdict']}: {report['verdict_reason']}"
     assert list(report["notes"]) == [str(small)]
     assert report["alive_per_frame"][: waiting + 1] == [0, 0]
     assert {black, flat} <= set(report["frames_lost"])

@@ -30,6 +30,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = pliant("run", TINY, "--profile", "deformable", "--output", folder, *FEW)
     assert done.returncode == 0, done.stderr
     assert f"{FRAMES} frames" in done.stdout
+    assert done.stdout.splitlines()[-1] == "good: all frames have a pose in one segment"
     return folder
 
 
@@ -40,6 +41,7 @@ def test_a_run_leaves_everything_a_user_opens(result: Path) -> None:
     assert report["births"] == 60
     assert len(report["alive_per_frame"]) == FRAMES
     assert report["alive_per_frame"][0] == 60
+    assert (report["verdict"], report["doubtful_frames"]) == ("good", [])
     assert len(np.loadtxt(result / "trajectory.txt")) == FRAMES
     with np.load(result / "surfels.npz") as surfels:
         counts = surfels["counts"]
@@ -58,6 +60,7 @@ def test_the_page_shows_the_surface(result: Path) -> None:
     assert layers["mesh"]["triangles"] > layers["points"]["count"]
     assert layers["path"]["count"] == FRAMES
     assert f"{FRAMES}, {FRAMES} followed" in page
+    assert '<span class="verdict good">good</span>' in page
     assert "surfels.npz" in page
     assert "://" not in page
 

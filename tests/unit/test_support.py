@@ -1,5 +1,7 @@
 """What counts for a pose and for a run: share and spread over the image, not inliers alone."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
@@ -9,7 +11,7 @@ from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, SupportParameters
 from pliant.algorithms.mapping.support import doubt, support_of
 from pliant.algorithms.tracks import FrameExtrema
-from pliant.results.judgement import BAD, DOUBTFUL, GOOD, judge
+from pliant.results.judgement import BAD, DOUBTFUL, GOOD, judge, judge_surfels, slipping_frames
 
 
 def doubt_of(points, inliers, settled):
@@ -102,3 +104,33 @@ def test_a_run_of_which_many_images_are_broken_is_doubtful() -> None:
     few = judge(frames=95, in_segments=[95], doubtful=0, unused=5, broken=5)
     many = judge(frames=60, in_segments=[60], doubtful=0, unused=40, broken=40)
     assert (few[0], many) == (GOOD, (DOUBTFUL, "40% of the images are broken"))
+
+
+@pytest.mark.parametrize(
+    ("changed", "word", "says"),
+    [
+        ({}, GOOD, "all frames have a pose in one segment"),
+        ({"slipping": 20}, GOOD, "all frames"),
+        ({"slipping": 61}, DOUBTFUL, "in 61% of the frames less than 75% of the surfels in view"),
+        ({"in_segments": [60, 40]}, DOUBTFUL, "60% of the frames"),
+        ({"in_segments": [30, 20, 10]}, BAD, "30% of the frames"),
+        ({"in_segments": []}, BAD, "no surfels were followed"),
+        ({"in_segments": [0]}, BAD, "no surfels were followed"),
+        ({"frames": 0, "in_segments": []}, BAD, "no surfels were followed"),
+        ({"unusable": 50}, DOUBTFUL, "50% of the depth maps could not be used"),
+        ({"depth_from": "flat"}, DOUBTFUL, "started on a plane"),
+        ({"depth_from": "map"}, GOOD, "all frames"),
+        ({"broken": 40, "unused": 40}, DOUBTFUL, "of the images are broken"),
+    ],
+)
+def test_a_run_of_surfels_is_judged_with_a_reason(
+    changed: dict[str, Any], word: str, says: str
+) -> None:
+    evidence: dict[str, Any] = {"frames": 100, "in_segments": [100], "slipping": 0, "unusable": 0}
+    found, reason = judge_surfels(**{"depth_from": "sensor", **evidence, **changed})
+    assert found == word
+    assert says in reason
+
+
+def test_a_frame_slips_in_which_few_of_the_surfels_in_view_are_tracked() -> None:
+    assert slipping_frames([0, 100, 75, 74, 40], [0, 100, 100, 100, 50]) == [3]

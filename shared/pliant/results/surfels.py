@@ -14,7 +14,7 @@ from pliant.config import recorded_config
 from pliant.formats.npz import NpzWriter
 from pliant.formats.tum import write_tum
 from pliant.messages import topics
-from pliant.messages.types import WAITING_FOR_DEPTH, Surfels
+from pliant.messages.types import WAITING_FOR_DEPTH, CameraStream, Surfels
 from pliant.recording.reader import Recording
 from pliant.results.folder import (
     PAGE_NAME,
@@ -24,9 +24,10 @@ from pliant.results.folder import (
     TRAJECTORY_NAME,
     all_or_none,
 )
+from pliant.results.judgement import judge_surfels, slipping_frames
 from pliant.results.page.surface import Surface
 from pliant.results.page.surfel_page import write_surfel_page
-from pliant.results.report import counted, ended_early, process_figures
+from pliant.results.report import broken_images, counted, ended_early, process_figures
 from pliant.results.run import Run, read_run
 from pliant.trajectory import Trajectory
 
@@ -41,6 +42,7 @@ class _Counts:
     """What the report says of each frame."""
 
     alive: list[int] = field(default_factory=list[int])
+    in_view: list[int] = field(default_factory=list[int])
     listed: list[int] = field(default_factory=list[int])
     lost: list[int] = field(default_factory=list[int])
     missing: dict[int, str] = field(default_factory=dict[int, str])
@@ -77,7 +79,7 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
             for recorded in Recording(recording).messages(topics.SURFELS):
                 surfels = recorded.decode()
                 assert isinstance(surfels, Surfels)
-                _count(counts, surfels, recorded.log_time_ns)
+                _count(counts, surfels, recorded.log_time_ns, run.stream)
                 _add(npz, surfels)
                 followed += _followed(surfels)
                 if _followed(surfels):
@@ -94,13 +96,13 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
 
 def surfel_report(recording: Path) -> dict[str, Any]:
     """What report.json says of a run of the deformable profile."""
-    counts, followed = _Counts(), 0
+    run, counts, followed = read_run(recording), _Counts(), 0
     for recorded in Recording(recording).messages(topics.SURFELS):
         surfels = recorded.decode()
         assert isinstance(surfels, Surfels)
-        _count(counts, surfels, recorded.log_time_ns)
+        _count(counts, surfels, recorded.log_time_ns, run.stream)
         followed += len(_followed(surfels))
-    return _report(read_run(recording), counts, followed)
+    return _report(run, counts, followed)
 
 
 def surfel_trajectory(recording: Path) -> Trajectory:
@@ -158,9 +160,10 @@ def _add(npz: NpzWriter, surfels: Surfels) -> None:
         npz.add(name, getattr(surfels, name))
 
 
-def _count(counts: _Counts, surfels: Surfels, arrival_ns: int) -> None:
+def _count(counts: _Counts, surfels: Surfels, arrival_ns: int, stream: CameraStream | None) -> None:
     states = np.bincount(surfels.state, minlength=len(SurfelState)).tolist()
     counts.alive.append(states[SurfelState.TRACKED])
+    counts.in_view.append(_in_view(surfels, stream))
     counts.listed.append(len(surfels.ids))
     counts.arrivals_ns.append(arrival_ns)
     if surfels.note:
@@ -178,12 +181,26 @@ def _count(counts: _Counts, surfels: Surfels, arrival_ns: int) -> None:
     }
 
 
+def _in_view(surfels: Surfels, stream: CameraStream | None) -> int:
+    """How many of the surfels lie within the image, tracked or not."""
+    tracked = surfels.state == SurfelState.TRACKED
+    if stream is None:
+        return int(tracked.sum())
+    x, y = surfels.points_px.T
+    inside = (x >= 0) & (x < stream.width) & (y >= 0) & (y < stream.height)
+    return int((tracked | (inside & (surfels.state != SurfelState.OUTSIDE))).sum())
+
+
 def is_metric(metadata: Mapping[str, Mapping[str, str]]) -> bool:
     """Depth maps of a sensor are; a map of one camera has a scale of its own.
 
     metadata: of the recording.
     """
-    return recorded_config(metadata, []).surfels.depth_from == "sensor"
+    return _depth_from(metadata) == "sensor"
+
+
+def _depth_from(metadata: Mapping[str, Mapping[str, str]]) -> str:
+    return recorded_config(metadata, []).surfels.depth_from
 
 
 def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
@@ -191,7 +208,24 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
     spent_ns = counts.arrivals_ns[-1] - counts.arrivals_ns[0] if frames else 0
     missing = counts.missing
     reasons = [*missing.values()]
+    without_pixels = {
+        f: why for f, why in sorted(missing.items()) if not why.startswith(WAITING_FOR_DEPTH)
+    }
+    lost = {*counts.lost, *missing}
+    slipping = [f for f in slipping_frames(counts.alive, counts.in_view) if f not in lost]
+    word, why = judge_surfels(
+        frames=frames - len(without_pixels),
+        in_segments=[len(set(members) - lost) for members in counts.segments.values()],
+        slipping=len(slipping),
+        depth_from=_depth_from(run.recorded.metadata),
+        unusable=len(counts.notes),
+        unused=len(without_pixels),
+        broken=len(broken_images(without_pixels)),
+    )
     return {
+        "verdict": word,
+        "verdict_reason": why,
+        "doubtful_frames": slipping,
         "source": run.stream.source if run.stream else "",
         "mode": run.stream.mode if run.stream else "",
         "profile": "deformable",
@@ -206,11 +240,7 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
             for segment, members in sorted(counts.segments.items())
         ],
         "last_reason": reasons[-1] if reasons else "no frames",
-        "frames_without_pixels": {
-            str(f): why
-            for f, why in sorted(missing.items())
-            if not why.startswith(WAITING_FOR_DEPTH)
-        },
+        "frames_without_pixels": {str(f): why for f, why in without_pixels.items()},
         "frames_lost": counts.lost,
         "notes": {str(f): note for f, note in sorted(counts.notes.items())},
         "births": counts.births,

@@ -23,7 +23,7 @@ def grade(report: dict[str, Any]) -> int:
 def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
     """The report in a few lines.  has_map: False where nobody was to make one, as in a replay."""
     if report.get("profile") == "deformable":
-        return [*surfel_summary(report), *_faults(report)]
+        return [*surfel_summary(report), *_faults(report), _judged(report)]
     frames = counted(report["frames"], "frame")
     if not has_map:
         median = f"median per frame: {report['median_tracks_per_frame']:.0f} tracks"
@@ -47,7 +47,11 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         lines.append(f"no map could start: {report['last_reason'] or 'no frames'}")
     elif len(report["segments"]) > 1:
         lines.append(f"the map was lost and restarted: {len(report['segments'])} segments")
-    return [*lines, f"{report['verdict']}: {report['verdict_reason']}"]
+    return [*lines, _judged(report)]
+
+
+def _judged(report: dict[str, Any]) -> str:
+    return f"{report['verdict']}: {report['verdict_reason']}"
 
 
 def _mapped(report: dict[str, Any]) -> str:

@@ -27,13 +27,13 @@ def write_surfel_page(
     """
     fill_page(
         path, report, names,
-        verdict="",
-        reason=escape(lines[0]),
+        verdict=escape(report["verdict"]),
+        reason=escape(report["verdict_reason"]),
         map="" if surface is None else canvas(surface.scene()) + _TINTS,
         clip="",
         figures=table_rows(_surfel_figures(report)),
         chart=_surfel_chart(report),
-        advice=bullets("What else it said", lines[1:]),
+        advice=bullets("What else it said", lines),
     )  # fmt: skip
 
 
