@@ -1,8 +1,12 @@
 """``--mask``: a run on what is left of the images, its replay, and its exports."""
 
+import base64
 import json
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -13,9 +17,12 @@ import pliant as pliant_api
 from pliant.algorithms.image.masks import clearance_of, unpacked
 from pliant.datasets import open_source
 from pliant.datasets.builtin import builtin_folder
+from pliant.export.export import export_result
+from pliant.export.models import draw
 from pliant.messages import topics
 from pliant.messages.types import Extrema, Keyframe, SourceImage
 from pliant.recording.reader import Recording
+from pliant.viewers.canvas import Canvas, Moment
 
 pytestmark = pytest.mark.system
 HIDDEN = 160
@@ -66,6 +73,49 @@ def test_nothing_of_a_run_lies_under_its_mask(result: Path) -> None:
             assert not unpacked(mask)[HIDDEN:].any()
     assert sum(len(message.masks()) for message in shown) > 3
     assert json.loads((result / "report.json").read_text())["verdict"] == "good"
+
+
+class Shown:
+    """A canvas that keeps the images alone."""
+
+    def __init__(self, dims_masks: bool) -> None:
+        self.dims_masks = dims_masks
+        self.images: list[np.ndarray] = []
+
+    def image(self, at: Moment, data: bytes, encoding: str) -> None:
+        self.images.append(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE))
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *_: None
+
+
+def assert_dark_below(image: np.ndarray, whole: np.ndarray, scale: float = 1.0) -> None:
+    """Where the mask has it ignored, and nowhere else."""
+    row = round(scale * HIDDEN)
+    for part, low, high in ((slice(row + 4, None), 0.2, 0.4), (slice(row - 4), 0.75, 1.3)):
+        share = float(image[part].mean()) / float(whole[: image.shape[0]][part].mean())
+        assert low < share < high
+
+
+def test_what_is_left_out_is_dark_to_the_eye(result: Path, bonnet: Path, tmp_path: Path) -> None:
+    paths = sorted((bonnet / "drive" / "images").iterdir())
+    files = [np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in paths]
+    seen, raw = Shown(True), Shown(False)
+    for canvas in (seen, raw):
+        draw(Recording(result / "recording.mcap"), cast(Canvas, canvas))
+    assert len(seen.images) == len(raw.images) == len(files)
+    for shown, as_it_is, file in zip(seen.images, raw.images, files, strict=True):
+        assert_dark_below(shown, file)
+        np.testing.assert_array_equal(as_it_is, file)
+    video = cv2.VideoCapture(str(export_result(result, "overlay", tmp_path / "overlay.mp4")))
+    good, frame = video.read()
+    assert good
+    assert_dark_below(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)[:240], files[0])
+    page = (result / "report.html").read_text(encoding="utf-8")
+    (clip,) = re.findall(r"data:image/webp;base64,([^\"]+)", page)
+    data = np.frombuffer(base64.b64decode(clip), np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    assert_dark_below(np.asarray(image), files[0], image.shape[0] / 240)
 
 
 def test_its_replay_gives_the_same_bytes(result: Path, tmp_path: Path) -> None:

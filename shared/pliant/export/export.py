@@ -36,6 +36,7 @@ from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Extrema, MapUpdate
 from pliant.pictures.map import choose_view
+from pliant.pictures.masked import dimmed
 from pliant.pictures.movie import animation_suffix, write_animation, write_image, write_movie
 from pliant.pictures.overlay import OverlayFrame, write_overlay_video
 from pliant.recording.parts import parts_in
@@ -60,7 +61,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """One frame of a recording with what became of it.  image: None where it has no pixels."""
+    """One frame of a recording with what became of it.
+
+    image: None where it has no pixels; dark where a mask has it ignored.
+    """
 
     image: U8 | None
     tracks: Extrema
@@ -162,13 +166,14 @@ def recorded_frames(
         recording.decoded(topics.MAP_UPDATE),
         strict=False,  # a recording that was cut off ends where its shortest topic ends
     )
-    at, pixels = -1, None
+    at, pixels, used = -1, None, None
     for tracks, update in others:
         assert isinstance(tracks, Extrema)
         assert isinstance(update, MapUpdate)
         while at < tracks.frame:
-            at, _, pixels, _ = next(images, (tracks.frame, 0, None, None))
-        yield RecordedFrame(pixels if at == tracks.frame else None, tracks, update)
+            at, _, pixels, used = next(images, (tracks.frame, 0, None, None))
+        shown = dimmed(pixels, used) if pixels is not None and at == tracks.frame else None
+        yield RecordedFrame(shown, tracks, update)
 
 
 def _overlay(recording: Recording, path: Path, folder: Path | None) -> None:

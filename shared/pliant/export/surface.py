@@ -13,6 +13,7 @@ from pliant.export.images import camera_of, make_folder, rectified_images
 from pliant.formats.ply import write_ply
 from pliant.messages import topics
 from pliant.messages.types import Surfels
+from pliant.pictures.masked import dimmed
 from pliant.pictures.overlay import draw_marks
 from pliant.recording.reader import Recording
 from pliant.results.surfels import has_surfels, recorded_surfels
@@ -54,11 +55,12 @@ def overlay_pictures(recording: Recording) -> Iterator[U8]:
     for surfels in recorded_surfels(recording.path):
         if surfels.missing:
             continue
-        pixels = next(each.pixels for each in images if each.number == surfels.frame)
+        image = next(each for each in images if each.number == surfels.frame)
         seen = surfel_picture(surfels, stream.camera)
         counts = [f"{np.count_nonzero(surfels.state == s)} {name}" for s, name in states.items()]
         words = "   ".join([f"frame {surfels.frame}", *counts])
-        yield draw_marks(pixels, seen.points_px, seen.point_colours, words)
+        shown = dimmed(image.pixels, image.used)
+        yield draw_marks(shown, seen.points_px, seen.point_colours, words)
 
 
 def _write(path: Path, surfels: Surfels, pixels: U8 | None) -> None:

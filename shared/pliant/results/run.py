@@ -151,10 +151,12 @@ def known_keyframes(recording: Recording) -> Iterator[MapKeyframe]:
 class SeenKeyframe:
     """What was told of a keyframe's image and of what it sees, last.
 
-    jpeg: b"" where none was recorded.   point_ids: (N,).   points_px: (N, 2).
+    jpeg: b"" where none was recorded.   mask: of that image; b"": all of it is used.
+    point_ids: (N,).   points_px: (N, 2).
     """
 
     jpeg: bytes = b""
+    mask: bytes = b""
     point_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     points_px: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
@@ -165,9 +167,10 @@ def seen_by_keyframes(recording: Recording, wanted: Container[int]) -> dict[int,
     for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
         for message in recording.decoded(topic):
             assert isinstance(message, Keyframe)
+            masks = message.masks()
             for number, jpeg in message.images().items():
                 if number in wanted:
-                    seen[number].jpeg = jpeg
+                    seen[number].jpeg, seen[number].mask = jpeg, masks.get(number, b"")
             ends = np.cumsum(message.counts)
             for row, number in enumerate(message.keyframe_ids.tolist()):
                 if number in wanted:

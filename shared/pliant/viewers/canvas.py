@@ -21,6 +21,9 @@ class Moment:
 class Canvas(Protocol):
     """Draws.  Worlds are numbered by map segment; each has a place and a scale of its own."""
 
+    dims_masks: bool
+    """Whether images are for the eye, and show dark what their masks leave out."""
+
     def camera(
         self, at: Moment, camera: PinholeCamera, lens: tuple[float, float] = (0.0, 0.0)
     ) -> None:

@@ -50,6 +50,8 @@ def world_name(segment: int) -> str:
 class FoxgloveFile:
     """A canvas that is an MCAP file.  A context manager: leaving it closes the file."""
 
+    dims_masks = True
+
     def __init__(self, path: Path) -> None:
         """Raises ResultError where the definitions are missing or the file cannot be written."""
         self._path = path

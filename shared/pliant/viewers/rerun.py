@@ -69,6 +69,8 @@ def load_rerun() -> Any:
 class RerunCanvas:
     """A canvas that is a Rerun recording."""
 
+    dims_masks = True
+
     def __init__(
         self, where: Where, *, name: str, web_port: int | None = None, grpc_port: int | None = None
     ) -> None:

@@ -47,6 +47,7 @@ class RosCanvas:
     """A canvas that is a node of ROS 2."""
 
     is_watched = True
+    dims_masks = False
 
     def __init__(self, node: Node, name: str) -> None:
         """name: what all topics but /tf begin with, such as /pliant."""

@@ -31,6 +31,7 @@ from pliant.messages.types import (
     Status,
     Surfels,
 )
+from pliant.pictures.masked import dimmed_by
 from pliant.viewers.canvas import Canvas, Moment
 from pliant.viewers.point_blocks import PointBlocks
 from pliant.viewers.rates import Rates
@@ -120,14 +121,17 @@ class Scene:
     def _draw_image(self, at: Moment, frame: SourceFrame) -> None:
         if self._rectifier is None or frame.dropped:
             return
-        if self._rectifier.changes_nothing and _shows_as_it_is(frame):
+        dims = frame.mask and self._canvas.dims_masks
+        if self._rectifier.changes_nothing and _shows_as_it_is(frame) and not dims:
             self._canvas.image(at, frame.data, frame.encoding)
             return
         try:
             grey, colour = self._rectifier.rectify(frame)
+            mask = self._rectifier.mask(frame) if dims else b""
         except BrokenFrame:
             return
-        bgr = grey if colour is None else np.ascontiguousarray(colour[:, :, ::-1])
+        shown = dimmed_by(grey if colour is None else colour, mask)
+        bgr = shown if colour is None else np.ascontiguousarray(shown[:, :, ::-1])
         _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         self._canvas.image(at, data.tobytes(), "jpeg")
 

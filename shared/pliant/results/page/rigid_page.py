@@ -13,6 +13,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.geometry import inverse, pose_to_matrix, transform
 from pliant.errors import ResultError
+from pliant.pictures.masked import dimmed_by
 from pliant.pictures.movie import encode_animation
 from pliant.recording.reader import Recording
 from pliant.results.mesh import mesh_of
@@ -95,6 +96,7 @@ def _picture(run: Run, number: int, seen: SeenKeyframe) -> U8:
     image = np.asarray(
         cv2.imdecode(np.frombuffer(seen.jpeg, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8
     )
+    image = dimmed_by(image, seen.mask)
     scale = min(1.0, _WIDTH_PX / image.shape[1])
     size = round(image.shape[1] * scale), round(image.shape[0] * scale)
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
