@@ -3,6 +3,8 @@
 import math
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from running import TINY, assert_one_line, pliant
 
@@ -26,3 +28,18 @@ def test_a_camera_is_found_without_a_board(tmp_path: Path) -> None:
     assert off < 3.0 * found.focal_sigma
     assert off < 0.25 * abs(math.log(guess / true.fx))
     assert [path.name for path in tmp_path.iterdir()] == ["found.yaml"]
+    black = np.zeros((48, 64), np.uint8)
+    cv2.imwrite(str(tmp_path / "black.png"), black)
+    for name, says in (("black.png", "is black all over"), ("none.png", "cannot be read")):
+        mask = tmp_path / name
+        done = pliant("calibrate", TINY, "--fov", "50", "--mask", mask, "--output", file, "--force")
+        assert_one_line(done, f"--mask {mask}: {says}")
+    black[:44] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), black)
+    anew = tmp_path / "masked.yaml"
+    masked = pliant(
+        "calibrate", TINY, "--fov", "50", "--mask", tmp_path / "mask.png", "--output", anew
+    )
+    assert "8 % of each image are ignored (mask.png)" in masked.stderr
+    assert masked.returncode == 0, masked.stderr
+    assert read_calibration(anew) != found

@@ -115,6 +115,26 @@ def test_a_folder_of_images_becomes_a_calibration_with_a_picture(tmp_path: Path)
     assert output.read_bytes() == before
 
 
+def test_what_a_mask_covers_is_no_board(tmp_path: Path) -> None:
+    """A poster of the board at the edge of every image, as another board of the room would be."""
+    images = [image.copy() for image in filmed("charuco", LENS)]
+    for image in images:
+        image[330:] = images[0][150:300]
+    source, output = folder(tmp_path / "board", images), tmp_path / "phone.yaml"
+    mask = np.full((480, 640), 255, np.uint8)
+    mask[330:] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    command = ["calibrate", source, "--board", "charuco:7x10", "--output", str(output)]
+    done = CliRunner().invoke(app, [*command, "--mask", str(tmp_path / "mask.png")])
+    assert done.exit_code == 0, done.output + str(done.exception)
+    assert abs(read_calibration(output, (640, 480)).fx - LENS.fx) < 3.0
+    output.unlink()
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code != 0 or abs(read_calibration(output).fx - LENS.fx) > 10.0
+    done = CliRunner().invoke(app, [*command, "--force", "--mask", str(tmp_path / "none.png")])
+    assert "none.png: cannot be read" in str(done.exception)
+
+
 REFUSED = [
     ("chessboard", "chessboard:8x5", "a chessboard of 9x6 squares in them: is that the --board?"),
     ("chessboard", "charuco:7x10", "there is a chessboard of 9x6 squares"),

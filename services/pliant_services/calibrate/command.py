@@ -22,11 +22,13 @@ from pliant.algorithms.board_calibration import (
 )
 from pliant.algorithms.boards import BoardFinder, BoardView, boards_seen
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
+from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.image.sharpness import LONGEST_SIDE_PX, resized, sharpness
 from pliant.datasets import BrokenFrame, Dataset, decode, open_source
 from pliant.datasets.calibration import UNSAID_FOV_DEG, Calibration, calibration_yaml
 from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.excerpt import Excerpt
+from pliant.datasets.rectifier import Rectifier
 from pliant.errors import CalibrationError, DatasetError, ResultError
 from pliant.files import make_folder, write_whole
 from pliant.pictures.calibration import SeenCorners, coverage, draw_calibration
@@ -63,23 +65,33 @@ class _Found:
     sharpness: float
 
 
-def check_file(output: Path, *, source: str, force: bool) -> None:
+def check_file(output: Path, *, source: str, mask: Path | None, force: bool) -> None:
     """Raise ResultError where the calibration cannot go there.  Changes nothing."""
     if output.is_dir():
         raise ResultError(f"{output} is a folder: name a file, such as {output / 'calib.yaml'}")
     if output.exists() and not force:
         raise ResultError(f"{output} exists: choose another --output, or --force to replace it")
-    keep_apart(output, [Path(source)] if Path(source).exists() else [])
+    read = [Path(source)] if Path(source).exists() else []
+    keep_apart(output, read if mask is None else [*read, mask])
 
 
 def calibrate_with_board(
-    source: str, printed: PrintedBoard, output: Path, *, lens: BoardLens, topic: str
+    source: str,
+    printed: PrintedBoard,
+    output: Path,
+    *,
+    lens: BoardLens,
+    topic: str,
+    mask: Path | None = None,
 ) -> list[str]:
     """Write the calibration of a source that shows a board, and a picture of how good it is.
 
+    mask: what of the images is ignored: no corner is found there.
     Returns what to tell.  Raises PliantError: no board, another one, too few views, no lens.
     """
-    dataset = open_source(source, fov_deg=UNSAID_FOV_DEG, topic=topic, longest_side_px=_WHOLE_PX)
+    dataset = open_source(
+        source, fov_deg=UNSAID_FOV_DEG, topic=topic, longest_side_px=_WHOLE_PX, mask=mask
+    )
     width, height = dataset.calibration.width, dataset.calibration.height
     found, others, looked = _look_for(dataset, printed, source)
     if not found:
@@ -123,18 +135,20 @@ def _look_for(
     every = max(1, math.ceil(count / _LOOKED_AT))
     frames = Excerpt(dataset, _Part(every=every, sharpest=every > 1))
     finder, found = BoardFinder(printed.board), list[_Found]()
+    as_it_is = Rectifier(dataset.calibration)  # a guess without distortion
     others: list[U8] = []
     total, looked = -(-count // every), 0
     for frame in frames:
         tell_progress("looking for the board", min(looked, total - 1), total)
         try:
-            pixels = decode(frame)
+            pixels, clearance = decode(frame), clearance_in(as_it_is.mask(frame))
         except BrokenFrame:
             continue
         if pixels.ndim == 3:
             pixels = cast(U8, cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
         if pixels.shape != (dataset.calibration.height, dataset.calibration.width):
             continue
+        pixels = filled(pixels, clearance)
         looked += 1
         view = finder.find(np.ascontiguousarray(pixels))
         if view is not None:
@@ -200,13 +214,13 @@ def _advice(covered: float, focal_sigma: float) -> list[str]:
 
 
 def calibrate_without_board(
-    source: str, output: Path, *, fov_deg: float | None, topic: str
+    source: str, output: Path, *, fov_deg: float | None, topic: str, mask: Path | None = None
 ) -> list[str]:
     """Write the calibration that a run finds by itself, of any scene; returns what to tell.
 
     It is a run, without its mesh and images, whose other results are thrown away.
     """
-    dataset = open_source(source, fov_deg=fov_deg, topic=topic)
+    dataset = open_source(source, fov_deg=fov_deg, topic=topic, mask=mask)
     if dataset.is_live:
         raise DatasetError(f"{source}: is live: film, and give the video")
     if dataset.calibration.focal_sigma == 0.0:
@@ -221,6 +235,7 @@ def calibrate_without_board(
             overrides=["meshing.enabled=false", "recorder.images=false"],
             fov_deg=fov_deg,
             topic=topic,
+            mask=mask,
         )
         with contextlib.redirect_stdout(io.StringIO()):  # of results that nobody will find
             code = run_pipeline(request)

@@ -31,6 +31,12 @@ def calibrate(
     topic: Annotated[
         str, typer.Option(help="The images of an MCAP file or ROS bag that has several.")
     ] = "",
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            help="Image whose black parts are ignored in all frames, or a folder of them."
+        ),
+    ] = None,
     print_board: Annotated[
         Path | None,
         typer.Option(help="Write the board as a PDF in its true size [charuco:7x10:25]."),
@@ -45,6 +51,8 @@ def calibrate(
     pliant calibrate board.mp4 --board chessboard:10x7 --output phone.yaml
 
     pliant calibrate anything.mp4
+
+    pliant calibrate dashcam.mp4 --mask bonnet.png
     """
     from pliant.errors import ResultError
     from pliant_services.calibrate import board as boards
@@ -64,9 +72,9 @@ def calibrate(
         return
     from pliant_services.calibrate import command
 
-    command.check_file(output, source=source, force=force)
+    command.check_file(output, source=source, mask=mask, force=force)
     if board is None:
-        lines = command.calibrate_without_board(source, output, fov_deg=fov, topic=topic)
+        lines = command.calibrate_without_board(source, output, fov_deg=fov, topic=topic, mask=mask)
     else:
         lines = command.calibrate_with_board(
             source,
@@ -74,6 +82,7 @@ def calibrate(
             output,
             lens="fisheye" if lens == "fisheye" else "pinhole-radtan",
             topic=topic,
+            mask=mask,
         )
     for line in lines:
         typer.echo(line)
