@@ -3,20 +3,20 @@
 import json
 import sys
 import threading
-import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pliant.datasets import sources_in
 from pliant.errors import DatasetError, ResultError
 from pliant.files import make_folder, write_whole
-from pliant.results.folder import REPORT_NAME, STATE_FOLDER, folder_name, keep_apart, written
-from pliant.results.verdict import DONE, INCOMPLETE, grade
-from pliant_services.batch.one_run import OneRun
+from pliant.results.folder import folder_name, keep_apart, written
+from pliant.results.verdict import DONE, INCOMPLETE
+from pliant_services.batch.one_run import Errand, Outcome, run_clip
 
 SUMMARY_NAME = "batch.json"
 _FAILED = 1
@@ -55,17 +55,64 @@ class _Batch:
     output: Path
     options: list[str]
     clips: list[Clip]
-    stopped: threading.Event = field(default_factory=threading.Event)
     lock: threading.Lock = field(default_factory=threading.Lock)
-    running: dict[str, OneRun] = field(default_factory=dict[str, OneRun])
+
+    def errands(self) -> dict[str, Errand]:
+        """What is left to do, by name."""
+        return {
+            clip.name: Errand(
+                source=clip.source,
+                result=clip.result,
+                log=str(self.log_of(clip)),
+                state=clip.state,
+                options=self.options,
+            )
+            for clip in self.clips
+            if clip.state != "done"
+        }
+
+    def begin(self, name: str, where: str) -> None:
+        """A clip is run now.  where: on which machine; "": on this one."""
+        clip = self._called(name)
+        with self.lock:
+            again = " again" if clip.state != "waiting" else ""
+            clip.state, clip.exit_code = "begun", None
+            self.save()
+            _say(f"{name}: begun{again}{where and f' on {where}'}")
+
+    def end(self, name: str, outcome: Outcome) -> None:
+        """What came of it."""
+        clip = self._called(name)
+        with self.lock:
+            clip.seconds = round(clip.seconds + outcome.seconds, 1)
+            if outcome.exit_code is not None:
+                clip.exit_code = outcome.exit_code
+                clip.state = "done" if outcome.exit_code in (DONE, INCOMPLETE) else "failed"
+                for key, value in outcome.told.items():
+                    setattr(clip, key, value)
+                _say(f"{name}: {clip.verdict}: {clip.reason} ({clip.seconds:.0f} s)")
+            self.save()
+
+    def log_of(self, clip: Clip) -> Path:
+        """What its run says."""
+        return self.output / "logs" / f"{clip.name}.log"
+
+    def _called(self, name: str) -> Clip:
+        return next(clip for clip in self.clips if clip.name == name)
 
     def save(self) -> None:
         content = {"options": self.options, "clips": [asdict(clip) for clip in self.clips]}
         write_whole(self.output / SUMMARY_NAME, json.dumps(content, indent=1) + "\n")
 
 
-def run_batch(folder: Path, output: Path, *, jobs: int, options: Sequence[str]) -> int:
-    """Run all of them; returns the exit code.  Raises PliantError before anything is begun."""
+def run_batch(
+    folder: Path, output: Path, *, jobs: int, options: Sequence[str], dask: str | None = None
+) -> int:
+    """Run all of them; returns the exit code.  Raises PliantError before anything is begun.
+
+    jobs: at a time, on this machine.    dask: address of a scheduler whose workers run them, as
+    many at a time as they have threads.
+    """
     refused = [each for each in options if each.partition("=")[0] in _OWN]
     if refused:
         raise ResultError(f"{refused[0]} is for one run: leave it, each clip has its own folder")
@@ -74,16 +121,28 @@ def run_batch(folder: Path, output: Path, *, jobs: int, options: Sequence[str]) 
     begun = _read(output, list(options))
     known = {clip.source: clip for clip in begun or ()}
     clips = [known.get(str(s)) or Clip(str(s), str(output / n)) for s, n in _named(sources)]
-    with written(output, force=begun is not None):
+    with written(output, force=begun is not None), _engine(dask, jobs) as run:
         make_folder(output / "logs")
         batch = _Batch(output, list(options), clips)
         batch.save()
         try:
-            _run_all(batch, jobs)
+            run(batch.errands(), batch.begin, batch.end)
         finally:
-            _tell(clips, output)
+            _tell(batch)
     codes = {clip.exit_code for clip in clips}
     return _FAILED if codes - {DONE, INCOMPLETE} else max(DONE, *(c or 0 for c in codes))
+
+
+@contextmanager
+def _engine(dask: str | None, jobs: int) -> Generator[Callable[..., None]]:
+    """Who runs the clips."""
+    if dask is None:
+        yield partial(_run_here, jobs=jobs)
+        return
+    from pliant_services.batch.on_cluster import Cluster  # others need no Dask
+
+    with closing(Cluster(dask)) as cluster:
+        yield cluster.run
 
 
 def _named(sources: Sequence[Path]) -> list[tuple[Path, str]]:
@@ -119,100 +178,34 @@ def _read(output: Path, options: list[str]) -> list[Clip] | None:
     return clips
 
 
-def _run_all(batch: _Batch, jobs: int) -> None:
-    """Ctrl-C cuts off those that run, and begins no more; raises KeyboardInterrupt then."""
+def _run_here(
+    errands: Mapping[str, Errand],
+    begun: Callable[[str, str], None],
+    over: Callable[[str, Outcome], None],
+    *,
+    jobs: int,
+) -> None:
+    """So many at a time.  Ctrl-C cuts off those that run; raises KeyboardInterrupt then."""
+    stopped = threading.Event()
+
+    def run(name: str, errand: Errand) -> None:
+        if not stopped.is_set():
+            begun(name, "")
+            over(name, run_clip(errand, stopped.is_set))
+
     with ThreadPoolExecutor(jobs) as threads:
-        futures = [threads.submit(_run_one, batch, clip) for clip in batch.clips]
+        futures = [threads.submit(run, name, errand) for name, errand in errands.items()]
         try:
             for future in as_completed(futures):
                 future.result()  # what is no failure of a clip ends all
         except BaseException:
-            with batch.lock:
-                batch.stopped.set()
-                running = list(batch.running.values())
-            for each in running:
-                each.cut_off()
+            stopped.set()
             raise
 
 
-def _run_one(batch: _Batch, clip: Clip) -> None:
-    result = Path(clip.result)
-    with _running(batch, clip) as run:
-        if run is None:
-            return
-        began = time.monotonic()
-        code = run.wait()
-        spent = time.monotonic() - began
-        words = run.last_words()
-    with batch.lock:
-        clip.seconds = round(clip.seconds + spent, 1)
-        if batch.stopped.is_set() and code < 0:
-            batch.save()
-            return
-        clip.exit_code = code
-        clip.state = "done" if code in (DONE, INCOMPLETE) else "failed"
-        if clip.state == "done":
-            _take(clip, _report_of(result) or {})
-        else:
-            clip.verdict, clip.reason = "failed", words
-        batch.save()
-        _say(f"{clip.name}: {clip.verdict}: {clip.reason} ({clip.seconds:.0f} s)")
-
-
-@contextmanager
-def _running(batch: _Batch, clip: Clip) -> Generator[OneRun | None]:
-    """Its run, begun or taken up again; None where nothing is left to do, or nothing is begun."""
-    result = Path(clip.result)
-    with batch.lock:
-        report = _report_of(result) if clip.state == "begun" else None
-        if report is not None and not (result / STATE_FOLDER).is_dir():
-            clip.state, clip.exit_code = "done", grade(report)  # it outlived its batch
-            _take(clip, report)
-            batch.save()
-        if clip.state == "done" or batch.stopped.is_set():
-            run = None
-        else:
-            arguments = [clip.source, "--output", clip.result]
-            if "--on-crash" not in batch.options:
-                arguments += ["--on-crash", "restart"]  # it can be taken up again
-            if (result / STATE_FOLDER).is_dir():
-                arguments += ["--resume"]
-            elif clip.state != "waiting":
-                arguments += ["--force"]
-            again = " again" if clip.state != "waiting" else ""
-            clip.state, clip.exit_code = "begun", None
-            batch.save()
-            log = batch.output / "logs" / f"{clip.name}.log"
-            run = batch.running[clip.name] = OneRun([*arguments, *batch.options], log)
-            _say(f"{clip.name}: begun{again}")
-    try:
-        yield run
-    finally:
-        with batch.lock:
-            batch.running.pop(clip.name, None)
-
-
-def _report_of(result: Path) -> dict[str, Any] | None:
-    try:
-        return json.loads((result / REPORT_NAME).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-
-
-def _take(clip: Clip, report: dict[str, Any]) -> None:
-    """What the table says of a run that came to its end."""
-    segments = report.get("segments") or []
-    clip.frames = report.get("frames", 0)
-    clip.frames_with_pose = report.get("frames_with_pose", 0)
-    clip.segments = len(segments)
-    longest = max((segment["frames"] for segment in segments), default=0)
-    clip.longest_share = round(longest / max(clip.frames, 1), 4)
-    clip.verdict = report.get("verdict") or ("done" if segments else "bad")
-    clip.reason = report.get("verdict_reason") or report.get("last_reason", "")
-
-
-def _tell(clips: Sequence[Clip], output: Path) -> None:
+def _tell(batch: _Batch) -> None:
     """The table, one row a clip."""
+    clips, output = batch.clips, batch.output
     head = ("clip", "verdict", "frames", "posed", "longest", "seconds", "result")
     rows = [
         (
@@ -222,7 +215,7 @@ def _tell(clips: Sequence[Clip], output: Path) -> None:
             str(clip.frames_with_pose or "-"),
             f"{100.0 * clip.longest_share:.0f} %" if clip.frames else "-",
             f"{clip.seconds:.0f}",
-            clip.result if clip.state != "failed" else str(output / "logs" / f"{clip.name}.log"),
+            clip.result if clip.state != "failed" else str(batch.log_of(clip)),
         )
         for clip in clips
     ]

@@ -1,23 +1,132 @@
-"""One ``pliant run`` of a batch: a process of its own, that can be cut off and goes on later."""
+"""One clip of a batch: ``pliant run`` in a process of its own, that can be cut off and goes on.
 
+It runs where the batch is, or on another machine that sees the same folders (``on_cluster.py``).
+"""
+
+import json
 import os
+import platform
 import select
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+from pliant import __version__
+from pliant.results.folder import REPORT_NAME, STATE_FOLDER, is_being_written
+from pliant.results.verdict import DONE, INCOMPLETE, grade
+
+_LOOK_S = 0.2
+_FAILED = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Errand:
+    """What is to be run.  state: of the clip so far, as in ``batch.json``.
+
+    folder: from which the paths are meant, those of the options, too.  version: of Pliant.
+    """
+
+    source: str
+    result: str
+    log: str
+    state: str
+    options: list[str]
+    folder: str = field(default_factory=os.getcwd)
+    version: str = __version__
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What came of it.  exit_code: None where it was cut off.  told: what the table says of it."""
+
+    exit_code: int | None
+    seconds: float = 0.0
+    told: dict[str, Any] = field(default_factory=dict[str, Any])
+
+
+def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
+    """Run it, or go on with it, until its end or until it is to stop."""
+    here = Path(errand.folder)
+    result, log = here / errand.result, here / errand.log
+    if errand.version != __version__:
+        return _failed(f"{platform.node()} has pliant {__version__}, the batch {errand.version}")
+    if not log.parent.is_dir():
+        return _failed(
+            f"{platform.node()} has no folder {log.parent}: clips and results have to lie where "
+            "all machines see them, under the same names"
+        )
+    # One that was to be begun, and has a log, was begun by somebody who could not say it any more.
+    begun = errand.state == "begun" or (errand.state == "waiting" and log.exists())
+    while begun and is_being_written(result):  # by a run that has outlived who began it
+        if stopped():
+            return Outcome(exit_code=None)
+        time.sleep(_LOOK_S)
+    report = _report_of(result) if begun else None
+    resumes = (result / STATE_FOLDER).is_dir()
+    if report is not None and not resumes:
+        return Outcome(exit_code=grade(report), told=_told(report))
+    arguments = [errand.source, "--output", errand.result]
+    if "--on-crash" not in errand.options:
+        arguments += ["--on-crash", "restart"]  # it can be taken up again
+    if resumes:
+        arguments += ["--resume"]
+    elif begun or errand.state != "waiting":
+        arguments += ["--force"]
+    began = time.monotonic()
+    run = OneRun([*arguments, *errand.options], log, here)
+    code = run.wait(stopped)
+    seconds = time.monotonic() - began
+    if code in (DONE, INCOMPLETE):
+        return Outcome(exit_code=code, seconds=seconds, told=_told(_report_of(result) or {}))
+    if code is None:
+        return Outcome(exit_code=None, seconds=seconds)
+    return Outcome(
+        exit_code=code, seconds=seconds, told={"verdict": "failed", "reason": run.last_words()}
+    )
+
+
+def _failed(why: str) -> Outcome:
+    return Outcome(exit_code=_FAILED, told={"verdict": "failed", "reason": why})
+
+
+def _report_of(result: Path) -> dict[str, Any] | None:
+    try:
+        return json.loads((result / REPORT_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _told(report: dict[str, Any]) -> dict[str, Any]:
+    """What the table says of a run that came to its end."""
+    segments = report.get("segments") or []
+    frames = report.get("frames", 0)
+    longest = max((segment["frames"] for segment in segments), default=0)
+    return {
+        "frames": frames,
+        "frames_with_pose": report.get("frames_with_pose", 0),
+        "segments": len(segments),
+        "longest_share": round(longest / max(frames, 1), 4),
+        "verdict": report.get("verdict") or ("done" if segments else "bad"),
+        "reason": report.get("verdict_reason") or report.get("last_reason", ""),
+    }
 
 
 class OneRun:
     """What it says goes to its log."""
 
-    def __init__(self, arguments: list[str], log: Path) -> None:
+    def __init__(self, arguments: list[str], log: Path, folder: Path) -> None:
         """arguments: of ``pliant run``.  Raises OSError where the log cannot be written."""
         command = [sys.executable, "-m", "pliant_services.cli", "run", *arguments]
         with log.open("w", encoding="utf-8") as file:
             self._process = subprocess.Popen(
                 command,
+                cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -25,16 +134,22 @@ class OneRun:
             )
         self._log = log
 
-    def wait(self) -> int:
-        """Its exit code; negative where it was cut off."""
-        return self._process.wait()
+    def wait(self, stopped: Callable[[], bool]) -> int | None:
+        """Its exit code; None where it was cut off, as it was to stop."""
+        while True:
+            try:
+                return self._process.wait(_LOOK_S)
+            except subprocess.TimeoutExpired:
+                if stopped():
+                    self._cut_off()
+                    return None
 
     def last_words(self) -> str:
         """The last line that it said."""
         lines = self._log.read_text(encoding="utf-8", errors="replace").split("\n")
         return next((line for line in reversed(lines) if line.strip()), "").removeprefix("pliant: ")
 
-    def cut_off(self) -> None:
+    def _cut_off(self) -> None:
         """End it and its services as a power cut does: ``--resume`` goes on exactly there.
 
         Ctrl-C would end the stream instead: what was recorded then has an end, and is no beginning.
@@ -47,6 +162,7 @@ class OneRun:
         for handle in services:
             select.select([handle], [], [])  # nobody writes there any more
             os.close(handle)
+        self._process.wait()
 
     def _children(self) -> list[int]:
         number = self._process.pid

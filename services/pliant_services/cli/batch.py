@@ -15,7 +15,13 @@ def batch(
         Path | None,
         typer.Option("--output", "-o", help="Folder of the result folders [results/<folder>]."),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Runs at a time; each takes 2 cores.")] = 1,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Runs at a time; each takes 2 cores [1].")
+    ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(help="Scheduler of Dask's, tcp://HOST:8786, whose workers run the clips."),
+    ] = None,
 ) -> None:
     """Run every clip of a folder; the same command again goes on after an interruption.
 
@@ -23,14 +29,20 @@ def batch(
 
     pliant batch clips --fov 70 --every 2 --set tracking.max_tracks=5000
 
+    pliant batch clips --dask tcp://rack.local:8786
+
     Options of `pliant run` come after the folder, and go to each run.
     """
     from pliant.results.folder import folder_name
     from pliant_services.batch import command
     from pliant_services.cli import app
 
+    if dask is not None and jobs is not None:
+        raise typer.BadParameter("--jobs is for one machine: with --dask its workers' threads tell")
     command.check_folder(folder)
     runs = typer.main.get_command(app).commands["run"]  # type: ignore[attr-defined]
     command.check_options(runs, context.args)
     where = output or Path("results") / folder_name(str(folder))
-    raise typer.Exit(command.run_batch(folder, where, jobs=jobs, options=context.args))
+    raise typer.Exit(
+        command.run_batch(folder, where, jobs=jobs or 1, options=context.args, dask=dask)
+    )

@@ -148,6 +148,21 @@ def _locked(output: Path) -> int:
         os.close(lock)  # its holder left between our two looks, and took the file away
 
 
+def is_being_written(output: Path) -> bool:
+    """Whether another process holds a result folder, perhaps on another machine."""
+    try:
+        lock = os.open(output / _LOCK_NAME, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno in (errno.EACCES, errno.EAGAIN)
+    finally:
+        os.close(lock)
+    return False
+
+
 def running_session(result: Path) -> tuple[list[str], str]:
     """The endpoint and name of the run that is writing this result; ([], "") if none is."""
     try:
