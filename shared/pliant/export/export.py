@@ -96,8 +96,8 @@ def export_result(
     recording = _Followed(result / RECORDING_NAME if folder is not None else result, progress)
     name, write = EXPORTS[to]
     path = output or (result / name if folder is not None else _beside(result, name))
-    _check_ending(path, to, name)
     keep_apart(path, files_read(result))
+    _check_ending(path, to, name)
     if path.exists() and not force:
         raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
     fresh = not path.exists()
