@@ -2,7 +2,7 @@
 
 import pytest
 from benchmarks.deceiving import run
-from benchmarks.deceiving_scenes import rooms
+from benchmarks.deceiving_scenes import floor, rooms
 
 from pliant.config import load_config
 
@@ -17,3 +17,13 @@ def test_of_two_rendered_rooms_neither_is_taken_for_the_other() -> None:
         assert one.joined == 0
         assert one.wrong == []
     assert came["the second"].found == came["the second"].frames
+
+
+@pytest.mark.slow
+def test_no_part_of_a_chequered_floor_is_taken_for_another() -> None:
+    """Not by chance, and not by a frame of many, for the image itself says that it cannot tell."""
+    for one in dict(run(floor(0), load_config(), 0)).values():
+        assert one.told == 0
+        assert one.joined == 0
+        assert one.wrong == []
+        assert one.found == 0

@@ -42,10 +42,14 @@ def keyframes(points: PointRows, count: int) -> list[Keyframe]:
 
 
 def ask(
-    monkeypatch: pytest.MonkeyPatch, said: dict[int, tuple[int, int]], first: int = 1
+    monkeypatch: pytest.MonkeyPatch,
+    said: dict[int, tuple[int, int]],
+    first: int = 1,
+    repeated: float = 0.0,
 ) -> Recognised | None:
     """What is recognised where keyframes have so many corners and points for them, each at a pose
-    of its own.   first: places that look most like the frame; the others are elsewhere."""
+    of its own.   first: places that look most like the frame; the others are elsewhere.
+    repeated: share of the corners that the image shows again."""
     points = PointRows()
     places = [
         Place(keyframe=k, features=NOTHING, segment=[k])
@@ -57,7 +61,9 @@ def ask(
         corners = np.random.default_rng(0).uniform(0, 600, (said[place.keyframe.id][0], 2))
         return SimpleNamespace(
             T_world_camera=looking((3.0 * place.keyframe.id, 0.0, 0.0)),
+            corners=np.arange(len(corners)),
             corners_px=corners.astype(np.float32),
+            xyz=np.zeros((len(corners), 3)),
             share=0.9,
         )
 
@@ -65,8 +71,12 @@ def ask(
         count = said[round(T_world_camera[0, 3] / 3.0)][1]
         return SimpleNamespace(T_world_camera=T_world_camera, inliers=np.ones(count, np.bool_))
 
+    def share(*_: object, **__: object) -> float:
+        return repeated
+
     monkeypatch.setattr(relocalisation, "_propose", propose)
     monkeypatch.setattr(relocalisation, "prove", prove)
+    monkeypatch.setattr(relocalisation, "repeated_share", share)
     return relocalise(
         NOTHING, places[:first], places[first:], points, NO_MAXIMA, DARK, CAMERA, PARAMETERS,
         np.random.default_rng(0),
@@ -89,6 +99,13 @@ def test_poses_by_keyframes_that_see_the_same_points_are_of_one_place(
     found = ask(monkeypatch, {0: (170, 2400), 1: (420, 690)})
     assert found is not None
     assert found.keyframe.id == 0
+
+
+def test_what_the_image_shows_again_a_step_aside_proves_no_pose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert ask(monkeypatch, {0: (170, 2400)}, repeated=0.4) is not None
+    assert ask(monkeypatch, {0: (170, 2400)}, repeated=0.6) is None
 
 
 def test_places_elsewhere_are_asked_where_one_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.absolute_pose import pose_by_ransac
-from pliant.algorithms.arrays import F32, F64, U8, BoolArray
+from pliant.algorithms.arrays import F32, F64, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.mapping.covisibility import most_shared, rows_of
@@ -23,6 +23,7 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
 from pliant.algorithms.mapping.recovery import prove
 from pliant.algorithms.places.features import Features, match
+from pliant.algorithms.places.repetition import repeated_share
 
 _NEAR_SHARE = 0.0125
 """Of the image's width: a corner is as far as the nearest point of the map within."""
@@ -42,11 +43,13 @@ _MOST = 0.5
 
 
 class _Proposed(NamedTuple):
-    """A pose, the corners (n, 2) of the frame that agree on it, and their share of those that look
-    alike."""
+    """A pose, the corners (n,) of the frame that agree on it, their pixels, where in the world they
+    are, and their share of those that look alike."""
 
     T_world_camera: F64
+    corners: I64
     corners_px: F32
+    xyz: F64
     share: float
 
 
@@ -90,12 +93,14 @@ def relocalise(
     own = parameters.recovery
     best: Recognised | None = None
     rivals: list[Recognised] = []
+    proposals: dict[int, _Proposed] = {}
     for number, place in enumerate(chain(places, elsewhere)):
         if number >= len(places) and best is None:
             break
         proposed = _propose(seen, place, points, camera, parameters, generator)
         if proposed is None:
             continue
+        proposals[place.keyframe.id] = proposed
         near = most_shared(place.segment, [place.keyframe], points)[:_NEAR_KEYFRAMES]
         rows = rows_of(near, np.zeros(0, np.int32), len(points.state))
         rows = rows[points.state[rows] == MAPPED]
@@ -120,7 +125,23 @@ def relocalise(
         best = found
     if best is None or any(_is_as_good(rival, best, points, parameters) for rival in rivals):
         return None
-    return best
+    told = proposals[best.keyframe.id]
+    here = transform(inverse(told.T_world_camera), told.xyz)
+    return None if repeats(seen, told.corners, here, camera, parameters) else best
+
+
+def repeats(
+    seen: Features, corners: I64, xyz: F64, camera: PinholeCamera, parameters: MappingParameters
+) -> bool:
+    """Whether as much speaks for a pose a step aside, for the image shows the same again there.
+
+    corners, xyz: what speaks for a pose, as of ``repeated_share``.
+    """
+    share = repeated_share(
+        seen, corners, xyz, camera, gate_px=parameters.localisation.ransac_gate_px,
+        least_step=_SAME_SHIFT * float(np.median(xyz[:, 2])),
+    )  # fmt: skip
+    return share > _AS_GOOD
 
 
 def corners_in_map(
@@ -167,7 +188,10 @@ def _propose(
     if found is None or found[1].sum() < own.min_agreeing:
         return None
     T_world_camera = refine(found[0], xyz, points_px, camera, limits).T_world_camera
-    return _Proposed(T_world_camera, points_px[found[1]], float(found[1].mean()))
+    agree = found[1]
+    return _Proposed(
+        T_world_camera, pairs[agree, 0], points_px[agree], xyz[agree], float(agree.mean())
+    )
 
 
 def _speaks_for_itself(

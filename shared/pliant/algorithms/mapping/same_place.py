@@ -13,7 +13,7 @@ from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
-from pliant.algorithms.mapping.relocalisation import Place, corners_in_map
+from pliant.algorithms.mapping.relocalisation import Place, corners_in_map, repeats
 from pliant.algorithms.places.features import match
 from pliant.algorithms.places.similarity import Pairs, refine_similarity, similarity_by_ransac
 
@@ -61,9 +61,10 @@ def same_place(
         samples=parameters.recovery.ransac_samples,
     )  # fmt: skip
     if found is None or found[1].sum() < parameters.recovery.min_agreeing:
-        agreeing = 0 if found is None else int(found[1].sum())
-        return f"{agreeing} of {len(pairs.xyz_a)} corners that look alike agree"
-    S_a_b, rows, points_px = found[0], np.zeros((0, 2), np.int32), np.zeros((0, 2), np.float32)
+        count = 0 if found is None else int(found[1].sum())
+        return f"{count} of {len(pairs.xyz_a)} corners that look alike agree"
+    S_a_b, agreeing = found
+    rows, points_px = np.zeros((0, 2), np.int32), np.zeros((0, 2), np.float32)
     for gate_px in (limits.ransac_gate_px, limits.inlier_px):
         rows, guided, points_px = _guided(S_a_b, old, new, points, camera, gate_px)
         if len(rows) < limits.min_inliers:
@@ -72,6 +73,9 @@ def same_place(
     spread = (points_px.std(axis=0) / np.array([camera.width, camera.height])).min()
     if spread < parameters.support.min_spread:
         return "all that agrees lies in one spot of the image"
+    told = alike[known][agreeing, 1]
+    if repeats(new.features, told, pairs.xyz_b[agreeing], camera, parameters):
+        return "what agrees is seen again a step aside"
     S_old_new = old.keyframe.T_world_camera @ S_a_b @ inverse(new.keyframe.T_world_camera)
     return SamePlace(S_old_new=S_old_new, rows=rows)
 

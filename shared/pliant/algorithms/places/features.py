@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, I32, I64, U8, U64
+from pliant.algorithms.arrays import F32, I32, I64, U8, U64, BoolArray
 from pliant.compiler.kernel import fast_kernel, kernel
 
 _FEATURES = 700
@@ -70,6 +70,24 @@ def match(a: Features, b: Features) -> I64:
     found = np.flatnonzero(there >= 0)
     found = found[back[there[found]] == found]
     return np.column_stack([found, there[found]]).astype(np.int64)
+
+
+def look_alike(seen: Features, corners: I64) -> I64:
+    """(m, 2) of an image: which of some corners (n,), and which of all looks as they do."""
+    every = np.ascontiguousarray(seen.descriptors).view(np.uint64)
+    found = np.zeros((len(corners), len(every)), np.bool_)
+    _alike(every[corners], every, found)
+    return np.argwhere(found)
+
+
+@kernel
+def _alike(A: U64, B: U64, found: BoolArray) -> None:
+    for i in range(A.shape[0]):
+        for j in range(B.shape[0]):
+            distance = 0
+            for k in range(_WORDS):
+                distance += _bits(A[i, k] ^ B[j, k])
+            found[i, j] = distance <= _MAX_BITS
 
 
 @fast_kernel
