@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.deceiving_scenes import CAMERA, Deceiver, Film, Way, doors, floor, rooms
+from benchmarks.deceiving_scenes import CAMERA, Deceiver, Film, Way, doors, floor, room_with, rooms
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.geometry import pose_to_matrix
@@ -69,9 +69,10 @@ class _Session:
         self.history, self.truth, self.joined = MapHistory(), dict[int, F64](), 0
         self._next = 0
 
-    def part(self) -> "_Session":
-        """Another one that has seen the same."""
+    def part(self, film: Film) -> "_Session":
+        """Another one that has seen the same, and goes on in a film."""
         other = copy(self)
+        other._film = film
         other.tracker, other.mapper = deepcopy((self.tracker, self.mapper))
         other.history, other.truth = deepcopy((self.history, self.truth))
         return other
@@ -122,8 +123,9 @@ def run(deceiver: Deceiver, config: Config, seed: int) -> Iterator[tuple[str, Ru
     session.see(deceiver.there)
     night = len(session.truth)
     session.be_in_the_dark()
+    film = Film(deceiver.after_the_dark(), seed)
     for name, way in deceiver.again.items():
-        one = session.part()
+        one = session.part(film)
         one.see(way)
         yield name, one.end(night, deceiver.apart_m)
 
@@ -153,6 +155,8 @@ SCENES: dict[str, Callable[[int], Deceiver]] = {
     "the same door twenty times": partial(doors, bare=False),
     "the same door twenty times, on a bare wall": partial(doors, bare=True),
     "a chequered floor": floor,
+    "a room whose picture hangs elsewhere": lambda seed: room_with(seed, "picture"),
+    "a room with two of nine things elsewhere": lambda seed: room_with(seed, "thing 1", "poster 0"),
 }
 
 

@@ -4,7 +4,7 @@ What is alike has the very same texture, light included; noise of the sensor alo
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -37,6 +37,7 @@ class Deceiver:
 
     twins: of solids, by name, the name of the one whose look they have.   chequers_m: side of the
     checks on the floor, 0: none.   apart_m: what looks alike is farther apart than twice this.
+    moved_m: by which solids, by name, are to the right of where they were, after the dark.
     """
 
     solids: list[Solid]
@@ -45,6 +46,17 @@ class Deceiver:
     again: dict[str, Way]
     apart_m: float
     chequers_m: float = 0.0
+    moved_m: dict[str, float] = field(default_factory=dict[str, float])
+
+    def after_the_dark(self) -> "Deceiver":
+        """What the camera comes back to."""
+
+        def place(solid: Solid) -> Solid:
+            x, y, z = solid.centre
+            centre = (x + self.moved_m.get(solid.name, 0.0), y, z)
+            return solid.model_copy(update={"centre": centre})
+
+        return replace(self, solids=[place(solid) for solid in self.solids])
 
 
 def _box(name: str, low: Vector, high: Vector, material: Material, texels: float = 160.0) -> Solid:
@@ -82,6 +94,11 @@ def _room(name: str, x: float, rng: np.random.Generator) -> list[Solid]:
     return s
 
 
+def _inside(x: float) -> Way:
+    about = [(1.2, 1.3), (2.8, 1.1), (2.0, 0.9)]
+    return [((x + u, v, 1.4), (x + 2.0 + 0.5 * (u - 2.0), 3.4, 1.2)) for u, v in about]
+
+
 def rooms(seed: int, *, both: bool, other: Sequence[str] = ("picture",)) -> Deceiver:
     """Two rooms that are alike but for a picture, on one passage.
 
@@ -102,26 +119,34 @@ def rooms(seed: int, *, both: bool, other: Sequence[str] = ("picture",)) -> Dece
         low = (3.0 + 1.5 * i, -0.13, 1.0)
         passage.append(_box(f"notice {i}", low, (low[0] + 0.8, -0.1, 1.8), _PICTURE))
 
-    def inside(x: float) -> Way:
-        about = [(1.2, 1.3), (2.8, 1.1), (2.0, 0.9)]
-        return [((x + u, v, 1.4), (x + 2.0 + 0.5 * (u - 2.0), 3.4, 1.2)) for u, v in about]
-
     def aside(x: float) -> Way:
         return [((x + 3.0, v, 1.4), (x + 3.7, 3.4, 1.0)) for v in (1.7, 1.5, 1.3)]
 
     def outside(x: float) -> Way:
         return [((x + 2.0, -1.6, 1.4), (x + 2.0, 3.4, 1.2))]
 
-    there, x = inside(0.0), _ROOM_APART
-    again = {"the second, never seen before": inside(x)}
+    there, x = _inside(0.0), _ROOM_APART
+    again = {"the second, never seen before": _inside(x)}
     if both:
-        there += [*outside(0.0), *outside(x), *inside(x)[::-1]]
+        there += [*outside(0.0), *outside(x), *_inside(x)[::-1]]
         again = {
-            "the first": inside(0.0)[::-1],
-            "the second": inside(x)[::-1],
-            "the second, its picture not in view at first": aside(x) + inside(x)[::-1],
+            "the first": _inside(0.0)[::-1],
+            "the second": _inside(x)[::-1],
+            "the second, its picture not in view at first": aside(x) + _inside(x)[::-1],
         }
     return Deceiver([*first, *second, *passage], twins, there, again, apart_m=1.0)
+
+
+_MOVED_M = 0.4
+
+
+def room_with(seed: int, *moved: str) -> Deceiver:
+    """A room in which some things hang or stand elsewhere after the dark."""
+    solids = _room("first", 0.0, np.random.default_rng([seed, 1]))
+    return Deceiver(
+        solids, {}, _inside(0.0), {"the room again": _inside(0.0)[::-1]}, apart_m=0.5 * _MOVED_M,
+        moved_m={f"first {name}": _MOVED_M for name in moved},
+    )  # fmt: skip
 
 
 _DOORS, _DOOR_APART = 20, 1.2

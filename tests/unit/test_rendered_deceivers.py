@@ -2,7 +2,7 @@
 
 import pytest
 from benchmarks.deceiving import run
-from benchmarks.deceiving_scenes import floor, rooms
+from benchmarks.deceiving_scenes import floor, room_with, rooms
 
 from pliant.config import load_config
 
@@ -27,3 +27,11 @@ def test_no_part_of_a_chequered_floor_is_taken_for_another() -> None:
         assert one.joined == 0
         assert one.wrong == []
         assert one.found == 0
+
+
+@pytest.mark.slow
+def test_a_room_is_where_most_of_it_is_and_not_where_its_picture_hangs_now() -> None:
+    """Most corners are the picture's, and agree with each other."""
+    (one,) = dict(run(room_with(0, "picture"), load_config(), 0)).values()
+    assert one.wrong == []
+    assert one.found >= 0.9 * one.frames

@@ -57,15 +57,16 @@ def ask(
         if k.id in said
     ]
 
-    def propose(_: Features, place: Place, *__: object) -> SimpleNamespace:
+    def propose(_: Features, place: Place, *__: object) -> list[SimpleNamespace]:
         corners = np.random.default_rng(0).uniform(0, 600, (said[place.keyframe.id][0], 2))
-        return SimpleNamespace(
+        proposed = SimpleNamespace(
             T_world_camera=looking((3.0 * place.keyframe.id, 0.0, 0.0)),
             corners=np.arange(len(corners)),
             corners_px=corners.astype(np.float32),
             xyz=np.zeros((len(corners), 3)),
             share=0.9,
         )
+        return [proposed]
 
     def prove(T_world_camera: F64, *_: object) -> SimpleNamespace:
         count = said[round(T_world_camera[0, 3] / 3.0)][1]

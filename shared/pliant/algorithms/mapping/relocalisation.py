@@ -5,7 +5,7 @@ over corners that look alike; it counts only where the map's own points prove it
 and where no other place is proved nearly as well: what looks the same in two places shows neither.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple
@@ -93,39 +93,38 @@ def relocalise(
     own = parameters.recovery
     best: Recognised | None = None
     rivals: list[Recognised] = []
-    proposals: dict[int, _Proposed] = {}
+    told: _Proposed | None = None
     for number, place in enumerate(chain(places, elsewhere)):
         if number >= len(places) and best is None:
             break
-        proposed = _propose(seen, place, points, camera, parameters, generator)
-        if proposed is None:
-            continue
-        proposals[place.keyframe.id] = proposed
         near = most_shared(place.segment, [place.keyframe], points)[:_NEAR_KEYFRAMES]
         rows = rows_of(near, np.zeros(0, np.int32), len(points.state))
         rows = rows[points.state[rows] == MAPPED]
-        proved = prove(
-            proposed.T_world_camera, rows, points, maxima, grey, camera, parameters,
-            0.0 if _speaks_for_itself(proposed, camera, parameters) else own.min_agreement,
-        )  # fmt: skip
-        if proved is None:
-            continue
-        found = Recognised(
-            keyframe=place.keyframe,
-            T_world_camera=proved.T_world_camera,
-            inliers=int(proved.inliers.sum()),
-            corners=len(proposed.corners_px),
-        )
-        if best is not None and _is_same(best, found, place, points):
-            best = max(best, found, key=lambda each: each.inliers)
-            continue
-        if best is not None:
-            rivals.append(min(best, found, key=lambda each: each.inliers))
-            found = max(best, found, key=lambda each: each.inliers)
-        best = found
-    if best is None or any(_is_as_good(rival, best, points, parameters) for rival in rivals):
+        for proposed in _propose(seen, place, points, camera, parameters, generator):
+            proved = prove(
+                proposed.T_world_camera, rows, points, maxima, grey, camera, parameters,
+                0.0 if _speaks_for_itself(proposed, camera, parameters) else own.min_agreement,
+            )  # fmt: skip
+            if proved is None:
+                continue
+            found = Recognised(
+                keyframe=place.keyframe,
+                T_world_camera=proved.T_world_camera,
+                inliers=int(proved.inliers.sum()),
+                corners=len(proposed.corners),
+            )
+            if best is None:
+                best, told = found, proposed
+                continue
+            same = _is_same(best, found, place, points)
+            if found.inliers > best.inliers:
+                best, told, found = found, proposed, best
+            if not same:
+                rivals.append(found)
+    if best is None or told is None:
         return None
-    told = proposals[best.keyframe.id]
+    if any(_is_as_good(rival, best, points, parameters) for rival in rivals):
+        return None
     here = transform(inverse(told.T_world_camera), told.xyz)
     return None if repeats(seen, told.corners, here, camera, parameters) else best
 
@@ -172,26 +171,31 @@ def _propose(
     camera: PinholeCamera,
     parameters: MappingParameters,
     generator: np.random.Generator,
-) -> _Proposed | None:
-    """The pose that most corners agree on which look like those of a place."""
+) -> Iterator[_Proposed]:
+    """The pose that most corners agree on which look like those of a place, and then that of the
+    rest of them, as long as enough agree.
+
+    What has been moved takes its corners along, which may be the most.
+    """
     limits, own = parameters.localisation, parameters.recovery
     pairs = match(seen, place.features)
     world, known = corners_in_map(place.keyframe, place.features, points, camera)
     pairs = pairs[known[pairs[:, 1]]]
-    if len(pairs) < own.min_agreeing:
-        return None
-    xyz, points_px = world[pairs[:, 1]], seen.points_px[pairs[:, 0]]
-    found = pose_by_ransac(
-        xyz, camera.normalise(points_px.astype(np.float64)), generator,
-        gate=limits.ransac_gate_px / camera.fx, samples=own.ransac_samples,
-    )  # fmt: skip
-    if found is None or found[1].sum() < own.min_agreeing:
-        return None
-    T_world_camera = refine(found[0], xyz, points_px, camera, limits).T_world_camera
-    agree = found[1]
-    return _Proposed(
-        T_world_camera, pairs[agree, 0], points_px[agree], xyz[agree], float(agree.mean())
-    )
+    alike = len(pairs)
+    while len(pairs) >= own.min_agreeing:
+        xyz, points_px = world[pairs[:, 1]], seen.points_px[pairs[:, 0]]
+        found = pose_by_ransac(
+            xyz, camera.normalise(points_px.astype(np.float64)), generator,
+            gate=limits.ransac_gate_px / camera.fx, samples=own.ransac_samples,
+        )  # fmt: skip
+        if found is None or found[1].sum() < own.min_agreeing:
+            return
+        agree = found[1]
+        T_world_camera = refine(found[0], xyz, points_px, camera, limits).T_world_camera
+        yield _Proposed(
+            T_world_camera, pairs[agree, 0], points_px[agree], xyz[agree], agree.sum() / alike
+        )
+        pairs = pairs[~agree]
 
 
 def _speaks_for_itself(
