@@ -143,8 +143,12 @@ _MOVED_M = 0.4
 def room_with(seed: int, *moved: str) -> Deceiver:
     """A room in which some things hang or stand elsewhere after the dark."""
     solids = _room("first", 0.0, np.random.default_rng([seed, 1]))
+    beside = [(0.8, 0.8), (1.6, 0.6), (0.8, 1.0), (1.6, 0.8), (1.0, 1.0), (2.0, 1.1), (2.8, 1.1)]
+    at = [(4.0, 0.4), (4.0, 0.9), (4.0, 1.6), (4.0, 2.6), (3.6, 3.4), (2.6, 3.4), (2.4, 3.4)]
+    turning: Way = [((*a, 1.4), (*b, 1.2)) for a, b in zip(beside, at, strict=True)]
+    again = {"the room again": _inside(0.0)[::-1], "first a wall beside": turning}
     return Deceiver(
-        solids, {}, _inside(0.0), {"the room again": _inside(0.0)[::-1]}, apart_m=0.5 * _MOVED_M,
+        solids, {}, _inside(0.0), again, apart_m=0.5 * _MOVED_M,
         moved_m={f"first {name}": _MOVED_M for name in moved},
     )  # fmt: skip
 
