@@ -24,7 +24,7 @@ from pliant.map_history import MapHistory
 
 _HEADER = (
     *("after the dark the camera sees", "runs", "frames", "found in the map", "wrong poses"),
-    *("loops told twice", "segments joined"),
+    *("wrong in segments of their own", "loops told twice", "segments joined"),
 )
 _DARK_S = 1.5
 _REFERENCE = 30
@@ -48,7 +48,8 @@ class Run:
     """What came of one way after the dark.
 
     frames: after the dark.   found: those of them that have a pose in a segment of before.
-    wrong: all frames with a wrong pose, as it was known then or at the end.
+    wrong: all frames with a wrong pose in those, as it was known then or at the end.   astray: in
+    segments that began later.
     """
 
     frames: int
@@ -56,6 +57,7 @@ class Run:
     told: int
     joined: int
     wrong: list[int]
+    astray: list[int]
 
 
 class _Session:
@@ -103,9 +105,9 @@ class _Session:
         before = {segment for frame, (segment, _) in final.items() if frame < night}
         after = [frame for frame in self.truth if frame > night]
         wrong = {
-            frame
+            each
             for poses in (self.history.causal, final)
-            for frame in _wrong(poses, self.truth, apart_m)
+            for each in _wrong(poses, self.truth, apart_m)
         }
         assert isinstance(self.mapper.atlas.places, _Watched)
         return Run(
@@ -113,7 +115,8 @@ class _Session:
             found=sum(frame in final and final[frame][0] in before for frame in after),
             told=len(self.mapper.atlas.places.told),
             joined=self.joined + len(delta.joined),
-            wrong=sorted(wrong),
+            wrong=sorted({frame for segment, frame in wrong if segment in before}),
+            astray=sorted({frame for segment, frame in wrong if segment not in before}),
         )
 
 
@@ -132,8 +135,8 @@ def run(deceiver: Deceiver, config: Config, seed: int) -> Iterator[tuple[str, Ru
 
 def _wrong(
     poses: dict[int, tuple[int, F64]], truth: dict[int, F64], apart_m: float
-) -> Iterator[int]:
-    """Frames that are elsewhere."""
+) -> Iterator[tuple[int, int]]:
+    """Segments and their frames that are elsewhere."""
     for segment in {segment for segment, _ in poses.values()}:
         frames = sorted(f for f, (of, _) in poses.items() if of == segment and f in truth)
         mine = pose_to_matrix(np.array([poses[frame][1] for frame in frames]))
@@ -146,7 +149,8 @@ def _wrong(
         a, b = a - middle_a, b - middle_b
         scale = np.sqrt((b[first] ** 2).sum() / (a[first] ** 2).sum())
         errors = np.linalg.norm(scale * a - b, axis=1)
-        yield from (f for f, error in zip(frames, errors, strict=True) if error > apart_m)
+        far = [frame for frame, error in zip(frames, errors, strict=True) if error > apart_m]
+        yield from ((segment, frame) for frame in far)
 
 
 SCENES: dict[str, Callable[[int], Deceiver]] = {
@@ -176,6 +180,7 @@ def measure(config: Config, seeds: int, only: str) -> Iterator[str]:
                 sum(one.frames for one in some),
                 sum(one.found for one in some),
                 sum(len(one.wrong) for one in some),
+                sum(len(one.astray) for one in some),
                 sum(one.told for one in some),
                 sum(one.joined for one in some),
             ]

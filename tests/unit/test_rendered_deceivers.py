@@ -15,7 +15,7 @@ def test_of_two_rendered_rooms_neither_is_taken_for_the_other() -> None:
     for one in came.values():
         assert one.told >= 2  # it does deceive
         assert one.joined == 0
-        assert one.wrong == []
+        assert one.wrong == one.astray == []
     assert came["the second"].found == came["the second"].frames
 
 
