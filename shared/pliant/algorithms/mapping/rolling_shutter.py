@@ -140,15 +140,10 @@ class RolledFrame:
         columns, rows = -(-width // _GRID_PX) + 1, -(-height // _GRID_PX) + 1
         v, u = np.mgrid[:rows, :columns].astype(np.float32) * _GRID_PX
         nodes = np.stack([u.ravel(), v.ravel()], axis=1)
-        moved = self._shifts(nodes, None, seen=False).reshape(rows, columns, 2)
-        # Not cv2.resize, whose samples are the centres of cells.
-        to_nodes = np.array([[1.0 / _GRID_PX, 0.0, 0.0], [0.0, 1.0 / _GRID_PX, 0.0]])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        shift = cv2.warpAffine(moved, to_nodes, (width, height), None, flags)
-        return (
-            np.arange(width, dtype=np.float32) + shift[:, :, 0],
-            np.arange(height, dtype=np.float32)[:, None] + shift[:, :, 1],
-        )
+        shifts = self._shifts(nodes, None, seen=False).reshape(rows, columns, 2)
+        places = np.empty((2, height, width), np.float32)
+        _interpolate(shifts, places)
+        return places[0], places[1]
 
     def _shifts(self, points_px: F32, inverse_depths: F64 | None, *, seen: bool) -> F32:
         camera = self.camera
@@ -232,3 +227,27 @@ def _shifts(
             a, b = _velocity(motion, x, y, inverse_depths[n])
             du, dv = share * K[0] * a, share * K[1] * b
         shifts[n, 0], shifts[n, 1] = du, dv
+
+
+@kernel
+def _interpolate(shifts: F32, places: F32) -> None:
+    """Write the place (2, H, W) of each pixel by shifts (., ., 2) that are given at the nodes."""
+    height, width = places.shape[1:]
+    across = np.arange(_GRID_PX).astype(np.float32) / np.float32(_GRID_PX)
+    one = np.float32(1.0)
+    for row in range(height):
+        r = row // _GRID_PX
+        down = across[row - r * _GRID_PX]
+        # Of the corners of a cell, for each of its columns.
+        w00, w01 = (one - down) * (one - across), (one - down) * across
+        w10, w11 = down * (one - across), down * across
+        for c in range(shifts.shape[1] - 1):
+            left = c * _GRID_PX
+            for k in range(2):
+                s00, s01 = shifts[r, c, k], shifts[r, c + 1, k]
+                s10, s11 = shifts[r + 1, c, k], shifts[r + 1, c + 1, k]
+                own = np.float32(row if k else left)
+                for j in range(min(_GRID_PX, width - left)):
+                    shift = s00 * w00[j] + s01 * w01[j] + s10 * w10[j] + s11 * w11[j]
+                    at = own if k else own + np.float32(j)
+                    places[k, row, left + j] = at + shift
