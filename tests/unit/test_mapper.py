@@ -80,6 +80,43 @@ def flight():
     return scene, poses, *run(scene.frames(poses))
 
 
+def test_points_are_told_again_only_where_they_are_known_otherwise():
+    """What readers know of the others is near enough, and exact in the end."""
+    mapper, known, again = Mapper(CAMERA, PARAMETERS, 0), {}, 0
+
+    def told(delta):
+        rows = zip(delta.points_world, delta.point_sigmas, delta.point_hosts, strict=True)
+        return dict(zip(delta.point_ids.tolist(), rows, strict=True))
+
+    for frame, tracks in enumerate(Scene.box(death=0.02, noise_px=0.3).frames(sideways(60))):
+        delta = mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+        is_keyframe = mapper.publish_keyframes().new >= 0
+        if (active := mapper.atlas.active) is None:
+            continue
+        centre = active.keyframes[-1].T_world_camera[:3, 3]
+        for i, (xyz, sigma, host) in told(delta).items():
+            if i not in known or host != known[i][2]:
+                continue
+            moved = np.linalg.norm(xyz - known[i][0]) / np.linalg.norm(xyz - centre)
+            assert is_keyframe
+            assert moved > 2e-3 or not 0.81 < sigma / known[i][1] < 1.23
+            again += 1
+        known |= told(delta)
+        if is_keyframe:
+            points, rows = active.points, active.window.rows[active.window.mapped_columns()]
+            xyz = np.array([known[i][0] for i in points.ids[rows].tolist()])
+            moved = np.linalg.norm(points.xyz[rows] - xyz, axis=1)
+            distance = np.linalg.norm(points.xyz[rows] - centre, axis=1)
+            near = np.maximum(2e-3, 0.25 * points.sigmas[rows]) * distance
+            assert (moved <= 1.01 * near).all()
+    assert again > 100
+    known |= told(mapper.finish())
+    points = mapper.atlas.points
+    rows = points.mapped(0)
+    xyz = np.array([known[i][0] for i in points.ids[rows].tolist()])
+    np.testing.assert_allclose(xyz, points.xyz[rows], rtol=1e-6, atol=1e-6)
+
+
 def test_points_are_told_as_files_have_them():
     """What is below is noise, which no compression makes smaller."""
     _, deltas = run(Scene.box().frames(sideways(12)))

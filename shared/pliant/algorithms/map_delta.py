@@ -69,7 +69,8 @@ class MapDelta:
     keyframe_ids, keyframe_frames, keyframe_segments: keyframes that are new or have moved; frame -1
         for those that an earlier session made.
     keyframe_poses: T_world_camera for each.
-    point_ids: points that are new or have changed.      point_segments: theirs.
+    point_ids: points that are new, or changed by more than a share of how uncertain they are; after
+        the final adjustment all of it.      point_segments: theirs.
     points_world: positions, as float32 has them.    point_colours: RGB (grey is repeated).
     point_keyframes: keyframes that observe the point.
     point_parallax_rad: largest angle between two of the rays that observe it.

@@ -297,9 +297,9 @@ class Atlas:
         return limits.final_adjustment and few
 
     def take_changed(self, *, everything: bool) -> tuple[list[Keyframe], I32]:
-        """The keyframes, and rows of the points, that may have changed since the last call.
+        """The keyframes, and rows of the points, of which readers may have to be told.
 
-        everything: not only the points that the last frame sees.
+        everything: not only points that are new, of those that the last frame sees.
         """
         adjusted, self._adjusted = self._adjusted, False
         keyframes: list[Keyframe] = []
@@ -309,8 +309,12 @@ class Atlas:
         elif self.active is not None:
             window = self.active.window
             keyframes = window.keyframes
-            rows = window.rows if everything else window.current_rows()
+            rows = window.rows if everything else self._untold(window.current_rows())
         for earlier in self._earlier.adjusted:
             keyframes = [*keyframes, *earlier.keyframes]
             rows = np.concatenate([rows, earlier.mapped_rows()])
         return keyframes, rows
+
+    def _untold(self, rows: I32) -> I32:
+        """Those of which nothing has been published."""
+        return rows[np.isnan(self.points.published_sigmas[rows])]

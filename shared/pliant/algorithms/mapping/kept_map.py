@@ -228,7 +228,7 @@ def _put(points: PointRows, rows: I32, kept: KeptKeyframe, calibration: SelfCali
     points.first_keyframe[rows] = kept.id
     points.xyz[rows] = points.published_xyz[rows] = kept.points_world
     points.spread[rows] = 0.0
-    points.published_keyframes[rows] = -1  # told again where this session sees them
+    points.published_sigmas[rows] = np.nan  # told again where this session sees them
     points.colours[rows] = kept.point_colours
     points.keyframes[rows] = points.base_keyframes[rows] = kept.point_keyframes
     points.parallax_rad[rows] = points.base_parallax_rad[rows] = kept.point_parallax_rad

@@ -28,7 +28,7 @@ class PointRows:
     xyz: world position of mapped points, and of candidates the provisional one.
     spread: (3,) how uncertain that is, see ``directions``; 0 for mapped points, NaN for candidates
     that have no place yet.    published_xyz: as last published, NaN before.
-    published_keyframes: ``keyframes`` when last published.    segment: of the map.
+    published_sigmas: ``sigmas`` when last published.    segment: of the map.
     first_keyframe: keyframe id of the first observation.
     keyframes, parallax_rad, sigmas: as MapDelta defines them.
     base_keyframes, base_parallax_rad: what of those is due to keyframes out of the window.
@@ -46,7 +46,7 @@ class PointRows:
         self.xyz: F64 = np.zeros((1024, 3))
         self.spread: F64 = np.zeros((1024, 3))
         self.published_xyz: F64 = np.zeros((1024, 3))
-        self.published_keyframes: I32 = np.zeros(1024, np.int32)
+        self.published_sigmas: F32 = np.zeros(1024, np.float32)
         self.colours: U8 = np.zeros((1024, 3), np.uint8)
         self.first_keyframe: I32 = np.zeros(1024, np.int32)
         self.base_keyframes: I32 = np.zeros(1024, np.int32)
@@ -84,6 +84,7 @@ class PointRows:
         self.alias[rows] = rows
         self.spread[rows] = np.nan
         self.published_xyz[rows] = np.nan
+        self.published_sigmas[rows] = np.nan
         return rows
 
     def free(self, rows: I32) -> None:
@@ -109,8 +110,9 @@ class PointRows:
             self._note_removed(np.array([old], np.int32))
         self.state[old] = MERGED
         self.alias[old] = new
-        self.first_keyframe[new] = min(self.first_keyframe[old], self.first_keyframe[new])
-        self.published_keyframes[new] = -1  # others are told on what it hangs
+        if self.first_keyframe[old] < self.first_keyframe[new]:
+            self.first_keyframe[new] = self.first_keyframe[old]
+            self.published_sigmas[new] = np.nan  # readers are told on what it hangs
 
     def remove(self, rows: I32) -> None:
         """Points go.  As candidates they may come back while their track lives."""
@@ -118,6 +120,7 @@ class PointRows:
         self.state[rows] = CANDIDATE
         self.ids[rows] = -1
         self.published_xyz[rows] = np.nan
+        self.published_sigmas[rows] = np.nan
 
     def _note_removed(self, rows: I32) -> None:
         """Points go that have been published; nobody knows of the others."""

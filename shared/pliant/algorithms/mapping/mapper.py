@@ -356,7 +356,7 @@ class Mapper:
         self._timer = no_stages  # the frame is done: nothing of its caller stays with the map
         self._published_frames += 1
         snapshot = snapshot or self._published_frames % self._parameters.snapshot_frames == 0
-        # Between keyframes only points that the frame sees can move or be new.
+        # Between keyframes points are new; how they move is told with the next one.
         keyframes, rows = self.atlas.take_changed(everything=snapshot or self._keyframe_is_new)
         centre = np.zeros(3)
         if self.atlas.active is not None:

@@ -5,14 +5,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, I64, U8, with_bits
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, with_bits
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta, MapMoves
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.compiler.kernel import kernel
 
 _MOVED_SHARE = 2e-3
-"""Points are published again when they moved by this share of their distance to the camera."""
+"""Points are published again when they moved by this share of their distance to the camera: across
+the ray, about a px of an image with 640 columns."""
+
+_MOVED_SIGMAS = 0.25
+"""Along the ray, where they are known worse than that: this share of their standard deviation for a
+noise of 1 px."""
+
+_KNOWN_SHARE = 0.8
+"""Or when their standard deviation has become this share of what was published, or the reverse."""
+
+_TINY = 1e-300
 
 _BITS = 12
 """Significant ones of how well a point is known."""
@@ -76,8 +86,8 @@ class MapChanges:
         for keyframe in moved:
             keyframe.published_pose = keyframe.T_world_camera.copy()
         rows = _unpublished(
-            rows, points.state, points.xyz, points.published_xyz, points.keyframes,
-            points.published_keyframes, centre, snapshot,
+            rows, points.state, points.xyz, points.published_xyz, points.sigmas,
+            points.published_sigmas, centre, snapshot,
         )  # fmt: skip
         delta = MapDelta(
             state=state,
@@ -120,28 +130,43 @@ def _unpublished(
     state: U8,
     xyz: F64,
     published_xyz: F64,
-    keyframes: I32,
-    published_keyframes: I32,
+    sigmas: F32,
+    published_sigmas: F32,
     centre: F64,
     snapshot: bool,
 ) -> I32:
-    """Those of the mapped rows that must be published; they are noted as published."""
+    """Those of the mapped rows that must be published; they are noted as published.
+
+    Each keyframe moves every point of the window a little, mostly along its ray and far less than
+    the point is known: told each time, such moves would be most of what is told of the map.  So a
+    move m of a point at distance d along the unit ray r is small when
+
+        |m - (r^T m) r|^2 / s^2 + (r^T m)^2 / max(s, k sigma)^2  <=  d^2
+
+    with s the least share that is told, sigma the deviation along the ray as a share of d.
+    """
     chosen = np.empty(rows.size, np.int32)
     count = 0
     for i in range(rows.size):
         row = rows[i]
         if state[row] != MAPPED:
             continue
-        distance2, moved2 = 0.0, 0.0
+        distance2, moved2, along = 0.0, 0.0, 0.0
         for k in range(3):
-            distance2 += (xyz[row, k] - centre[k]) ** 2
-            moved2 += (xyz[row, k] - published_xyz[row, k]) ** 2
-        # Points never published compare with NaN, which is never small.
-        still = moved2 <= _MOVED_SHARE * _MOVED_SHARE * distance2
-        if snapshot or not still or published_keyframes[row] != keyframes[row]:
+            ray, moved = xyz[row, k] - centre[k], xyz[row, k] - published_xyz[row, k]
+            distance2 += ray * ray
+            moved2 += moved * moved
+            along += ray * moved
+        deep2 = along * along / max(distance2, _TINY)
+        sigma, before = sigmas[row], published_sigmas[row]
+        deep = _MOVED_SHARE / max(_MOVED_SHARE, _MOVED_SIGMAS * sigma)
+        # What was never published compares with NaN, which is never small.
+        still = moved2 - (1.0 - deep * deep) * deep2 <= _MOVED_SHARE * _MOVED_SHARE * distance2
+        known = before * _KNOWN_SHARE <= sigma and sigma * _KNOWN_SHARE <= before
+        if snapshot or not (still and known):
             for k in range(3):
                 published_xyz[row, k] = xyz[row, k]
-            published_keyframes[row] = keyframes[row]
+            published_sigmas[row] = sigma
             chosen[count] = row
             count += 1
     return chosen[:count].copy()
