@@ -7,7 +7,7 @@ import pytest
 from pliant.algorithms.epipolar import (
     decompose_essential,
     rays,
-    relative_pose,
+    relative_poses,
     rotation_between,
     two_view_depths,
 )
@@ -29,8 +29,7 @@ def two_views(outliers=0, noise=0.0):
 
 def test_relative_pose_is_found_among_outliers():
     _, _, points_a, points_b = two_views(outliers=150, noise=0.0002)
-    found = relative_pose(points_a, points_b, gate=0.002)
-    assert found is not None
+    found = relative_poses(points_a, points_b, gate=0.002)[0]
     assert np.degrees(np.linalg.norm(so3_log(found.T_b_a[:3, :3] @ R_B_A.T))) < 0.2
     direction = T_B_A / np.linalg.norm(T_B_A)
     assert found.T_b_a[:3, 3] @ direction > np.cos(np.radians(2.0))
@@ -43,15 +42,29 @@ def test_relative_pose_does_not_depend_on_the_random_numbers_of_opencv():
     for seed in range(3):
         cv2.setRNGSeed(seed)
         cv2.randu(np.zeros(100), 0, 1)
-        found = relative_pose(points_a, points_b, gate=0.002)
-        assert found is not None
-        answers.add(found.T_b_a.tobytes())
+        found = relative_poses(points_a, points_b, gate=0.002)
+        answers.add(b"".join(each.T_b_a.tobytes() for each in found))
     assert len(answers) == 1
 
 
 def test_relative_pose_needs_eight_points():
     _, _, points_a, points_b = two_views()
-    assert relative_pose(points_a[:7], points_b[:7], gate=0.01) is None
+    assert relative_poses(points_a[:7], points_b[:7], gate=0.01) == []
+
+
+def test_a_plane_leaves_two_motions():
+    """One homography, two motions that explain every point and see it before both cameras."""
+    generator = np.random.default_rng(2)
+    a = generator.uniform((-1.0, -1.0, 4.0), (1.0, 1.0, 4.0), (300, 3))
+    a[:, 2] += 0.4 * a[:, 0]
+    b = a @ R_B_A.T + T_B_A
+    points_a, points_b = a[:, :2] / a[:, 2:], b[:, :2] / b[:, 2:]
+    points_b += generator.normal(0.0, 0.0001, points_b.shape)
+    found = relative_poses(points_a, points_b, gate=0.002)
+    fitting = [each.T_b_a for each in found if each.inliers.mean() > 0.99]
+    errors = [np.linalg.norm(so3_log(T[:3, :3] @ R_B_A.T)) for T in fitting]
+    assert min(errors) < np.radians(0.5)
+    assert max(errors) > np.radians(2.0)
 
 
 def test_one_of_four_decompositions_is_true():

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F64, BoolArray
+from pliant.algorithms.geometry import hat
 
 _ROTATION_ITERATIONS = 6
 _CONFIDENCE = 0.9999
@@ -24,11 +25,13 @@ class RelativePose:
     """Two views by the essential matrix.
 
     T_b_a: (4, 4), translation of length 1.  inliers: (N,) points that agree and lie before both
-    cameras.  parallax_rad: (N,) angle between the two rays of each point.
+    cameras.  misfit: mean of Geman-McClure's kernel, at the gate's scale, over all points.
+    parallax_rad: (N,) angle between the two rays of each point.
     """
 
     T_b_a: F64
     inliers: BoolArray
+    misfit: float
     parallax_rad: F64
 
 
@@ -63,31 +66,70 @@ def rotation_between(points_a: F64, points_b: F64, *, scale: float) -> tuple[F64
     return rotation, residuals
 
 
-def relative_pose(points_a: F64, points_b: F64, *, gate: float) -> RelativePose | None:
-    """Essential matrix by RANSAC, and the decomposition that puts most points before both cameras.
+def relative_poses(points_a: F64, points_b: F64, *, gate: float) -> list[RelativePose]:
+    """Motions that may explain two views: several, for noise and planes leave room for more than
+    one, and more views than two decide.
+
+    The essential matrix by two estimators that improve each sample on all points that agree with it
+    (with the few points of a sample alone the noise decides), and the motions that a homography
+    allows (Ma et al. 2004, section 5.3): of a plane there are two.
 
     points_a, points_b: (N, 2), the same points on the plane z = 1 of each view.  ``gate`` is the
-    largest epipolar error of an inlier.  OpenCV seeds this RANSAC itself at every call, so the
-    result depends on the arguments alone.  None where no essential matrix fits.
+    largest epipolar error of an inlier.  OpenCV seeds its samples itself at every call, so the
+    result depends on the arguments alone.  Empty where nothing fits.
     """
     if len(points_a) < 8:
-        return None
-    found: Any = cv2.findEssentialMat(
-        points_a, points_b, np.eye(3), method=cv2.RANSAC, prob=_CONFIDENCE, threshold=gate,
-        maxIters=_SAMPLES,
-    )  # fmt: skip
-    E, mask = found
-    if E is None or E.shape != (3, 3) or not np.isfinite(E).all():
-        return None
-    agreeing = mask.ravel() > 0
-    rays_a, rays_b = rays(points_a), rays(points_b)
-    best: RelativePose | None = None
-    for T_b_a in decompose_essential(E):
-        depth_a, depth_b, parallax = two_view_depths(T_b_a, rays_a, rays_b)
-        inliers = agreeing & (depth_a > 0.0) & (depth_b > 0.0)
-        if best is None or inliers.sum() > best.inliers.sum():
-            best = RelativePose(T_b_a=T_b_a, inliers=inliers, parallax_rad=parallax)
-    return best
+        return []
+    motions: list[F64] = []
+    for method in (cv2.USAC_ACCURATE, cv2.USAC_MAGSAC):
+        E: Any = cv2.findEssentialMat(
+            points_a, points_b, np.eye(3), method=method, prob=_CONFIDENCE, threshold=gate,
+            maxIters=_SAMPLES,
+        )[0]  # fmt: skip
+        if E is not None and E.shape == (3, 3) and np.isfinite(E).all():
+            motions.append(_before_both(decompose_essential(E), points_a, points_b, gate))
+    H: Any = cv2.findHomography(
+        points_a, points_b, cv2.RANSAC, gate, maxIters=_SAMPLES, confidence=_CONFIDENCE
+    )[0]
+    if H is not None and np.isfinite(H).all():
+        motions += decompose_homography(H)
+    found = [_two_views(T_b_a, points_a, points_b, gate) for T_b_a in motions]
+    return sorted((each for each in found if each.inliers.any()), key=lambda each: each.misfit)
+
+
+def _before_both(motions: list[F64], points_a: F64, points_b: F64, gate: float) -> F64:
+    """Of motions with one essential matrix that which puts most points before both cameras."""
+    return max(motions, key=lambda T: _two_views(T, points_a, points_b, gate).inliers.sum())
+
+
+def _two_views(T_b_a: F64, points_a: F64, points_b: F64, gate: float) -> RelativePose:
+    depth_a, depth_b, parallax = two_view_depths(T_b_a, rays(points_a), rays(points_b))
+    E = hat(T_b_a[:3, 3]) @ T_b_a[:3, :3]
+    a, b = (np.column_stack([each, np.ones(len(each))]) for each in (points_a, points_b))
+    lines_b, lines_a = a @ E.T, b @ E
+    slopes = np.hypot(np.hypot(*lines_b.T[:2]), np.hypot(*lines_a.T[:2]))
+    errors = np.abs((b * lines_b).sum(axis=1)) / np.maximum(slopes, 1e-12)  # Sampson's distance
+    before = (depth_a > 0.0) & (depth_b > 0.0)
+    fit = np.where(before, 1.0 / (1.0 + (errors / gate) ** 2), 0.0)
+    return RelativePose(
+        T_b_a=T_b_a,
+        inliers=(errors < gate) & before,
+        misfit=1.0 - float(fit.mean()),
+        parallax_rad=parallax,
+    )
+
+
+def decompose_homography(H: F64) -> list[F64]:
+    """The (4, 4) motions T_b_a, of unit translation, that a plane's homography allows."""
+    _, rotations, translations, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+    motions: list[F64] = []
+    for rotation, translation in zip(rotations, translations, strict=True):
+        length = float(np.linalg.norm(translation))
+        if length > 1e-9:
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = rotation, translation.ravel() / length
+            motions.append(T)
+    return motions
 
 
 def decompose_essential(E: F64) -> list[F64]:

@@ -223,8 +223,8 @@ def _find_start_of_guess(
 ) -> tuple[Start, SelfCalibration] | str:
     """The start under the focal length with which it agrees best with itself.
 
-    Where any of the focal lengths explains the flow by a turn alone, it waits: a wrong one sees
-    parallax in every turn.
+    Where any of the focal lengths explains the flow by a turn alone or finds too little parallax,
+    it waits: a wrong one sees parallax in every turn.
     """
     sigma = parameters.calibration.focal
     tried = [known.correction + k * sigma * np.eye(6)[0] for k in _HYPOTHESES]
@@ -233,20 +233,17 @@ def _find_start_of_guess(
     if any(reasons):
         return next(filter(None, reasons))
     best: tuple[float, Start, F64] | None = None
-    reason = ""
     for correction, camera in zip(tried, cameras, strict=True):
         found = find_start(waiting, camera, parameters)
         if isinstance(found, str):
-            reason = reason or found
-            continue
+            return found
         refined = _refine(found, camera, parameters)
         cost = refined.final_cost / len(found.points_px)
         if best is None or cost < best[0]:
             poses, points = refined.T_world_camera, refined.points_world
             start = dataclasses.replace(found, T_world_camera=poses, points_world=points)
             best = cost, start, correction + refined.correction
-    if best is None:
-        return reason
+    assert best is not None
     _, start, correction = best
     following = int(np.ceil(_GROWTH * len(start.frames)))
     return start, SelfCalibration(known.given, correction, known.covariance, following)

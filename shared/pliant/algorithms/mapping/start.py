@@ -1,9 +1,11 @@
 """How a map starts: the frames seen so far become a small reconstruction, or a reason why not.
 
 Every new frame is compared with the best earlier one: many shared tracks, and flow that no rotation
-explains.  The essential matrix of the two gives a first structure, frames in between join it by
-their tracks, and all are adjusted together.  Only a start that many points in several frames
-support is accepted, so that slow, rotating or still beginnings merely wait.
+explains.  Two views allow several motions, above all where most of what they share lies in a plane.
+Each gives a first structure, frames in between join it by their tracks, and all are adjusted
+together.  The start that the tracks fit best is accepted, if many points in several frames support
+it and no other motion explains them nearly as well, so that slow, rotating, still or ambiguous
+beginnings merely wait.
 """
 
 from dataclasses import dataclass
@@ -18,13 +20,14 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.epipolar import (
     RelativePose,
     rays,
-    relative_pose,
+    relative_poses,
     rotation_between,
     two_view_depths,
 )
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.parameters import MappingParameters, StartParameters
+from pliant.algorithms.triangulation import triangulate
 
 _TRIED_REFERENCES = 8
 """Earlier frames compared with a new one."""
@@ -40,6 +43,12 @@ _MIN_FRAMES = 3
 
 _ADJUSTMENTS = 3
 """Rounds of adjusting and removing outliers."""
+
+_AS_GOOD = 1.3
+"""Times the least misfit: a motion with less has not been ruled out."""
+
+_ONE_WAY = float(np.cos(0.1))
+"""Cosine of the angle between translations that count as the same."""
 
 _LEAST_WAITING = 12
 """Frames that wait for a start however old they are: a time lapse has no more."""
@@ -196,16 +205,65 @@ def _start_from(
     start = parameters.start
     a = _normalise(camera, waiting[pair.reference].points_px[pair.indices_reference])
     b = _normalise(camera, waiting[-1].points_px[pair.indices_newest])
-    two_views = relative_pose(a, b, gate=start.epipolar_gate_px / camera.fx)
-    if two_views is None:
+    tried = relative_poses(a, b, gate=start.epipolar_gate_px / camera.fx)
+    if not tried:
         return "no essential matrix fits the tracks"
+    reason = _why_not_with(tried[0], start)
+    if reason:
+        return reason  # parallax that a worse motion sees is its mistake
+    shared = waiting[-1].ids[pair.indices_newest]
+    found: list[tuple[float, Start]] = []
+    for two_views in tried:
+        each = _why_not_with(two_views, start) or _reconstruct(
+            pair, two_views, waiting, camera, parameters
+        )
+        if isinstance(each, str):
+            reason = reason or each
+            continue
+        found.append((_misfit(each, shared, waiting, camera, parameters), each))
+    if not found:
+        return reason
+    least, best = min(found, key=lambda each: each[0])
+    for misfit, other in found:
+        if misfit < _AS_GOOD * least and not _agree(best, other):
+            return "two motions explain the tracks alike"
+    return best
+
+
+def _agree(a: Start, b: Start) -> bool:
+    """Whether the camera of both starts has moved in one direction."""
+    ways = [each.T_world_camera[-1, :3, 3] for each in (a, b)]
+    return bool(ways[0] @ ways[1] > _ONE_WAY * np.prod(np.linalg.norm(ways, axis=1)))
+
+
+def _why_not_with(two_views: RelativePose, start: StartParameters) -> str:
     share = float(two_views.inliers.mean())
     if share < start.min_inlier_share:
         return f"too few tracks agree with one motion: {share:.0%} of {start.min_inlier_share:.0%}"
     parallax = float(np.degrees(np.median(two_views.parallax_rad[two_views.inliers])))
     if parallax < start.min_parallax_deg:
         return _too_little(parallax, start.min_parallax_deg, "deg")
-    return _reconstruct(pair, two_views, waiting, camera, parameters)
+    return ""
+
+
+def _misfit(
+    start: Start,
+    ids: I64,
+    waiting: list[WaitingFrame],
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+) -> float:
+    """Mean of Geman-McClure's kernel over tracks under the poses of a start, whether it has them as
+    points or not: a wrong motion leaves out what tells against it."""
+    chosen = [frame for frame in waiting if frame.frame in start.frames]
+    frames, columns, points_px = _observations(chosen, ids)
+    u, v = np.zeros((2, len(chosen), len(ids)), np.float32)
+    seen = np.zeros(u.shape, np.bool_)
+    u[frames, columns], v[frames, columns] = points_px.T
+    seen[frames, columns] = True
+    every = np.arange(len(ids))
+    errors = triangulate(start.T_world_camera, u, v, seen, every, camera)[1].astype(np.float64)
+    return float(np.mean(1.0 - 1.0 / (1.0 + (errors / parameters.bundle.kernel_sigma_px) ** 2)))
 
 
 def _reconstruct(
