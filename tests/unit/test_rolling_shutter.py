@@ -208,7 +208,7 @@ def test_frames_with_a_known_readout_are_as_good_as_if_taken_at_once():
     _, history, _, _ = shaken.mapped(known=0.6)
     _, best, _, _ = straight.mapped()
     reached = shaken.error(history, history.causal)
-    assert reached < 1.5 * straight.error(best, best.causal)
+    assert reached < 2.0 * straight.error(best, best.causal)  # unknown it would be 13 times
 
 
 def test_published_is_what_was_seen():

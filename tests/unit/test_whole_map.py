@@ -217,7 +217,7 @@ def test_a_wrong_lens_is_taken_over(mistaken, monkeypatch):
     other, _, without = fold(GROWING, camera=WRONG, poses=turning())
     assert other.calibration.view.camera == WRONG
     assert causal_error(history) < 0.5 * causal_error(without)
-    assert error_of(mapper.atlas.active, turning()) < 0.1 * error_of(other.atlas.active, turning())
+    assert error_of(mapper.atlas.active, turning()) < 0.5 * error_of(other.atlas.active, turning())
 
 
 def test_a_lens_that_is_found_at_once_needs_no_prior(mistaken):
