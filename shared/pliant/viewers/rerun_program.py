@@ -13,6 +13,7 @@ from pliant.errors import ResultError
 
 LOOPBACK = "127.0.0.1"
 _UP_S = 30.0
+_GONE_S = 30.0
 _LOOK_S = 0.05
 
 
@@ -31,6 +32,7 @@ class RerunProgram:
                     f"port {port} is taken here: another viewer may be open; close it, or choose "
                     "another --web-port"
                 )
+        self._ports = ports
         command = [sys.executable, "-m", "rerun", "--bind", LOOPBACK, "--port", str(ports[0])]
         self._process = subprocess.Popen(
             [*command, *arguments],
@@ -56,10 +58,15 @@ class RerunProgram:
             time.sleep(_LOOK_S)
 
     def close(self) -> None:
-        """End it, and what it started."""
+        """End it, and what it started: its ports are free then."""
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
+        # The server is its child, which nobody here can wait for: on a busy machine it may still
+        # take connections.
+        deadline = time.monotonic() + _GONE_S
+        while any(listens(port) for port in self._ports) and time.monotonic() < deadline:
+            time.sleep(_LOOK_S)
 
 
 def address_of(port: int) -> str:
