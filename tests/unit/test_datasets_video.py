@@ -1,5 +1,6 @@
 """Videos written here, and cameras that are simulated: there may be none on this machine."""
 
+import os
 import re
 from itertools import islice
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from pliant.config import IngestParameters
 from pliant.datasets import open_source
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import UNSAID_SIGMA, calibration_from_yaml, calibration_yaml
@@ -90,6 +92,11 @@ def test_files_that_are_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[st
     (tmp_path / "junk.mp4").write_bytes(b"not a video" * 100)
     with pytest.raises(DatasetError, match=r"junk.mp4: not a video that OpenCV can read"):
         open_source(str(tmp_path / "junk.mp4"), fov_deg=60.0)
+    (tmp_path / "empty.mp4").touch()
+    with pytest.raises(DatasetError, match=r"empty.mp4: is empty \(0 bytes\)"):
+        open_source(str(tmp_path / "empty.mp4"), fov_deg=60.0)
+    with pytest.raises(DatasetError, match=r"holds some: .* `pliant batch"):
+        open_source(str(tmp_path))
     (tmp_path / "image.png").write_bytes(b"")
     with pytest.raises(DatasetError, match="give its folder"):
         open_source(str(tmp_path / "image.png"), fov_deg=60.0)
@@ -219,3 +226,21 @@ def test_a_video_that_is_written_to_while_it_is_read_is_told_and_one_without_a_n
     next(frames)
     file.unlink()
     assert len(list(frames)) == 5
+
+
+def test_a_video_that_is_written_to_while_a_part_of_it_is_read_is_told(tmp_path: Path) -> None:
+    file = video(tmp_path)
+    content = file.read_bytes()
+    for time, mask in enumerate((None, _white(tmp_path / "mask.png"))):
+        part = IngestParameters(end_s=0.1)
+        frames = iter(open_source(str(file), fov_deg=60.0, part=part, mask=mask))
+        next(frames)
+        file.write_bytes(content)
+        os.utime(file, (time, time))
+        with pytest.raises(DatasetError, match=r"clip.avi: was written to while it was read"):
+            list(frames)
+
+
+def _white(file: Path) -> Path:
+    cv2.imwrite(str(file), np.full((48, 64), 255, np.uint8))
+    return file

@@ -186,6 +186,11 @@ def open_source(
         raise DatasetError(f"{source}: cannot be read: {error.strerror or error}") from None
     if not path.is_dir():
         raise DatasetError(f"{source}: neither a file nor a folder; understood are {understood()}")
+    if any(_is_clip(each) for each in path.iterdir()):
+        raise DatasetError(
+            f"{source}: is no source, but holds some: name one of them, or all by "
+            f"`pliant batch {source}`"
+        )
     what = "holds none of the sources" if any(path.iterdir()) else "is an empty folder"
     raise DatasetError(f"{source}: {what}; understood are {understood()}")
 

@@ -71,6 +71,8 @@ class Excerpt:
             first_ns = first_ns if frame.index else frame.stamp_ns
             time_s = 1e-9 * (frame.stamp_ns - first_ns)
             if part.end_s and time_s >= part.end_s:
+                if isinstance(self._origin, VideoFile):  # which has not come to its own end
+                    self._origin.check_unwritten()
                 break
             if time_s >= part.start_s:
                 count += 1
@@ -85,12 +87,16 @@ class Excerpt:
 
     def check_start(self) -> None:
         """Raise DatasetError where the source ends before the start, in no time if it can tell."""
-        origin = self.source.source if isinstance(self.source, Masked) else self.source
+        origin = self._origin
         if isinstance(origin, ImageFiles):
             if origin.length_s < self.part.start_s:
                 raise self._too_short(origin.length_s)
         elif not (isinstance(origin, VideoFile) and origin.reaches(self.part.start_s)):
             next(iter(self))
+
+    @property
+    def _origin(self) -> Dataset:
+        return self.source.source if isinstance(self.source, Masked) else self.source
 
     def _too_short(self, length_s: float) -> DatasetError:
         return DatasetError(

@@ -62,6 +62,10 @@ class VideoFile:
         A file that has lost its name while it is read is there until its end.
         """
         yield from self._frames()
+        self.check_unwritten()
+
+    def check_unwritten(self) -> None:
+        """Raise DatasetError where it was written to since it was opened."""
         now = file_version(self.file)
         if now != self._version and now[:2] == self._version[:2]:
             raise DatasetError(
@@ -122,6 +126,15 @@ def _damaged(index: int, stamp_ns: int) -> SourceFrame:
     )
 
 
+def _why_not(file: Path) -> str:
+    if file_version(file) and not file.stat().st_size:
+        return "is empty (0 bytes): copy it again"
+    return (
+        "not a video that OpenCV can read: without pictures, cut off before its end, or in a "
+        "format that it does not know (then convert it, e.g. to MP4)"
+    )
+
+
 @contextlib.contextmanager
 def quiet_opencv() -> Generator[None, None, None]:
     """Keep OpenCV and FFmpeg from writing to the terminal: our own line says what is wrong."""
@@ -149,7 +162,7 @@ def opened(file: Path) -> Generator[cv2.VideoCapture, None, None]:
             capture = cv2.VideoCapture(str(file))
     try:
         if not capture.isOpened():
-            raise DatasetError(f"{file}: not a video that OpenCV can read; convert it, e.g. to MP4")
+            raise DatasetError(f"{file}: {_why_not(file)}")
         yield capture
     finally:
         capture.release()
