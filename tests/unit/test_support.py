@@ -112,6 +112,8 @@ def test_a_run_of_which_many_images_are_broken_is_doubtful() -> None:
         ({}, GOOD, "all frames have a pose in one segment"),
         ({"slipping": 20}, GOOD, "all frames"),
         ({"slipping": 61}, DOUBTFUL, "in 61% of the frames less than 75% of the surfels in view"),
+        ({"together": 20}, GOOD, "all frames"),
+        ({"together": 61}, DOUBTFUL, "if it is the camera that moves, --camera moving"),
         ({"in_segments": [60, 40]}, DOUBTFUL, "60% of the frames"),
         ({"in_segments": [30, 20, 10]}, BAD, "30% of the frames"),
         ({"in_segments": []}, BAD, "no surfels were followed"),

@@ -63,12 +63,13 @@ def slipping_frames(tracked: Sequence[int], in_view: Sequence[int]) -> list[int]
 
 def judge_surfels(
     *, frames: int, in_segments: list[int], slipping: int, depth_from: str, unusable: int,
-    unused: int = 0, broken: int = 0,
+    together: int = 0, unused: int = 0, broken: int = 0,
 ) -> tuple[str, str]:  # fmt: skip
     """As ``judge``, of a surface that deforms.
 
     in_segments: frames in which the surfels of each start were followed.   slipping: those of them
     in which few of the surfels in view are.   unusable: depth maps that no surfel could start on.
+    together: frames of a camera that was said to stand still in which all move like one thing.
     """
     word, why = judge(
         frames=frames, in_segments=in_segments, doubtful=0, unused=unused, broken=broken
@@ -85,6 +86,11 @@ def judge_surfels(
         )
     if word != GOOD:
         return word, why
+    if together > _DOUBTS * posed:
+        return DOUBTFUL, (
+            f"in {together / posed:.0%} of the frames all surfels have moved like one rigid thing: "
+            "if it is the camera that moves, --camera moving"
+        )
     if unusable > (1.0 - _WHOLE) * frames:
         return DOUBTFUL, f"{unusable / frames:.0%} of the depth maps could not be used"
     if depth_from == "flat":

@@ -25,6 +25,7 @@ from pliant.results.folder import (
     all_or_none,
 )
 from pliant.results.judgement import judge_surfels, slipping_frames
+from pliant.results.moving_together import MovingTogether
 from pliant.results.page.surface import Surface
 from pliant.results.page.surfel_page import write_surfel_page
 from pliant.results.report import broken_images, counted, ended_early, process_figures
@@ -51,6 +52,7 @@ class _Counts:
     births: int = 0
     last_states: dict[str, int] = field(default_factory=dict[str, int])
     arrivals_ns: list[int] = field(default_factory=list[int])
+    together: MovingTogether = field(default_factory=MovingTogether)
 
 
 def has_surfels(recording: Path) -> bool:
@@ -173,6 +175,8 @@ def _count(counts: _Counts, surfels: Surfels, arrival_ns: int, stream: CameraStr
         return
     if surfels.lost:
         counts.lost.append(surfels.frame)
+    else:
+        counts.together.take(surfels.frame, surfels)
     counts.births += int(np.count_nonzero(surfels.age == 0))
     counts.segments.setdefault(surfels.segment, []).append(surfels.frame)
     names = [state.name.lower() for state in SurfelState]
@@ -203,6 +207,10 @@ def _depth_from(metadata: Mapping[str, Mapping[str, str]]) -> str:
     return recorded_config(metadata, []).surfels.depth_from
 
 
+def _stands_still(metadata: Mapping[str, Mapping[str, str]]) -> bool:
+    return recorded_config(metadata, []).surfels.camera == "static"
+
+
 def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
     frames = len(counts.alive)
     spent_ns = counts.arrivals_ns[-1] - counts.arrivals_ns[0] if frames else 0
@@ -219,6 +227,7 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         slipping=len(slipping),
         depth_from=_depth_from(run.recorded.metadata),
         unusable=len(counts.notes),
+        together=len(counts.together.frames) if _stands_still(run.recorded.metadata) else 0,
         unused=len(without_pixels),
         broken=len(broken_images(without_pixels)),
     )
