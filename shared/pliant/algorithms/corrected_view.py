@@ -33,8 +33,7 @@ class CorrectedView:
         """(N, 2) pixels of the rectified image in the ideal one."""
         if not self._correction.any():
             return points_px
-        u, v = np.ascontiguousarray(points_px.T)
-        return np.stack(ideal_pixels(u, v, self.camera, self._correction), axis=1)
+        return ideal_pixels(np.ascontiguousarray(points_px), self.camera, self._correction)
 
     def seen(self, points_px: F32) -> F32:
         """(N, 2) pixels of the ideal image in the rectified one: undoes ``pixels``."""

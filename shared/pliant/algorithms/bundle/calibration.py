@@ -48,10 +48,12 @@ from pliant.algorithms.bundle.projection import (
     point_rows,
 )
 from pliant.algorithms.camera import PinholeCamera
-from pliant.compiler.kernel import fast_kernel
+from pliant.compiler.kernel import fast_kernel, kernel
 
 LOWER = np.tril_indices(SHARED)
 _NEWTON_STEPS = 8
+_SQUARES_TO_ROUNDING = 1e-8
+"""A step of Newton's method after which there is nothing left: its error is about its square."""
 _LEAST_SLOPE = 0.1
 _FARTHEST = 4.0
 """Times as far from the axis as it is seen: no lens within the model moves a point farther."""
@@ -262,25 +264,34 @@ def _add_points(
             points[n, 3 * q + 2] += a * p2 + c * q2
 
 
-def ideal_pixels(u: F32, v: F32, camera: PinholeCamera, correction: F64) -> tuple[F32, F32]:
-    """Move pixels (N,) of the image to where ``camera``, were it right, would have seen them.
+def ideal_pixels(points_px: F32, camera: PinholeCamera, correction: F64) -> F32:
+    """Move pixels (N, 2) of the image to where ``camera``, were it right, would have seen them.
 
     correction: (6,) of ``solve_schur``; what the readout does is not undone here.  Newton's
     method on the radius, to rounding for corrections under which the radius still grows with the
     angle; elsewhere the nearest it gets.
     """
-    s, k1, k2, _, a, b = correction.tolist()
-    x = np.exp(-s) / camera.fx * (u - camera.cx) - a
-    y = np.exp(-s) / camera.fy * (v - camera.cy) - b
-    wanted = np.hypot(x, y).astype(np.float64)
-    r = wanted.copy()
-    for _ in range(_NEWTON_STEPS):
-        r2 = r * r
-        slope = np.maximum(1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2), _LEAST_SLOPE)
-        r -= (r * (1.0 + r2 * (k1 + k2 * r2)) - wanted) / slope
-        r = np.clip(r, 0.0, _FARTHEST * wanted)
-    share = np.divide(r, wanted, out=np.ones_like(r), where=wanted > 0.0)
-    return (
-        (camera.cx + camera.fx * x * share).astype(np.float32),
-        (camera.cy + camera.fy * y * share).astype(np.float32),
-    )
+    ideal = np.empty((len(points_px), 2), np.float32)
+    K = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    _ideal_pixels(points_px, K, correction, np.exp(-correction[0]), ideal)
+    return ideal
+
+
+@kernel
+def _ideal_pixels(points_px: F32, K: F64, correction: F64, shrunk: float, ideal: F32) -> None:
+    k1, k2, a, b = correction[1], correction[2], correction[4], correction[5]
+    for n in range(points_px.shape[0]):
+        x = shrunk / K[0] * (points_px[n, 0] - np.float32(K[2])) - a
+        y = shrunk / K[1] * (points_px[n, 1] - np.float32(K[3])) - b
+        wanted = np.sqrt(x * x + y * y)
+        r = wanted
+        for _ in range(_NEWTON_STEPS):
+            r2, before = r * r, r
+            slope = max(1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2), _LEAST_SLOPE)
+            r -= (r * (1.0 + r2 * (k1 + k2 * r2)) - wanted) / slope
+            r = min(max(r, 0.0), _FARTHEST * wanted)
+            if abs(r - before) <= _SQUARES_TO_ROUNDING * wanted:
+                break
+        share = r / wanted if wanted > 0.0 else 1.0
+        ideal[n, 0] = K[2] + K[0] * x * share
+        ideal[n, 1] = K[3] + K[1] * y * share
