@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32
+from pliant.algorithms.arrays import F64, I32, U8
 from pliant.algorithms.geometry import move_by_similarity
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.covisibility import focus_of, seen_by_none
@@ -19,6 +19,7 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import PassedFrames
 from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.compiler.kernel import kernel
 
 _MIN_DEPTH = 1e-6
 
@@ -93,10 +94,9 @@ class Segment:
 
     def inverse_depths(self, rows: I32, T_world_camera: F64) -> F64:
         """(n,) of the rows (UNLINKED among them) in a camera; the map's where they are unknown."""
-        mapped = (rows != UNLINKED) & (self.points.state[rows] == MAPPED)
-        z = (self.points.xyz[rows] - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
-        known = mapped & (z > _MIN_DEPTH)
-        return np.divide(1.0, z, out=np.full(len(rows), self.inverse_distance), where=known)
+        depths = np.full(len(rows), self.inverse_distance)
+        _inverse_depths(rows, self.points.state, self.points.xyz, T_world_camera, depths)
+        return depths
 
     def rolled(self, calibration: SelfCalibration, motion: F64) -> RolledFrame:
         """What the readout does to a frame that moves so."""
@@ -168,3 +168,15 @@ class Segment:
         if found.readout and not known.readout:
             self.passed.forget()
         return found
+
+
+@kernel
+def _inverse_depths(rows: I32, state: U8, xyz: F64, T_world_camera: F64, depths: F64) -> None:
+    T = T_world_camera
+    for i in range(rows.size):
+        row = rows[i]
+        if row != UNLINKED and state[row] == MAPPED:
+            x, y, z = xyz[row, 0] - T[0, 3], xyz[row, 1] - T[1, 3], xyz[row, 2] - T[2, 3]
+            depth = x * T[0, 2] + y * T[1, 2] + z * T[2, 2]
+            if depth > _MIN_DEPTH:
+                depths[i] = 1.0 / depth
