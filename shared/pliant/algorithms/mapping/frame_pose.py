@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, U8
+from pliant.algorithms.arrays import F64, I32, I64, U8
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.directions import (
     Spread,
@@ -34,31 +34,36 @@ def directions_of(active: ActiveMap) -> I64:
 
 def localise(
     active: ActiveMap,
+    calibration: SelfCalibration,
     motion: Motion,
     stamp_ns: int,
-    tracks: FrameTracks,
-    maxima: F32,
+    seen: FrameExtrema,
     grey: U8 | None,
     generator: np.random.Generator,
 ) -> F64 | None:
     """T_world_camera of the frame from the tracks of mapped points, or else from the map's points
-    in the image, which has these maxima (M, 3); None where both fail."""
+    in the image; None where both fail."""
     points, parameters = active.points, active.parameters
+    predictions = motion.predictions(stamp_ns)
     directions = directions_of(active)
     linked = np.concatenate([active.linked(MAPPED), directions])
     limits = parameters.localisation
     if len(linked) >= limits.min_inliers:
-        rows = active.links.rows[linked]
+        rows, points_px = active.links.rows[linked], seen.points_px[linked]
+        if calibration.readout:
+            rolled = active.segment.rolled(calibration, motion.velocity())
+            depths = active.segment.inverse_depths(rows, predictions[0])
+            points_px = points_px - rolled.shifts(points_px, depths)
         located = locate(
-            motion.predictions(stamp_ns), points.xyz[rows], tracks.points_px[linked],
-            active.camera, limits, generator, _spread(active, rows, directions),
+            predictions, points.xyz[rows], points_px, active.camera, limits, generator,
+            _spread(active, rows, directions),
         )  # fmt: skip
         if located.inliers.sum() >= limits.min_inliers:
             return located.T_world_camera
     if grey is None:
         return None
     return recover(
-        motion, stamp_ns, active.nearby(), points, maxima, grey, active.camera, parameters,
+        motion, stamp_ns, active.nearby(), points, seen.maxima, grey, active.camera, parameters,
         generator,
     )  # fmt: skip
 

@@ -75,7 +75,8 @@ class Localiser:
         timer: StageTimer = no_stages,
     ) -> MapDelta:
         """Find a frame in the map.  stamp_ns, grey, colour: as of ``Mapper.process``."""
-        tracks, grey, _ = self.calibration.ideal(tracks, grey, None)
+        tracks = self.calibration.ideal(tracks)
+        grey = self.calibration.ideal_image(grey)
         if self._map is not None:
             self._map.links.follow(tracks.ids)
         located = self._locate(stamp_ns, tracks, grey, timer)
@@ -134,13 +135,8 @@ class Localiser:
     ) -> F64 | None:
         if self._map is not None and self._motion is not None:
             with timer("localisation"):
-                taken = tracks
-                if self.calibration.readout:
-                    predicted = self._motion.predictions(stamp_ns)[0]
-                    velocity = self._motion.velocity()
-                    taken, _ = at_once(self._map, self.calibration, predicted, velocity, tracks)
                 located = localise(
-                    self._map, self._motion, stamp_ns, taken, tracks.maxima, grey,
+                    self._map, self.calibration, self._motion, stamp_ns, tracks, grey,
                     self._generator,
                 )  # fmt: skip
             if located is not None:

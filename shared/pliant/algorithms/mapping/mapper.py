@@ -125,7 +125,9 @@ class Mapper:
                 if not self.calibration.sees_like(before):
                     self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
             atlas.active.links.follow(tracks.ids)
-        tracks, grey, colour = self.calibration.ideal(tracks, grey, colour)
+        with self._timer("corrected view"):
+            tracks = self.calibration.ideal(tracks)
+            grey = self.calibration.ideal_image(grey)
         seen, rolled = tracks, None
         located = self._locate(frame, stamp_ns, seen, grey)
         active = atlas.active
@@ -148,6 +150,7 @@ class Mapper:
         if self._keyframe_is_new:
             with self._timer("keyframe"):
                 T_world_camera, turned = stand(active, T_world_camera, found, tracks)
+                colour = self.calibration.ideal_image(colour)
                 if rolled is not None:
                     colour = colour if colour is None else rolled.image(colour)
                     active.segment.unroll(active.window.keyframes, self.calibration)
@@ -244,6 +247,7 @@ class Mapper:
         if isinstance(found, str):
             return self._publish(WAITING, found, 0)
         with self._timer("start"):
+            colour = self.calibration.ideal_image(colour)
             inliers = self._begin(*found, grey, colour)
         return self._publish(TRACKING, "", inliers)
 
@@ -279,13 +283,8 @@ class Mapper:
         active = self.atlas.active
         if active is not None:
             with self._timer("localisation"):
-                taken = tracks
-                if self.calibration.readout:
-                    predicted = self._motion.predictions(stamp_ns)[0]
-                    velocity = self._motion.velocity()
-                    taken, _ = at_once(active, self.calibration, predicted, velocity, tracks)
                 located = localise(
-                    active, self._motion, stamp_ns, taken, tracks.maxima, grey, self._generator
+                    active, self.calibration, self._motion, stamp_ns, tracks, grey, self._generator
                 )
             if located is not None:
                 return located

@@ -145,18 +145,18 @@ class SelfCalibration:
         """Moves what is seen to where the camera found so far, were it ideal, would see it."""
         return corrected_view(self.given, tuple(self.correction.tolist()))
 
-    def ideal(
-        self, tracks: FrameExtrema, grey: U8 | None, colour: U8 | None
-    ) -> tuple[FrameExtrema, U8 | None, U8 | None]:
-        """Tracks and images of the camera found so far."""
+    def ideal(self, tracks: FrameExtrema) -> FrameExtrema:
+        """Tracks of the camera found so far."""
         view = self.view
         if view.lens == (0.0, 0.0):
-            return tracks, grey, colour
+            return tracks
         maxima = tracks.maxima.copy()
         maxima[:, :2] = view.pixels(tracks.maxima[:, :2])
-        moved = dataclasses.replace(tracks, points_px=view.pixels(tracks.points_px), maxima=maxima)
-        images = [None if image is None else view.image(image) for image in (grey, colour)]
-        return moved, images[0], images[1]
+        return dataclasses.replace(tracks, points_px=view.pixels(tracks.points_px), maxima=maxima)
+
+    def ideal_image(self, pixels: U8 | None) -> U8 | None:
+        """(H, W) or (H, W, 3) an image of the camera found so far."""
+        return None if pixels is None else self.view.image(pixels)
 
     def told_with(self, delta: MapDelta) -> MapDelta:
         """What is published, with what the map was made with."""
