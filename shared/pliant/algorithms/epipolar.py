@@ -5,7 +5,7 @@ views is unknown.  Points are on the plane z = 1, so errors are in units of the 
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -80,32 +80,40 @@ def relative_poses(points_a: F64, points_b: F64, *, gate: float) -> list[Relativ
     """
     if len(points_a) < 8:
         return []
-    motions: list[F64] = []
+    views = _Views(points_a, points_b, rays(points_a), rays(points_b), gate)
+    found: list[RelativePose] = []
     for method in (cv2.USAC_ACCURATE, cv2.USAC_MAGSAC):
         E: Any = cv2.findEssentialMat(
             points_a, points_b, np.eye(3), method=method, prob=_CONFIDENCE, threshold=gate,
             maxIters=_SAMPLES,
         )[0]  # fmt: skip
         if E is not None and E.shape == (3, 3) and np.isfinite(E).all():
-            motions.append(_before_both(decompose_essential(E), points_a, points_b, gate))
+            # That which puts most points before both cameras.
+            of_one = [_two_views(T_b_a, views) for T_b_a in decompose_essential(E)]
+            found.append(max(of_one, key=lambda each: each.inliers.sum()))
     H: Any = cv2.findHomography(
         points_a, points_b, cv2.RANSAC, gate, maxIters=_SAMPLES, confidence=_CONFIDENCE
     )[0]
     if H is not None and np.isfinite(H).all():
-        motions += decompose_homography(H)
-    found = [_two_views(T_b_a, points_a, points_b, gate) for T_b_a in motions]
+        found += [_two_views(T_b_a, views) for T_b_a in decompose_homography(H)]
     return sorted((each for each in found if each.inliers.any()), key=lambda each: each.misfit)
 
 
-def _before_both(motions: list[F64], points_a: F64, points_b: F64, gate: float) -> F64:
-    """Of motions with one essential matrix that which puts most points before both cameras."""
-    return max(motions, key=lambda T: _two_views(T, points_a, points_b, gate).inliers.sum())
+class _Views(NamedTuple):
+    """What two views have in common: points (N, 2) on the plane z = 1, rays (N, 3), the gate."""
+
+    points_a: F64
+    points_b: F64
+    rays_a: F64
+    rays_b: F64
+    gate: float
 
 
-def _two_views(T_b_a: F64, points_a: F64, points_b: F64, gate: float) -> RelativePose:
-    depth_a, depth_b, parallax = two_view_depths(T_b_a, rays(points_a), rays(points_b))
+def _two_views(T_b_a: F64, views: _Views) -> RelativePose:
+    depth_a, depth_b, parallax = two_view_depths(T_b_a, views.rays_a, views.rays_b)
+    gate = views.gate
     E = hat(T_b_a[:3, 3]) @ T_b_a[:3, :3]
-    a, b = (np.column_stack([each, np.ones(len(each))]) for each in (points_a, points_b))
+    a, b = (np.column_stack([each, np.ones(len(each))]) for each in views[:2])
     lines_b, lines_a = a @ E.T, b @ E
     slopes = np.hypot(np.hypot(*lines_b.T[:2]), np.hypot(*lines_a.T[:2]))
     errors = np.abs((b * lines_b).sum(axis=1)) / np.maximum(slopes, 1e-12)  # Sampson's distance
