@@ -167,9 +167,8 @@ class ActiveMap:
         near = self._same_depth(former, new)
         taken = differ & (~mapped | near)
         self.links.rows[track[taken]] = new[taken]
-        for old, to in zip(former[taken].tolist(), new[taken].tolist(), strict=True):
-            if old != UNLINKED:
-                self.points.merge(old, to)
+        taken &= former != UNLINKED
+        self.points.merge(former[taken], new[taken])
         points_px = reacquired.points_px[alone]
         return Observations(
             rows=reacquired.rows[alone], points_px=points_px, rolled_px=np.zeros_like(points_px)
@@ -208,7 +207,7 @@ class ActiveMap:
         points = self.points
         alive = points.ids[loop.rows] == loop.ids
         alive &= points.state[loop.rows] == MAPPED
-        for old, new in loop.rows[alive.all(axis=1)].tolist():
+        for old, new in loop.rows[alive.all(axis=1), :, None]:
             if points.state[old] == MAPPED and points.state[new] == MAPPED and old != new:
                 points.merge(new, old)
         linked = self.links.rows != UNLINKED

@@ -104,15 +104,14 @@ class PointRows:
         self.ids[rows] = np.arange(self._next_id, self._next_id + len(rows))
         self._next_id += len(rows)
 
-    def merge(self, old: int, new: int) -> None:
-        """Let a row stand for another one."""
-        if self.state[old] == MAPPED:
-            self._note_removed(np.array([old], np.int32))
+    def merge(self, old: I32, new: I32) -> None:
+        """Let rows stand for others, none of which is merged; of one named twice the last holds."""
+        self._note_removed(np.unique(old[self.state[old] == MAPPED]))
         self.state[old] = MERGED
         self.alias[old] = new
-        if self.first_keyframe[old] < self.first_keyframe[new]:
-            self.first_keyframe[new] = self.first_keyframe[old]
-            self.published_sigmas[new] = np.nan  # readers are told on what it hangs
+        older = self.first_keyframe[old] < self.first_keyframe[new]
+        self.first_keyframe[new[older]] = self.first_keyframe[old[older]]
+        self.published_sigmas[new[older]] = np.nan  # readers are told on what they hang
 
     def remove(self, rows: I32) -> None:
         """Points go.  As candidates they may come back while their track lives."""
