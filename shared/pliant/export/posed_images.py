@@ -97,7 +97,7 @@ class IdealCamera:
             return None
         T = self.poses[frame]
         first, last = self.poses[near[0]], self.poses[near[-1]]
-        motion = motion_between(first, last, T, near[-1] - near[0])
+        motion = motion_between(first, last, T) / (near[-1] - near[0])
         local = (self._positions - T[:3, 3]) @ T[:3, :3]
         local = local[local[:, 2] > 0.0]
         depths = local[self.shows(self.camera.project(local)), 2]

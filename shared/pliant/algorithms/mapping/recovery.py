@@ -59,7 +59,7 @@ class Motion:
     def velocity(self) -> F64:
         """(6,) between the two, as of ``Path.motions``."""
         frames = max(1, self.frames[1] - self.frames[0])
-        return motion_between(*self.poses, self.poses[1], frames)
+        return motion_between(*self.poses, self.poses[1]) / frames
 
     def velocity_at(self, frame: int, T_world_camera: F64) -> F64:
         """(6,) at a frame that follows with this pose."""

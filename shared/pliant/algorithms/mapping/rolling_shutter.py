@@ -78,6 +78,9 @@ class Path:
         """
         T_world_keyframe = {keyframe.id: keyframe.T_world_camera for keyframe in keyframes}
         motions = np.zeros((len(keyframes), 6))
+        rows: list[int] = []
+        frames: list[int] = []
+        between: list[tuple[F64, F64, F64]] = []
         for row, keyframe in enumerate(keyframes):
             if keyframe.id in self._known:
                 motions[row] = self._known[keyframe.id]
@@ -90,17 +93,21 @@ class Path:
                 T_world_keyframe[hanging] @ T_keyframe_camera
                 for hanging, T_keyframe_camera in (self._poses[known[0]], self._poses[known[-1]])
             )
-            frames = known[-1] - known[0]
-            motions[row] = motion_between(first, last, keyframe.T_world_camera, frames)
+            rows.append(row)
+            frames.append(known[-1] - known[0])
+            between.append((first, last, keyframe.T_world_camera))
+        if rows:
+            first, last, own = np.array(between).swapaxes(0, 1)
+            motions[rows] = motion_between(first, last, own) / np.array(frames)[:, None]
         return motions
 
 
-def motion_between(first: F64, last: F64, T_world_camera: F64, frames: int) -> F64:
-    """(6,) as of ``Path.motions``, in a camera near both of two poses (4, 4) so many frames
-    apart."""
+def motion_between(first: F64, last: F64, T_world_camera: F64) -> F64:
+    """(..., 6) as of ``Path.motions``, from one of two poses (..., 4, 4) to the other, in a camera
+    near both."""
     first, last = inverse(first) @ T_world_camera, inverse(last) @ T_world_camera
-    turn = so3_log(last[:3, :3] @ first[:3, :3].T)
-    return np.concatenate([turn, last[:3, 3] - first[:3, 3]]) / frames
+    turn = so3_log(last[..., :3, :3] @ np.swapaxes(first[..., :3, :3], -1, -2))
+    return np.concatenate([turn, last[..., :3, 3] - first[..., :3, 3]], axis=-1)
 
 
 @dataclass(frozen=True)
