@@ -149,7 +149,7 @@ BROKEN = {
     "an empty file": (b"", "empty"),
     "rubbish": (b"not an image", "does not decode"),
     "cut off": (png(1)[:-30], "cut off"),
-    "another size": (png(2, WIDTH, HEIGHT + 2), "24x18 px, but the calibration is for 24x16"),
+    "another size": (png(2, WIDTH, HEIGHT + 2), "24x18 px, but the camera has 24x16"),
 }
 
 

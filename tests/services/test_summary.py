@@ -1,6 +1,7 @@
 """What a user reads of a run: everything that went wrong is counted, named and said once."""
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -166,6 +167,16 @@ def test_broken_images_are_a_fault_and_dropped_ones_are_not(
     report |= {"segments": [{"id": 0}], "frames_without_pixels": missing}
     monkeypatch.setattr("pliant.results.write.write_results", lambda _: report)
     assert pipeline._finish(tmp_path, interrupted=False, failure=None) == code
+
+
+def test_the_end_of_a_run_says_what_to_look_at_and_how_large_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(tmp_path, [""] * 3)
+    pipeline._finish(tmp_path, interrupted=False, failure=None)
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert re.search(r"\(\d[\d.]* [KM]iB, of which the recording \d[\d.]* KiB\): traj", first)
+    assert second == f"to look at: {tmp_path / 'report.html'}, in a browser"
 
 
 def test_a_source_that_failed_says_why(tmp_path: Path) -> None:

@@ -37,6 +37,8 @@ def test_a_run_leaves_everything_a_user_opens(result: Path) -> None:
         assert (result / name).stat().st_size > 0
     assert (result / "points.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
     assert len(np.loadtxt(result / "trajectory.txt")) == report["frames"]
+    page = (result / "report.html").read_text()
+    assert all(f"<th>{name}</th>" in page for name in ("mesh.ply", "map.pliant", "recording.mcap"))
 
 
 def test_nothing_is_missing_in_the_recording(result: Path) -> None:

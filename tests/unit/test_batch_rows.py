@@ -10,6 +10,7 @@ import pytest
 from pliant.config import config_yaml, load_config
 from pliant.datasets import sources_in
 from pliant.errors import DatasetError, ResultError
+from pliant.results.folder import folder_name
 from pliant_services.batch.command import run_batch
 from pliant_services.run.command import RunRequest, resumed_config
 
@@ -60,3 +61,8 @@ def test_a_run_is_taken_up_with_the_options_that_it_was_begun_with(tmp_path: Pat
     for other in (RunRequest(source="a.mp4", overrides=settings), RunRequest(source="a", seed=4)):
         with pytest.raises(ResultError, match="and this is another one"):
             resumed_config(tmp_path, other)
+
+
+def test_a_result_folder_keeps_the_letters_of_its_source() -> None:
+    named = {"clips/Küche 1.mp4": "Küche_1.mp4", "家.mov": "家.mov", "a/b/": "b", "x?*y": "x_y"}
+    assert {source: folder_name(source) for source in named} == named

@@ -103,7 +103,7 @@ def broken_frames() -> list[tuple[SourceFrame, str]]:
         (source(jpeg[: len(jpeg) // 2]), "the jpeg image is cut off"),
         (source(jpeg[:-2]), "the jpeg image is cut off"),
         (source(png[:20] + b"\xff" * 8 + png[28:]), "the png image does not decode"),
-        (source(encode(picture()[:-1])), "64x47 px, but the calibration is for 64x48"),
+        (source(encode(picture()[:-1])), "64x47 px, but the camera has 64x48"),
         (SourceFrame(index=7, stamp_ns=1, encoding="bgr8", data=bgr.data), "are no bgr8 image of"),
         (raw(picture(), "mono8"), "are no mono8 image of 64x48"),
         (bgr.without_data(), "was dropped"),

@@ -24,6 +24,7 @@ from pliant.recording.map_file import MapFile
 from pliant.recording.recover import mend
 from pliant.results.folder import (
     CONFIG_NAME,
+    PAGE_NAME,
     RECORDING_NAME,
     STATE_FOLDER,
     discard,
@@ -290,12 +291,22 @@ def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> 
         raise failure
     with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
         files = ", ".join(files_of(output, report))
-        print(f"results in {output}/: {files}, {_recording_in(output)}")
+        print(f"results in {output}/ ({_sizes(output)}): {files}, {_recording_in(output)}")
+        print(f"to look at: {output / PAGE_NAME}, in a browser")
         for line in summary(report):
             print(line)
     if failure is not None:
         raise failure
     return INTERRUPTED if interrupted else grade(report)
+
+
+def _sizes(output: Path) -> str:
+    """How much room all of a result folder takes, and its recording."""
+    from pliant.recording.summary import in_words
+
+    every = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
+    recorded = sum(path.stat().st_size for path in parts.parts_of(output / RECORDING_NAME))
+    return f"{in_words(every)}, of which the recording {in_words(recorded)}"
 
 
 def _recording_in(output: Path) -> str:

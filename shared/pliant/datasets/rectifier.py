@@ -92,7 +92,7 @@ class Rectifier:
         height, width = pixels.shape[:2]
         if (width, height) != self._size:
             raise BrokenFrame(
-                f"{frame.called}: {width}x{height} px, but the calibration is for "
+                f"{frame.called}: {width}x{height} px, but the camera has "
                 f"{self._size[0]}x{self._size[1]}"
             )
         if self._maps is not None:

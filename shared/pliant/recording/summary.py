@@ -144,7 +144,7 @@ def describe(summary: Summary) -> Iterator[str]:
     """The summary as lines for people."""
     pliant = summary.metadata.get("pliant", {})
     yield (
-        f"{_size(summary.size)}, {summary.duration_s:.1f} s, "
+        f"{in_words(summary.size)}, {summary.duration_s:.1f} s, "
         f"{sum(t.messages for t in summary.topics.values())} messages, {state(summary)}"
     )
     if pliant:
@@ -152,7 +152,7 @@ def describe(summary: Summary) -> Iterator[str]:
         yield f"recorded by {written}, Python {pliant.get('python', '?')}"
         yield f"command: {pliant.get('command', '?')}"
     if summary.clip:
-        size = _size(summary.topics[topics.CLIP.key].size)
+        size = in_words(summary.topics[topics.CLIP.key].size)
         yield f"images: frames of {summary.clip}, which is in it as it was ({size})"
     packages = summary.metadata.get("packages", {})
     if packages:
@@ -161,9 +161,9 @@ def describe(summary: Summary) -> Iterator[str]:
         yield f"{'topic':<26}{'messages':>9}{'rate':>10}{'size':>12}  missing"
     for key, topic in sorted(summary.topics.items()):
         rate = f"{topic.rate_hz:.1f} Hz" if topic.rate_hz else ""
-        yield f"{key:<26}{topic.messages:>9}{rate:>10}{_size(topic.size):>12}  {_missing(topic)}"
+        yield f"{key:<26}{topic.messages:>9}{rate:>10}{in_words(topic.size):>12}  {_missing(topic)}"
     for damage in summary.damage:
-        yield f"damage at byte {damage.offset}, {_size(damage.size)}: {damage.what}"
+        yield f"damage at byte {damage.offset}, {in_words(damage.size)}: {damage.what}"
 
 
 def state(summary: Summary) -> str:
@@ -193,7 +193,8 @@ def _missing(topic: TopicSummary) -> str:
     return count if topic.end is not None else f"{count}, no end"
 
 
-def _size(count: int) -> str:
+def in_words(count: int) -> str:
+    """So many bytes."""
     if count < 1 << 10:
         return f"{count} B"
     return f"{count / (1 << 20):.1f} MiB" if count >= 1 << 20 else f"{count / (1 << 10):.1f} KiB"

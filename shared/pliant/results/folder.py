@@ -56,7 +56,7 @@ def folder_name(source: str) -> str:
     name = source.rstrip("/").rsplit("/", 1)[-1]
     if name in ("", ".", ".."):
         name = Path(source).resolve().name
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name) or "run"
+    return re.sub(r"[^\w.-]+", "_", name) or "run"
 
 
 def keep_apart(output: Path, read: Iterable[Path], *, option: str = "--output") -> None:

@@ -47,10 +47,10 @@ def write_rigid_results(output: Path, scale: Scale | None = None) -> dict[str, A
     final = run.history.final()
     report = rigid_report(run, final)
     with all_or_none(output) as folder:
-        _write_files(folder, run, recording, final, report)
         _write_map(folder, recording, run)
         if scale is not None:
             (folder / SCALE_NAME).write_text(scale.yaml(), encoding="utf-8")
+        _write_files(folder, run, recording, final, report)  # at last the page, which lists all
     return report
 
 
