@@ -504,7 +504,8 @@ def surfels(
         str | None, typer.Option(help="mdh_23frames_301pts.npz of the Kinect paper.")
     ] = None,
     tables: Annotated[
-        str, typer.Option(help="targets,models,sizes,scales,cameras,neighbours,troubles,limits")
+        str,
+        typer.Option(help="targets,models,sizes,scales,cameras,neighbours,troubles,limits,losses"),
     ] = "",
     frames: Annotated[int, typer.Option(min=2, help="Of each sequence.")] = 60,
     count: Annotated[int, typer.Option("--surfels", min=8, help="At most.")] = 200,

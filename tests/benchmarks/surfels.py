@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.surfel_limits import measure_limits
+from benchmarks.surfel_losses import measure_losses
 from benchmarks.surfel_sequences import Sequence, load
 from benchmarks.table import markdown
 from pliant.algorithms.surfels.parameters import SurfelParameters
@@ -40,7 +41,7 @@ _HEADER = (
     ),
     *("dragged", "AUC", "AUC in view", "AUC 1 px", "camera %", "until loss", "ms a frame"),
 )
-LIMITS = "limits"
+LIMITS, LOSSES = "limits", "losses"
 TABLES = (
     "targets",
     "models",
@@ -51,6 +52,7 @@ TABLES = (
     "predictions",
     "troubles",
     LIMITS,
+    LOSSES,
 )
 
 
@@ -89,6 +91,9 @@ def measure(
     for name in tables or TABLES:
         if name == LIMITS:
             yield from measure_limits(surfels)
+            continue
+        if name == LOSSES:
+            yield from measure_losses(sources, tracks, surfels)
             continue
         rows = _rows(name, list(sources), tracks)
         rows = _fewer(rows) if quick else rows

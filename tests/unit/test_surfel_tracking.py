@@ -11,6 +11,7 @@ from pliant.algorithms.surfels.deformation_graph import pull_of_edges
 from pliant.algorithms.surfels.graph_alignment import relocate
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import X
+from pliant.algorithms.surfels.remembered_views import RememberedViews
 from pliant.algorithms.surfels.surfel_alignment import (
     Templates,
     align_all,
@@ -301,6 +302,7 @@ def test_prediction_bridges_a_jump(mode: str) -> None:
         shown = camera.project(transform(inverse(motions[1]), first.positions))
         prediction = shown - first.points_px + 2.0
         prediction[::10] = np.nan
+        tracker._views = RememberedViews()  # else it is found back
         result = tracker.track(frames[1].image, prediction if predicted else None)
         staying = (shown[:, 0] > 15) & (shown[:, 0] < WIDTH - 15) & np.isfinite(prediction[:, 0])
         px = result.points_px - shown

@@ -20,6 +20,8 @@ from pliant.algorithms.surfels.surfel_alignment import (
     evaluate_all,
 )
 
+_RIGID_SURFELS = 150
+"""So many surfels say where the camera is before each of them is looked for."""
 _RIDGE = 1e-9
 _FIT_STEPS = 3
 _FITTED = 1e-6
@@ -39,6 +41,14 @@ def se3_exp(zeta: F64) -> F64:
     c = 1.0 / 6.0 if small else (angle - np.sin(angle)) / angle**3
     T[:3, 3] = rho + b * (W @ rho) + c * (W @ W @ rho)
     return T
+
+
+def spread(rows: U8) -> U8:
+    """Of the rows that are 1 every so many, ``_RIGID_SURFELS`` or up to twice as many."""
+    chosen = np.flatnonzero(rows)
+    out = np.zeros_like(rows)
+    out[chosen[:: max(1, len(chosen) // _RIGID_SURFELS)]] = 1
+    return out
 
 
 def align_rigid(poses: F64, active: U8, T_camera_world: F64, matcher: Matcher) -> F64:

@@ -28,7 +28,7 @@ class SurfelFrame:
     """N surfels in one frame, ordered by id.  No entry is ever NaN or infinite."""
 
     frame: int  # 0 at the start, of this tracker
-    segment: int  # counts restarts; surfels of different segments share no id
+    segment: int  # one more at each start, or an earlier one again; each has ids of its own
     lost: bool  # too few surfels are tracked; waits for depth
     T_world_camera: Annotated[F64, Shape(4, 4)]
     ids: Annotated[I64, Shape("N")]

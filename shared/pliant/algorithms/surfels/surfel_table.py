@@ -1,10 +1,10 @@
 """The surfels that are being tracked, as columns."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, I64, U8, BoolArray
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.surfels.births import Births, join, select
 from pliant.algorithms.surfels.deformation_graph import (
     Edges,
@@ -14,10 +14,19 @@ from pliant.algorithms.surfels.deformation_graph import (
     no_edges,
 )
 from pliant.algorithms.surfels.deformation_models import move_poses
-from pliant.algorithms.surfels.patch_sampling import POSE_FLOATS, X
+from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, X
 from pliant.algorithms.surfels.surfel_alignment import Templates
-from pliant.algorithms.surfels.surfel_frame import SurfelState
-from pliant.algorithms.surfels.validation import FRONT, INSIDE, VISIBLE, ZNCC, new_validations
+from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
+from pliant.algorithms.surfels.validation import (
+    FRONT,
+    INSIDE,
+    SIGMA,
+    VISIBLE,
+    ZNCC,
+    U,
+    V,
+    new_validations,
+)
 
 
 def _none() -> list[Templates]:
@@ -68,6 +77,10 @@ class SurfelTable:
         self.missing = np.concatenate([self.missing, np.zeros(n, np.int32)])
         self.validations = np.concatenate([self.validations, validations])
 
+    def copy(self) -> "SurfelTable":
+        """One that may be followed into another frame and leaves this one as it is."""
+        return replace(self, poses=self.poses.copy(), validations=self.validations.copy())
+
     def keep(self, rows: I64) -> None:
         """Drop all but some rows."""
         self.edges = keep_rows(self.edges, rows, len(self))
@@ -96,3 +109,39 @@ class SurfelTable:
     def tracked(self) -> BoolArray:
         """(N,) whether a surfel was found in the last frame."""
         return self.state == SurfelState.TRACKED
+
+
+def told(
+    table: SurfelTable, *, frame: int, segment: int, lost: bool, T_world_camera: F64
+) -> SurfelFrame:
+    """What is said of the surfels in a frame."""
+    poses, validations = table.poses, table.validations
+    f11, f12, f22 = (poses[:, F + k, None] for k in range(3))
+    a, b = poses[:, A : A + 3], poses[:, B : B + 3]
+    means = table.templates[0].means if table.templates else np.zeros(0)
+    # Inside, grey levels have lost the template's mean; outside they are those of Eq. 5.
+    biases = poses[:, BIAS] + means * (1.0 - poses[:, GAIN])
+    return SurfelFrame(
+        frame=frame,
+        segment=segment,
+        lost=lost,
+        T_world_camera=T_world_camera.copy(),
+        ids=table.ids.copy(),
+        positions=poses[:, X : X + 3].copy(),
+        tangents=np.stack([f11 * a + f12 * b, f12 * a + f22 * b], axis=2),
+        deformations=poses[:, F : F + 3].copy(),
+        points_px=_f32(validations[:, U : V + 1]),
+        zncc=_f32(validations[:, ZNCC]),
+        visible=_f32(validations[:, VISIBLE]),
+        sigma=_f32(validations[:, SIGMA]),
+        gains=_f32(poses[:, GAIN]),
+        biases=_f32(biases),
+        state=table.state.copy(),
+        age=(frame - table.born).astype(np.int32),
+        born=table.born.copy(),
+        tried=table.tried.copy(),
+    )
+
+
+def _f32(values: F64) -> F32:
+    return np.ascontiguousarray(values, np.float32)

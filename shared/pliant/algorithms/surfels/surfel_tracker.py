@@ -2,28 +2,20 @@
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, U8, BoolArray
+from pliant.algorithms.arrays import F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.places.features import Features, describe
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.surfels import validation
 from pliant.algorithms.surfels.births import find_births
-from pliant.algorithms.surfels.camera_alignment import align_rigid, fit_camera
+from pliant.algorithms.surfels.camera_alignment import align_rigid, fit_camera, spread
 from pliant.algorithms.surfels.deformation_models import MODELS, move_poses
 from pliant.algorithms.surfels.graph_alignment import COARSE_STEPS, STEPS, align_graph, relocate
 from pliant.algorithms.surfels.parameters import SurfelParameters
-from pliant.algorithms.surfels.patch_sampling import (
-    BIAS,
-    GAIN,
-    A,
-    B,
-    F,
-    Level,
-    X,
-    make_pyramid,
-    usable_levels,
-)
+from pliant.algorithms.surfels.patch_sampling import Level, X, make_pyramid, usable_levels
 from pliant.algorithms.surfels.prediction import start_at, targets
+from pliant.algorithms.surfels.remembered_views import FoundBack, RememberedViews
 from pliant.algorithms.surfels.surfel_alignment import (
     OMEGA_E,
     Equilibrium,
@@ -35,15 +27,19 @@ from pliant.algorithms.surfels.surfel_alignment import (
     no_equilibrium,
 )
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
-from pliant.algorithms.surfels.surfel_table import SurfelTable
+from pliant.algorithms.surfels.surfel_table import SurfelTable, told
 
 _RELOCATED_ZNCC = 0.9
 """A surfel that was missing must fit better than one that was followed: chance has had tries."""
 _TOGETHER_LEVELS = {False: 2, True: 1}
 """Levels, the finest, at which surfels with neighbours move as one: before a static camera, and
 before a moving one, where more takes twice as long and the camera is hardly better."""
-_RIGID_SURFELS = 150
-"""So many surfels say where the camera is before each of them is looked for."""
+_KEPT = 0.7
+"""With a smaller share of the surfels tracked than in the frame before, something has happened."""
+_FOUND_BACK = 0.5
+"""Least share of the surfels whose corners tell where they have gone that must be there."""
+_EARLIER = 2
+"""Segments that are kept, beside the present one, to go on in: some 15 MB each."""
 _BLEND, _COARSE_STATIC_BLEND = 1.0, 0.5
 """Share of the frame in the derivatives of a patch; the rest is the texture's.  At the coarse
 scales of a static camera their mean converges most often (second order, as in ESM); before a moving
@@ -64,8 +60,10 @@ class SurfelTracker:
         self._table = SurfelTable()
         self._camera: PinholeCamera | None = None
         self._T_world_camera: F64 = np.eye(4)
-        self._frame, self._segment, self._next_id = 0, 0, 0
+        self._frame, self._segment, self._segments, self._next_id = 0, 0, 0, 0
         self._lost = True
+        self._views = RememberedViews()
+        self._earlier: dict[int, SurfelTable] = {}
 
     def start(
         self, image: U8, depth: F64, camera: PinholeCamera, T_world_camera: F64 | None = None
@@ -76,10 +74,13 @@ class SurfelTracker:
         default the camera's frame is the world.  Raises ValueError for arrays of another size.
         """
         self._camera = camera
-        self._table, self._frame, self._segment, self._next_id = SurfelTable(), 0, 0, 0
+        self._table, self._frame, self._next_id = SurfelTable(), 0, 0
+        self._segment = self._segments = 0
+        self._views, self._earlier = RememberedViews(), {}
         self._T_world_camera = np.eye(4) if T_world_camera is None else T_world_camera.copy()
         pyramid = self._pyramid(image)
         self._give_birth(pyramid, _checked_depth(depth, camera))
+        self._remember(image)
         return self._result()
 
     def track(
@@ -102,13 +103,14 @@ class SurfelTracker:
             pyramid = self._pyramid(image)
         goals = self._goals(prediction, len(pyramid))
         self._frame += 1
-        poses = move_poses(self._table.guesses, inverse(self._T_world_camera))
-        torn = self._align(pyramid, poses, goals, timer)
-        with timer("validation"):
-            self._validate(pyramid[0], poses, torn)
+        before, was_lost = self._table.copy(), self._lost
+        self._follow(pyramid, goals, timer)
+        with timer("views"):
+            seen = self._look_back(image, pyramid, before, was_lost=was_lost)
         if depth is not None:
             with timer("births"):
                 self._give_birth(pyramid, _checked_depth(depth, self._camera))
+        self._remember(image, seen)
         return self._result()
 
     def add(self, image: U8, depth: F64, T_world_camera: F64 | None = None) -> SurfelFrame:
@@ -123,6 +125,7 @@ class SurfelTracker:
         if self._lost and T_world_camera is not None:
             self._T_world_camera = T_world_camera.copy()
         self._give_birth(self._pyramid(image), _checked_depth(depth, self._camera))
+        self._remember(image)
         return self._result()
 
     def _pyramid(self, image: U8) -> list[Level]:
@@ -149,6 +152,73 @@ class SurfelTracker:
             )
         points = self._table.validations[:, validation.U : validation.V + 1]
         return targets(points, prediction, float(2 ** (levels - 1)))
+
+    def _look_back(
+        self, image: U8, pyramid: list[Level], before: SurfelTable, *, was_lost: bool
+    ) -> Features | None:
+        """Go on where a view is recognised.  Returns the corners of the image where it was asked.
+
+        before: the surfels as they were in the last frame.  Where many of them were lost they are
+        looked for by the index, too; those of older segments whenever the view is another.
+        """
+        camera, followed = self._camera, int(self._table.tracked.sum())
+        assert camera is not None
+        lost = self._lost or was_lost or followed < _KEPT * int(before.tracked.sum())
+        if not lost and not self._views.is_another(self._table, camera):
+            return None
+        seen = describe(image)
+        older = {n: table for n, table in self._earlier.items() if n < self._segment}
+        tables = {**self._earlier, self._segment: before} if lost else older
+        still = None if self._parameters.camera == "moving" else self._T_world_camera
+        found = self._views.recognise(seen, tables, still, camera)
+        if found is not None:
+            self._go_on(found, tables, pyramid)
+        return seen
+
+    def _remember(self, image: U8, seen: Features | None = None) -> None:
+        """This view, where it is another one.  seen: its corners, where they are known."""
+        camera, patch_px = self._camera, self._parameters.patch_px
+        assert camera is not None
+        if not self._lost and self._views.is_another(self._table, camera):
+            seen = seen or describe(image)
+            self._views.remember(
+                seen, self._table, self._segment, self._T_world_camera, camera, patch_px
+            )
+
+    def _go_on(
+        self, found: FoundBack, tables: dict[int, SurfelTable], pyramid: list[Level]
+    ) -> None:
+        """Follow surfels from where they may be.  All stays as it is where they are not there, no
+        more of them than were found without, or few beside those of this segment.
+        """
+        now = self._table, self._T_world_camera, self._segment, self._lost
+        self._table, self._segment = tables[found.segment].copy(), found.segment
+        self._table.guesses, self._T_world_camera = found.poses, found.T_world_camera
+        self._follow(pyramid, None, no_stages)
+        there, followed = self._table.tracked, now[0].tracked
+        another = found.segment != now[2]
+        if (
+            self._lost
+            or there[found.rows].mean() < _FOUND_BACK
+            or there.sum() <= (_FOUND_BACK if another else 1.0) * followed.sum()
+        ):
+            self._table, self._T_world_camera, self._segment, self._lost = now
+        elif another:
+            self._earlier.pop(found.segment)
+            self._leave(now[0], now[2])
+
+    def _leave(self, table: SurfelTable, segment: int) -> None:
+        """Keep the surfels of a segment that is left, for as long as there is room."""
+        self._earlier[segment] = table
+        for old in list(self._earlier)[:-_EARLIER]:
+            del self._earlier[old]
+            self._views.forget_segment(old)
+
+    def _follow(self, pyramid: list[Level], goals: F64 | None, timer: StageTimer) -> None:
+        poses = move_poses(self._table.guesses, inverse(self._T_world_camera))
+        torn = self._align(pyramid, poses, goals, timer)
+        with timer("validation"):
+            self._validate(pyramid[0], poses, torn)
 
     def _align(
         self, pyramid: list[Level], poses: F64, goals: F64 | None, timer: StageTimer
@@ -199,7 +269,7 @@ class SurfelTracker:
         self, level: Level, poses: F64, guides: U8, T_camera_world: F64, timer: StageTimer
     ) -> F64:
         matcher = self._matcher(-1, level)
-        some = _spread(guides * matcher.templates.usable)
+        some = spread(guides * matcher.templates.usable)
         with timer("camera alone"):
             return align_rigid(poses, some, T_camera_world, matcher)
 
@@ -255,6 +325,8 @@ class SurfelTracker:
         state[~good & (table.missing > p.lost_after)] = SurfelState.LOST
         table.state = state
         self._lost = int(good.sum()) < p.min_alive
+        if self._lost:  # nobody is given up in the dark
+            table.missing = np.minimum(table.missing, p.lost_after + 1)
         world = move_poses(poses, self._T_world_camera)
         finite = np.isfinite(world).all(axis=1, keepdims=True)
         table.tried = np.where(finite, world[:, X : X + 3], table.poses[:, X : X + 3])
@@ -268,15 +340,19 @@ class SurfelTracker:
     def _give_birth(self, pyramid: list[Level], depth: F64) -> None:
         table, p, camera = self._table, self._parameters, self._camera
         assert camera is not None
-        if self._lost and len(table):
-            self._segment += 1
-            table.keep(np.zeros(0, np.int64))
-        table.keep(np.flatnonzero(table.missing <= p.lost_after + p.forget_after))
-        occupied = table.validations[table.tracked][:, validation.U : validation.V + 1]
-        births = find_births(
-            pyramid, depth, camera, p, occupied, p.max_surfels - int(table.tracked.sum())
-        )
+        anew = self._lost and len(table) > 0
+        if not self._lost:
+            table.keep(np.flatnonzero(table.missing <= p.lost_after + p.forget_after))
+        alive = np.flatnonzero(table.tracked & (not anew))
+        occupied = table.validations[alive, validation.U : validation.V + 1]
+        births = find_births(pyramid, depth, camera, p, occupied, p.max_surfels - len(alive))
         n = len(births.poses)
+        if anew and n < p.min_alive:
+            return  # in the dark nothing can start: what was followed is still looked for
+        if anew:
+            self._leave(table, self._segment)
+            self._table = table = SurfelTable()
+            self._segment = self._segments = self._segments + 1
         # The heuristic covariance of section V: a share of the surfel's depth, all directions.
         sigmas = np.maximum(p.expected_motion * births.poses[:, X + 2], 1e-9)
         table.add(births, self._T_world_camera, self._next_id, self._frame, sigmas)
@@ -306,41 +382,10 @@ class SurfelTracker:
         )
 
     def _result(self) -> SurfelFrame:
-        table = self._table
-        poses, validations = table.poses, table.validations
-        f11, f12, f22 = (poses[:, F + k, None] for k in range(3))
-        a, b = poses[:, A : A + 3], poses[:, B : B + 3]
-        means = table.templates[0].means if table.templates else np.zeros(0)
-        # Inside, grey levels have lost the template's mean; outside they are those of Eq. 5.
-        biases = poses[:, BIAS] + means * (1.0 - poses[:, GAIN])
-        return SurfelFrame(
-            frame=self._frame,
-            segment=self._segment,
-            lost=self._lost,
-            T_world_camera=self._T_world_camera.copy(),
-            ids=table.ids.copy(),
-            positions=poses[:, X : X + 3].copy(),
-            tangents=np.stack([f11 * a + f12 * b, f12 * a + f22 * b], axis=2),
-            deformations=poses[:, F : F + 3].copy(),
-            points_px=_f32(validations[:, validation.U : validation.V + 1]),
-            zncc=_f32(validations[:, validation.ZNCC]),
-            visible=_f32(validations[:, validation.VISIBLE]),
-            sigma=_f32(validations[:, validation.SIGMA]),
-            gains=_f32(poses[:, GAIN]),
-            biases=_f32(biases),
-            state=table.state.copy(),
-            age=(self._frame - table.born).astype(np.int32),
-            born=table.born.copy(),
-            tried=table.tried.copy(),
-        )
-
-
-def _spread(rows: U8) -> U8:
-    """Of the rows that are 1 every so many, ``_RIGID_SURFELS`` or up to twice as many."""
-    chosen = np.flatnonzero(rows)
-    out = np.zeros_like(rows)
-    out[chosen[:: max(1, len(chosen) // _RIGID_SURFELS)]] = 1
-    return out
+        return told(
+            self._table, frame=self._frame, segment=self._segment, lost=self._lost,
+            T_world_camera=self._T_world_camera,
+        )  # fmt: skip
 
 
 def _checked_depth(depth: F64, camera: PinholeCamera) -> F64:
@@ -350,7 +395,3 @@ def _checked_depth(depth: F64, camera: PinholeCamera) -> F64:
         )
     depth = np.ascontiguousarray(depth, np.float64)
     return np.where(np.isfinite(depth) & (depth > 0.0), depth, 0.0)
-
-
-def _f32(values: F64) -> F32:
-    return np.ascontiguousarray(values, np.float32)
