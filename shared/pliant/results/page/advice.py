@@ -20,7 +20,8 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
     if not segments:
         told.append(
             "No map could start. Move the camera sideways by a tenth of the distance to the scene "
-            f"or more, not only turn it. It said: {report['last_reason'] or 'no frames'}."
+            "or more, not only turn it, with things at several distances in view, not one wall or "
+            f"table alone. It said: {report['last_reason'] or 'no frames'}."
         )
     first_ns = min(stamps_ns.values(), default=0)
     for before, after in itertools.pairwise(segments):
