@@ -22,6 +22,7 @@ from pliant_services.runtime.link_images import clearance, receive_images, whole
 from pliant_services.runtime.monitor import SilentMonitor
 
 FRAMES = 3
+SOURCE = f"built-in:tiny?frames={FRAMES}&distortion=-0.2,0.1,0,0"
 
 
 class _Jpegs:
@@ -52,7 +53,7 @@ class _Bonnet(_Jpegs):
 
 
 def ingested(how: str, *, jpegs: bool = False, masked: bool = False) -> dict[Topic, list[Header]]:
-    dataset: Dataset = open_source(f"built-in:tiny?frames={FRAMES}&distortion=-0.2,0.1,0,0")
+    dataset: Dataset = open_source(SOURCE)
     bus = ReplayBus({})
     config = load_config(overrides=[f"bus.link_images={how}", "bus.jpeg_quality=70"])
     source = _Jpegs(dataset) if jpegs else _Bonnet(dataset) if masked else dataset
@@ -91,7 +92,7 @@ def test_what_is_worked_on_is_the_jpeg_that_is_recorded() -> None:
         assert image.grey.size == 0
     again = ingest.run  # a run from the recorded frames, without a link
     bus = ReplayBus({})
-    dataset = _Recorded(sent[topics.SOURCE], open_source("built-in:tiny?distortion=-0.2,0.1,0,0"))
+    dataset = _Recorded(sent[topics.SOURCE], open_source(SOURCE))
     again(bus, load_config(), SilentMonitor(), dataset, stopping=lambda: False)
     assert wire(read(bus.outputs)) == wire(read(sent))
     assert wire(read(sent)) != wire(read(ingested("raw")))
@@ -150,7 +151,6 @@ def test_the_size_is_found_behind_other_segments() -> None:
 
 
 def test_the_calibration_that_crosses_is_the_source_s() -> None:
-    dataset = open_source("built-in:tiny?frames=2&distortion=-0.2,0.1,0,0")
     sent = ingested("jpeg")[topics.IMAGE][0]
     assert isinstance(sent, Image)
-    assert sent.calibration == calibration_yaml(dataset.calibration)
+    assert sent.calibration == calibration_yaml(open_source(SOURCE).calibration)

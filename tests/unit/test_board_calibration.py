@@ -34,9 +34,10 @@ def filmed(kind: str, lens: Lens, count: int = 16, tilt_deg: float = 35.0) -> li
     return list(film(board, lens, count, tilt_deg=tilt_deg))
 
 
-def views_of(kind: str, lens: Lens) -> list[BoardView]:
+@cache
+def views_of(kind: str, lens: Lens) -> tuple[BoardView, ...]:
     finder = BoardFinder(CHESSBOARD if kind == "chessboard" else CHARUCO)
-    return [view for view in map(finder.find, filmed(kind, lens)) if view is not None]
+    return tuple(view for view in map(finder.find, filmed(kind, lens)) if view is not None)
 
 
 def folder(path: Path, images: list[Any]) -> str:
@@ -65,7 +66,7 @@ def test_the_lens_is_found(kind: str, lens: Lens) -> None:
 
 
 def test_a_view_that_is_wrong_is_left_out() -> None:
-    views = views_of("chessboard", LENS)
+    views = list(views_of("chessboard", LENS))
     random = np.random.default_rng(3)
     views[2] = BoardView(views[2].corners, views[2].points_px + random.normal(0, 3, (40, 2)))
     found = calibrate(views, 640, 480, "pinhole-radtan")

@@ -144,9 +144,9 @@ def test_a_motion_goes_on_to_change_as_it_did():
 class Shaken:
     """A hand-held camera that slides along a box of points, with this readout."""
 
-    def __init__(self, readout, frames=100):
-        self.frames, self.readout = frames, readout
-        self.poses = [self.at(k) for k in range(frames)]
+    def __init__(self, readout):
+        self.readout = readout
+        self.poses = [self.at(k) for k in range(100)]
 
     def at(self, t):
         shake = np.array([np.sin(0.3 * t), np.cos(0.25 * t), 0.6 * np.sin(0.2 * t)])
@@ -186,14 +186,28 @@ def rolling():
     return shaken, *shaken.mapped()
 
 
-def test_the_readout_is_found_and_straightens_the_map(rolling):
+@pytest.fixture(scope="module")
+def straight():
+    """As a global shutter has it."""
+    shaken = Shaken(0.0)
+    return shaken, *shaken.mapped()
+
+
+@pytest.fixture(scope="module")
+def known():
+    """The readout was told."""
+    shaken = Shaken(0.6)
+    return shaken, *shaken.mapped(known=0.6)
+
+
+def test_the_readout_is_found_and_straightens_the_map(rolling, straight):
     shaken, mapper, history, _, _ = rolling
     assert mapper.calibration.readout == pytest.approx(0.6, abs=0.03)
     final = finished(mapper, history)
-    _, straight, _, _ = Shaken(0.0).mapped()
+    _, _, best, _, _ = straight
     bent, without, _, _ = shaken.mapped(prior=0.0)
     assert shaken.error(history, final) < 0.5 * shaken.error(without, finished(bent, without))
-    assert shaken.error(straight, straight.causal) < shaken.error(history, final)
+    assert shaken.error(best, best.causal) < shaken.error(history, final)
     assert mapper.calibration.readout == pytest.approx(0.6, abs=0.02)
 
 
@@ -203,16 +217,15 @@ def finished(mapper, history):
     return history.final()
 
 
-def test_frames_with_a_known_readout_are_as_good_as_if_taken_at_once():
-    shaken, straight = Shaken(0.6), Shaken(0.0)
-    _, history, _, _ = shaken.mapped(known=0.6)
-    _, best, _, _ = straight.mapped()
+def test_frames_with_a_known_readout_are_as_good_as_if_taken_at_once(known, straight):
+    shaken, _, history, _, _ = known
+    _, _, best, _, _ = straight
     reached = shaken.error(history, history.causal)
-    assert reached < 2.0 * straight.error(best, best.causal)  # unknown it would be 13 times
+    assert reached < 2.0 * shaken.error(best, best.causal)  # unknown it would be 13 times
 
 
-def test_published_is_what_was_seen():
-    mapper, _, tracks, keyframes = Shaken(0.6, frames=60).mapped(known=0.6)
+def test_published_is_what_was_seen(known):
+    _, mapper, _, tracks, keyframes = known
     newest = mapper.atlas.active.keyframes[-1]
     assert np.abs(newest.rolled_px).max() > 0.5
     told = next(delta for delta in reversed(keyframes) if delta.new >= 0)
@@ -223,7 +236,7 @@ def test_published_is_what_was_seen():
     assert np.quantile(nearest, 0.9) < 1e-3
 
 
-def test_a_global_shutter_stays_one():
-    mapper, _, _, _ = Shaken(0.0, frames=60).mapped()
+def test_a_global_shutter_stays_one(straight):
+    _, mapper, _, _, _ = straight
     assert mapper.calibration.readout == 0.0
     assert not any(keyframe.rolled_px.any() for keyframe in mapper.atlas.active.keyframes)

@@ -99,15 +99,6 @@ def test_adjustments_come_at_their_distance_and_seldom(grown):
     assert not any(len(delta.moved_keyframes) for delta in deltas)
 
 
-@pytest.mark.parametrize("how", ["beside", "killed"])
-def test_where_the_answer_was_found_changes_nothing(grown, how):
-    _, deltas, _ = grown
-    _, others, _ = fold(GROWING, **{how: True})
-    for one, other in zip(deltas, others, strict=True):
-        for name, value in vars(one).items():
-            np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
-
-
 def test_readers_have_the_map_that_the_mapper_has(grown):
     mapper, _, history = grown
     active = mapper.atlas.active
@@ -238,8 +229,12 @@ def test_readers_have_the_map_under_another_lens(mistaken):
 
 
 @pytest.mark.parametrize("how", ["beside", "killed"])
-def test_where_a_lens_was_found_changes_nothing(mistaken, how):
+def test_where_the_answer_was_found_changes_nothing(mistaken, how):
+    """Of a question whose answer moves keyframes, and of one that finds a lens."""
     _, deltas, _ = mistaken
+    assert sum(len(delta.moved_keyframes) > 0 for delta in deltas) > len(
+        {delta.calibration_correction for delta in deltas} - {()}
+    )
     _, others, _ = fold(GROWING, camera=WRONG, poses=turning(), **{how: True})
     for one, other in zip(deltas, others, strict=True):
         for name, value in vars(one).items():
