@@ -69,6 +69,12 @@ def follow(config: Config, made: Messages, *reads: Topic) -> list[Surfels]:
     return [m for m in bus.outputs[topics.SURFELS] if isinstance(m, Surfels)]
 
 
+@pytest.fixture(scope="module")
+def followed(everything: Messages) -> list[Surfels]:
+    """Surfels of our own map, born later, too."""
+    return follow(load_config(None, LATER), without_depth(everything), *OPTIONAL)
+
+
 def without_depth(made: Messages) -> Messages:
     depths = [replace(m, data=b"") for m in made[topics.DEPTH] if isinstance(m, Depth)]
     return {**made, topics.DEPTH: list(depths)}
@@ -169,9 +175,9 @@ def with_map(made: Messages, after: int, change: Callable[[F64, F64], F64]) -> M
     return {**made, topics.MAP_UPDATE: updates}
 
 
-def test_surfels_are_born_later_on_our_own_map(everything: Messages) -> None:
-    made = without_depth(everything)
-    followed = follow(load_config(None, LATER), made, *OPTIONAL)
+def test_surfels_are_born_later_on_our_own_map(
+    everything: Messages, followed: list[Surfels]
+) -> None:
     births = born_later(followed)
     keyframes = [m for m in everything[topics.KEYFRAME] if isinstance(m, Keyframe)]
     assert births
@@ -188,10 +194,11 @@ def test_surfels_are_born_later_on_our_own_map(everything: Messages) -> None:
     assert (later.state[mine] == SurfelState.TRACKED).mean() > 0.7
 
 
-def test_a_map_of_another_scale_is_brought_to_that_of_the_surfels(everything: Messages) -> None:
+def test_a_map_of_another_scale_is_brought_to_that_of_the_surfels(
+    everything: Messages, followed: list[Surfels]
+) -> None:
     """A world half as large, from the frame after the start on, makes the same surfels."""
     config, made = load_config(None, LATER), without_depth(everything)
-    followed = follow(config, made, *OPTIONAL)
     start = next(m.frame for m in followed if not m.missing)
     halved = follow(config, with_map(made, start, lambda points, _: 0.5 * points), *OPTIONAL)
     assert born_later(followed).keys() == born_later(halved).keys() != set()
@@ -200,7 +207,9 @@ def test_a_map_of_another_scale_is_brought_to_that_of_the_surfels(everything: Me
         np.testing.assert_allclose(one.positions, other.positions, rtol=1e-3, atol=1e-3)
 
 
-def test_nothing_is_born_on_a_map_that_surfels_do_not_agree_with(everything: Messages) -> None:
+def test_nothing_is_born_on_a_map_that_surfels_do_not_agree_with(
+    everything: Messages, followed: list[Surfels]
+) -> None:
     """Points lie on the rays of the keyframe, and the nearer the further to the right."""
 
     def bent(points: F64, T: F64) -> F64:
@@ -211,7 +220,6 @@ def test_nothing_is_born_on_a_map_that_surfels_do_not_agree_with(everything: Mes
         return T[:3, 3] + rays * (1.0 + 0.5 * np.clip(along, -0.8, 0.8))
 
     config, made = load_config(None, LATER), without_depth(everything)
-    followed = follow(config, made, *OPTIONAL)
     start = next(m.frame for m in followed if not m.missing)
     wrong = follow(config, with_map(made, start, bent), *OPTIONAL)
     assert born_later(followed)
@@ -220,10 +228,12 @@ def test_nothing_is_born_on_a_map_that_surfels_do_not_agree_with(everything: Mes
     assert wrong[-1].ids.tolist() == wrong[start].ids.tolist()
 
 
-def test_after_a_loss_surfels_start_again_on_our_own_map(everything: Messages) -> None:
+def test_after_a_loss_surfels_start_again_on_our_own_map(
+    everything: Messages, followed: list[Surfels]
+) -> None:
     """At the scale they had, from where the map says that the camera is."""
     config, made = load_config(None, LATER), without_depth(everything)
-    images, followed = list(made[topics.IMAGE]), follow(config, made, *OPTIONAL)
+    images = list(made[topics.IMAGE])
     again = min(born_later(followed))
     image = images[again]
     assert isinstance(image, Image)
@@ -250,25 +260,26 @@ def test_after_a_loss_surfels_start_again_on_our_own_map(everything: Messages) -
     assert depths[1] == pytest.approx(depths[0], rel=0.1)
 
 
-def test_a_service_that_is_started_again_knows_the_map(everything: Messages) -> None:
+def test_a_service_that_is_started_again_knows_the_map(
+    everything: Messages, followed: list[Surfels]
+) -> None:
     config, made = load_config(None, LATER), without_depth(everything)
     inputs = {topic: made[topic] for topic in (*ALONE, *OPTIONAL)}
-    whole = follow(config, made, *OPTIONAL)
-    before = min(born_later(whole)) - 1
+    before = min(born_later(followed)) - 1
     kept = Stopping(inputs, before)
     surfels.run(kept, config, SilentMonitor())
     rest = {t: m if t == topics.STREAM else m[before + 1 :] for t, m in inputs.items()}
     continued = Restarted({**rest, topics.STREAM: []}, kept.state)
     surfels.run(continued, config, SilentMonitor())
     made_then = continued.outputs[topics.SURFELS]
-    assert [codec.encode(m) for m in made_then] == [codec.encode(m) for m in whole[before + 1 :]]
+    assert [codec.encode(m) for m in made_then] == [codec.encode(m) for m in followed[before + 1 :]]
 
 
-def test_the_same_again(everything: Messages) -> None:
-    config = load_config(None, LATER)
-    once, again = (follow(config, everything, *OPTIONAL) for _ in range(2))
-    assert born_later(once)
-    assert [codec.encode(m) for m in once] == [codec.encode(m) for m in again]
+def test_the_same_again(everything: Messages, followed: list[Surfels]) -> None:
+    """Also where there is depth that nobody has asked for."""
+    again = follow(load_config(None, LATER), everything, *OPTIONAL)
+    assert born_later(followed)
+    assert [codec.encode(m) for m in followed] == [codec.encode(m) for m in again]
 
 
 def test_a_map_that_is_never_good_enough_is_named(everything: Messages) -> None:

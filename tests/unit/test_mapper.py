@@ -26,13 +26,8 @@ class Published:
 
     def apply(self, delta):
         check_arrays(delta)
-        moves = delta.map_moves()
-        for i, T in self.keyframes.items():
-            self.keyframes[i] = move_by_similarity(moves.matrices(np.array(i)), T)
-        if self.points:
-            xyz, seen, hosts = zip(*self.points.values(), strict=True)
-            moved = moves.points(np.array(xyz), np.array(hosts))
-            self.points = dict(zip(self.points, zip(moved, seen, hosts, strict=True), strict=True))
+        if len(delta.moved_keyframes):
+            self._move(delta.map_moves())
         for i, pose in zip(delta.keyframe_ids.tolist(), delta.keyframe_poses, strict=True):
             self.keyframes[i] = pose_to_matrix(pose)
         for k, frame in enumerate(delta.pose_frames.tolist()):
@@ -47,6 +42,14 @@ class Published:
         self.states.append(delta.state)
         self.reasons.append(delta.reason)
         return self
+
+    def _move(self, moves):
+        for i, T in self.keyframes.items():
+            self.keyframes[i] = move_by_similarity(moves.matrices(np.array(i)), T)
+        if self.points:
+            xyz, seen, hosts = zip(*self.points.values(), strict=True)
+            moved = moves.points(np.array(xyz), np.array(hosts))
+            self.points = dict(zip(self.points, zip(moved, seen, hosts, strict=True), strict=True))
 
     def pose(self, frame):
         keyframe, T_keyframe_camera, _ = self.poses[frame]

@@ -27,14 +27,19 @@ def picture(scene: Scene, squares: list[np.ndarray], T_world_camera: F64) -> U8:
     """The image of the scene: the square of each point where it is seen, near ones in front."""
     points = transform(inverse(T_world_camera), scene.points)
     image = np.full((CAMERA.height, CAMERA.width), 120, np.float32)
-    for i in np.argsort(-points[:, 2]).tolist():
-        if points[i, 2] < 0.1:
-            continue
-        u, v = CAMERA.project(points[i : i + 1])[0] - 0.5 * (_SIDE - 1)
-        x, y = int(np.floor(u)), int(np.floor(v))
-        if min(x, y) < 0 or x + _SIDE >= CAMERA.width or y + _SIDE >= CAMERA.height:
-            continue
-        shift = np.array([[1.0, 0.0, u - x], [0.0, 1.0, v - y]])
+    order = np.argsort(-points[:, 2])
+    order = order[points[order, 2] >= 0.1]
+    corners = CAMERA.project(points[order]) - 0.5 * (_SIDE - 1)
+    floors = np.floor(corners)
+    fits = (floors >= 0).all(axis=1) & (floors + _SIDE < (CAMERA.width, CAMERA.height)).all(axis=1)
+    shift = np.eye(2, 3)
+    for i, (x, y), rest in zip(
+        order[fits].tolist(),
+        floors[fits].astype(int).tolist(),
+        (corners - floors)[fits],
+        strict=True,
+    ):
+        shift[:, 2] = rest
         square = cv2.warpAffine(squares[i], shift, (_SIDE, _SIDE), borderMode=cv2.BORDER_REFLECT)
         image[y : y + _SIDE, x : x + _SIDE] = square
     return image.astype(np.uint8)
