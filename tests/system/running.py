@@ -1,22 +1,29 @@
 """Starts ``pliant`` as a process, and waits for its lines, its end and the end of its services."""
 
+import io
 import os
 import select
 import signal
 import subprocess
 import sys
 from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from hashlib import sha256
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
+import pytest
 import yaml
+
+from pliant_services import cli
 
 TINY = "built-in:tiny"
 TIMEOUT_S = 300
 UP = "services are up"
+NO_MESH = ("--set", "meshing.enabled=false")
+"""For tests of what does not end in a mesh: a process and a third of a run's work less."""
 FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
 """Of a run's results, those that depend on nothing but its input."""
 
@@ -41,6 +48,24 @@ def pliant(
         cwd=cwd,
         env={**os.environ, **(env or {})},
     )
+
+
+def in_this_process(
+    *arguments: object, cwd: Path | None = None
+) -> subprocess.CompletedProcess[str]:
+    """As `pliant`, of a command that is refused at once: a process takes a second to start."""
+    words, output, errors = list(map(str, arguments)), io.StringIO(), io.StringIO()
+    with (
+        chdir(cwd or Path.cwd()),
+        patch.object(sys, "argv", ["pliant", *words]),
+        redirect_stdout(output),
+        redirect_stderr(errors),
+        pytest.raises(SystemExit) as ended,
+    ):
+        cli.run_and_exit(cli.app)
+    code = ended.value.code
+    assert isinstance(code, int)
+    return subprocess.CompletedProcess(words, code, output.getvalue(), errors.getvalue())
 
 
 class Running:

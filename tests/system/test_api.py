@@ -23,8 +23,8 @@ pytestmark = pytest.mark.system
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> pliant.Result:
-    return pliant.run(TINY, output=tmp_path_factory.mktemp("api") / "result", quiet=True)
+def result(tiny_run: Path) -> pliant.Result:
+    return pliant.open(tiny_run)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 from collections.abc import Generator, Sequence
 from pathlib import Path
 
@@ -13,11 +12,13 @@ import cv2
 import numpy as np
 import pytest
 from running import (
+    NO_MESH,
     TINY,
     UP,
     assert_one_line,
     command,
     has_ended,
+    in_this_process,
     pliant,
     running,
     write_sequence,
@@ -27,7 +28,6 @@ from pliant.bus.session import free_endpoint, open_router
 from pliant.datasets.builtin import builtin_folder
 from pliant.messages import topics
 from pliant.recording.reader import Recording
-from pliant_services import cli
 from pliant_services.processes import PROFILES
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
@@ -112,23 +112,14 @@ MISTAKES: list[tuple[Sequence[str], int, Sequence[str]]] = [
 
 @pytest.mark.parametrize(("arguments", "code", "texts"), MISTAKES, ids=lambda x: str(x)[:60])
 def test_a_mistake_is_one_line(
-    here: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: Sequence[str],
-    code: int,
-    texts: Sequence[str],
+    here: Path, arguments: Sequence[str], code: int, texts: Sequence[str]
 ) -> None:
     before = sorted(here.rglob("*"))
-    monkeypatch.setattr(sys, "argv", ["pliant", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        cli.run_and_exit(cli.app)
-    output, errors = capsys.readouterr()
-    assert ended.value.code == code
-    assert len(errors.splitlines()) == 1, errors
-    assert errors.startswith("pliant: ")
-    assert all(text in errors for text in texts), errors
-    assert output == ""
+    done = in_this_process(*arguments)
+    assert_one_line(done, "pliant: ", code)
+    assert done.stderr.startswith("pliant: ")
+    assert all(text in done.stderr for text in texts), done.stderr
+    assert done.stdout == ""
     assert sorted(here.rglob("*")) == before, "a mistake leaves nothing behind"
 
 
@@ -172,8 +163,6 @@ def test_output_that_nobody_reads_or_that_finds_no_room() -> None:
 
 
 def test_broken_frames_are_counted_named_and_passed_over(tmp_path: Path) -> None:
-    from pliant.datasets.builtin import builtin_folder
-
     source = tmp_path / "source"
     shutil.copytree(builtin_folder(TINY), source)
     images = sorted((source / "images").iterdir())
@@ -181,7 +170,7 @@ def test_broken_frames_are_counted_named_and_passed_over(tmp_path: Path) -> None
     images[6].write_bytes(images[6].read_bytes()[:2000])
     other = cv2.imread(str(images[8]))
     cv2.imwrite(str(images[8]), other[:-20])
-    done = pliant("run", source, "--output", tmp_path / "result")
+    done = pliant("run", source, "--output", tmp_path / "result", *NO_MESH)
     assert done.returncode == 3, done.stderr
     report = json.loads((tmp_path / "result" / "report.json").read_text())
     assert report["frames"] == len(images)
@@ -203,7 +192,7 @@ def test_broken_frames_are_counted_named_and_passed_over(tmp_path: Path) -> None
 def test_sigterm_is_a_ctrl_c(tmp_path: Path) -> None:
     """As a container stops: the stream ends, and everything before is kept."""
     folder = tmp_path / "result"
-    with running(TINY, "--output", folder, "--mode", "live") as run:
+    with running(TINY, "--output", folder, "--mode", "live", *NO_MESH) as run:
         run.wait_for(UP)
         run.send(signal.SIGTERM)
         code, output, _ = run.finish()
@@ -217,7 +206,7 @@ def test_sigterm_is_a_ctrl_c(tmp_path: Path) -> None:
 def test_a_second_ctrl_c_does_not_wait(tmp_path: Path) -> None:
     """A tracker that hangs keeps the stream from ending."""
     folder = tmp_path / "result"
-    with running(TINY, "--output", folder, "--mode", "live") as run:
+    with running(TINY, "--output", folder, "--mode", "live", *NO_MESH) as run:
         run.wait_for(UP)
         run.send(signal.SIGSTOP, "tracking")
         run.send(signal.SIGINT)
@@ -231,7 +220,7 @@ def test_a_second_ctrl_c_does_not_wait(tmp_path: Path) -> None:
 def test_a_killed_recorder_is_named_and_its_recording_is_read(tmp_path: Path) -> None:
     folder = tmp_path / "result"
     # On the disk after every message, so that the first one is there whenever the signal comes.
-    arguments = [TINY, "--output", folder, "--mode", "live", "--set"]
+    arguments = [TINY, "--output", folder, "--mode", "live", *NO_MESH, "--set"]
     with running(*arguments, "recorder.sync_interval_s=1e-9") as run:
         run.wait_for(UP)
         run.send(signal.SIGKILL, "recorder")
@@ -244,7 +233,7 @@ def test_a_killed_recorder_is_named_and_its_recording_is_read(tmp_path: Path) ->
 
 def test_services_end_when_their_launcher_is_killed(tmp_path: Path) -> None:
     folder = tmp_path / "result"
-    with running(TINY, "--output", folder, "--mode", "live") as run:
+    with running(TINY, "--output", folder, "--mode", "live", *NO_MESH) as run:
         run.wait_for(UP)
         run.send(signal.SIGKILL)
         left = [name for name, pid in run.services.items() if not has_ended(pid, 10.0)]

@@ -1,5 +1,6 @@
 """Services killed in the middle of a run: the results are the same bytes as without the fault."""
 
+import json
 import os
 import signal
 import threading
@@ -10,7 +11,7 @@ from pathlib import Path
 import cv2
 import pytest
 from hostile import attack, samples
-from running import TINY, assert_one_line, digests, pliant
+from running import TINY, assert_one_line, digests, in_this_process, pliant
 
 from pliant.config import config_yaml, load_config
 from pliant.datasets import open_source
@@ -22,21 +23,22 @@ from pliant.messages import topics
 from pliant.messages.types import ClipPiece, SourceImage, Status
 from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
-from pliant.results.folder import STATE_FOLDER, prepare
+from pliant.results.folder import RECORDING_NAME, STATE_FOLDER, prepare
 from pliant.results.write import write_results
 from pliant_services.processes import PROFILES
+from pliant_services.replay.command import SAME, ReplayRequest, run_replay
 from pliant_services.run.command import (
     RunRequest,
     resumed_config,
     resumed_map,
     service_arguments,
 )
-from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime import launcher
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
 pytestmark = pytest.mark.system
 
+FRAMES = 40
 SERVICES = PROFILES["points"]
 _HELD_S, _LET_GO_S = 10.0, 0.01
 REQUEST = RunRequest(source=TINY)
@@ -76,10 +78,10 @@ def run(
     return digests(output)
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    warm_up.compile_kernels(print)
-    return run(tmp_path_factory.mktemp("undisturbed"))
+@pytest.fixture
+def undisturbed(tiny_run: Path) -> dict[str, str]:
+    """Of an ordinary run: neither checkpoints nor a mesher change what the others make."""
+    return digests(tiny_run)
 
 
 def once_at(*when: tuple[int, Sequence[str]]) -> Callable[[Status, Fleet], Sequence[str]]:
@@ -94,13 +96,11 @@ def once_at(*when: tuple[int, Sequence[str]]) -> Callable[[Status, Fleet], Seque
     return victims
 
 
-@pytest.mark.parametrize("first", [2, 16])
-def test_killed_services_go_on_where_they_were(
-    first: int, tmp_path: Path, undisturbed: dict[str, str]
-) -> None:
+def test_killed_services_go_on_where_they_were(tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """Each in its turn, early, before there is a checkpoint, and late."""
     killed: list[str] = []
-    kills = once_at(*((first + 3 * i, (name,)) for i, name in enumerate(SERVICES)))
+    each = [(3 * i, (name,)) for i, name in enumerate(SERVICES)]
+    kills = once_at(*((first + after, name) for first in (2, 16) for after, name in each))
 
     def victims(status: Status, fleet: Fleet) -> Sequence[str]:
         chosen = kills(status, fleet)
@@ -108,16 +108,25 @@ def test_killed_services_go_on_where_they_were(
         return chosen
 
     assert run(tmp_path, victims) == undisturbed
-    assert killed == list(SERVICES)
+    assert killed == 2 * list(SERVICES)
 
 
-@pytest.mark.parametrize("look_s", [0.01, 1.0])
 def test_all_at_once(
-    look_s: float, tmp_path: Path, undisturbed: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, undisturbed: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whether the launcher sees one dead and others alive, or, looking seldom, all dead."""
-    monkeypatch.setattr(launcher, "_POLL_S", look_s)
-    assert run(tmp_path, once_at((18, SERVICES))) == undisturbed
+    monkeypatch.setattr(launcher, "_POLL_S", 0.01)
+    kills, killed = once_at((8, SERVICES), (20, SERVICES)), list[str]()
+
+    def victims(status: Status, fleet: Fleet) -> Sequence[str]:
+        if status.service == "bundle_adjustment" and status.frame >= 14:
+            monkeypatch.setattr(launcher, "_POLL_S", 1.0)
+        chosen = kills(status, fleet)
+        killed.extend(chosen)
+        return chosen
+
+    assert run(tmp_path, victims) == undisturbed
+    assert killed == 2 * list(SERVICES)
 
 
 def test_all_with_the_launcher_and_resume(tmp_path: Path, undisturbed: dict[str, str]) -> None:
@@ -131,6 +140,19 @@ def test_all_with_the_launcher_and_resume(tmp_path: Path, undisturbed: dict[str,
         run(tmp_path, cut)
     resumed_config(tmp_path, REQUEST)
     assert run(tmp_path, resume=True) == undisturbed
+
+
+def replayed(recorded: Path, output: Path) -> dict[str, str]:
+    """What the services make, undisturbed, of all frames of the source."""
+    assert json.loads((recorded / "report.json").read_text())["frames"] == FRAMES
+    request = ReplayRequest(
+        recording=recorded / RECORDING_NAME,
+        services=("tracking", "bundle_adjustment"),
+        output=output,
+        check=True,
+    )
+    assert run_replay(request) == SAME
+    return digests(output)
 
 
 def in_map(known: Path) -> RunRequest:
@@ -153,24 +175,25 @@ def test_all_with_the_launcher_and_resume_in_a_map(
         return ()
 
     request = in_map(tiny_run)
-    whole = run(tmp_path / "whole", request=request, settings=settings)
     with pytest.raises(ServiceDiedError):
         run(tmp_path / "cut", cut, request=request, settings=settings)
     again = run(tmp_path / "cut", resume=True, request=request, settings=settings)
-    assert again == whole
+    assert again == replayed(tmp_path / "cut", tmp_path / "whole")
 
 
 def test_a_run_is_taken_up_in_its_own_map(tmp_path: Path, tiny_run: Path) -> None:
     (tmp_path / "cut" / STATE_FOLDER).mkdir(parents=True)
     (tmp_path / "cut" / "config.yaml").write_text(config_yaml(load_config()))
-    refused = pliant("run", TINY, "--resume", "--map", tiny_run, "--output", tmp_path / "cut")
+    refused = in_this_process(
+        "run", TINY, "--resume", "--map", tiny_run, "--output", tmp_path / "cut"
+    )
     assert_one_line(refused, "which has none")
     note = tmp_path / "cut" / STATE_FOLDER / "known_map"
     note.write_text(str(tiny_run / "map.pliant"))
     assert resumed_map(tmp_path / "cut", RunRequest(source=TINY)) == tiny_run / "map.pliant"
     assert resumed_map(tmp_path / "cut", in_map(tiny_run)) == tiny_run / "map.pliant"
     note.write_text(str(tmp_path / "gone" / "map.pliant"))
-    refused = pliant("run", TINY, "--resume", "--output", tmp_path / "cut")
+    refused = in_this_process("run", TINY, "--resume", "--output", tmp_path / "cut")
     assert_one_line(refused, "no map there")
 
 
@@ -203,11 +226,11 @@ def test_the_recording_of_a_video_has_all_images_whoever_is_killed(
             return SERVICES
         return kills(status, fleet)
 
-    whole = run(tmp_path / "whole", request=clip)
     with pytest.raises(ServiceDiedError):
         run(tmp_path / "cut", victims, request=clip)
     resumed_config(tmp_path / "cut", clip)
-    assert run(tmp_path / "cut", resume=True, request=clip) == whole
+    again = run(tmp_path / "cut", resume=True, request=clip)
+    assert again == replayed(tmp_path / "cut", tmp_path / "whole")
     recording = Recording(tmp_path / "cut")
     stored = [m for m in recording.decoded(topics.SOURCE) if isinstance(m, SourceImage)]
     assert not any(image.data for image in stored)
@@ -229,7 +252,7 @@ def test_a_live_run_is_not_resumed_but_its_recording_is_a_source(
             for n, each in enumerate(islice(whole.messages(topic), 20)):
                 half.write(topic, each.data, sequence=n, log_time_ns=n, publish_time_ns=n)
     (tmp_path / "config.yaml").write_text(config_yaml(load_config(overrides=["ingest.mode=live"])))
-    refused = pliant("run", TINY, "--resume", "--output", tmp_path)
+    refused = in_this_process("run", TINY, "--resume", "--output", tmp_path)
     assert_one_line(refused, "was recorded live")
     said = refused.stderr[refused.stderr.index("`pliant run ") + 1 :].split()[1:3]
     again = pliant(*said, "--output", tmp_path / "again", "--set", "meshing.enabled=false")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks.recorder_kills import measure
-from running import TINY, pliant
+from running import NO_MESH, TINY, pliant
 
 from pliant.config import config_yaml, load_config
 from pliant.messages import topics
@@ -19,16 +19,7 @@ from pliant_services.runtime.launcher import Fleet
 
 pytestmark = pytest.mark.system
 
-FRAMES = 10
 DETERMINISTIC = [t for t in topics.TOPICS if t.logged and t.deterministic]
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("run") / "tiny"
-    pliant("run", f"{TINY}?frames={FRAMES}", "--output", folder)
-    assert summarise(folder).complete
-    return folder
 
 
 def assert_same(a: Path, b: Path) -> None:
@@ -37,30 +28,30 @@ def assert_same(a: Path, b: Path) -> None:
     assert summarise(b).complete
 
 
-def test_the_report_proves_that_nothing_was_lost(result: Path) -> None:
-    proof = json.loads((result / "report.json").read_text())["recorder"]
+def test_the_report_proves_that_nothing_was_lost(tiny_run: Path) -> None:
+    report = json.loads((tiny_run / "report.json").read_text())
+    proof = report["recorder"]
     assert (proof["lost"], proof["duplicated"]) == (0, 0)
     for topic in (topics.SOURCE, topics.EXTREMA, topics.MAP_UPDATE):
-        assert proof["messages"][topic.key] == FRAMES
+        assert proof["messages"][topic.key] == report["frames"]
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 1, 0, 2)])
 def test_the_same_bytes_with_delays_a_busy_core_and_another_order_of_start(
-    result: Path, tmp_path: Path, order: tuple[int, ...]
+    tiny_run: Path, tmp_path: Path
 ) -> None:
-    names = ("ingest", "tracking", "bundle_adjustment", "recorder")
+    names = ("recorder", "tracking", "ingest", "bundle_adjustment")
     prepare(tmp_path, config_yaml(load_config()))
 
     def arguments(name: str) -> list[str]:
         extra = ["--config", str(tmp_path / "config.yaml"), "--delays-ms", "40"]
         if name == "ingest":
-            extra += ["--source", f"{TINY}?frames={FRAMES}"]
+            extra += ["--source", TINY]
         if name == "recorder":
             extra += ["--output", str(tmp_path / "recording.mcap")]
         return extra
 
     busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-    fleet = Fleet([names[i] for i in order], log_folder=tmp_path / "logs", on_status=lambda _: None)
+    fleet = Fleet(names, log_folder=tmp_path / "logs", on_status=lambda _: None)
     try:
         fleet.start(arguments)
         fleet.wait()
@@ -68,7 +59,7 @@ def test_the_same_bytes_with_delays_a_busy_core_and_another_order_of_start(
         fleet.close()
         busy.kill()
         busy.wait()
-    assert_same(result, tmp_path)
+    assert_same(tiny_run, tmp_path)
 
 
 def test_a_full_disk_is_one_line_and_what_was_written_is_readable(tmp_path: Path) -> None:
@@ -100,7 +91,7 @@ def test_a_full_disk_is_one_line_and_what_was_written_is_readable(tmp_path: Path
 
 def test_a_recording_without_images_says_what_cannot_be_replayed(tmp_path: Path) -> None:
     folder = tmp_path / "small"
-    pliant("run", f"{TINY}?frames=6", "--output", folder, "--no-images")
+    pliant("run", f"{TINY}?frames=12", "--output", folder, "--no-images", *NO_MESH)
     summary = summarise(folder)
     assert summary.complete
     assert topics.SOURCE.key not in summary.topics
