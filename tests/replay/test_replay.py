@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from running import TINY, assert_one_line, pliant
+from running import NO_MESH, TINY, assert_one_line, in_this_process, pliant
 
 from pliant.config import config_yaml, load_config, recorded_config
 from pliant.errors import ConfigError, RecordingError
@@ -46,7 +46,7 @@ def test_a_run_over_a_link_with_jpegs_records_them_and_a_replay_makes_the_same_o
     tmp_path: Path,
 ) -> None:
     folder = tmp_path / "jpegs"
-    settings = ("--set", "bus.link_images=jpeg", "--set", "bus.jpeg_quality=80")
+    settings = ("--set", "bus.link_images=jpeg", "--set", "bus.jpeg_quality=80", *NO_MESH)
     done = pliant("run", f"{TINY}?frames=12", "--output", folder, *settings)
     assert done.returncode == 0, done.stderr
     sources = list(Recording(folder / "recording.mcap").decoded(topics.SOURCE))
@@ -139,9 +139,11 @@ def test_a_recording_cut_off_is_recovered_and_then_replays(
 
 
 def test_what_cannot_be_replayed_is_one_line(result: Path, tmp_path: Path) -> None:
-    assert_one_line(pliant("replay", tmp_path / "none.mcap"), "no such recording")
-    assert_one_line(pliant("replay", result, "--output", result), "is read from there")
-    assert_one_line(pliant("replay", result, "--check", "--loop"), "--loop is for playing", 2)
+    assert_one_line(in_this_process("replay", tmp_path / "none.mcap"), "no such recording")
+    assert_one_line(in_this_process("replay", result, "--output", result), "is read from there")
+    assert_one_line(
+        in_this_process("replay", result, "--check", "--loop"), "--loop is for playing", 2
+    )
 
 
 def without(result: Path, output: Path, *left_out: Topic, frame: int | None = None) -> Path:

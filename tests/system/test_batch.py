@@ -10,13 +10,22 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 
 import pytest
-from running import TIMEOUT_S, TINY, UP, assert_one_line, command, digests, pliant
+from running import (
+    NO_MESH,
+    TIMEOUT_S,
+    TINY,
+    UP,
+    assert_one_line,
+    command,
+    digests,
+    in_this_process,
+    pliant,
+)
 
 from pliant.datasets.builtin import builtin_folder
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
-OPTIONS = ("--set", "meshing.enabled=false")
-
+OPTIONS = NO_MESH
 
 CLUSTER = """
 import sys
@@ -113,7 +122,9 @@ def test_an_interrupted_batch_goes_on_and_a_broken_clip_stops_nobody(
     assert at_last.returncode == 0, at_last.stderr
     assert at_last.stderr == ""  # nothing was left to do
     assert "1 of 1 done" in at_last.stdout
-    assert_one_line(pliant("batch", clips, "--output", output), "begun with other options of run")
+    assert_one_line(
+        in_this_process("batch", clips, "--output", output), "begun with other options of run"
+    )
 
 
 def test_the_clip_of_a_worker_that_is_killed_goes_to_another_one(
@@ -145,14 +156,14 @@ def test_no_scheduler_no_dask_and_workers_without_the_clips_are_one_line(
     (tmp_path / "none" / "distributed").mkdir(parents=True)
     (tmp_path / "none" / "distributed" / "__init__.py").write_text("raise ImportError('none')")
     batch = ("batch", "clips", "--dask")
-    done = pliant(*batch, "tcp://127.0.0.1:1", cwd=tmp_path)
+    done = in_this_process(*batch, "tcp://127.0.0.1:1", cwd=tmp_path)
     assert_one_line(done, "--dask tcp://127.0.0.1:1: no scheduler answers")
     for address in ("nonsense://rack:8786", "tcp://", "rack", ""):
-        assert_one_line(pliant(*batch, address, cwd=tmp_path), "no scheduler answers")
+        assert_one_line(in_this_process(*batch, address, cwd=tmp_path), "no scheduler answers")
     without = {"PYTHONPATH": str(tmp_path / "none")}
     done = pliant(*batch, "tcp://127.0.0.1:1", cwd=tmp_path, env=without)
     assert_one_line(done, "needs Dask: pip install 'pliant[dask]'")
-    done = pliant(*batch, scheduler, "--jobs", "2", cwd=tmp_path)
+    done = in_this_process(*batch, scheduler, "--jobs", "2", cwd=tmp_path)
     assert_one_line(done, "--jobs is for one machine", 2)
     assert [path.name for path in tmp_path.iterdir()] == ["clips", "none"]
 
@@ -165,6 +176,6 @@ def test_what_run_would_not_take_is_refused_before_anything_is_begun(tmp_path: P
         (["--profile", "elastic"], "elastic", 2),
         (["elsewhere"], "unexpected extra argument", 2),
     ):
-        done = pliant("batch", tmp_path, *options, cwd=tmp_path)
+        done = in_this_process("batch", tmp_path, *options, cwd=tmp_path)
         assert_one_line(done, says, code)
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]

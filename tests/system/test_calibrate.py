@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from running import TINY, assert_one_line, pliant
+from running import TINY, assert_one_line, in_this_process, pliant
 
 from pliant.datasets.builtin import builtin_folder
 from pliant.datasets.calibration_files import read_calibration
@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.system]
 
 def test_a_camera_is_found_without_a_board(tmp_path: Path) -> None:
     file = tmp_path / "found.yaml"
-    given = pliant("calibrate", TINY, "--output", file)
+    given = in_this_process("calibrate", TINY, "--output", file)
     assert_one_line(given, "has a calibration, which `pliant run` takes: --fov DEGREES")
     done = pliant("calibrate", TINY, "--fov", "50", "--output", file)
     assert done.returncode == 0, done.stderr
@@ -32,7 +32,9 @@ def test_a_camera_is_found_without_a_board(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "black.png"), black)
     for name, says in (("black.png", "is black all over"), ("none.png", "cannot be read")):
         mask = tmp_path / name
-        done = pliant("calibrate", TINY, "--fov", "50", "--mask", mask, "--output", file, "--force")
+        done = in_this_process(
+            "calibrate", TINY, "--fov", "50", "--mask", mask, "--output", file, "--force"
+        )
         assert_one_line(done, f"--mask {mask}: {says}")
     black[:44] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), black)

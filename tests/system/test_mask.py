@@ -11,7 +11,7 @@ from typing import cast
 import cv2
 import numpy as np
 import pytest
-from running import TINY, assert_one_line, pliant
+from running import TINY, assert_one_line, in_this_process, pliant
 
 import pliant as pliant_api
 from pliant.algorithms.image.masks import clearance_of, unpacked
@@ -154,9 +154,7 @@ def test_an_image_is_found_in_its_map_by_what_is_left(result: Path, bonnet: Path
 def test_exports_have_masks_beside_images(
     result: Path, tmp_path: Path, kind: str, masks: str
 ) -> None:
-    done = pliant("export", result, "--to", kind, "--output", tmp_path / "export")
-    assert done.returncode == 0, done.stderr
-    folder = tmp_path / "export"
+    folder = export_result(result, kind, tmp_path / "export")
     names = {path.name for path in (folder / "images").iterdir()}
     assert names
     assert {path.name for path in (folder / "masks").iterdir()} == {masks.format(n) for n in names}
@@ -183,7 +181,7 @@ def test_exports_have_masks_beside_images(
 
 def test_a_mask_that_is_none_is_one_line(bonnet: Path, tmp_path: Path) -> None:
     for mask, words in (("nothing.png", "cannot be read"), ("drive", "holds no images")):
-        done = pliant(
+        done = in_this_process(
             "run", bonnet / "drive", "--mask", bonnet / mask, "--output", tmp_path / "result"
         )
         assert_one_line(done, words)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from running import TINY, assert_one_line, children, digests, pliant, running
+from running import TINY, assert_one_line, children, digests, in_this_process, pliant, running
 
 from pliant.formats.ply import read_ply
 
@@ -89,7 +89,7 @@ def test_the_mesh_is_made_again_with_other_parameters(result: Path, tmp_path: Pa
     assert (tmp_path / "rough" / "mesh.ply").stat().st_size < (
         0.3 * (result / "mesh.ply").stat().st_size
     )
-    assert_one_line(pliant("mesh", result, "--output", result), "is read from there")
+    assert_one_line(in_this_process("mesh", result, "--output", result), "is read from there")
 
 
 def test_a_voxel_too_small_for_the_memory_is_refused_before_the_work(
@@ -97,7 +97,7 @@ def test_a_voxel_too_small_for_the_memory_is_refused_before_the_work(
 ) -> None:
     sets = ("--output", tmp_path / "small", "--set", "meshing.tsdf.fine_voxel=0.0001")
     for command in (("run", TINY), ("mesh", result)):
-        done = pliant(*command, *sets)
+        done = in_this_process(*command, *sets)
         assert_one_line(done, "fine_voxel=0.0001 needs")
         assert "would fit" in done.stderr
         assert not (tmp_path / "small").exists()

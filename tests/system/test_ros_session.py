@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import pytest
 import zenoh
-from running import UP, assert_one_line, command, pliant, running
+from running import UP, assert_one_line, command, in_this_process, running
 
 from pliant.bus.session import free_endpoint, open_router, open_session
 from pliant.datasets import decode, open_source
@@ -152,4 +152,4 @@ def test_wrong_requests_are_one_line(tmp_path: Path) -> None:
         (("--connect", "tcp/127.0.0.1:9", "--session", "a", "--name", "my robot"), "not a name"),
         (("--connect", "tcp/127.0.0.1:9", "--session", "a", "--router", "x"), "not an endpoint"),
     ):
-        assert_one_line(pliant("ros", *arguments), says)
+        assert_one_line(in_this_process("ros", *arguments), says)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from running import TINY, assert_one_line
+from running import NO_MESH, TINY, assert_one_line, in_this_process
 from running import pliant as command
 
 import pliant
@@ -86,7 +86,7 @@ def test_the_scale_goes_on_in_the_map_and_goes_with_the_result(
 ) -> None:
     assert "scale: metres" in command("map", "info", doubled).stdout
     today = tmp_path / "today"
-    arguments = ("--map", doubled, "--end", "0.7", "--set", "meshing.enabled=false")
+    arguments = ("--map", doubled, "--end", "0.7", *NO_MESH)
     done = command("run", TINY, *arguments, "--output", today)
     assert done.returncode == 0, done.stderr
     assert json.loads((today / "report.json").read_text())["scale_is_metric"]
@@ -111,8 +111,7 @@ def test_a_marker_tells_the_scale(tmp_path: Path) -> None:
     source, result = tmp_path / "with-marker", tmp_path / "result"
     shutil.copytree(builtin_folder(TINY), source)
     put_marker_into(source, side_m=0.25)
-    settings = ("--set", "meshing.enabled=false")
-    assert command("run", source, *settings, "--output", result).returncode == 0
+    assert command("run", source, *NO_MESH, "--output", result).returncode == 0
     done = command("scale", result, "--marker", 0.25)
     assert done.returncode == 0, done.stderr
     assert "1 marker of 0.25 m" in done.stdout
@@ -172,6 +171,6 @@ def test_what_tells_nothing_changes_nothing(tiny_run: Path, known: Known, says: 
 def test_a_scale_that_is_none_is_one_line(doubled: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(doubled, tmp_path / "tiny"))
     (folder / "scale.yaml").write_text("metres_per_unit: -1\nsigma: 0\nsource: nobody\n")
-    assert_one_line(command("export", folder, "--to", "tum"), "scale.yaml: no scale")
+    assert_one_line(in_this_process("export", folder, "--to", "tum"), "scale.yaml: no scale")
     told = command("scale", folder, "--points", "1,2", "1,2,4", 1)
     assert_one_line(told, "expected X,Y,Z", code=2)

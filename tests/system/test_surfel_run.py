@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from running import assert_one_line, pliant
+from running import assert_one_line, in_this_process, pliant
 
 from pliant.export.export import export_result
 from pliant.formats.ply import read_ply
@@ -140,11 +140,11 @@ def test_the_overlay_shows_how_each_surfel_fares(result: Path, tmp_path: Path) -
 
 
 def test_wrong_use_is_one_line(tmp_path: Path) -> None:
-    done = pliant("run", TINY, "--camera", "static", "--output", tmp_path / "x")
+    done = in_this_process("run", TINY, "--camera", "static", "--output", tmp_path / "x")
     assert done.returncode == 2
     assert "--profile deformable" in done.stderr
     images = tmp_path / "images"
     images.mkdir()
     (images / "0.pgm").write_bytes(b"P5 64 48 255 " + bytes(64 * 48))
-    done = pliant("run", images, "--fov", "60", "--profile", "deformable")
+    done = in_this_process("run", images, "--fov", "60", "--profile", "deformable")
     assert_one_line(done, "brings no depth along")
