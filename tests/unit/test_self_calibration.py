@@ -9,7 +9,7 @@ from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.map_delta import TRACKING, WAITING
-from pliant.algorithms.mapping import trial
+from pliant.algorithms.mapping import start, trial
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import widened
@@ -61,6 +61,19 @@ def test_frames_on_trial_wait_and_then_all_get_their_poses_at_once(turning, monk
     assert set(published.states[:begun]) == {WAITING}
     assert "focal length is known to" in published.reasons[begun - 1]
     assert sorted(published.poses) == list(range(len(poses)))
+
+
+def test_a_trial_begins_though_two_motions_are_alike_which_wrong_focal_lengths_make_them(
+    turning, monkeypatch
+):
+    monkeypatch.setattr(start, "_agree", lambda one, other: one is other)
+    frames = turning[1][:20]
+    published, calibrated = run(frames, 0.65)[0], Published()
+    mapper = Mapper(CAMERA, PARAMETERS, 0)
+    for frame, tracks in enumerate(frames):
+        calibrated.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+    assert "two motions" in calibrated.reasons[-1]
+    assert "focal length is known to" in published.reasons[-2]  # before the end
 
 
 def test_keyframes_tell_the_pixels_of_the_image_not_of_the_camera_that_was_found(turning):

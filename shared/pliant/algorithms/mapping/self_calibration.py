@@ -224,7 +224,9 @@ def _find_start_of_guess(
     """The start under the focal length with which it agrees best with itself.
 
     Where any of the focal lengths explains the flow by a turn alone or finds too little parallax,
-    it waits: a wrong one sees parallax in every turn.
+    it waits: a wrong one sees parallax in every turn.  Only the motion that two views fit best is
+    asked for: a wrong focal length bends all until they are alike, and the map begins anew with the
+    right one (``trial.py``), which compares them.
     """
     sigma = parameters.calibration.focal
     tried = [known.correction + k * sigma * np.eye(6)[0] for k in _HYPOTHESES]
@@ -234,7 +236,7 @@ def _find_start_of_guess(
         return next(filter(None, reasons))
     best: tuple[float, Start, F64] | None = None
     for correction, camera in zip(tried, cameras, strict=True):
-        found = find_start(waiting, camera, parameters)
+        found = find_start(waiting, camera, parameters, motions=1)
         if isinstance(found, str):
             return found
         refined = _refine(found, camera, parameters)

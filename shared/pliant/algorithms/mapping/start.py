@@ -112,9 +112,16 @@ def keep_waiting(waiting: list[_F], newest: _F, parameters: StartParameters) -> 
 
 
 def find_start(
-    waiting: list[WaitingFrame], camera: PinholeCamera, parameters: MappingParameters
+    waiting: list[WaitingFrame],
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    *,
+    motions: int | None = None,
 ) -> Start | str:
-    """The map that starts with the newest of the waiting frames, or the reason why it cannot."""
+    """The map that starts with the newest of the waiting frames, or the reason why it cannot.
+
+    motions: how many of those that two views allow are compared, None: all.
+    """
     start = parameters.start
     if len(waiting) < _MIN_FRAMES:
         return f"too few frames: {len(waiting)} of {_MIN_FRAMES}"
@@ -125,7 +132,7 @@ def find_start(
     # The more parallax the better; shared tracks count less, for there are many.
     pairs.sort(key=lambda pair: -pair.residual_px * len(pair.indices_newest) ** 0.5)
     for pair in pairs[:2]:
-        found = _start_from(pair, waiting, camera, parameters)
+        found = _start_from(pair, waiting, camera, parameters, motions)
         if not isinstance(found, str):
             return found
         reason = reason or found
@@ -200,7 +207,11 @@ def _too_little(parallax: float, least: float, unit: str) -> str:
 
 
 def _start_from(
-    pair: _Pair, waiting: list[WaitingFrame], camera: PinholeCamera, parameters: MappingParameters
+    pair: _Pair,
+    waiting: list[WaitingFrame],
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    motions: int | None,
 ) -> Start | str:
     start = parameters.start
     a = _normalise(camera, waiting[pair.reference].points_px[pair.indices_reference])
@@ -213,7 +224,7 @@ def _start_from(
         return reason  # parallax that a worse motion sees is its mistake
     shared = waiting[-1].ids[pair.indices_newest]
     found: list[tuple[float, Start]] = []
-    for two_views in tried:
+    for two_views in tried[:motions]:
         each = _why_not_with(two_views, start) or _reconstruct(
             pair, two_views, waiting, camera, parameters
         )
