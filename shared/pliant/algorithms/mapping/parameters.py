@@ -206,7 +206,7 @@ class WholeMapParameters(Parameters):
     """Adjustments of the whole map while it grows."""
 
     growth: float = Field(
-        default=0.15,
+        default=0.2,
         ge=0.0,
         description="Share by which the keyframes of a segment grow from one adjustment of all of "
         "them to the next; 0: only at the end",
@@ -217,7 +217,7 @@ class WholeMapParameters(Parameters):
         description="Frames after which the result is taken over; who has not found it waits",
     )
     iterations: int = Field(
-        default=5, ge=1, description="Most iterations of Schur LM; the next adjustment goes on"
+        default=20, ge=1, description="Most iterations of Schur LM; the next adjustment goes on"
     )
 
 

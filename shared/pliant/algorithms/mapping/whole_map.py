@@ -7,13 +7,12 @@ Where the shutter may roll it begins with the first keyframes: they tell the rea
 
 Meanwhile the map has grown and the window has moved.  So the result is not where the points are,
 but how the map around each keyframe moves: one similarity for each, as drift is small within what
-a keyframe sees.  The window and all that is new move rigidly with the last keyframe that has left
-the window.  The first keyframe stays, and with it place and scale of the beginning.  Lens, focal
-length and readout are found anew each time, and used for what comes next once they are certainly
-other than those in use.
+a keyframe sees.  The keyframes that were in the window do, too: in a map of a few dozen most of the
+drift is there.  What is newer moves rigidly with the last of them.  The first keyframe stays, and
+with it place and scale of the beginning.  Lens, focal length and readout are found anew each time,
+and used for what comes next once they are certainly other than those in use.
 
-A place that is recognised asks at once, and then the window moves as the rest does: what drifted
-since drifted in the window, too.
+A place that is recognised asks at once.
 """
 
 from dataclasses import dataclass, field, replace
@@ -42,14 +41,12 @@ _LEAST_TOLD = 0.2
 class Question:
     """A copy of the map of a frame, to be adjusted.
 
-    keyframe_ids: (M,).   seen: what they see.   settled: how many of them, the oldest, move each
-    by itself.   known: of the camera; ``seen`` has pixels of the rectified image.   loops: to be
-    closed.   hosts, sigmas: (N,) of the points that are seen.
+    keyframe_ids: (M,).   seen: what they see.   known: of the camera; ``seen`` has pixels of the
+    rectified image.   loops: to be closed.   hosts, sigmas: (N,) of the points that are seen.
     """
 
     frame: int
     keyframe_ids: I64
-    settled: int
     seen: ListedMap
     known: SelfCalibration
     parameters: MappingParameters
@@ -121,7 +118,6 @@ class WholeMap:
         self.question = Question(
             frame=frame,
             keyframe_ids=keyframe_ids,
-            settled=count if loops or count < 2 * window else count - window,
             seen=seen,
             known=calibration,
             parameters=parameters,
@@ -167,7 +163,7 @@ class WholeMap:
 
 
 def find_moves(question: Question) -> Answer:
-    """How each settled keyframe moves with what hangs on it, and the readout."""
+    """How each keyframe moves with what hangs on it, and the readout."""
     before, xyz = question.seen.T_world_camera, question.seen.xyz
     depths, loops = question.seen.depths(), question.loops
     seen = replace(question.seen, T_world_camera=before.copy(), xyz=xyz.copy())
@@ -219,19 +215,16 @@ def _without_prior(
 
 def _moves(question: Question, seen: ListedMap, before: F64, depths: F64) -> MapMoves:
     """before: (M, 4, 4) poses and depths: (O,) of the observations until now."""
-    settled = slice(0, question.settled)
-    scales = _scales(seen, depths, question.settled)
-    T = seen.T_world_camera[settled].copy()
+    scales = _scales(seen, depths)
+    T = seen.T_world_camera.copy()
     # Nothing holds the scale of a map: that of its beginning stays.
     T[:, :3, 3] = T[0, :3, 3] + (T[:, :3, 3] - T[0, :3, 3]) / scales[0]
     scales /= scales[0]
-    moved = T @ inverse(before[settled])
-    moved[:, :3, 3] = (
-        T[:, :3, 3]
-        - scales[:, None] * (moved[:, :3, :3] @ before[settled][:, :3, 3, None])[:, :, 0]
-    )
+    moved = T @ inverse(before)
+    turned = (moved[:, :3, :3] @ before[:, :3, 3, None])[:, :, 0]
+    moved[:, :3, 3] = T[:, :3, 3] - scales[:, None] * turned
     return MapMoves(
-        keyframe_ids=question.keyframe_ids[settled],
+        keyframe_ids=question.keyframe_ids,
         moves=np.column_stack([matrix_to_pose(moved), scales]),
     )
 
@@ -253,8 +246,9 @@ def held(moves: MapMoves, spans: list[tuple[int, int]], segment: int) -> MapMove
     return MapMoves(keyframe_ids=ids, moves=rows)
 
 
-def _scales(seen: ListedMap, before: F64, count: int) -> F64:
-    """(count,) by how much what each of the first keyframes sees has grown: the median."""
+def _scales(seen: ListedMap, before: F64) -> F64:
+    """(M,) by how much what each keyframe sees has grown: the median."""
+    count = len(seen.T_world_camera)
     after = seen.depths()
     usable = (before > _MIN_DEPTH) & (after > _MIN_DEPTH)
     cameras = seen.camera[usable]
