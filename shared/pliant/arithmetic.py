@@ -24,6 +24,9 @@ _X86_64_V3 = {
     "OPENBLAS_CORETYPE": "Haswell",
     "OPENCV_IPP": "avx2",
 }
+VARIABLES = (*_ONE_THREAD, *_X86_64_V3, "OPENCV_CPU_DISABLE")
+"""What is set in the environment, and what processes that are started from here find in it."""
+
 _FLAGS_OF_V3 = {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"}
 _FLAGS_OF_V4 = {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
 

@@ -3,13 +3,13 @@
 import itertools
 import shutil
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
+from running import command
 
 pytest.importorskip("cryptography")
 
@@ -107,7 +107,7 @@ def test_only_the_routers_certificate_proves_a_server(folder: Path) -> None:
 def test_a_router_that_anybody_reaches_says_so(host: str) -> None:
     endpoint = free_endpoint().replace("127.0.0.1", host)
     router = subprocess.Popen(
-        [sys.executable, "-m", "pliant_services.cli", "router", "--listen", endpoint],
+        command("router", "--listen", endpoint),
         stderr=subprocess.PIPE,
         text=True,
     )

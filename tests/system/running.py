@@ -17,10 +17,14 @@ import numpy as np
 import pytest
 import yaml
 
+from pliant import arithmetic
 from pliant_services import cli
 
 TINY = "built-in:tiny"
 TIMEOUT_S = 300
+AS_FROM_A_SHELL = ["env", *(f"-u{name}" for name in arithmetic.VARIABLES)]
+"""Before a command: without what `import pliant` has set in this process, which a user's shell has
+not.  A command that forgot to fix its arithmetic would not be seen otherwise."""
 UP = "services are up"
 NO_MESH = ("--set", "meshing.enabled=false")
 """For tests of what does not end in a mesh: a process and a third of a run's work less."""
@@ -34,7 +38,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "pliant_services.cli", *map(str, arguments)]
+    return [*AS_FROM_A_SHELL, sys.executable, "-m", "pliant_services.cli", *map(str, arguments)]
 
 
 def pliant(

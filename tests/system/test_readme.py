@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import pytest
+from running import AS_FROM_A_SHELL, TIMEOUT_S, pliant
 
 from pliant.datasets.builtin import builtin_folder
 
@@ -20,7 +21,6 @@ pytestmark = pytest.mark.system
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 OUTPUTS = (ROOT / "docs" / "outputs.md").read_text(encoding="utf-8")
-TIMEOUT_S = 300
 FRAMES_A_SECOND = 20.0
 
 
@@ -55,23 +55,13 @@ def clean_folder(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder
 
 
-def pliant(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "pliant_services.cli", *shlex.split(command)[1:]],
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-        cwd=folder,
-    )
-
-
 @pytest.fixture(scope="module")
 def after_all_commands(clean_folder: Path) -> Path:
     """The folder after every command of the README, in order."""
     for command in commands():
         if "camera:" in command:  # there may be none, or one that films for ever
             continue
-        done = pliant(command, clean_folder)
+        done = pliant(*shlex.split(command)[1:], cwd=clean_folder)
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
         # The README shows several ways to run one video; somebody who tries all adds --force.
         shutil.rmtree(clean_folder / "results" / "video.mp4", ignore_errors=True)
@@ -95,7 +85,7 @@ def test_a_run_leaves_the_files_of_the_table(after_all_commands: Path) -> None:
 @pytest.mark.skipif(os.path.exists("/dev/video0"), reason="there is a camera, which never ends")
 def test_a_camera_that_is_not_there_is_one_line(clean_folder: Path) -> None:
     (command,) = [command for command in commands() if "camera:" in command]
-    done = pliant(command, clean_folder)
+    done = pliant(*shlex.split(command)[1:], cwd=clean_folder)
     assert done.returncode == 1
     (line,) = done.stderr.strip().splitlines()
     assert "camera" in line
@@ -120,7 +110,11 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     script = tmp_path / "cells.py"
     script.write_text("\n".join(code))
     done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, timeout=TIMEOUT_S, cwd=tmp_path
+        [*AS_FROM_A_SHELL, sys.executable, script],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        cwd=tmp_path,
     )
     assert done.returncode == 0, done.stderr
     assert "40 poses" in done.stdout

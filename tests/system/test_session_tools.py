@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from running import AS_FROM_A_SHELL, command, pliant
 
+from pliant import arithmetic
 from pliant.bus.session import free_endpoint
 from pliant_services.processes import PROFILES
 
 pytestmark = pytest.mark.system
 
 REFERENCE = Path(__file__).parents[1] / "data" / "reference" / "reference.mcap"
-PLIANT = [sys.executable, "-m", "pliant_services.cli"]
 
 
 class Part(subprocess.Popen[str]):
@@ -30,11 +31,7 @@ class Part(subprocess.Popen[str]):
 
 
 def start(*arguments: str) -> Part:
-    return Part([*PLIANT, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
-def call(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*PLIANT, *arguments], capture_output=True, text=True, timeout=120)
+    return Part(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 @pytest.fixture
@@ -65,44 +62,53 @@ def test_status_and_stop_of_a_session_in_parts(endpoint: str, tmp_path) -> None:
         }
         rows: dict[str, str] = {}
         while not set(services) <= set(rows):  # they come up by and by
-            shown = call("status", "--connect", endpoint, "--session", "lab")
+            shown = pliant("status", "--connect", endpoint, "--session", "lab")
             rows = {line.split()[1]: line for line in shown.stdout.splitlines()[1:]}
             assert all(service.poll() is None for service in services.values())
         assert rows["tracking"].startswith("lab ")
-        stopped = call("stop", "--connect", endpoint, "--session", "lab")
+        stopped = pliant("stop", "--connect", endpoint, "--session", "lab")
         assert stopped.returncode == 0, stopped.stderr
         assert {name: service.wait(60) for name, service in services.items()} == dict.fromkeys(
             services, 0
         )
-    info = call("info", str(tmp_path / "recording.mcap"))
+    info = pliant("info", str(tmp_path / "recording.mcap"))
     assert info.returncode == 0, info.stderr
 
 
+def test_a_command_fixes_its_arithmetic_itself() -> None:
+    """No command that a test starts has the variables from the test's own process."""
+    shown = subprocess.run([*AS_FROM_A_SHELL, "env"], capture_output=True, text=True).stdout
+    inherited = {line.partition("=")[0] for line in shown.splitlines()}
+    assert inherited.isdisjoint(arithmetic.VARIABLES)
+    (said,) = (line for line in pliant("doctor").stdout.splitlines() if "arithmetic" in line)
+    assert said.split()[0] == "ok", said
+
+
 def test_an_empty_router_has_no_services_and_no_session(endpoint: str) -> None:
-    shown = call("status", "--connect", endpoint, "--seconds", "1.5")
+    shown = pliant("status", "--connect", endpoint, "--seconds", "1.5")
     assert (shown.returncode, "no services" in shown.stderr) == (1, True)
-    stopped = call("stop", "--connect", endpoint, "--session", "none")
+    stopped = pliant("stop", "--connect", endpoint, "--session", "none")
     assert (stopped.returncode, "no session none" in stopped.stderr) == (1, True)
 
 
 def test_a_run_is_found_by_its_result_folder(tmp_path: Path) -> None:
     """Its router is at a socket that only its user reaches."""
     (idle := tmp_path / "idle").mkdir()
-    for command in ("status", "stop"):
-        refused = call(command, str(idle))
+    for name in ("status", "stop"):
+        refused = pliant(name, str(idle))
         assert (refused.returncode, "no run goes on there" in refused.stderr) == (1, True)
     result = tmp_path / "room"
     with start("run", "built-in:room", "--output", str(result)) as run:
         rows: set[str] = set()
         while not {"ingest", "recorder"} <= rows:
-            shown = call("status", str(result), "--seconds", "1.5")
+            shown = pliant("status", str(result), "--seconds", "1.5")
             rows = {line.split()[1] for line in shown.stdout.splitlines()[1:]}
             assert run.poll() is None
         endpoint = json.loads((result / "session.json").read_text())["endpoint"]
         socket = Path(endpoint.removeprefix("unixsock-stream/"))
         assert stat.S_ISSOCK(socket.stat().st_mode)
         assert socket.parent.stat().st_mode & 0o777 == 0o700
-        stopped = call("stop", str(result))
+        stopped = pliant("stop", str(result))
         assert stopped.returncode == 0, stopped.stderr
         assert run.wait(120) in (0, 3)
         assert not socket.parent.exists()
@@ -142,7 +148,7 @@ def test_results_go_to_no_folder_with_another_recording(endpoint: str, tmp_path:
     (tmp_path / "recording.mcap").write_bytes(b"of another session")
     output, state = str(tmp_path / "recording.mcap"), str(tmp_path / "state")
     arguments = ["--connect", endpoint, "--output", output, "--results", "--state", state]
-    done = call("service", "recorder", *arguments)
+    done = pliant("service", "recorder", *arguments)
     assert (done.returncode, "choose another folder" in done.stderr) == (1, True)
 
 
@@ -151,7 +157,7 @@ def test_a_recording_is_replayed_to_a_viewer_elsewhere(endpoint: str, tmp_path: 
     to = ["--connect", endpoint, "--session", "replay"]
     with start("replay", str(REFERENCE), *to, "--rate", "max", "--loop") as player:
         try:
-            seen = call("view", *to, "--save", str(tmp_path / "seen.rrd"), "--patience", "60")
+            seen = pliant("view", *to, "--save", str(tmp_path / "seen.rrd"), "--patience", "60")
             assert seen.returncode == 0, seen.stderr
         finally:
             player.terminate()

@@ -11,7 +11,7 @@ from urllib.request import urlopen
 
 import pytest
 from benchmarks.viewer_cost import run_with
-from running import in_this_process
+from running import command, in_this_process, pliant
 
 from pliant.bus.session import free_endpoint
 from pliant.errors import ResultError
@@ -25,11 +25,6 @@ from pliant_services.runtime.launcher import Fleet
 pytestmark = pytest.mark.system
 
 
-def pliant(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pliant_services.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
-
-
 @pytest.mark.slow
 def test_a_run_is_seen_live_and_afterwards(tmp_path: Path) -> None:
     rr = pytest.importorskip("rerun")
@@ -40,11 +35,11 @@ def test_a_run_is_seen_live_and_afterwards(tmp_path: Path) -> None:
     assert not (result / "session.json").exists()
     done = pliant("view", result, "--save", after)
     assert done.returncode == 0, done.stderr
-    command = Path(sys.executable).with_name("rerun")
-    if not command.is_file():
+    rerun = Path(sys.executable).with_name("rerun")
+    if not rerun.is_file():
         pytest.skip(f"the command of rerun {rr.__version__} is not here")
     for path in (live, after):
-        printed = subprocess.run([command, "rrd", "print", path], capture_output=True, text=True)
+        printed = subprocess.run([rerun, "rrd", "print", path], capture_output=True, text=True)
         assert printed.returncode == 0, printed.stderr
         for entity in (
             "camera",
@@ -147,9 +142,10 @@ def test_a_browser_is_told_to_reach_this_machine_alone() -> None:
 @pytest.mark.slow
 def test_a_run_that_a_browser_looks_on_at_gives_its_results_and_stays(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    command = [sys.executable, "-m", "pliant_services.cli", "run", "built-in:tiny", "--view", "web"]
     with subprocess.Popen(
-        [*command, "--output", tmp_path / "tiny"], stderr=subprocess.PIPE, text=True
+        command("run", "built-in:tiny", "--view", "web", "--output", tmp_path / "tiny"),
+        stderr=subprocess.PIPE,
+        text=True,
     ) as run:
         assert run.stderr is not None
         said = list(itertools.takewhile(lambda line: "until Ctrl-C" not in line, run.stderr))

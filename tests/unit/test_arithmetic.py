@@ -43,8 +43,8 @@ _LESSER = {
 
 def _answer(code: str, environment: dict[str, str]) -> str:
     """What a process prints that inherits nothing of what this one has set."""
-    ours = {"OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "NUMBA_DISABLE_INTEL_SVML"}
-    kept = {name: value for name, value in os.environ.items() if name not in {*_LESSER, *ours}}
+    ours = arithmetic.VARIABLES
+    kept = {name: value for name, value in os.environ.items() if name not in ours}
     paths = os.pathsep.join(str(TESTS / folder) for folder in ("unit", "replay"))
     done = subprocess.run(
         [sys.executable, "-c", code],
