@@ -116,7 +116,8 @@ def test_the_demo_sets_itself_up_and_leaves_what_it_names(machine_with_venv: Mac
 
 
 @pytest.mark.skipif(
-    "PLIANT_SOAK" not in os.environ, reason="takes minutes, and CI does the same: scripts/soak"
+    "PLIANT_SOAK" not in os.environ,
+    reason="takes minutes: scripts/soak runs it, and CI does the same",
 )
 def test_the_tests_set_themselves_up(machine_with_venv: Machine) -> None:
     done = machine_with_venv.shell(

@@ -120,7 +120,7 @@ def test_rerun_reads_both_its_file_and_foxgloves(result: Path, tmp_path: Path) -
     pytest.importorskip("foxglove_schemas_protobuf")
     command = shutil.which("rerun", path=str(Path(sys.executable).parent))
     if command is None:
-        pytest.skip("the command `rerun` is not here")
+        pytest.skip("the command of rerun is not here")
     recording = export_result(result, "rerun", tmp_path / "run.rrd")
     foxglove = export_result(result, "foxglove", tmp_path / "run.mcap")
     converted = tmp_path / "converted.rrd"
