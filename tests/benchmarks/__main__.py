@@ -335,6 +335,25 @@ def accuracy(
     _print(measure(sources, output, seeds=seeds, overrides=overrides or []))
 
 
+@app.command("in-process")
+def in_process(
+    sources: Sources,
+    overrides: Overrides = None,
+    seed: Annotated[int, typer.Option(help="Of the first run.")] = 0,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Runs of each source, with seeds after it.")
+    ] = 1,
+    focal: Annotated[float, typer.Option(help="Times the given focal length: a wrong one.")] = 1.0,
+) -> None:
+    """The rigid pipeline in one process, without services: final and causal ATE.
+
+    scripts/bench in-process path/to/tsukuba150 built-in:room --set tracking.turn_patches=false
+    """
+    from benchmarks.in_process import measure
+
+    _print(measure(sources, overrides or [], range(seed, seed + seeds), focal))
+
+
 @app.command()
 def losses(
     source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",

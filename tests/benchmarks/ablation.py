@@ -3,16 +3,8 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-
+from benchmarks.in_process import run, shown_ate
 from benchmarks.table import markdown
-from pliant.config import load_config
-from pliant.datasets import open_source
-from pliant.evaluation.report import metres
-from pliant.evaluation.result import evaluate_trajectory
-from pliant.formats.trajectory_files import read_trajectory
-from pliant.map_history import MapHistory
-from pliant.offline import process
 
 _OFF = {
     "mutual check": ["tracking.mutual_check=false"],
@@ -51,18 +43,7 @@ def measure(sources: Sequence[str]) -> Iterator[str]:
 
 
 def _cell(source: str, overrides: Sequence[str]) -> str:
-    dataset = open_source(source)
-    history = MapHistory()
-    inliers: list[int] = []
-    for frame in process(dataset, load_config(None, overrides), history):
-        inliers.append(frame.delta.inliers)
-    poses = history.final()
-    assert dataset.ground_truth_path is not None
-    truth = read_trajectory(dataset.ground_truth_path)
-    longest = history.longest_segment()
-    chosen = {frame: pose for frame, pose in poses.items() if pose[0] == longest}
-    evaluation = evaluate_trajectory(history.trajectory(chosen), truth, frames=len(inliers))
-    rate = 100.0 * (evaluation.success_rate or 0.0)
-    shown = metres(evaluation.ate_m.rmse) if evaluation.ate_m else "fails"
+    found = run(source, overrides)
+    rate = 100.0 * (found.final.success_rate or 0.0)
     at = f" at {rate:.0f} %" if rate < 99.0 else ""
-    return f"{shown}{at} / {np.median(inliers):.0f}"
+    return f"{shown_ate(found.final)}{at} / {found.median_inliers:.0f}"

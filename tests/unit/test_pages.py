@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import typer
+from benchmarks.__main__ import app as bench
 
 from pliant.export.export import EXPORTS
 from pliant_services.cli import app
@@ -18,7 +19,10 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 import_module("pliant_services.cli.commands")  # registers them
-PLIANT: Any = typer.main.get_command(app)
+PROGRAMS: dict[str, Any] = {
+    "pliant": typer.main.get_command(app),
+    "scripts/bench": typer.main.get_command(bench),
+}
 
 
 def heading_links(page: Path) -> set[str]:
@@ -38,20 +42,21 @@ def test_links_hold_on_a_git_host(page: Path) -> None:
         assert not anchor or anchor in heading_links(file), (page.name, target, anchor)
 
 
-def commands() -> Iterator[tuple[str, str]]:
-    """Each (page, ``pliant`` command) of the pages, without its comment."""
+def commands() -> Iterator[tuple[str, list[str]]]:
+    """Each page and command of ours on it, in words, without its comment."""
     for page in PAGES:
         for block in re.findall(r"^```sh\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL):
             for line in block.replace("\\\n", " ").splitlines():
-                if line.startswith("pliant "):
-                    yield page.name, line.partition(" #")[0].strip()
+                words = line.split("#")[0].split()
+                if len(words) > 1 and words[0] in PROGRAMS:
+                    yield page.name, shlex.split(line, comments=True)
 
 
-@pytest.mark.parametrize(("page", "line"), [*commands()])
-def test_commands_of_the_pages_are_commands(page: str, line: str) -> None:
+@pytest.mark.parametrize(("page", "words"), [*commands()], ids=str)
+def test_commands_of_the_pages_are_commands(page: str, words: list[str]) -> None:
     """Their names and options: that they work others show."""
-    command, (_, name, *arguments) = PLIANT, shlex.split(line)
-    command = PLIANT.commands[name]
+    program, name, *arguments = words
+    command = PROGRAMS[program].commands[name]
     if hasattr(command, "commands"):
         command = command.commands[arguments.pop(0)]
     command.make_context(name, arguments)
