@@ -20,6 +20,8 @@ class Process:
     niceness: how much it gives way where processors are few; others do not wait for what it makes.
     finishing: what it does when the last frame is done, for people; "" where that is nothing.
     may_lag: it may be further behind than others with frames that bundle adjustment passes over.
+    kernels: its module has ``warm_up()``, which calls each kernel once, on a small input of the
+    types that it meets: the first call compiles it, or loads it, so the first frame is no slower.
     """
 
     name: str
@@ -31,6 +33,7 @@ class Process:
     niceness: int = 0
     finishing: str = ""
     may_lag: bool = False
+    kernels: bool = False
 
 
 PROCESSES: tuple[Process, ...] = (
@@ -51,6 +54,7 @@ PROCESSES: tuple[Process, ...] = (
         "pliant_services.nodes.tracking",
         inputs=(topics.STREAM, topics.IMAGE),
         outputs=(topics.EXTREMA,),
+        kernels=True,
     ),
     Process(
         "bundle_adjustment",
@@ -66,6 +70,7 @@ PROCESSES: tuple[Process, ...] = (
             topics.MAP_KEPT,
         ),
         may_lag=True,
+        kernels=True,
     ),
     Process(
         "meshing",
@@ -80,6 +85,7 @@ PROCESSES: tuple[Process, ...] = (
         ),
         outputs=(topics.MESH_BLOCKS, topics.MESH_FINAL),
         niceness=5,
+        kernels=True,
     ),
     Process(
         "surfels",
@@ -88,12 +94,14 @@ PROCESSES: tuple[Process, ...] = (
         optional=(topics.EXTREMA, topics.MAP_UPDATE, topics.KEYFRAME),
         outputs=(topics.SURFELS,),
         may_lag=True,  # with a map: it reads an update for every frame
+        kernels=True,
     ),
     # Senders keep what it has not taken, some seconds' worth, and wait for it beyond.
     Process("recorder", "pliant_services.nodes.recorder", observer=True, niceness=5),
 )
 
 BY_NAME = {process.name: process for process in PROCESSES}
+COMPILED = tuple(process.name for process in PROCESSES if process.kernels)
 
 PROFILES: dict[str, tuple[str, ...]] = {
     "rigid": ("ingest", "tracking", "bundle_adjustment", "meshing", "recorder"),

@@ -23,7 +23,7 @@ from pliant.results.folder import RECORDING_NAME
 from pliant.results.mesh import meshes_of
 from pliant.results.run import read_run
 from pliant_services.mesh.command import Meshing, mesh_recording
-from pliant_services.runtime.warm_ups import WARM_UPS
+from pliant_services.nodes.meshing import warm_up
 
 _SMOOTHING = {
     "NLTGV": "nltgv",
@@ -59,7 +59,7 @@ def measure(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterato
 def measure_live(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterator[str]:
     """A table of both ways in which the live mesh can follow the map, and of the final one."""
     compared = _Compared(result, groundtruth)
-    WARM_UPS["meshing"]()
+    warm_up()
     rows: list[list[str]] = []
     for name, kind in _CORRECTIONS.items():
         found = compared.make([*overrides, f"meshing.corrections={kind}"])

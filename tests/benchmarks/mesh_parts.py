@@ -21,7 +21,7 @@ from pliant.algorithms.meshing.parameters import (
 )
 from pliant.algorithms.meshing.rendering import DepthMap, render_depth
 from pliant.algorithms.meshing.tsdf_volume import TsdfVolume
-from pliant_services.runtime.warm_ups import WARM_UPS
+from pliant_services.nodes.meshing import warm_up
 
 _CAMERA = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 _MANY_SEEN = 9
@@ -33,7 +33,7 @@ _Result = TypeVar("_Result")
 
 def measure(vertices: int = 10_000, repeats: int = 10, seeds: int = 8) -> Iterator[str]:
     """Least CPU time of all threads over the repeats, then errors over the seeds."""
-    WARM_UPS["meshing"]()
+    warm_up()
     scene = make_scene(vertices, 0)
     delaunay, _ = _least_ms(lambda: triangulate(scene.points_px), repeats)
     nltgv, smoothed = _least_ms(lambda: _smooth(scene), repeats)

@@ -19,7 +19,7 @@ from pliant.datasets.builtin import is_deforming
 from pliant.errors import DatasetError
 from pliant.evaluation.exact_surfels import ExactSurfels
 from pliant.evaluation.surfel_truth import SurfelTruth, mean_rows
-from pliant_services.runtime.warm_ups import WARM_UPS
+from pliant_services.nodes.surfels import warm_up
 
 _STATIC = ("sliding", "objects", "stretching", "stretching?poisson=1", "stretching?held=1")
 _BREATHING = tuple(f"breathing?amplitude={share}" for share in ("0", "0.01", "0.03", "0.08"))
@@ -83,7 +83,7 @@ def measure(
     unknown = [name for name in tables if name not in TABLES]
     if unknown:
         raise DatasetError(f"no table {unknown[0]!r}; there are {', '.join(TABLES)}")
-    WARM_UPS["surfels"]()
+    warm_up()
     if tracks is None and not sources:
         yield "(built-in:kinect-paper is left out: say --tracks PATH)"
     loaded: dict[str, Sequence] = {}

@@ -16,7 +16,7 @@ from pliant.bus.session import CONNECT_TIMEOUT_S, free_endpoint, open_router
 from pliant.messages import topics
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
-from pliant_services.runtime.warm_ups import WARM_UPS
+from pliant_services.processes import COMPILED
 
 pytestmark = pytest.mark.system
 
@@ -150,8 +150,8 @@ def test_compilers_end_with_a_launcher_that_was_killed(tmp_path: Path) -> None:
     with running(TINY, "--output", tmp_path / "run", env={"NUMBA_CACHE_DIR": str(tmp_path)}) as run:
         run.wait_for("compiling")
         compilers: list[int] = []
-        while len(compilers) < len(WARM_UPS):
+        while len(compilers) < len(COMPILED):
             assert run.process.poll() is None
-            compilers = children(run.process.pid, "WARM_UPS")
+            compilers = children(run.process.pid, "warm_up")
         run.send(signal.SIGKILL)
         assert all(has_ended(pid, 30.0) for pid in compilers)

@@ -133,7 +133,6 @@ CALLS_NO_KERNEL = (
     "pliant_services.nodes.recorder",
     "pliant_services.runtime.host",
     "pliant_services.runtime.status",
-    "pliant_services.runtime.warm_ups",
     "pliant_services.run.command",
 )
 

@@ -45,7 +45,9 @@ def test_every_topic_of_the_table_is_published_by_one_process() -> None:
 
 @pytest.mark.parametrize("process", PROCESSES, ids=lambda p: p.name)
 def test_every_process_has_a_module_with_run(process: processes.Process) -> None:
-    assert callable(importlib.import_module(process.module).run)
+    module = importlib.import_module(process.module)
+    assert callable(module.run)
+    assert callable(getattr(module, "warm_up", None)) == process.kernels
 
 
 def test_what_is_kept_for_checkpoints_is_what_the_docs_say() -> None:

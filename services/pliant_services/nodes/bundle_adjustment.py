@@ -20,14 +20,26 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeAlias
 
 import cv2
+import numpy as np
 
+from pliant.algorithms.absolute_pose import pose_by_ransac
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.image.masks import filled
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.localiser import Localiser
+from pliant.algorithms.mapping.loops import Loop
+from pliant.algorithms.mapping.map_store import Keyframe as KeyframeOfMap
+from pliant.algorithms.mapping.map_store import PointRows
 from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
 from pliant.algorithms.mapping.whole_map import Answer, Question, WholeMap, find_moves
+from pliant.algorithms.places.features import describe, match
+from pliant.algorithms.places.index import PlaceIndex
 from pliant.algorithms.tracking.maxima import maxima_of
+from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.bus.base import Bus, join, receive, receive_one, resume
 from pliant.config import Config
@@ -166,3 +178,49 @@ def _jpeg(image: Image) -> bytes:
 
 def _update(header: Header, delta: MapDelta) -> MapUpdate:
     return MapUpdate.of(header, delta, frame_id=WORLD_FRAME_ID)
+
+
+def warm_up() -> None:
+    """Start a map, extend it, lose some tracks and then all, find them again, close a loop."""
+    frames, n = 11, 400
+    camera = PinholeCamera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
+    generator = np.random.default_rng(0)
+    points = generator.uniform((-2.0, -1.5, 3.0), (2.0, 1.5, 8.0), (n, 3))
+    kappas = generator.uniform(1.0, 100.0, n).astype(np.float32)
+    grey = generator.integers(0, 256, (240, 320), np.uint8)
+    colour = np.repeat(grey[:, :, None], 3, axis=2)
+    parameters = MappingParameters()
+    known = SelfCalibration.of(camera, parameters.calibration).with_readout(0.11, 0.01)
+    mapper = Mapper(camera, parameters, seed=0, calibration=known)
+    for frame in range(frames):
+        step = min(frame, frames - 2)
+        turned = points @ so3_exp(np.array([0.0, 0.01 * step, 0.0])).T
+        px = camera.project(turned - (0.1 * step, 0.02 * step, 0.0)).astype(np.float32)
+        tracked = (np.arange(n) % frames != frame) & (frame < frames - 1)
+        tracks = FrameExtrema(
+            ids=np.flatnonzero(tracked),
+            points_px=px[tracked],
+            ages=np.full(int(tracked.sum()), frame, np.int32),
+            kappas=kappas[tracked],
+            states=np.zeros(int(tracked.sum()), np.uint8),
+            maxima=np.column_stack([px, kappas]),
+            dominant_flow=np.eye(2, 3),
+        )
+        mapper.process(frame, 33_333_333 * frame, tracks, grey, colour)
+    none = np.zeros((0, 2), np.int64)
+    loop = Loop(old=0, new=5, S_old_new=np.eye(4), rows=none.astype(np.int32), ids=none)
+    mapper.whole_map.loops.append(loop)
+    mapper.finish()
+    # What few frames need: a pose that no prediction led to, points that have merged.
+    px = camera.project(points).astype(np.float32)
+    pose_by_ransac(points, camera.normalise(px), generator, gate=0.1, samples=1)
+    keyframe = KeyframeOfMap(
+        id=0, frame=0, segment=0, T_world_camera=np.eye(4), rows=np.zeros(1, np.int32),
+        points_px=px[:1], rolled_px=px[:1],
+    )  # fmt: skip
+    keyframe.follow_aliases(PointRows())
+    maxima_of(grey, TrackingParameters())
+    seen, places = describe(grey), PlaceIndex()
+    places.add(0, seen)
+    places.query(seen)
+    match(seen, seen)

@@ -10,6 +10,12 @@ out  mesh/blocks          the blocks of the live mesh that changed
 
 from collections.abc import Iterable
 
+import numpy as np
+
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
+from pliant.algorithms.meshing.parameters import SurfaceParameters, TsdfParameters
+from pliant.algorithms.meshing.tsdf_volume import TsdfVolume
 from pliant.bus.base import Bus, join, receive, receive_one
 from pliant.config import Config
 from pliant.fusion.keyframe_spool import KeyframeSpool
@@ -62,3 +68,29 @@ def _publish(bus: Bus, header: Header, changes: Iterable[LiveChange]) -> None:
             first_key=change.span[0], last_key=change.span[1],
         )  # fmt: skip
         bus.publish(topics.MESH_BLOCKS, message)
+
+
+def warm_up() -> None:
+    """Mesh a keyframe twice, the second time from the first; fuse it and take it out again."""
+    n = 100
+    camera = PinholeCamera(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
+    generator = np.random.default_rng(0)
+    points_px = generator.uniform((0.0, 0.0), (64.0, 48.0), (n, 2)).astype(np.float32)
+    rays = np.concatenate([camera.normalise(points_px), np.ones((n, 1))], axis=1)
+    points = SeenPoints(
+        ids=np.arange(n, dtype=np.int64),
+        points_px=points_px,
+        points_world=rays * generator.uniform(2.0, 2.1, (n, 1)),
+        sigmas=np.full(n, 0.01, np.float32),
+        keyframes=np.full(n, 9, np.int32),
+    )
+    surfaces, pose = KeyframeSurfaces(camera, SurfaceParameters()), np.eye(4)
+    surfaces.surface(pose, points)
+    found = surfaces.surface(pose, points).depth_map
+    assert found is not None
+    volume = TsdfVolume(0.1, TsdfParameters())
+    colour = np.zeros((camera.height, camera.width, 3), np.uint8)
+    done = volume.integrate(found.depths, found.weights, colour, camera, pose)
+    volume.extract_all()
+    keys = volume.remove(done.serial, found.depths, found.weights, colour, camera, pose)
+    volume.extract(volume.affected(keys))

@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.masks import glaring
 from pliant.algorithms.surfels.depth_maps import agree
+from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.prediction import predict
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
@@ -202,3 +204,15 @@ def _add(
     T_world_camera = view.T_world_camera.copy()
     T_world_camera[:3, 3] *= state.ratio
     return state.tracker.add(image, state.ratio * view.depth, T_world_camera), ""
+
+
+def warm_up() -> None:
+    """Follow a few through two small images, with a camera that stands and one that moves."""
+    camera = PinholeCamera(width=96, height=72, fx=90.0, fy=90.0, cx=47.5, cy=35.5)
+    image = np.random.default_rng(0).integers(0, 200, (72, 96), np.uint8)
+    depth, nothing = np.ones((72, 96)), FrameTracks.empty()
+    still = SurfelParameters(camera="static", max_surfels=20)
+    for parameters in (still, still.model_copy(update={"camera": "moving"})):
+        tracker = SurfelTracker(parameters)
+        first = tracker.start(image, depth, camera)
+        tracker.track(image, predict(first.points_px, nothing, nothing), depth)

@@ -5,6 +5,9 @@ in   camera/stream    once
 out  tracks/extrema   one per frame, empty where the frame has no pixels
 """
 
+import numpy as np
+
+from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.bus.base import Bus, receive_one, resume
@@ -33,3 +36,11 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         bus.publish(topics.EXTREMA, extrema, may_lag=readers_that_may_lag(image))
         monitor.report(image, tracks=len(tracks.ids), maxima=len(tracks.maxima))
         bus.checkpoint(image.frame, tracker)
+
+
+def warm_up() -> None:
+    """Two frames of noise."""
+    grey = np.random.default_rng(0).integers(0, 256, (120, 160), np.uint8)
+    tracker = ExtremaTracker(160, 120, TrackingParameters())
+    for _ in range(2):
+        tracker.track(grey)

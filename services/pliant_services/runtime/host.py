@@ -23,7 +23,6 @@ from pliant.errors import SourceLostError
 from pliant.messages import topics
 from pliant_services import processes
 from pliant_services.runtime.monitor import StatusMonitor
-from pliant_services.runtime.warm_ups import WARM_UPS
 
 ENDED_EARLY = 3  # exit code of a source that failed after its first frame
 _GRACE_S = 3.0
@@ -71,8 +70,8 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
     open_session(
         options.endpoints, options.identity
     ).close()  # said now, not after a minute of compiling
-    if name in WARM_UPS:
-        WARM_UPS[name]()
+    if process.kernels:
+        module.warm_up()
     os.nice(process.niceness)
     lost: SourceLostError | None = None
     images = config.recorder.images

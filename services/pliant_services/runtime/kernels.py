@@ -13,7 +13,7 @@ import pliant
 from pliant import arithmetic
 from pliant.cache import cache_folder
 from pliant.errors import PliantError
-from pliant_services.runtime import warm_ups
+from pliant_services.processes import BY_NAME, COMPILED
 
 
 def compile_kernels(say: Callable[[str], None]) -> None:
@@ -23,7 +23,7 @@ def compile_kernels(say: Callable[[str], None]) -> None:
         return
     say("compiling kernels (once, about a minute) ...")
     # In processes of their own: the launcher stays small, a crash of the compiler is one line.
-    compilers = {service: start_compiler(service) for service in warm_ups.WARM_UPS}
+    compilers = {service: start_compiler(service) for service in COMPILED}
     try:
         for number, (service, compiler) in enumerate(compilers.items(), start=1):
             assert compiler.stderr is not None
@@ -44,7 +44,7 @@ def start_compiler(service: str) -> subprocess.Popen[str]:
     """Compile the kernels of a service in a process that ends with this one, whatever kills it."""
     code = (
         "from pliant_services.runtime.host import end_with_launcher; end_with_launcher(); "
-        f"from pliant_services.runtime.warm_ups import WARM_UPS; WARM_UPS[{service!r}]()"
+        f"from {BY_NAME[service].module} import warm_up; warm_up()"
     )
     return subprocess.Popen(
         [sys.executable, "-c", code],
@@ -67,8 +67,8 @@ def end_compiler(compiler: subprocess.Popen[str]) -> None:
 
 def _fingerprint() -> str:
     digest = hashlib.sha256()
-    root = Path(pliant.__file__).parent
-    for path in (*sorted(root.rglob("*.py")), Path(warm_ups.__file__)):
+    root, nodes = Path(pliant.__file__).parent, Path(__file__).parents[1] / "nodes"
+    for path in (*sorted(root.rglob("*.py")), *sorted(nodes.glob("*.py"))):
         digest.update(f"{path} {path.stat().st_mtime_ns}".encode())
     where = f"{root} {os.environ.get('NUMBA_CACHE_DIR', '')}"
     digest.update(f"{where} {sys.version} {version('numba')} {arithmetic.target()}".encode())

@@ -16,17 +16,7 @@ from pliant.errors import MessageError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 
-VIEWED = (
-    topics.SOURCE, topics.EXTREMA, topics.MAP_UPDATE, topics.MAP_FINAL,
-    topics.MESH_BLOCKS, topics.MESH_FINAL, topics.SURFELS,
-)  # fmt: skip
-"""What viewers draw."""
-_MESH_RING = 64  # changed blocks of 32 keyframes, or a final mesh of 8 million triangles
-_RING = {
-    topics.SOURCE.key: 2, topics.EXTREMA.key: 2, topics.SURFELS.key: 2,
-    topics.MESH_BLOCKS.key: _MESH_RING, topics.MESH_FINAL.key: _MESH_RING,
-}  # fmt: skip
-_MAP_RING = 256  # updates are deltas: lost ones are waited for until the next snapshot
+_STATUS_RING = 256
 _PAUSE_S = 0.005
 _LAST_WORDS_S = 2.0
 
@@ -101,9 +91,9 @@ class Relay:
 
     def _serve(self) -> None:
         """Hand on until the last viewer is gone; of a session that is over, what is there."""
-        outputs = {topic: self._publisher(topic) for topic in (*VIEWED, topics.STREAM)}
-        inputs = {topic: self._ring(topic.key, _RING.get(topic.key, _MAP_RING)) for topic in VIEWED}
-        told = self._ring(topics.status("*").key, _MAP_RING)
+        outputs = {topic: self._publisher(topic) for topic in (*topics.VIEWED, topics.STREAM)}
+        inputs = {topic: self._ring(topic.key, topic.viewed) for topic in topics.VIEWED}
+        told = self._ring(topics.status("*").key, _STATUS_RING)
         greeted: set[str] = set()
         idle, last_word = False, time.monotonic() + _LAST_WORDS_S
         while self._viewers:

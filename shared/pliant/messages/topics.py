@@ -41,13 +41,17 @@ class Topic:
     """A larger message is refused before memory is taken for it."""
     kept_whole: bool = False
     """Its readers take in all of it before they come to a checkpoint, so that senders keep all."""
+    viewed: int = 0
+    """Viewers draw it: so many of its newest messages are held for one that is slow."""
     compression: str = "zstd"
     """How its chunks of a recording are stored: "" as they are, or "zstd"."""
 
 
 STREAM = Topic("camera/stream", CameraStream, per_frame=False, max_bytes=_MIB)
 # Not compressed: most images come compressed, and of raw ones zstd saves a tenth.
-SOURCE = Topic("camera/source", SourceImage, per_frame=True, max_bytes=128 * _MIB, compression="")
+SOURCE = Topic(
+    "camera/source", SourceImage, per_frame=True, max_bytes=128 * _MIB, viewed=2, compression=""
+)
 # The file of a video, before the first frame: a recording has it instead of raw frames.
 CLIP = Topic("camera/clip", ClipPiece, per_frame=False, compression="")
 # Not logged: made again from camera/source and the calibration.
@@ -58,19 +62,21 @@ IMAGE = Topic(
 DEPTH = Topic("camera/depth", Depth, per_frame=True, max_bytes=128 * _MIB, compression="")
 # The map of earlier sessions, before the first frame: nothing where a run begins without one.
 MAP_KNOWN = Topic("map/known", MapKeyframe, per_frame=False, max_bytes=64 * _MIB, kept_whole=True)
-EXTREMA = Topic("tracks/extrema", Extrema, per_frame=True)
-MAP_UPDATE = Topic("map/update", MapUpdate, per_frame=True, max_bytes=64 * _MIB)
+EXTREMA = Topic("tracks/extrema", Extrema, per_frame=True, viewed=2)
+# Updates are deltas: what a viewer has lost it waits for until the next snapshot.
+MAP_UPDATE = Topic("map/update", MapUpdate, per_frame=True, max_bytes=64 * _MIB, viewed=256)
 # One message, after the last frame: what is only known once nothing more can come.
-MAP_FINAL = Topic("map/final", MapUpdate, per_frame=False, max_bytes=512 * _MIB)
+MAP_FINAL = Topic("map/final", MapUpdate, per_frame=False, max_bytes=512 * _MIB, viewed=256)
 KEYFRAME = Topic("map/keyframe", Keyframe, per_frame=True, max_bytes=64 * _MIB)
 # One message, after the last frame: the keyframes that were still in the window.
 KEYFRAME_FINAL = Topic("map/keyframe_final", Keyframe, per_frame=False, max_bytes=64 * _MIB)
 # After the last frame: the map with all that was known, for sessions to come.
 MAP_KEPT = Topic("map/kept", MapKeyframe, per_frame=False, max_bytes=64 * _MIB)
 # In live mode, what of the live mesh is told depends on what there was time for.
-MESH_BLOCKS = Topic("mesh/blocks", MeshUpdate, per_frame=False, max_bytes=256 * _MIB)
-MESH_FINAL = Topic("mesh/final", MeshPiece, per_frame=False)
-SURFELS = Topic("surfels/state", Surfels, per_frame=True, max_bytes=64 * _MIB)
+# For viewers the changed blocks of 32 keyframes, or a final mesh of 8 million triangles.
+MESH_BLOCKS = Topic("mesh/blocks", MeshUpdate, per_frame=False, max_bytes=256 * _MIB, viewed=64)
+MESH_FINAL = Topic("mesh/final", MeshPiece, per_frame=False, viewed=64)
+SURFELS = Topic("surfels/state", Surfels, per_frame=True, max_bytes=64 * _MIB, viewed=2)
 STREAM_END = Topic("stream/end", StreamEnd, per_frame=False, max_bytes=_MIB)
 
 
@@ -85,6 +91,7 @@ TOPICS = (
 )  # fmt: skip
 WITH_PIXELS = (IMAGE, SOURCE)
 """Those that are made smaller for a link between machines."""
+VIEWED = tuple(topic for topic in TOPICS if topic.viewed)
 _BY_KEY = {topic.key: topic for topic in TOPICS}
 
 
