@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pliant.algorithms.map_delta import TRACKING
+from pliant.algorithms.map_delta import LOST, TRACKING, MapDelta
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameTracks
+from pliant.map_history import Keyframe
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import (
@@ -229,3 +230,52 @@ def test_frames_that_waited_for_the_map_count_no_inliers(tmp_path: Path) -> None
     report = rigid_report(run, run.history.final())
     assert report["frames_with_pose"] == 8
     assert report["median_inliers_per_frame"] == 650.0
+
+
+def in_segment(delta: MapDelta, frame: int, segment: int) -> MapDelta:
+    """The frame is a keyframe in a segment."""
+    one, pose = np.array([frame]), np.eye(7)[6:]
+    return replace(
+        delta, state=TRACKING, segment=segment, inliers=100, pose_frames=one,
+        pose_segments=np.full(1, segment, np.int32), pose_keyframes=one + 1,
+        poses_keyframe_camera=pose, pose_inliers=np.full(1, 100, np.int32),
+        keyframe_ids=one + 1, keyframe_frames=one,
+        keyframe_segments=np.full(1, segment, np.int32), keyframe_poses=pose,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("segments", "joined_at", "told"),
+    [
+        ([0] * 4, -1, "4 frames (100.0%) in {}, recognised after 0 frames"),
+        # Of a segment that was joined, frames from before belong to the known map in the end.
+        ([-1, 1, 1, 1, 0], 4, "4 frames (80.0%) in {}, recognised after 4 frames"),
+        ([-1, 1, 1, 1], 4, "3 frames (75.0%) in {}, recognised after 4 frames"),
+        (
+            [1, 1],
+            -1,
+            "{} was recognised in none of 2 frames: the run went on in 1 segment of its own",
+        ),
+        ([-1, -1], -1, "{} was recognised in none of 2 frames"),
+    ],
+)
+def test_it_is_said_how_long_a_known_map_was_looked_for(
+    segments: list[int], joined_at: int, told: str
+) -> None:
+    """joined_at: the update with which segment 1 becomes part of the known 0; beyond the frames:
+    the one after the last."""
+    run, mapper = Run(known_segments={0}), Mapper(stream(0).camera, MappingParameters(), 0)
+    run.history.keyframes[0] = Keyframe(-1, 0, np.eye(7)[6])
+    for frame, segment in enumerate([*segments, -1]):
+        final = frame == len(segments)
+        delta = mapper.skip(frame)
+        delta = in_segment(delta, frame, segment) if segment >= 0 else replace(delta, state=LOST)
+        if frame == joined_at:
+            delta = replace(delta, joined=np.array([[1, 0]], np.int32))
+        run.history.apply(delta, frame=frame, stamp_ns=frame, final=final)
+        if not final:
+            run.inliers[frame], run.tracks[frame] = delta.inliers, 900
+    lines = summary(rigid_report(run, run.history.final()))
+    assert [line for line in lines if "known map" in line] == [
+        told.format("the known map of 1 keyframe")
+    ]

@@ -134,16 +134,17 @@ def _well_observed(run: Run, final: dict[int, Any]) -> int:
 def _known_map(run: Run, final: dict[int, Any]) -> dict[str, Any] | None:
     """How the run found its way in the map of earlier sessions; None where it had none.
 
-    looked: frames before the first that was recognised in it.
+    looked: frames before the first that was in it as it came, by itself or as its segment joined.
     """
-    known = {k.segment for k in run.history.keyframes.values() if k.frame < 0}
-    if not known:
+    if not run.known_segments:
         return None
-    inside = sorted(frame for frame, (segment, _) in final.items() if segment in known)
     came = sorted(run.history.states)
-    looked = came.index(inside[0]) if inside else len(came)
-    count = sum(k.frame < 0 for k in run.history.keyframes.values())
-    return {"keyframes": count, "frames_in_it": len(inside), "looked": looked}
+    as_it_came = [f for f, (of, _) in run.history.causal.items() if of in run.known_segments]
+    return {
+        "keyframes": sum(k.frame < 0 for k in run.history.keyframes.values()),
+        "frames_in_it": sum(segment in run.known_segments for segment, _ in final.values()),
+        "looked": came.index(min(as_it_came)) if as_it_came else len(came),
+    }
 
 
 def _correction(run: Run) -> dict[str, float] | None:

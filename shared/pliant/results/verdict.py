@@ -34,7 +34,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         f"{counted(report['keyframes'], 'keyframe')}, {counted(report['points'], 'point')}",
         f"median per frame: {report['median_tracks_per_frame']:.0f} tracks, {_mapped(report)}",
     ]
-    lines += _told_of_map(report.get("known_map"), report["frames"])
+    lines += _told_of_map(report)
     lines += [
         f"{mesh['level']} mesh: {mesh['triangles']} triangles "
         f"from {counted(mesh['keyframes'], 'keyframe')}"
@@ -61,19 +61,19 @@ def _mapped(report: dict[str, Any]) -> str:
     return f"{report['median_inliers_per_frame']:.0f} mapped inliers"
 
 
-def _told_of_map(known: dict[str, Any] | None, frames: int) -> list[str]:
+def _told_of_map(report: dict[str, Any]) -> list[str]:
     """How the run found its way in the map of earlier sessions."""
+    known = report.get("known_map")
     if known is None:
         return []
+    there = f"the known map of {counted(known['keyframes'], 'keyframe')}"
     if known["frames_in_it"] == 0:
-        return [
-            f"the known map of {counted(known['keyframes'], 'keyframe')} was recognised in none of "
-            f"{counted(frames, 'frame')}"
-        ]
-    share = known["frames_in_it"] / max(frames, 1)
+        own = len(report["segments"])
+        instead = f": the run went on in {counted(own, 'segment')} of its own" if own else ""
+        return [f"{there} was recognised in none of {counted(report['frames'], 'frame')}{instead}"]
+    share = known["frames_in_it"] / max(report["frames"], 1)
     return [
-        f"{counted(known['frames_in_it'], 'frame')} ({share:.1%}) in the known map of "
-        f"{counted(known['keyframes'], 'keyframe')}, recognised after "
+        f"{counted(known['frames_in_it'], 'frame')} ({share:.1%}) in {there}, recognised after "
         f"{counted(known['looked'], 'frame')}"
     ]
 
