@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.drone_scenes import drone_scene
+from benchmarks.painting import paint_faces
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64
 from pliant.config import load_config
@@ -24,7 +25,7 @@ from pliant.map_history import MapHistory
 from pliant.offline import process
 from pliant.rendering.atlas import FaceTexture
 from pliant.rendering.paths import SampledPath
-from pliant.rendering.render import CameraOptions, Renderer, SceneGeometry, paint_faces
+from pliant.rendering.render import CameraOptions, Renderer, SceneGeometry
 
 _THREADS = 2
 _AT_A_TIME = 16

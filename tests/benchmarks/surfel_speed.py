@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from benchmarks.painting import paint_faces
 from benchmarks.stopwatch import Stopwatch
 from benchmarks.table import markdown
 from pliant.algorithms.arrays import F32, F64, U8
@@ -22,7 +23,7 @@ from pliant.datasets.rectifier import Rectifier
 from pliant.errors import DatasetError
 from pliant.rendering.film import CameraOptions
 from pliant.rendering.paths import SampledPath
-from pliant.rendering.render import Renderer, SceneGeometry, paint_faces
+from pliant.rendering.render import Renderer, SceneGeometry
 from pliant.rendering.scene import Material, Scene, Solid
 
 KINDS: dict[str, dict[str, Any]] = {

@@ -1,6 +1,7 @@
 """Rendered boards and smooth images for the tests of surfels."""
 
 import numpy as np
+from benchmarks.painting import paint_faces
 
 from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
@@ -10,7 +11,7 @@ from pliant.algorithms.surfels.depth_maps import tangent_jacobian
 from pliant.algorithms.surfels.patch_sampling import A, B, Level, X, make_level
 from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.paths import SampledPath
-from pliant.rendering.render import Renderer, SceneGeometry, paint_faces
+from pliant.rendering.render import Renderer, SceneGeometry
 from pliant.rendering.scene import Material, Scene, Solid
 
 WIDTH, HEIGHT = 320, 240

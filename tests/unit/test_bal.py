@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.bal import load_bal, load_libmv
 
 from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.schur import solve_schur
-from pliant.datasets.bal import load_bal, load_libmv
 from pliant.errors import DatasetError
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "bundle_adjustment"

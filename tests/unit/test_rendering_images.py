@@ -3,16 +3,17 @@
 import cv2
 import numpy as np
 import pytest
+from benchmarks.painting import paint_faces
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import matrix_to_pose, so3_exp
 from pliant.evaluation.visible_depth import DepthView
-from pliant.rendering.atlas import FaceTexture
+from pliant.rendering.atlas import FaceTexture, make_face_colours
 from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.lens import lens, pixel_rays
 from pliant.rendering.paths import CameraPath, SampledPath
 from pliant.rendering.photometry import exposure_gain, sensor_image
-from pliant.rendering.render import Renderer, SceneGeometry, paint_colours, paint_faces
+from pliant.rendering.render import Renderer, SceneGeometry
 from pliant.rendering.scenes import SCENES
 from pliant.rendering.textures import make_texture, shrink
 
@@ -149,7 +150,9 @@ def test_the_sensor_saturates_and_rounds():
 
 def test_the_grey_image_of_a_colour_image_is_the_grey_one(painted):
     camera = CameraOptions(width=320, height=240)  # with noise, blur and exposure
-    colours = paint_colours(painted[0])
+    geometry = painted[0]
+    what = geometry.scene, geometry.solids
+    colours = [make_face_colours(*what, face) for face in range(geometry.n_faces)]
     grey, rgb = (
         Renderer(*painted, TINY.path, camera, given).frame(6, 0.2).image
         for given in (None, colours)

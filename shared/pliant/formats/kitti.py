@@ -9,7 +9,6 @@ from pliant.algorithms.geometry import quat_from_rotation, rotation_from_quat
 from pliant.errors import ResultError
 from pliant.formats.text import (
     build_trajectory,
-    format_seconds,
     numbered_lines,
     parse_numbers,
     parse_seconds,
@@ -66,8 +65,3 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
     """Ten significant digits: equal numbers give equal bytes.  The times are not in it."""
     rows = trajectory.T_world_camera[:, :3].reshape(-1, 12) + 0.0
     write_lines(path, (" ".join(f"{value:.9e}" for value in row) for row in rows.tolist()))
-
-
-def write_kitti_times(path: Path, trajectory: Trajectory) -> None:
-    """``times.txt``: one time in seconds a line, exact."""
-    write_lines(path, (format_seconds(stamp) for stamp in trajectory.stamps_ns.tolist()))

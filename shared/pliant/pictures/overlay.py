@@ -10,7 +10,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, I64, U8
 from pliant.algorithms.tracks import COASTING, FrameTracks
 from pliant.pictures.caption import with_caption
-from pliant.pictures.movie import write_image, write_movie
+from pliant.pictures.movie import write_movie
 
 TAIL = 10
 """Positions before the present one that a tail shows."""
@@ -177,11 +177,6 @@ def _fixed_point(points_px: F32, scale: int) -> "np.ndarray[tuple[int, ...], np.
     # Pixel centres are whole numbers in both images: u' = scale * (u + 0.5) - 0.5.
     enlarged = (points_px.astype(np.float64) + 0.5) * scale - 0.5
     return np.round(enlarged * (1 << _SHIFT)).astype(np.int32)
-
-
-def write_overlay_picture(path: Path, frame: OverlayFrame, *, scale: int | None = None) -> None:
-    """Write one frame's tracks on its image; the format follows the suffix (.png, .jpg, ...)."""
-    write_image(path, TrackPainter(scale=scale).draw(frame))
 
 
 def write_overlay_video(

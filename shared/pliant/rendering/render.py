@@ -9,8 +9,6 @@ from pliant.algorithms.geometry import so3_exp
 from pliant.rendering.atlas import (
     FaceColours,
     FaceTexture,
-    make_face,
-    make_face_colours,
     pack_atlas,
     pack_colours,
 )
@@ -146,16 +144,6 @@ class Renderer:
                 light,
             )
         return light
-
-
-def paint_faces(geometry: SceneGeometry) -> list[FaceTexture]:
-    """The textures of all faces, one after the other."""
-    return [make_face(geometry.scene, geometry.solids, i) for i in range(geometry.n_faces)]
-
-
-def paint_colours(geometry: SceneGeometry) -> list[FaceColours]:
-    """The colours of all faces, one after the other."""
-    return [make_face_colours(geometry.scene, geometry.solids, i) for i in range(geometry.n_faces)]
 
 
 def _coloured(grey: U8, light: F32) -> U8:
