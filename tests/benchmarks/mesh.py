@@ -32,7 +32,7 @@ _SMOOTHING = {
 }
 _CORRECTIONS = {
     "live, in the end: a preview until it is settled": "settled",
-    "live, in the end: put in again whenever it moves": "moved",
+    "live, in the end: put in again where the map moves it": "moved",
 }
 _FIGURES = (
     "covered", "median error", "within 5 %", "with the scale that fits", "normals",
@@ -64,7 +64,7 @@ def measure_live(result: Path, groundtruth: str, overrides: Sequence[str]) -> It
     for name, kind in _CORRECTIONS.items():
         found = compared.make([*overrides, f"meshing.corrections={kind}"])
         counts = found.counters
-        fusions = int(counts["fused"] + counts["settled"])
+        fusions = int(counts["fused"] + counts["settled"] + counts["again"])
         # The last report comes after the final mesh.
         spent = found.cpu_seconds[-2] - found.cpu_seconds[0]
         spent_ms = 1e3 * spent / len(compared.history.keyframes)

@@ -1,4 +1,4 @@
-"""Keyframes on disk: their images and observations, of which memory holds the places alone."""
+"""Keyframes on disk: their images, observations and surfaces, of which memory holds the places."""
 
 import tempfile
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from types import TracebackType
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I64
+from pliant.algorithms.meshing.rendering import DrawnTriangles
 
 _ID_BYTES = np.dtype(np.int64).itemsize
 _PIXEL_BYTES = 2 * np.dtype(np.float32).itemsize
@@ -14,8 +15,11 @@ _PIXEL_BYTES = 2 * np.dtype(np.float32).itemsize
 
 @dataclass(frozen=True)
 class _Place:
+    """room: bytes that there may be, the first ``size`` of which are used."""
+
     offset: int
     size: int
+    room: int
 
 
 class KeyframeSpool:
@@ -26,6 +30,7 @@ class KeyframeSpool:
         self._images: dict[int, _Place] = {}
         self._masks: dict[int, _Place] = {}
         self._observations: dict[int, _Place] = {}
+        self._surfaces: dict[int, _Place] = {}
 
     def __enter__(self) -> "KeyframeSpool":
         return self
@@ -45,15 +50,22 @@ class KeyframeSpool:
 
     def put_image(self, keyframe: int, jpeg: bytes) -> None:
         """Keep the image of a keyframe."""
-        self._images[keyframe] = self._append(jpeg)
+        self._put(self._images, keyframe, jpeg)
 
     def put_mask(self, keyframe: int, mask: bytes) -> None:
         """Keep the mask of that image."""
-        self._masks[keyframe] = self._append(mask)
+        self._put(self._masks, keyframe, mask)
 
     def put_observations(self, keyframe: int, point_ids: I64, points_px: F32) -> None:
         """Keep what a keyframe observes: (N,) and (N, 2)."""
-        self._observations[keyframe] = self._append(point_ids.tobytes() + points_px.tobytes())
+        self._put(self._observations, keyframe, point_ids.tobytes() + points_px.tobytes())
+
+    def put_surface(self, keyframe: int, drawn: DrawnTriangles) -> None:
+        """Keep what a keyframe's depth map shows."""
+        columns = (drawn.points_px, drawn.inverse_depths[:, None], drawn.sigmas[:, None])
+        corners = np.concatenate(columns, axis=1)
+        count = np.int64(len(corners)).tobytes()
+        self._put(self._surfaces, keyframe, count + corners.tobytes() + drawn.triangles.tobytes())
 
     def keyframes(self) -> list[int]:
         """Ids of the keyframes whose observations are here, ascending."""
@@ -77,10 +89,28 @@ class KeyframeSpool:
         pixels = np.frombuffer(raw, np.float32, 2 * count, count * _ID_BYTES)
         return ids, pixels.reshape(-1, 2).copy()
 
-    def _append(self, data: bytes) -> _Place:
-        place = _Place(self._file.seek(0, 2), len(data))
+    def surface(self, keyframe: int) -> DrawnTriangles:
+        """What a keyframe's depth map shows.  KeyError where that was not told."""
+        raw = self._read(self._surfaces[keyframe])
+        count = int(np.frombuffer(raw, np.int64, 1)[0])
+        corners = np.frombuffer(raw, np.float32, 4 * count, _ID_BYTES).reshape(-1, 4)
+        triangles = np.frombuffer(raw, np.int32, offset=_ID_BYTES + corners.nbytes).reshape(-1, 3)
+        return DrawnTriangles(
+            triangles=triangles.copy(),
+            points_px=corners[:, :2].copy(),
+            inverse_depths=corners[:, 2].copy(),
+            sigmas=corners[:, 3].copy(),
+        )
+
+    def _put(self, places: dict[int, _Place], keyframe: int, data: bytes) -> None:
+        """In the place of what was told before, where there is room."""
+        old = places.get(keyframe)
+        if old is not None and len(data) <= old.room:
+            self._file.seek(old.offset)
+            places[keyframe] = _Place(old.offset, len(data), old.room)
+        else:
+            places[keyframe] = _Place(self._file.seek(0, 2), len(data), len(data))
         self._file.write(data)
-        return place
 
     def _read(self, place: _Place) -> bytes:
         self._file.seek(place.offset)

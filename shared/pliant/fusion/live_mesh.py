@@ -1,40 +1,52 @@
 """The coarse mesh of one map segment while it grows, and what of it has changed."""
 
 import bisect
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, U8
+from pliant.algorithms.arrays import F64, I32, I64, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse
+from pliant.algorithms.meshing.keyframe_surface import SeenPoints
 from pliant.algorithms.meshing.mesh_blocks import LAST_KEY, BlockMesh, MeshBlocks, no_blocks
 from pliant.algorithms.meshing.parameters import TsdfParameters
 from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.meshing.tsdf_volume import TsdfVolume
 from pliant.algorithms.stages import StageTimer
+from pliant.map_history import CurrentMap
 
-_SPARSE = 8
-"""Every so many pixels give a keyframe's median depth."""
+_SAMPLES = 32
+"""Points of a keyframe that tell whether it has moved."""
 
 
 @dataclass(frozen=True)
-class _Preview:
-    """What was put in for a keyframe that may still move, so that it can be taken out again."""
+class Sight:
+    """What a keyframe gives to the volume.  colour: (H, W, 3) RGB.    T_world_camera: (4, 4)."""
 
-    serial: int
     depth_map: DepthMap
     colour: U8
     T_world_camera: F64
-    median_depth: float
+
+
+@dataclass(frozen=True)
+class Fused:
+    """How a keyframe was put in: with the depth map and the image it can be taken out again.
+
+    correction: what its view left of the calibration's.    point_ids, points_world: (S,), (S, 3)
+    some of the points that it saw, where they were.
+    """
+
+    serial: int
+    T_world_camera: F64
+    correction: tuple[float, ...]
+    point_ids: I64
+    points_world: F64
 
 
 class LiveMesh:
-    """One segment.  Keyframes in the window are put in as a preview, and for good as they leave it.
+    """One segment.  Of each keyframe some points are held, and neither depths nor image.
 
-    voxel_size: in units of the segment's world.
+    voxel_size: in units of the segment's world.    fused: keyframes in the volume, by their ids.
     """
 
     def __init__(
@@ -42,53 +54,56 @@ class LiveMesh:
     ) -> None:
         self.volume = TsdfVolume(voxel_size, parameters)
         self.held = BlockMesh()
+        self.fused: dict[int, Fused] = {}
         self._camera = camera
         self._again = again
-        self._previews: dict[int, _Preview] = {}
         self._touched: list[I32] = []
         self._next_again = 0
 
     def put(
-        self, keyframe: int, depth_map: DepthMap, colour: U8, T_world_camera: F64, *, settled: bool
+        self, keyframe: int, sight: Sight, correction: tuple[float, ...], seen: SeenPoints
     ) -> None:
-        """Put a keyframe in, in place of its preview where there is one.
+        """Put a keyframe in that is not in the volume.
 
-        Raises VolumeFullError where there is no room; the keyframe is not in the volume then.
+        Raises VolumeFullError where there is no room; it is not in the volume then.
         """
-        self.take_out(keyframe)
         put = self.volume.integrate(
-            depth_map.depths, depth_map.weights, colour, self._camera, T_world_camera
-        )
+            sight.depth_map.depths, sight.depth_map.weights, sight.colour, self._camera,
+            sight.T_world_camera,
+        )  # fmt: skip
         self._touched.append(put.keys)
-        if not settled:
-            some = depth_map.depths[::_SPARSE, ::_SPARSE]
-            depth = float(np.median(some[some > 0.0])) if some.any() else 0.0
-            self._previews[keyframe] = _Preview(
-                put.serial, depth_map, colour, T_world_camera, depth
-            )
+        some = slice(None, None, -(-len(seen.ids) // _SAMPLES))
+        self.fused[keyframe] = Fused(
+            put.serial, sight.T_world_camera, correction,
+            seen.ids[some].copy(), seen.points_world[some].copy(),
+        )  # fmt: skip
 
-    def take_out(self, keyframe: int) -> None:
-        """Take the preview of a keyframe out, exactly; nothing where there is none."""
-        old = self._previews.pop(keyframe, None)
-        if old is not None:
-            self._touched.append(
-                self.volume.remove(
-                    old.serial, old.depth_map.depths, old.depth_map.weights, old.colour,
-                    self._camera, old.T_world_camera,
-                )
-            )  # fmt: skip
+    def take_out(self, keyframe: int, depth_map: DepthMap, colour: U8) -> None:
+        """Take a keyframe out, exactly: what it was put in with is given again."""
+        old = self.fused.pop(keyframe)
+        removed = self.volume.remove(
+            old.serial, depth_map.depths, depth_map.weights, colour, self._camera,
+            old.T_world_camera,
+        )  # fmt: skip
+        self._touched.append(removed)
 
-    def moved(self, pose_of: Callable[[int], F64]) -> list[int]:
-        """Keyframes whose preview lies a voxel or more off where their poses now put it."""
-        found: list[int] = []
-        for keyframe, preview in self._previews.items():
-            T_old_new = inverse(preview.T_world_camera) @ pose_of(keyframe)
-            # A turn by an angle moves what lies at that depth by the chord.
-            chord = math.sqrt(max(0.0, 3.0 - float(np.trace(T_old_new[:3, :3]))))
-            off = float(np.linalg.norm(T_old_new[:3, 3])) + preview.median_depth * chord
-            if off >= self.volume.scale.voxel:
-                found.append(keyframe)
-        return found
+    def moved(self, current: CurrentMap) -> list[int]:
+        """Keyframes whose points lie a voxel or more (in the median) off from where they were put
+        in, the farthest first.
+
+        A mesh cannot show less than a voxel, and what was put in by less than a truncation aside
+        of it is one surface with it.
+        """
+        off = {keyframe: self._off(fused, current) for keyframe, fused in self.fused.items()}
+        moved = [keyframe for keyframe in sorted(off) if off[keyframe] >= self.volume.scale.voxel]
+        return sorted(moved, key=lambda keyframe: -off[keyframe])
+
+    def _off(self, fused: Fused, current: CurrentMap) -> float:
+        rows, points = current.points_of(fused.point_ids)
+        if not len(rows):
+            return 0.0
+        moved = np.linalg.norm(points.positions - fused.points_world[rows], axis=1)
+        return float(np.median(moved))
 
     def changes(self, timer: StageTimer) -> MeshBlocks | None:
         """The blocks that differ from what was told; None where nothing was put in."""

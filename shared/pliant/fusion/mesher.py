@@ -2,12 +2,14 @@
 
 VITAMIN-E section 4, but at keyframes instead of every frame.  While the map grows, a keyframe is a
 preview until it leaves the window of bundle adjustment; then its last pose, points and observations
-take the preview's place.  The final mesh is made anew from the final poses of all keyframes, whose
-images and observations wait on disk.
+take the preview's place.  Where the map moves it later, as a loop is closed, it is fused anew, one
+keyframe at a time.  The final mesh is made anew from the final poses of all keyframes.  Images,
+observations and surfaces of all keyframes wait on disk.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -18,15 +20,15 @@ from pliant.algorithms.corrected_view import CorrectedView, corrected_view, part
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.masks import unpacked
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
-from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints, Surface
-from pliant.algorithms.meshing.mesh_blocks import BLOCK_BYTES, MeshBlocks, TriangleMesh, sorted_keys
-from pliant.algorithms.meshing.parameters import MeshingParameters, TsdfParameters
+from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
+from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, TriangleMesh
+from pliant.algorithms.meshing.parameters import MeshingParameters
 from pliant.algorithms.meshing.rendering import DepthMap
-from pliant.algorithms.meshing.tsdf_integrate import blocks_in_band, pixel_planes
-from pliant.algorithms.meshing.tsdf_volume import TsdfVolume, VolumeFullError
+from pliant.algorithms.meshing.tsdf_volume import VolumeFullError
 from pliant.algorithms.stages import StageTimer, no_stages
+from pliant.fusion.final_volume import FinalVolume
 from pliant.fusion.keyframe_spool import KeyframeSpool
-from pliant.fusion.live_mesh import LiveMesh
+from pliant.fusion.live_mesh import LiveMesh, Sight
 from pliant.fusion.memory import too_fine
 from pliant.map_history import CurrentMap
 
@@ -59,40 +61,14 @@ class FinalMesh:
     mesh: TriangleMesh
 
 
-class _FinalVolume:
-    """A volume for a final mesh.  Once it is full it is empty, and counts what it would take."""
-
-    def __init__(self, voxel_size: float, camera: PinholeCamera, tsdf: TsdfParameters) -> None:
-        self.volume = TsdfVolume(voxel_size, tsdf)
-        self.is_full = False
-        self._camera = camera
-        self._tsdf = tsdf
-        self._needed = np.zeros((0, 3), np.int32)
-
-    @property
-    def needed_bytes(self) -> int:
-        """What all that was put in takes, where it is full."""
-        return len(self._needed) * BLOCK_BYTES
-
-    def put(self, depth_map: DepthMap, colour: U8, T_world_camera: F64) -> None:
-        """Fuse a keyframe, or count its blocks."""
-        depths, weights = depth_map.depths, depth_map.weights
-        if not self.is_full:
-            try:
-                self.volume.integrate(depths, weights, colour, self._camera, T_world_camera)
-                return
-            except VolumeFullError:
-                self.is_full, self._needed = True, self.volume.keys
-                self.volume = TsdfVolume(self.volume.scale.voxel, self._tsdf)
-        pixels = pixel_planes(depths, weights, self._camera)
-        band = blocks_in_band(pixels, T_world_camera, self.volume.scale)
-        self._needed = sorted_keys(np.concatenate([self._needed, band]))
+@lru_cache(maxsize=4)
+def _view(camera: PinholeCamera, correction: tuple[float, ...]) -> CorrectedView:
+    return CorrectedView(camera, correction)
 
 
 class Mesher:
-    """A function of what it is given; it holds no image but those of keyframes in the window.
+    """A function of what it is given; it holds neither images nor depth maps.
 
-    focal: logarithm of the camera's focal length over that of the camera which was given.
     counts: what has been done so far, for the report.    note: the last problem, or all of those
     of the final meshes; "" without.
     """
@@ -104,18 +80,19 @@ class Mesher:
         self._parameters = parameters
         self._spool = spool
         self._map = CurrentMap()
-        self._views: dict[int, CorrectedView] = {}
+        self._corrections: dict[int, tuple[float, ...]] = {}
         self._surfaces = KeyframeSurfaces(camera, parameters.surface)
         self._live: LiveMesh | None = None
         self._frozen = parts_of(())
         self._segment = -1
         self._pending: list[tuple[int, bool]] = []
-        self._told: dict[int, bool] = {}  # keyframes, and whether they were settled
-        self._fused: set[int] = set()
+        self._told: set[int] = set()
+        self._tried: set[int] = set()  # of the segment, fused or without a surface
         self._again: list[int] = []
+        self._has_moved = False
         self.note = ""
         self.counts: dict[str, float] = dict.fromkeys(
-            ("fused", "settled", "passed_over", "without_surface"), 0.0
+            ("fused", "settled", "again", "passed_over", "without_surface"), 0.0
         )
 
     def take(
@@ -132,6 +109,10 @@ class Mesher:
         one, as of ``algorithms.image.masks``: what they cover is no surface.
         """
         self._map.take(update, frame)
+        if len(update.moved_keyframes):
+            self._has_moved = True
+            # The last surface is where the map was.
+            self._surfaces = KeyframeSurfaces(self._camera, self._parameters.surface)
         if update.calibration_correction:
             self._see(update.segment, update.calibration_correction)
         for keyframe, jpeg in images.items():
@@ -144,38 +125,44 @@ class Mesher:
             self._spool.put_observations(
                 keyframe, keyframes.point_ids[told], keyframes.points_px[told]
             )
-            self._told[keyframe] = bool(keyframes.settled[row])
-            self._pending.append((keyframe, self._told[keyframe]))
+            self._told.add(keyframe)
+            self._pending.append((keyframe, bool(keyframes.settled[row])))
         for gone, segment in update.joined.tolist():
             self._join(gone, segment)
 
     def _join(self, gone: int, segment: int) -> None:
-        """Two segments are one: what the live mesh lacks of it is fused one by one."""
+        """Two segments are one."""
         if self._segment == gone:
             self._begin_live(segment)
-        if self._segment == segment:
-            joined = (k for k in self._told if self._map.keyframes[k].segment == segment)
-            self._again = sorted(k for k in joined if k not in self._fused)
+        elif self._segment == segment:
+            self._again = self._untried()
 
     def _begin_live(self, segment: int) -> None:
-        self._segment, self._live, self._fused, self._again = segment, None, set(), []
+        """The camera is in another segment: what was seen of it before is fused one by one."""
+        self._segment, self._live, self._tried = segment, None, set()
+        self._again = self._untried()
+
+    def _untried(self) -> list[int]:
+        left = sorted(self._told - self._tried)
+        return [k for k in left if self._map.keyframes[k].segment == self._segment]
 
     def _see(self, segment: int, correction: tuple[float, ...]) -> None:
         """A segment is made with a corrected calibration."""
-        if not self._views and not self._spool.keyframes():
+        if not self._corrections and not self._told:
             # Nothing was fused yet: where the focal length was a guess, all of the view is wanted.
             self._frozen = parts_of(correction)
             self._camera = corrected_view(self._camera, correction).camera
             self._surfaces = KeyframeSurfaces(self._camera, self._parameters.surface)
-        self._views[segment] = self._left_of(correction)
+        left = self._left_of(correction)
+        self._has_moved |= left != self._corrections.get(segment, left)
+        self._corrections[segment] = left
 
-    def _left_of(self, correction: tuple[float, ...]) -> CorrectedView:
+    def _left_of(self, correction: tuple[float, ...]) -> tuple[float, ...]:
         """What of a correction is left beside the pinhole that was frozen."""
         s, k1, k2, a, b = parts_of(correction)
         s0, _, _, a0, b0 = self._frozen
         share = float(np.exp(s0 - s))
-        rest = (s - s0, k1, k2, 0.0, a - share * a0, b - share * b0)
-        return CorrectedView(self._camera, rest)
+        return (s - s0, k1, k2, 0.0, a - share * a0, b - share * b0)
 
     def fuse(self, *, newest_only: bool = False, timer: StageTimer = no_stages) -> list[LiveChange]:
         """Fuse what waits; returns what changed.
@@ -185,26 +172,34 @@ class Mesher:
         self.note = ""
         pending, self._pending = self._pending, []
         if newest_only:
-            fresh = [item for item in pending if not item[1]]
-            self.counts["passed_over"] += max(0, len(fresh) - 1)
-            pending = [item for item in pending if item[1] or item == fresh[-1]]
-        if self._live is not None and self._parameters.corrections == "moved":
-            told = [keyframe for keyframe, _ in pending]
-            moved = [k for k in self._live.moved(self._pose) if k not in told]
-            self.counts["again"] = self.counts.get("again", 0.0) + len(moved)
-            pending = [*((k, False) for k in moved), *pending]
+            passed_over = [keyframe for keyframe, settled in pending if not settled][:-1]
+            pending = [item for item in pending if item[1] or item[0] not in passed_over]
+            self.counts["passed_over"] += len(passed_over)
+            self._told -= {*passed_over} - {keyframe for keyframe, _ in pending}
         changed: list[LiveChange] = []
         for keyframe, settled in pending:
             segment = self._map.keyframes[keyframe].segment
             if segment != self._segment:
                 changed += self._changes(timer)
                 self._begin_live(segment)
-            self._fuse_one(keyframe, settled=settled, timer=timer)
-        self._again = [keyframe for keyframe in self._again if keyframe not in self._fused]
-        if self._again:  # of a segment that was joined: one by one, so that nobody waits for all
-            keyframe = self._again[0]
-            self._fuse_one(keyframe, settled=self._told[keyframe], timer=timer)
-        return changed + self._changes(timer)
+            self._fuse_one(keyframe, "settled" if settled else "fused", timer)
+        self._follow_map(timer)
+        # What is fused again between keyframes is told with the next one, or when all of it is.
+        if pending or not self._again:
+            changed += self._changes(timer)
+        return changed
+
+    def _follow_map(self, timer: StageTimer) -> None:
+        """Fuse a keyframe that the live mesh lacks, or has elsewhere than the map has it by now:
+        one at a time, so that nobody waits for all."""
+        if self._live is None:
+            return
+        if self._has_moved and self._parameters.corrections == "moved":
+            lacking = [keyframe for keyframe in self._again if keyframe not in self._live.fused]
+            self._again = [*lacking, *self._live.moved(self._map)]
+        self._has_moved = False
+        if self._again:
+            self._fuse_one(self._again[0], "again", timer)
 
     @property
     def memory(self) -> dict[str, float]:
@@ -226,29 +221,44 @@ class Mesher:
         for segment, keyframes in sorted(by_segment.items()):
             yield from self._finish_segment(segment, keyframes, timer)
 
-    def _fuse_one(self, keyframe: int, *, settled: bool, timer: StageTimer) -> None:
-        self._fused.add(keyframe)
-        colour = self._colour(keyframe)
-        surface = self._surface(keyframe, timer)
-        if surface.depth_map is None or colour is None:
+    def _fuse_one(self, keyframe: int, count: str, timer: StageTimer) -> None:
+        """Put a keyframe into the live mesh as the map has it now, in place of what is in there."""
+        self._tried.add(keyframe)
+        self._again = [other for other in self._again if other != keyframe]
+        seen, correction = self._seen(keyframe), self._correction(keyframe)
+        surface = self._surfaces.surface(self._pose(keyframe), seen, timer)
+        colour = self._colour(keyframe, correction)
+        if self._live is not None:
+            with timer("coarse fusion"):
+                self._take_out(keyframe, self._live)
+        if surface.depth_map is None or surface.drawn is None or colour is None:
             self._pass_over(keyframe, surface.problem or _NO_IMAGE)
-            if self._live is not None:
-                self._live.take_out(keyframe)
             return
+        self._spool.put_surface(keyframe, surface.drawn)
+        depth_map = self._within(keyframe, surface.depth_map, correction)
+        sight = Sight(depth_map, colour, self._pose(keyframe))
         tsdf = self._parameters.tsdf
         try:
             if self._live is None:
                 voxel_size = tsdf.coarse_voxel * surface.median_depth
                 self._live = LiveMesh(voxel_size, self._camera, tsdf, self._parameters.again_blocks)
             with timer("coarse fusion"):
-                self._live.put(
-                    keyframe, surface.depth_map, colour, self._pose(keyframe), settled=settled
-                )
+                self._live.put(keyframe, sight, correction, seen)
         except VolumeFullError as error:
             needed = error.needed_bytes
             self._pass_over(keyframe, too_fine("coarse", tsdf, needed, "what was seen so far"))
             return
-        self.counts["settled" if settled else "fused"] += 1
+        self.counts[count] += 1
+
+    def _take_out(self, keyframe: int, live: LiveMesh) -> None:
+        """By the same depth map and image with which it was put in; nothing where it is not."""
+        old = live.fused.get(keyframe)
+        if old is None:
+            return
+        colour = self._colour(keyframe, old.correction)
+        assert colour is not None
+        depth_map = self._spool.surface(keyframe).depth_map(self._camera)
+        live.take_out(keyframe, self._within(keyframe, depth_map, old.correction), colour)
 
     def _finish_segment(
         self, segment: int, keyframes: list[int], timer: StageTimer
@@ -256,19 +266,21 @@ class Mesher:
         unit = self._median_depth(keyframes)
         tsdf = self._parameters.tsdf
         volumes = {
-            level: _FinalVolume(share * unit, self._camera, tsdf)
+            level: FinalVolume(share * unit, self._camera, tsdf)
             for level, share in (("fine", tsdf.fine_voxel), ("coarse", tsdf.coarse_voxel))
         }
         fused, problem = 0, ""
         for keyframe in keyframes:
-            colour = self._colour(keyframe)
-            surface = self._surface(keyframe, timer)
+            correction, pose = self._correction(keyframe), self._pose(keyframe)
+            colour = self._colour(keyframe, correction)
+            surface = self._surfaces.surface(pose, self._seen(keyframe), timer)
             if surface.depth_map is None or colour is None:
                 problem = f"keyframe {keyframe}: {surface.problem or _NO_IMAGE}"
                 continue
+            depth_map = self._within(keyframe, surface.depth_map, correction)
             for level, volume in volumes.items():
                 with timer(f"final {level} fusion"):
-                    volume.put(surface.depth_map, colour, self._pose(keyframe))
+                    volume.put(depth_map, colour, pose)
             fused += 1
         if fused == 0:
             self._tell(f"no keyframe of segment {segment} has a surface ({problem})")
@@ -295,18 +307,20 @@ class Mesher:
                 medians.append(float(np.median(depths)))
         return float(np.median(medians)) if medians else 1.0
 
-    def _surface(self, keyframe: int, timer: StageTimer) -> Surface:
-        found = self._surfaces.surface(self._pose(keyframe), self._seen(keyframe), timer)
+    def _within(
+        self, keyframe: int, depth_map: DepthMap, correction: tuple[float, ...]
+    ) -> DepthMap:
+        """Without what the mask of a keyframe covers."""
         mask = self._spool.mask(keyframe)
-        if found.depth_map is None or not mask:
-            return found
-        used = self._view(keyframe).image(np.uint8(255) * unpacked(mask).astype(np.uint8)) == 255
-        return replace(found, depth_map=found.depth_map.within(used))
+        if not mask:
+            return depth_map
+        shown = np.uint8(255) * unpacked(mask).astype(np.uint8)
+        return depth_map.within(_view(self._camera, correction).image(shown) == 255)
 
-    def _view(self, keyframe: int) -> CorrectedView:
-        """As the calibration has it with which the segment of the keyframe was made."""
-        none = self._left_of(())
-        return self._views.get(self._map.keyframes[keyframe].segment, none)
+    def _correction(self, keyframe: int) -> tuple[float, ...]:
+        """What is left of that with which the segment of a keyframe was made."""
+        segment = self._map.keyframes[keyframe].segment
+        return self._corrections.get(segment, self._left_of(()))
 
     def _pose(self, keyframe: int) -> F64:
         return pose_to_matrix(self._map.keyframes[keyframe].pose_world_camera)
@@ -317,19 +331,21 @@ class Mesher:
         rows, points = self._map.points_of(ids)
         return SeenPoints(
             ids=points.ids,
-            points_px=self._view(keyframe).pixels(pixels[rows]),
+            points_px=_view(self._camera, self._correction(keyframe)).pixels(pixels[rows]),
             points_world=points.positions,
             sigmas=np.asarray(points.sigmas, np.float32),
             keyframes=np.asarray(points.keyframes, np.int32),
         )
 
-    def _colour(self, keyframe: int) -> U8 | None:
+    def _colour(self, keyframe: int, correction: tuple[float, ...]) -> U8 | None:
         """(H, W, 3) RGB of a keyframe; None where its image is missing or broken."""
         jpeg = self._spool.image(keyframe)
         if not jpeg:
             return None
         pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
-        return None if pixels is None else self._view(keyframe).image(np.asarray(pixels, np.uint8))
+        if pixels is None:
+            return None
+        return _view(self._camera, correction).image(np.asarray(pixels, np.uint8))
 
     def _pass_over(self, keyframe: int, why: str) -> None:
         self.counts["without_surface"] += 1

@@ -12,7 +12,7 @@ from pliant.algorithms.geometry import inverse
 from pliant.algorithms.meshing.delaunay import Triangulation, triangulate
 from pliant.algorithms.meshing.nltgv import NltgvResult, NltgvStart, carry_duals, smooth
 from pliant.algorithms.meshing.parameters import SurfaceParameters, TriangleFilterParameters
-from pliant.algorithms.meshing.rendering import DepthMap, render_depth
+from pliant.algorithms.meshing.rendering import DepthMap, DrawnTriangles
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.compiler.kernel import kernel
 
@@ -45,11 +45,12 @@ class SeenPoints:
 class Surface:
     """A keyframe's depth map, or why there is none.
 
-    problem: "" or one line.    vertices, triangles, iterations: of its mesh and of NLTGV.
-    median_depth: of its vertices, 0 without any.
+    drawn: what it shows.    problem: "" or one line.    vertices, triangles, iterations: of its
+    mesh and of NLTGV.    median_depth: of its vertices, 0 without any.
     """
 
     depth_map: DepthMap | None
+    drawn: DrawnTriangles | None = None
     problem: str = ""
     vertices: int = 0
     triangles: int = 0
@@ -104,10 +105,12 @@ class KeyframeSurfaces:
                 mesh.triangles, pixels, smoothed, sigmas, points.keyframes[rows],
                 self._camera, self._parameters.triangles,
             )  # fmt: skip
-            depth_map = render_depth(mesh.triangles[kept], pixels, smoothed, sigmas, self._camera)
+            drawn = DrawnTriangles(mesh.triangles[kept], pixels, smoothed, sigmas)
+            depth_map = drawn.depth_map(self._camera)
         count = int(np.count_nonzero(kept))
         return Surface(
             depth_map=depth_map if count else None,
+            drawn=drawn if count else None,
             problem="" if count else "none of its triangles is surface",
             vertices=len(rows),
             triangles=count,

@@ -139,9 +139,9 @@ class MeshingParameters(Parameters):
         "for viewers that came late.",
     )
     corrections: Literal["settled", "moved"] = Field(
-        default="settled",
-        description="When a keyframe in the live mesh is put in again: once, as it leaves the "
-        "window, or also whenever it has moved by a voxel (to compare).",
+        default="moved",
+        description="When a keyframe in the live mesh is put in again: as it leaves the window, "
+        "or also where the whole map has moved it by a voxel since (the former is to compare).",
     )
     surface: SurfaceParameters = SurfaceParameters()
     tsdf: TsdfParameters = TsdfParameters()

@@ -32,6 +32,22 @@ class DepthMap:
         return DepthMap(depths=depths, weights=weights)
 
 
+@dataclass(frozen=True)
+class DrawnTriangles:
+    """What ``render_depth`` takes of a surface: far smaller than the depth map that it gives."""
+
+    triangles: Annotated[I32, Shape("T", 3)]
+    points_px: Annotated[F32, Shape("M", 2)]
+    inverse_depths: Annotated[F32, Shape("M")]
+    sigmas: Annotated[F32, Shape("M")]
+
+    def depth_map(self, camera: PinholeCamera) -> DepthMap:
+        """As ``render_depth`` gives it."""
+        return render_depth(
+            self.triangles, self.points_px, self.inverse_depths, self.sigmas, camera
+        )
+
+
 def render_depth(
     triangles: I32, points_px: F32, inverse_depths: F32, sigmas: F32, camera: PinholeCamera
 ) -> DepthMap:
