@@ -1,6 +1,7 @@
 """``pliant run --map`` and ``pliant map``: sessions in the map that an earlier one has left."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from running import NO_MESH, TINY, assert_one_line, digests, in_this_process, pliant
 
 import pliant as library
+from pliant.algorithms.geometry import inverse, so3_log
 from pliant.datasets import open_source
 from pliant.datasets.rectifier import decode
 from pliant.formats.tum import read_tum
@@ -45,9 +47,11 @@ def test_a_run_goes_on_in_a_map_and_replays(office: Path, tmp_path: Path) -> Non
     assert digests(tmp_path / "today") == digests(tmp_path / "again")
 
 
-def test_a_run_only_localises(office: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("source", [TINY, f"{TINY}?width=400"])
+def test_a_run_only_localises(source: str, office: Path, tmp_path: Path) -> None:
+    """Also with a larger camera than that of the map."""
     only = ("--map", office, "--localise", *NO_MESH)
-    done = pliant("run", TINY, *only, "--output", tmp_path / "robot")
+    done = pliant("run", source, *only, "--output", tmp_path / "robot")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "robot" / "report.json").read_text())
     assert report["frames_with_pose"] == report["frames"]
@@ -68,6 +72,37 @@ def test_a_map_tells_python_where_an_image_was_taken(office: Path) -> None:
     assert known.localise(np.zeros_like(decode(frames[10]))) is None
     assert known.localise(decode(frames[10]), known.calibration) is not None
     assert len(known.points) == len(known.colours) == len(known.segments) > 100
+
+
+def test_an_answer_depends_on_no_image_that_was_asked_for_before(office: Path) -> None:
+    known = library.load_map(office)
+    images = [decode(frame) for frame in list(open_source(TINY))[::8]]
+    answers = [known.localise(image) for image in images]
+    for image, first in reversed(list(zip(images, answers, strict=True))):
+        again = known.localise(image)
+        assert first is not None
+        assert again is not None
+        assert np.array_equal(first.T_world_camera, again.T_world_camera)
+        assert first.inliers == again.inliers
+
+
+def test_images_of_another_camera_are_found_in_the_map(office: Path) -> None:
+    """Larger ones, and their middle alone: another focal length, size and principal point."""
+    known, truth = library.load_map(office), read_tum(office / "trajectory.txt")
+    larger = open_source(f"{TINY}?width=400")
+    calibration = larger.calibration
+    cut = replace(
+        calibration, width=330, height=250,
+        cx=calibration.cx - 40.0, cy=calibration.cy - 20.0,
+    )  # fmt: skip
+    for frame in list(larger)[::6]:
+        whole = decode(frame)
+        for image, camera in ((whole, calibration), (whole[20:270, 40:370], cut)):
+            found = known.localise(image, camera)
+            assert found is not None
+            between = inverse(truth.T_world_camera[frame.index]) @ found.T_world_camera
+            assert np.linalg.norm(between[:3, 3]) < 0.01
+            assert np.degrees(np.linalg.norm(so3_log(between[:3, :3]))) < 0.5
 
 
 def test_two_maps_become_one_in_which_images_are_found(office: Path, tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ class KnownMap:
         self.colours = np.concatenate([each.point_colours for each in self._kept])
         counts = [len(each.point_ids) for each in self._kept]
         self.segments = np.repeat([each.segment for each in self._kept], counts)
-        self._tracking = load_config().tracking
+        self._config = load_config()
         self._finder: tuple[Calibration, Rectifier, Localiser] | None = None
 
     def localise(
@@ -69,7 +69,10 @@ class KnownMap:
         grey, _ = rectifier.rectify(frame)
         grey = filled(grey, clearance_in(rectifier.mask(frame)))
         ideal = localiser.calibration.view.image(grey)
-        found = localiser.recognise(maxima_of(ideal, self._tracking), ideal)
+        # A generator of its own: the answer depends on no image that was asked for before.
+        found = localiser.recognise(
+            maxima_of(ideal, self._config.tracking), ideal, np.random.default_rng(self._config.seed)
+        )
         if found is None:
             return None
         return Located(
@@ -84,9 +87,9 @@ class KnownMap:
         """What finds images of a camera: kept for the next one."""
         calibration = self.calibration if camera is None else calibration_of(camera)
         if self._finder is None or self._finder[0] != calibration:
-            rectifier, config = Rectifier(calibration), load_config()
-            parameters = config.bundle_adjustment
-            localiser = Localiser(rectifier.camera, parameters, config.seed, known=self._kept)
+            rectifier, parameters = Rectifier(calibration), self._config.bundle_adjustment
+            seed = self._config.seed
+            localiser = Localiser(rectifier.camera, parameters, seed, known=self._kept)
             self._finder = calibration, rectifier, localiser
         return self._finder
 

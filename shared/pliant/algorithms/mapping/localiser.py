@@ -96,12 +96,12 @@ class Localiser:
         why = doubt(support, self._parameters.support)
         return self._publish(TRACKING, why, support.inliers, looks_anew=looks_anew)
 
-    def recognise(self, maxima: F32, grey: U8) -> Recognised | None:
+    def recognise(self, maxima: F32, grey: U8, generator: np.random.Generator) -> Recognised | None:
         """Where an image (H, W) of the ideal camera, with its maxima (M, 3) of curvature, is seen
         from, by what it looks like alone."""
         return self._places.recognise(
             grey, maxima, self._segments, self._points, self.calibration, self._parameters,
-            self._generator,
+            generator,
         )  # fmt: skip
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
@@ -144,7 +144,7 @@ class Localiser:
         if grey is None:
             return None
         with timer("places"):
-            found = self.recognise(tracks.maxima, grey)
+            found = self.recognise(tracks.maxima, grey, self._generator)
         if found is None:
             return None
         self._hanging, self._motion = found.keyframe, None
