@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -20,8 +21,10 @@ from pliant.datasets.builtin import builtin_folder
 from pliant.export.export import export_result
 from pliant.export.models import draw
 from pliant.messages import topics
+from pliant.messages.codec import encode
 from pliant.messages.types import Extrema, Keyframe, SourceImage
 from pliant.recording.reader import Recording
+from pliant.recording.writer import RecordingWriter
 from pliant.viewers.canvas import Canvas, Moment
 
 pytestmark = pytest.mark.system
@@ -172,11 +175,58 @@ def test_exports_have_masks_beside_images(
             depth = cv2.imread(str(folder / "depth" / name), cv2.IMREAD_UNCHANGED)
             assert depth is not None
             assert not depth[mask == 0].any()
-    if kind == "nerfstudio":
-        frames = json.loads((folder / "transforms.json").read_text())["frames"]
-        assert [f["mask_path"] for f in frames] == [
-            f["file_path"].replace("images", "masks") for f in frames
-        ]
+
+
+@pytest.fixture(scope="module")
+def partly(result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recording of a run with a mask for every third frame, as ``--mask FOLDER`` gives."""
+    path = tmp_path_factory.mktemp("partly") / "recording.mcap"
+    whole = Recording(result / "recording.mcap")
+    with RecordingWriter(path, whole.metadata()) as part:
+        for recorded in whole.messages():
+            data, message = recorded.data, None
+            if recorded.topic == topics.SOURCE:
+                message = recorded.decode()
+                assert isinstance(message, SourceImage)
+                data = data if message.frame % 3 == 0 else encode(replace(message, mask=b""))
+            part.write(recorded.topic, data, sequence=0, log_time_ns=0, publish_time_ns=0)
+    return path
+
+
+@pytest.mark.parametrize("masked", ["all", "some", "none"])
+def test_nerfstudio_takes_what_it_gets(
+    result: Path, partly: Path, tiny_run: Path, tmp_path: Path, masked: str
+) -> None:
+    """By the rules of nerfstudio's own parser of ``transforms.json``, and of who reads its masks:
+    masks of all images or of none, of one channel; a camera model of its table; no key that it
+    would turn or scale the cameras by and not the points."""
+    run = {"all": result, "some": partly, "none": tiny_run}[masked]
+    folder = export_result(run, "nerfstudio", tmp_path / "export")
+    said = json.loads((folder / "transforms.json").read_text())
+    assert said["camera_model"] in (
+        *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
+    )
+    for key in ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"):
+        assert isinstance(said[key], float), key
+    size = said["h"], said["w"]
+    assert all(isinstance(side, int) for side in size)
+    assert not {"applied_transform", "applied_scale", "orientation_override"} & said.keys()
+    assert (folder / said["ply_file_path"]).is_file()
+    frames = said["frames"]
+    assert len({frame["file_path"] for frame in frames}) == len(frames) > 3
+    assert sum("mask_path" in frame for frame in frames) == (0 if masked == "none" else len(frames))
+    black = 0
+    for frame in frames:
+        matrix = np.array(frame["transform_matrix"])
+        assert matrix.shape == (4, 4)
+        assert np.isfinite(matrix).all()
+        assert cv2.imread(str(folder / frame["file_path"])).shape[:2] == size
+        if masked != "none":
+            mask = cv2.imread(str(folder / frame["mask_path"]), cv2.IMREAD_UNCHANGED)
+            assert mask is not None
+            assert mask.shape == size
+            black += bool((mask == 0).any())
+    assert {"all": black == len(frames), "some": 0 < black < len(frames), "none": not black}[masked]
 
 
 def test_a_mask_that_is_none_is_one_line(bonnet: Path, tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
     transforms.json    the camera, and for each image its file and camera-to-world
     images/            see ``posed_images``
-    masks/             black where trainers are to ignore them, of those that have a mask
+    masks/             black where trainers are to ignore them; of all images, or of none
     points.ply         the map, for splats to start from
 
 The camera's axes are OpenGL's, x right, y up, z back; the world is the map's.  Pixels have (0.5,

@@ -8,7 +8,7 @@ too, and of the image there is what the lens has shown of it.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import cast
@@ -41,7 +41,7 @@ _KEYFRAME = 1.1
 
 @dataclass(frozen=True)
 class PosedImage:
-    """A frame whose image was written.  T_world_camera: (4, 4).  masked: it has a mask, too."""
+    """A frame whose image was written.  T_world_camera: (4, 4).  masked: so was its mask."""
 
     frame: int
     T_world_camera: F64
@@ -112,24 +112,31 @@ def write_posed_images(
     folder: Path,
     mask_name: Callable[[str], str] = str,
 ) -> list[PosedImage]:
-    """Write the sharpest image around each keyframe into a folder, and where it has a mask that
-    into ``masks`` beside it: black where it is ignored.
+    """Write the sharpest image around each keyframe into a folder, and where any has a mask those
+    of all into ``masks`` beside it: black where it is ignored, white of those that have none, as
+    nerfstudio takes masks of all images or of none.
 
     mask_name: of its file, by the name of the image.    Raises ResultError where there are no
     images, and where the disk fails.
     """
     make_folder(folder)
+    masks = folder.with_name("masks")
     written: list[PosedImage] = []
     for frame, _, pixels, used in _sharpest(recording, stream, ideal):
         image = PosedImage(frame, ideal.poses[frame], used is not None)
         write_png(folder / image.name, ideal.image(frame, pixels))
         if used is not None:
-            masks = folder.with_name("masks")
             make_folder(masks)
             mask = mask_image(used, partial(ideal.image, frame))
             write_png(masks / mask_name(image.name), mask)
         written.append(image)
-    return written
+    if not any(image.masked for image in written):
+        return written
+    white = np.full((ideal.camera.height, ideal.camera.width), 255, np.uint8)
+    for image in written:
+        if not image.masked:
+            write_png(masks / mask_name(image.name), white)
+    return [replace(image, masked=True) for image in written]
 
 
 def _sharpest(
