@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from mp4_patches import spaced, ticks_a_second, turned
 
 import pliant
 from pliant.algorithms.image.masks import unpacked
@@ -146,6 +147,25 @@ def test_a_masked_video_is_recorded_as_the_video_and_its_masks(clip: Path, tmp_p
     black = [int((~unpacked(m.mask)[0]).sum()) if m.mask else 0 for m in published]
     assert black == [11, 0, 21, 0]
     assert [frame.mask for frame in open_source(str(path))] == [m.mask for m in published]
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_a_clip_of_a_telephone_held_upright(clip: Path, tmp_path: Path, degrees: int) -> None:
+    """What is in the recording is turned as the run had it, in order and by itself."""
+    own, content = tmp_path / "own.mp4", clip.read_bytes()
+    tick = ticks_a_second(content) // 20
+    own.write_bytes(spaced(turned(content, degrees), [tick, 3 * tick] * (FRAMES // 2)))
+    path = tmp_path / "recording.mcap"
+    published = record(opened(own), path)
+    lying = degrees == 180
+    size = (WIDTH, HEIGHT) if lying else (HEIGHT, WIDTH)
+    assert {(m.width, m.height) for m in published} == {size}
+    assert [round(1e-6 * m.stamp_ns) for m in published[:4]] == [0, 50, 200, 250]
+    assert not any(m.data for m in references(path))
+    assert_same_images(path, published)
+    images = RecordedImages(Recording(path))
+    for number in (20, 3):
+        assert images.whole(references(path)[number]).data == published[number].data
 
 
 def test_any_image_by_itself(clip: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from mp4_patches import spaced, ticks_a_second, turned
 
 from pliant.config import IngestParameters
 from pliant.datasets import open_source
@@ -16,7 +17,7 @@ from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import UNSAID_SIGMA, calibration_from_yaml, calibration_yaml
 from pliant.datasets.camera_device import CameraDevice, camera_index
 from pliant.datasets.images import SourceOptions
-from pliant.datasets.rectifier import Rectifier
+from pliant.datasets.rectifier import Rectifier, decode
 from pliant.datasets.video import quiet_opencv
 from pliant.errors import CalibrationError, DatasetError
 
@@ -50,6 +51,34 @@ def test_video(tmp_path: Path) -> None:
         grey, rgb = rectifier.rectify(frame)
         assert abs(float(grey.mean()) - 20 * number) < 5.0
         assert rgb is not None
+
+
+def test_a_telephone_that_was_held_upright_and_frames_at_unequal_times(tmp_path: Path) -> None:
+    """The matrix and the times of the container are those of the frames."""
+    lying = tmp_path / "clip.mp4"
+    code = cv2.VideoWriter.fourcc(*"mp4v")
+    with quiet_opencv():
+        writer = cv2.VideoWriter(str(lying), code, 10.0, (WIDTH, HEIGHT))
+    image = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
+    image[: HEIGHT // 2, : WIDTH // 2] = 220
+    for _ in range(6):
+        writer.write(image)
+    writer.release()
+    content = lying.read_bytes()
+    tenth = ticks_a_second(content) // 10
+    stamps_ms = {"equal": [0, 100, 200, 300, 400, 500], "unequal": [0, 50, 200, 300, 350, 500]}
+    unequal = spaced(content, [tenth // 2, 3 * tenth // 2, tenth] * 2)
+    for times, file in (("equal", content), ("unequal", unequal)):
+        for quarters, degrees in enumerate((0, 90, 180, 270)):
+            lying.write_bytes(turned(file, degrees) if degrees else file)
+            dataset = open_source(str(lying), fov_deg=60.0)
+            size = (HEIGHT, WIDTH) if quarters % 2 else (WIDTH, HEIGHT)
+            assert (dataset.calibration.width, dataset.calibration.height) == size
+            frames = list(dataset)
+            assert [round(1e-6 * frame.stamp_ns) for frame in frames] == stamps_ms[times]
+            expected = np.rot90(image, -quarters).astype(int)  # clockwise
+            for frame in frames:
+                assert np.abs(decode(frame).astype(int) - expected).mean() < 5.0
 
 
 def test_a_damaged_frame_is_named_and_ends_nothing(tmp_path: Path) -> None:
