@@ -288,6 +288,12 @@ def test_field_of_view() -> None:
             calibration_from_fov(640, 480, impossible)
 
 
+def test_a_lens_that_nobody_describes_sees_as_much_held_upright() -> None:
+    wide, upright = calibration_from_fov(1920, 1080), calibration_from_fov(1080, 1920)
+    assert upright.fx == upright.fy == wide.fx == pytest.approx(960.0 * 3.0**0.5)
+    assert upright.focal_sigma == wide.focal_sigma > calibration_from_fov(640, 480, 60).focal_sigma
+
+
 finite = st.floats(-1e-2, 1e-2, allow_subnormal=False)
 
 

@@ -13,13 +13,7 @@ from pliant.api.mapped import Mapped
 from pliant.config import load_config, settings_of
 from pliant.datasets import open_source
 from pliant.datasets.base import SourceFrame
-from pliant.datasets.calibration import (
-    SAID_SIGMA,
-    UNSAID_FOV_DEG,
-    UNSAID_SIGMA,
-    Calibration,
-    calibration_from_fov,
-)
+from pliant.datasets.calibration import Calibration, calibration_from_fov
 from pliant.errors import CalibrationError, DatasetError
 from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
@@ -95,8 +89,7 @@ class Slam(Mapped):
             )
         source = source_frame(image, self._camera, number=number, stamp_ns=stamp_ns, mask=mask)
         if self._camera is None:
-            known = (UNSAID_FOV_DEG, UNSAID_SIGMA) if self._fov is None else (self._fov, SAID_SIGMA)
-            self._camera = calibration_from_fov(source.width, source.height, *known)
+            self._camera = calibration_from_fov(source.width, source.height, self._fov)
         return self._step(source)
 
     def finish(self) -> "Slam":

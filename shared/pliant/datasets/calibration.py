@@ -44,7 +44,8 @@ _MODELS: tuple[str, ...] = get_args(LensModel)
 SAID_SIGMA = 0.3
 """How far a field of view that somebody says may be wrong: standard deviation of log focal."""
 UNSAID_FOV_DEG, UNSAID_SIGMA = 60.0, 0.4
-"""What is taken where nobody says anything: +-2 standard deviations are 29 to 104 degrees."""
+"""What is taken along the longer side where nobody says anything: +-2 standard deviations are 29 to
+104 degrees."""
 _MAX_SIGMA = 1.0
 _MAX_UNITS = 65535  # of a 16-bit depth map
 _MAX_SIDE_PX = 32767  # what the fixed-point maps can address
@@ -113,21 +114,22 @@ class Calibration:
         )
 
 
-def calibration_from_fov(
-    width: int, height: int, fov_deg: float, focal_sigma: float = SAID_SIGMA
-) -> Calibration:
+def calibration_from_fov(width: int, height: int, fov_deg: float | None = None) -> Calibration:
     """A first guess: a pinhole camera with this horizontal field of view, looking straight ahead.
 
-    focal_sigma: as in ``Calibration``.
+    fov_deg: None where nobody says it: a lens sees as much, whichever way it is held.
 
     Raises CalibrationError for a field of view that a pinhole camera cannot have.
     """
+    said = fov_deg is not None
+    side = width if said else max(width, height)
+    fov_deg = fov_deg if said else UNSAID_FOV_DEG
     if not 1.0 <= fov_deg <= 170.0:  # also refuses NaN
         raise CalibrationError(
             f"--fov {fov_deg:g}: the horizontal field of view must be 1 to 170 degrees; a wider "
             "lens needs a calibration file"
         )
-    focal = 0.5 * width / math.tan(math.radians(0.5 * fov_deg))
+    focal = 0.5 * side / math.tan(math.radians(0.5 * fov_deg))
     return Calibration(
         model="pinhole",
         width=width,
@@ -136,7 +138,7 @@ def calibration_from_fov(
         fy=focal,
         cx=0.5 * (width - 1),
         cy=0.5 * (height - 1),
-        focal_sigma=focal_sigma,
+        focal_sigma=SAID_SIGMA if said else UNSAID_SIGMA,
     )
 
 

@@ -9,12 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from pliant.datasets.base import BrokenFrame, SourceFrame, encoding_of
-from pliant.datasets.calibration import (
-    UNSAID_FOV_DEG,
-    UNSAID_SIGMA,
-    Calibration,
-    calibration_from_fov,
-)
+from pliant.datasets.calibration import Calibration, calibration_from_fov
 from pliant.datasets.calibration_files import check_size, read_calibration
 from pliant.datasets.rectifier import decode
 from pliant.datasets.stereo import StereoPair
@@ -153,7 +148,7 @@ def choose_calibration(
         return found
     if found is not None and found.is_file():
         return read_calibration(found, size, kitti_camera=kitti_camera)
-    return calibration_from_fov(*size, UNSAID_FOV_DEG, UNSAID_SIGMA)
+    return calibration_from_fov(*size)
 
 
 def existing(*candidates: Path) -> Path | None:
