@@ -55,22 +55,26 @@ def test_too_few_pairs_give_the_identity() -> None:
     np.testing.assert_array_equal(fit_affine(few, few, sigma_px=6.0), np.eye(2, 3))
 
 
-@pytest.mark.parametrize("shift", [(12, -18), (36, 24)])
-def test_features_of_a_shifted_image_match(shift: tuple[int, int]) -> None:
+@pytest.mark.parametrize(
+    ("size", "shift"), [((640, 480), (12, -18)), ((640, 480), (36, 24)), ((320, 96), (18, 6))]
+)
+def test_features_of_a_shifted_image_match(size: tuple[int, int], shift: tuple[int, int]) -> None:
+    width, height = size
     rng = np.random.default_rng(5)
     coarse = rng.integers(0, 256, (90, 120)).astype(np.uint8)
     world = np.kron(coarse, np.ones((8, 8), np.uint8))
-    first = np.ascontiguousarray(world[100:580, 100:740])
-    second = np.ascontiguousarray(
-        world[100 - shift[1] : 580 - shift[1], 100 - shift[0] : 740 - shift[0]]
-    )
+    part = world[100 : 100 + height, 100 : 100 + width]
+    rows, columns = slice(100 - shift[1], None), slice(100 - shift[0], None)
+    first = np.ascontiguousarray(part)
+    second = np.ascontiguousarray(world[rows, columns][:height, :width])
     brief = BriefExtractor(np.random.default_rng(0), 300)
     sources, targets = match_features(
         brief.extract(first), brief.extract(second), max_distance_bits=64, max_shift_px=180.0
     )
     assert len(sources) > 50
     fit = fit_affine(sources, targets, sigma_px=6.0)
-    moved = np.array([320.0, 240.0]) @ fit[:, :2].T + fit[:, 2] - [320.0, 240.0]
+    middle = 0.5 * np.array(size)
+    moved = middle @ fit[:, :2].T + fit[:, 2] - middle
     np.testing.assert_allclose(moved, shift, atol=1.5)
 
 

@@ -1,7 +1,8 @@
 """The dominant flow between two frames (VITAMIN-E, section 2.2).
 
-BRIEF pairs (Calonder et al. 2010, without steering) on the image at a sixth of its size, and an
-affine model y = A x + b fitted to them with the Geman-McClure kernel (Eq. 2-3).
+BRIEF pairs (Calonder et al. 2010, without steering) on the image at a sixth of its size, or larger
+where that leaves too few rows for them, and an affine model y = A x + b fitted to them with the
+Geman-McClure kernel (Eq. 2-3).
 """
 
 from dataclasses import dataclass
@@ -22,8 +23,10 @@ BRIEF_RADIUS = 7
 """Half-width in pixels of the window that BRIEF compares points in."""
 BRIEF_WORDS = 4
 """64-bit words of a descriptor: 256 comparisons."""
-_CLEAR_PX = 2 * SHRINK
-"""Nearer than this to what a mask covers, its edge is in the curvature of the small image."""
+_LEAST_SIDE = 2 * (2 * BRIEF_RADIUS + 1)
+"""Pixels of a small image of which half the rows and columns can be described."""
+_CLEAR = 2
+"""Nearer than so many small pixels to what a mask covers, its edge is in their curvature."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +38,7 @@ class BriefFeatures:
 
 
 class BriefExtractor:
-    """Describes curvature extrema of the image at a sixth of its size."""
+    """Describes curvature extrema of the small image."""
 
     def __init__(self, rng: np.random.Generator, max_points: int) -> None:
         """Draw the comparisons from an isotropic Gaussian: the best of the paper's variants."""
@@ -49,7 +52,8 @@ class BriefExtractor:
 
         clearance: (H, W) of its mask, whose unused parts are filled in; None: without one.
         """
-        small = shrink(grey, SHRINK)
+        factor = min(SHRINK, max(1, min(grey.shape) // _LEAST_SIDE))
+        small = shrink(grey, factor)
         if min(small.shape) <= 2 * BRIEF_RADIUS + 1:
             return _no_features()
         smooth, _, _, maxima = curvature_and_maxima(small, 1.0, 0.1, both_signs=True)
@@ -58,14 +62,15 @@ class BriefExtractor:
         limit_u, limit_v = width - 1 - BRIEF_RADIUS, height - 1 - BRIEF_RADIUS
         inside = (u >= BRIEF_RADIUS) & (u <= limit_u) & (v >= BRIEF_RADIUS) & (v <= limit_v)
         if clearance is not None:
-            seen = np.ascontiguousarray(clearance[SHRINK // 2 :: SHRINK, SHRINK // 2 :: SHRINK])
-            inside &= seen[np.rint(v).astype(np.int32), np.rint(u).astype(np.int32)] > _CLEAR_PX
+            seen = np.ascontiguousarray(clearance[factor // 2 :: factor, factor // 2 :: factor])
+            clear = seen[np.rint(v).astype(np.int32), np.rint(u).astype(np.int32)]
+            inside &= clear > _CLEAR * factor
         kept = np.flatnonzero(inside)
         strongest = np.argsort(-strength[kept], kind="stable")[: self._max_points]
         points = maxima[kept[np.sort(strongest)], :2]
         descriptors = np.zeros((len(points), BRIEF_WORDS), np.uint64)
         _describe(smooth, points, self._tests, descriptors)
-        full = (points + np.float32(0.5)) * np.float32(SHRINK) - np.float32(0.5)
+        full = (points + np.float32(0.5)) * np.float32(factor) - np.float32(0.5)
         return BriefFeatures(points_px=full, descriptors=descriptors)
 
 
