@@ -1,11 +1,11 @@
 """Poisson reconstruction by Open3D, for comparison with our own meshes."""
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32
-from pliant.export.open3d_import import require_open3d
 
 NEIGHBOURS = 16
 DEPTH = 8
@@ -16,9 +16,10 @@ CUT = 0.05
 def poisson_mesh(points_world: F64, p_world_camera: F64) -> tuple[F32, F32, I32]:
     """Vertices, normals and triangles through points, normals towards the cameras that saw them.
 
-    points_world, p_world_camera: (N, 3).  Raises Open3dError without open3d.
+    points_world, p_world_camera: (N, 3).  On Debian and Ubuntu Open3D needs libegl1, libgl1,
+    libx11-6 and libusb-1.0-0.
     """
-    open3d: Any = require_open3d()
+    open3d: Any = import_module("open3d")  # it takes 1-3 s
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points_world))
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
     normals = np.asarray(cloud.normals)

@@ -22,7 +22,7 @@ from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import RECORDING_NAME
 from pliant.results.page.advice import advice
-from pliant.results.page.scene import MAX_TRIANGLES, make_scene, simplified
+from pliant.results.page.scene import make_scene
 from pliant.results.write import write_results
 
 pytestmark = pytest.mark.system
@@ -229,20 +229,6 @@ def test_all_triangles_turn_outwards() -> None:
     out = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert layer["triangles"] > 500
     assert (out[:, 2] > 0.0).all()
-
-
-def test_a_large_mesh_becomes_small_and_keeps_its_shape() -> None:
-    mesh = sheet(300)
-    assert len(mesh.triangles) > 2 * MAX_TRIANGLES
-    vertices, colours, triangles = simplified(
-        mesh.positions, mesh.colours, mesh.triangles, MAX_TRIANGLES
-    )
-    assert MAX_TRIANGLES / 3 < len(triangles) <= MAX_TRIANGLES
-    assert len(vertices) == len(colours)
-    assert (colours == 100).all()
-    assert np.abs(vertices[:, 2] - np.sin(vertices[:, 0] / 10.0)).max() < 0.1
-    same = simplified(vertices, colours, triangles, MAX_TRIANGLES)
-    np.testing.assert_array_equal(same[2], triangles)
 
 
 def report(**changes: Any) -> dict[str, Any]:

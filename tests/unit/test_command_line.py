@@ -67,7 +67,12 @@ def test_a_missing_package_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None
     assert found.grade == "error"
 
 
-def test_open3d_is_found_whatever_it_was_installed_as(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", SimpleNamespace(__version__="9.8.7"))
-    (found,) = (f for f in doctor.diagnose() if f.what == "open3d")
-    assert (found.grade, found.detail) == ("ok", "9.8.7")
+def test_what_plots_is_a_warning_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, told in ((SimpleNamespace(__version__="9.8.7"), ("ok", "9.8.7")), (None, None)):
+        monkeypatch.setitem(sys.modules, "matplotlib", module)
+        (found,) = (f for f in doctor.diagnose() if f.what == "matplotlib")
+        if told is not None:
+            assert (found.grade, found.detail) == told
+        else:
+            assert found.grade == "warning"
+            assert "pip install 'pliant[plot]'" in found.detail

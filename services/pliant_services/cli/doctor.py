@@ -50,13 +50,10 @@ def doctor() -> None:
 
 def diagnose() -> list[Finding]:
     """Every check, in the order in which a user would mend them."""
-    from pliant.export.open3d_import import OPEN3D_REMEDY
-
     return [
         _python(),
         *(_package(distribution, module) for distribution, module in _PACKAGES.items()),
         _optional("matplotlib", "plots of `pliant eval`", "pip install 'pliant[plot]'"),
-        _optional("open3d", "`pliant export --to glb`", OPEN3D_REMEDY),
         _arithmetic(),
         _scratch(),
         _bus(),
@@ -80,7 +77,7 @@ def _package(distribution: str, module: str) -> Finding:
 
 
 def _optional(module: str, purpose: str, remedy: str) -> Finding:
-    try:  # not of its package: that of open3d may be named open3d-cpu
+    try:
         return Finding("ok", module, str(importlib.import_module(module).__version__))
     except (ImportError, OSError) as error:
         return Finding("warning", module, f"{_line(error)}; for {purpose}: {remedy}")

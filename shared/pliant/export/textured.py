@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +10,7 @@ from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
 from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.masks import unpacked
-from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.algorithms.meshing.decimation import decimated
 from pliant.algorithms.meshing.texturing import (
     TexelColours,
     cut_apart,
@@ -21,7 +20,6 @@ from pliant.algorithms.meshing.texturing import (
 )
 from pliant.errors import ResultError
 from pliant.export.images import make_folder, mask_image
-from pliant.export.open3d_import import require_open3d
 from pliant.formats.textured import TexturedMesh, write_glb, write_obj
 from pliant.messages import topics
 from pliant.messages.types import Keyframe, MeshPiece
@@ -53,16 +51,15 @@ def obj(
 def textured_mesh(recording: Recording, triangles: int) -> TexturedMesh:
     """The fine mesh of the longest segment, of at most so many triangles.
 
-    Raises Open3dError where there is no open3d, ResultError where there is no mesh.
+    Raises ResultError where there is none.
     """
-    open3d = require_open3d()
     run = read_run(recording.path)
     segment = run.history.longest_segment()
     pieces = [p for p in recording.decoded(topics.MESH_FINAL) if isinstance(p, MeshPiece)]
     fine = mesh_of(pieces, segment)
     if run.stream is None or fine is None or not len(fine.triangles):
         raise ResultError(f"{recording.path}: there is no mesh in it: run its source again")
-    points, faces, colours = _decimated(open3d, fine, triangles)
+    points, tints, faces = decimated(fine.positions, fine.colours, fine.triangles, triangles)
     cut, _ = cut_apart(faces, patches(points[faces]))
     uvs = make_atlas(points[faces], cut, _TEXELS)
     texels = find_texels(uvs, _TEXELS)
@@ -71,27 +68,8 @@ def textured_mesh(recording: Recording, triangles: int) -> TexturedMesh:
     for T_world_camera, image, used in keyframe_images(recording, run, segment):
         seen = None if used is None else mask_image(used, view.image) > 0
         shown.add(view.image(image), view.camera, T_world_camera, seen)
-    unseen = np.rint(texels.interpolate(colours[faces])).astype(np.uint8)
+    unseen = np.rint(texels.interpolate(tints[faces].astype(np.float32))).astype(np.uint8)
     return _with_texture(points, faces, uvs, shown.texture(unseen))
-
-
-def _decimated(open3d: Any, mesh: TriangleMesh, triangles: int) -> tuple[F32, I32, F32]:
-    """Vertices, triangles and colours (0 to 255) of a mesh of no more triangles."""
-    utility = open3d.utility
-    made = open3d.geometry.TriangleMesh(
-        utility.Vector3dVector(mesh.positions.astype(np.float64)),
-        utility.Vector3iVector(mesh.triangles),
-    )
-    made.vertex_colors = utility.Vector3dVector(mesh.colours / 255.0)
-    if len(mesh.triangles) > triangles:
-        made = made.simplify_quadric_decimation(triangles)
-    made.remove_degenerate_triangles()
-    made.remove_unreferenced_vertices()
-    return (
-        np.asarray(made.vertices, np.float32),
-        np.asarray(made.triangles, np.int32),
-        np.asarray(made.vertex_colors, np.float32) * np.float32(255.0),
-    )
 
 
 def keyframe_images(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.meshing.decimation import decimated
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.pictures.map import PATH_COLOUR, PLACES_COLOUR, choose_view
 
@@ -48,7 +49,7 @@ def make_scene(
     size = np.maximum(high - low, 1e-9)
     block = _Block(low, size)
     if mesh is not None and len(mesh.triangles):
-        vertices, tints, triangles = simplified(*_outwards(mesh), MAX_TRIANGLES)
+        vertices, tints, triangles = decimated(*_outwards(mesh), MAX_TRIANGLES)
         inside = ((vertices >= low - size) & (vertices <= high + size)).all(axis=1)
         triangles = triangles[inside[triangles].all(axis=1)]
         block.add("mesh", vertices, tints, triangles)
@@ -115,29 +116,3 @@ def _outwards(mesh: TriangleMesh) -> tuple[F32, U8, I32]:
     triangles = mesh.triangles.copy()
     triangles[inwards] = triangles[inwards][:, ::-1]
     return mesh.positions, mesh.colours, triangles
-
-
-def simplified(vertices: F32, colours: U8, triangles: I32, most: int) -> tuple[F32, U8, I32]:
-    """A mesh of at most so many triangles: vertices within cells of a grid become their mean
-    (Rossignac and Borrel 1993); the cells grow until it is small enough."""
-    if len(triangles) <= most:
-        return vertices, colours, triangles
-    corners = vertices[triangles].astype(np.float64)
-    edges = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
-    cell = float(np.median(edges))
-    while True:
-        cell *= 1.25
-        keys = np.floor(vertices / cell).astype(np.int64)
-        _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-        cells = cells.reshape(-1)
-        merged = cells[triangles].astype(np.int32)
-        a, b, c = merged.T
-        merged = merged[(a != b) & (b != c) & (c != a)]
-        if len(merged) <= most:
-            break
-    together = np.column_stack([vertices, colours]).astype(np.float64)
-    sums = np.zeros((len(counts), 6))
-    np.add.at(sums, cells, together)
-    means = sums / counts[:, None]
-    tints = np.round(means[:, 3:]).astype(np.uint8)
-    return means[:, :3].astype(np.float32), tints, merged

@@ -1,0 +1,146 @@
+"""Meshes of fewer triangles: edges collapse where that moves the surface the least.
+
+Garland and Heckbert 1997: what a vertex may not leave are the planes of the triangles that it has
+stood for, summed up as a quadric q by their areas; an edge collapses into the point with the least
+sum of both, [x 1] (q_u + q_v) [x 1]^T.  Planes that stand on its rim keep a surface's outline.
+Edges that are the cheapest at both of their ends collapse
+together, so that a few passes over arrays do it.
+"""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
+
+_AT_ONCE = 0.2
+"""Share of the edges, the cheapest ones, that may collapse in a pass."""
+_EVEN = 1e-4
+"""How much an edge's squared length counts beside squared distances from planes: where all is flat
+the shortest collapse, and triangles stay even.  More of it costs shape, less makes splinters."""
+_FOLD_COSINE = 0.2
+"""Of the angle by which no triangle turns in a pass."""
+
+
+def decimated(positions: F32, colours: U8, triangles: I32, most: int) -> tuple[F32, U8, I32]:
+    """A mesh of at most so many triangles, without vertices that none of them has.
+
+    positions, colours: (V, 3).    triangles: (T, 3).  Which way they turn stays.  It has more only
+    where nothing can collapse without a fold.
+    """
+    places = positions.astype(np.float64)
+    tints = np.column_stack([colours, np.ones(len(colours))]).astype(np.float64)
+    triangles = _proper(triangles.astype(np.int64))
+    quadrics = _quadrics(places, triangles)
+    blocked = np.zeros(0, np.int64)
+    while len(triangles) > most:
+        edges, _ = _edges(triangles, len(places))
+        free = edges[~np.isin(edges, blocked)]
+        chosen, onto = _cheapest(free, places, quadrics, -(-(len(triangles) - most) // 2))
+        kept = _unfolded(chosen, onto, places, triangles)
+        blocked = np.concatenate([blocked, chosen[~kept]])
+        if not kept.any():
+            if not len(chosen):
+                break
+            continue
+        u, v = np.divmod(chosen[kept], len(places))
+        places[u] = onto[kept]
+        quadrics[u] += quadrics[v]
+        tints[u] += tints[v]
+        becomes = np.arange(len(places))
+        becomes[v] = u
+        triangles = _proper(becomes[triangles])
+    used, corners = np.unique(triangles, return_inverse=True)
+    means = np.rint(tints[used, :3] / tints[used, 3:]).astype(np.uint8)
+    return places[used].astype(np.float32), means, corners.reshape(-1, 3).astype(np.int32)
+
+
+def _proper(triangles: I64) -> I64:
+    """Those of three different vertices."""
+    a, b, c = triangles.T
+    return triangles[(a != b) & (b != c) & (c != a)]
+
+
+def _edges(triangles: I64, vertices: int) -> tuple[I64, I64]:
+    """(E,) u * vertices + v of each edge, u < v, and of how many triangles it is a side."""
+    return np.unique(np.concatenate(_sides(triangles, vertices)), return_counts=True)
+
+
+def _sides(triangles: I64, vertices: int) -> list[I64]:
+    """The edges (T,) of all triangles, side by side, as ``_edges`` numbers them."""
+    pairs = [(triangles[:, k], triangles[:, (k + 1) % 3]) for k in range(3)]
+    return [np.minimum(a, b) * vertices + np.maximum(a, b) for a, b in pairs]
+
+
+def _turned(places: F64, triangles: I64) -> F64:
+    """(T, 3) normals, as long as twice the area."""
+    a, b, c = places[triangles].transpose(1, 0, 2)
+    return np.cross(b - a, c - a)
+
+
+def _quadrics(places: F64, triangles: I64) -> F64:
+    """(V, 4, 4) of the vertices: planes of their triangles, and those that stand on their rims."""
+    turned = _turned(places, triangles)
+    twice = np.linalg.norm(turned, axis=1)
+    normals = turned / np.maximum(twice, 1e-300)[:, None]
+    found = np.zeros((len(places), 16))
+    _add(found, triangles, normals, places[triangles[:, 0]], 0.5 * twice)
+    edges, sides = _edges(triangles, len(places))
+    for side in _sides(triangles, len(places)):
+        rim = sides[np.searchsorted(edges, side)] == 1
+        ends = np.stack(np.divmod(side[rim], len(places)), axis=1)
+        along = places[ends[:, 1]] - places[ends[:, 0]]
+        length = np.linalg.norm(along, axis=1)
+        upright = np.cross(along / np.maximum(length, 1e-300)[:, None], normals[rim])
+        _add(found, ends, upright, places[ends[:, 0]], length**2)
+    return found.reshape(-1, 4, 4)
+
+
+def _add(quadrics: F64, corners: I64, normals: F64, on: F64, weights: F64) -> None:
+    """Add planes, by their unit normals and a point of each, to the vertices at their corners."""
+    planes = np.column_stack([normals, -(normals * on).sum(axis=1)])
+    each = (weights[:, None, None] * planes[:, :, None] * planes[:, None, :]).reshape(-1, 16)
+    for column in corners.T:
+        np.add.at(quadrics, column, each)
+
+
+def _cheapest(edges: I64, places: F64, quadrics: F64, most: int) -> tuple[I64, F64]:
+    """(C,) edges that collapse together, at most so many, and (C, 3) what they become."""
+    u, v = np.divmod(edges, len(places))
+    both = quadrics[u] + quadrics[v]
+    middle, apart = 0.5 * (places[u] + places[v]), places[u] - places[v]
+    # By the middle, where little is to be said: along a plane.
+    A = both[:, :3, :3]
+    stiff = _EVEN * np.trace(A, axis1=1, axis2=2) + 1e-300
+    shift = -(both[:, :3, 3] + np.einsum("nij,nj->ni", A, middle))
+    onto = middle + np.linalg.solve(A + stiff[:, None, None] * np.eye(3), shift[..., None])[..., 0]
+    at = np.column_stack([onto, np.ones(len(onto))])
+    costs = np.einsum("ni,nij,nj->n", at, both, at) + stiff * (apart**2).sum(axis=1)
+    order = np.argsort(costs, kind="stable")
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    best = np.full(len(places), len(order))
+    np.minimum.at(best, u, rank)
+    np.minimum.at(best, v, rank)
+    order = order[: int(np.ceil(_AT_ONCE * len(order)))]
+    chosen = order[(best[u] == rank)[order] & (best[v] == rank)[order]][:most]
+    return edges[chosen], onto[chosen]
+
+
+def _unfolded(edges: I64, onto: F64, places: F64, triangles: I64) -> BoolArray:
+    """(C,) which of the edges may collapse together so that no triangle turns too far."""
+    u, v = np.divmod(edges, len(places))
+    kept, before = np.ones(len(edges), np.bool_), _turned(places, triangles)
+    while True:
+        moved, becomes = places.copy(), np.arange(len(places))
+        moved[u[kept]] = moved[v[kept]] = onto[kept]
+        becomes[v[kept]] = u[kept]
+        after = _turned(moved, triangles)
+        lengths = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+        a, b, c = becomes[triangles].T
+        stays = (a != b) & (b != c) & (c != a)
+        folds = stays & ((before * after).sum(axis=1) < _FOLD_COSINE * lengths)
+        touched = np.zeros(len(places), np.bool_)
+        touched[triangles[folds]] = True
+        bad = kept & (touched[u] | touched[v])
+        if not bad.any():
+            return kept
+        kept &= ~bad
