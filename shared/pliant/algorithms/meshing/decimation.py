@@ -5,6 +5,10 @@ stood for, summed up as a quadric q by their areas; an edge collapses into the p
 sum of both, [x 1] (q_u + q_v) [x 1]^T.  Planes that stand on its rim keep a surface's outline.
 Edges that are the cheapest at both of their ends collapse
 together, so that a few passes over arrays do it.
+
+Why not a library: Open3D's needs libraries of the system.  fast-simplification orders edges by
+thresholds, not by cost: of a flat square it loses 6 % at 40 triangles, and it spends as many on
+what is flat as on what is bent (tests/unit/test_decimation.py fails with it).
 """
 
 import numpy as np
