@@ -5,6 +5,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from pliant import arithmetic
+from pliant.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from pliant.algorithms.camera import PinholeCamera as PinholeCamera
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
 arithmetic.fix()
 # FFmpeg is silent: our own line says what is wrong with a video.  Read at OpenCV's first one.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-
-__version__ = "0.1.0"
 
 _WHERE = {
     "Calibration": "pliant.datasets.calibration",

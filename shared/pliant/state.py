@@ -20,8 +20,8 @@ import msgpack
 import numpy as np
 from pydantic import BaseModel
 
-from pliant import __version__
 from pliant.errors import StateError
+from pliant.version import __version__
 
 STATE_VERSION = 2
 

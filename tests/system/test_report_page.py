@@ -270,14 +270,17 @@ def test_of_a_good_run_there_is_nothing_to_say() -> None:
             },
             "Before 2.0 s",
         ),
-        ({"frames_with_pose": 80}, "20 frames have no pose"),
+        ({"frames_with_pose": 80}, "No pose for 20 frames"),
         ({"median_tracks_per_frame": 100.0}, "100 tracks"),
         ({"median_inliers_per_frame": 100.0}, "turned more than it moved"),
         ({"doubtful_frames": [1, 2, 3], "verdict": "doubtful"}, "3 poses rest on"),
         ({"calibration_verdict": "the focal length is wrong"}, "The focal length is wrong."),
         ({"frames_passed_over": [5]}, "did not keep up"),
         ({"frames_without_pixels": {"5": "dropped"}}, "did not keep up"),
-        ({"frames_without_pixels": {str(n): "broken: cut off" for n in range(9)}}, "9 images are"),
+        (
+            {"frames_without_pixels": {str(n): "broken: cut off" for n in range(9)}},
+            "9 broken images",
+        ),
     ],
 )
 def test_what_went_wrong_is_told(changes: dict[str, Any], said: str) -> None:

@@ -16,13 +16,13 @@ from typing import Annotated
 import numpy as np
 import zenoh
 
-from pliant import __version__
 from pliant.algorithms.arrays import I64, Shape
 from pliant.bus.inbox import Inbox
 from pliant.bus.outbox import Outbox
 from pliant.errors import MessageError
 from pliant.messages import codec
 from pliant.messages.types import Header
+from pliant.version import __version__
 
 MAX_BYTES = 1 << 16
 _STATM = Path("/proc/self/statm")

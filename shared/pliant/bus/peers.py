@@ -9,10 +9,10 @@ import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
-from pliant import __version__
 from pliant.errors import BusError, SessionOverError
 from pliant.messages import codec
 from pliant.messages.topics import TOPICS, status
+from pliant.version import __version__
 
 WIRE_VERSION = 5
 """Of envelopes and credits; services of different ones refuse each other."""

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 
-from pliant import __version__
 from pliant.algorithms.arrays import F32, I32, U8, Shape
 from pliant.formats.text import write_bytes
+from pliant.version import __version__
 
 _FLOAT, _UNSIGNED = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pliant import __version__
 from pliant.algorithms.kept_keyframe import MAP_VERSION
 from pliant.errors import MapError, MessageError, RecordingError
 from pliant.files import put_in_place
@@ -22,6 +21,8 @@ from pliant.messages.types import MapKeyframe
 from pliant.recording.reader import Recorded, Recording
 from pliant.recording.scan import Closed, Damage
 from pliant.recording.writer import RecordingWriter
+from pliant.version import __version__
+from pliant.wording import counted
 
 MAP_NAME = "map.pliant"
 _RECORD = "map"
@@ -142,11 +143,11 @@ def describe(path: Path) -> Iterator[str]:
     yield f"scale: {'metres' if header.metric else 'arbitrary'}"
     yield f"cameras: {'; '.join(sorted(cameras))}"
     yield (
-        f"{count} keyframes, {places} of them places, {size / 1e6:.1f} MB, "
+        f"{counted(count, 'keyframe')}, {places} of them places, {size / 1e6:.1f} MB, "
         f"{size / 1e3 / count:.0f} kB each"
     )
     for segment, (keyframes, points) in sorted(segments.items()):
-        yield f"segment {segment}: {keyframes} keyframes, {points} points"
+        yield f"segment {segment}: {counted(keyframes, 'keyframe')}, {counted(points, 'point')}"
 
 
 def _write(writer: RecordingWriter, keyframe: MapKeyframe) -> None:

@@ -20,7 +20,6 @@ from mcap.records import (
     Schema,
 )
 
-from pliant import __version__
 from pliant.errors import RecordingError
 from pliant.files import sync
 from pliant.messages import codec
@@ -29,6 +28,7 @@ from pliant.messages.topics import Topic
 from pliant.recording import layout
 from pliant.recording.layout import CHUNK_BYTES
 from pliant.recording.sections import ChunkIndexes, OpenChunk, as_bytes, closing
+from pliant.version import __version__
 
 _AT_ONCE = 1024
 """Parts that the system takes in one call (IOV_MAX)."""

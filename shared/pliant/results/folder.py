@@ -16,11 +16,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pliant import __version__, arithmetic
+from pliant.arithmetic import target
 from pliant.errors import ResultError
 from pliant.files import make_folder, move_all, write_whole
 from pliant.recording import parts
 from pliant.recording.map_file import MAP_NAME
+from pliant.version import __version__
 
 RECORDING_NAME = "recording.mcap"
 CONFIG_NAME = "config.yaml"
@@ -239,7 +240,7 @@ def run_metadata(config: str) -> dict[str, dict[str, str]]:
             "machine": f"{platform.system()} {platform.machine()}",
             "cpu_count": str(os.cpu_count()),
         },
-        "arithmetic": {"target": arithmetic.target()},
+        "arithmetic": {"target": target()},
         "packages": {name: version(name) for name in _VERSIONS},
         "config": {"yaml": config},
     }

@@ -161,11 +161,6 @@ def _correction(run: Run) -> dict[str, float] | None:
     return {name: round(value, 6) for name, value in found.items()}
 
 
-def counted(number: int, noun: str) -> str:
-    """A number of things in words: "1 frame", "2 frames"."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
 def _median(values: Any) -> float:
     values = list(values)
     return float(np.median(values)) if values else 0.0

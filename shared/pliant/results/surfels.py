@@ -28,9 +28,10 @@ from pliant.results.judgement import judge_surfels, slipping_frames
 from pliant.results.moving_together import MovingTogether
 from pliant.results.page.surface import Surface
 from pliant.results.page.surfel_page import write_surfel_page
-from pliant.results.report import broken_images, counted, ended_early, process_figures
+from pliant.results.report import broken_images, ended_early, process_figures
 from pliant.results.run import Run, read_run
 from pliant.trajectory import Trajectory
+from pliant.wording import counted
 
 _PER_SURFEL = (
     *("ids", "positions", "tangents", "deformations", "points_px", "zncc", "visible", "sigma"),

@@ -6,6 +6,7 @@ from typing import Any
 
 from pliant.messages.types import DROPPED
 from pliant.results.report import broken_images
+from pliant.wording import counted
 
 _FEW_TRACKS = 600
 _FEW_MAPPED = 0.25
@@ -28,21 +29,22 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
         when_s = 1e-9 * (stamps_ns.get(after["first_frame"], first_ns) - first_ns)
         told.append(
             f"Before {when_s:.1f} s the camera was lost for good, and another map began "
-            f"({before['frames']} and {after['frames']} frames): move more slowly there, and let "
-            "half of what is in view stay in view; or come back to what was seen before."
+            f"({before['frames']} and {counted(after['frames'], 'frame')}): move more slowly "
+            "there, and let half of what is in view stay in view; or come back to what was "
+            "seen before."
         )
     frames, posed = report["frames"], report["frames_with_pose"]
     missing = frames - posed - len(report["frames_without_pixels"])
     if segments and missing > _LONG * frames:
         told.append(
-            f"{missing} frames have no pose: dark, blurred or covered images, or a camera that was "
-            "carried off. More light makes exposures shorter and images sharper."
+            f"No pose for {counted(missing, 'frame')}: dark, blurred or covered images, or a "
+            "camera that was carried off. More light makes exposures shorter and images sharper."
         )
     broken = len(broken_images(report["frames_without_pixels"]))
     if broken > _LONG * frames:
         told.append(
-            f"{broken} images are broken: copy the video again from where it was taken, or convert "
-            "it once."
+            f"{counted(broken, 'broken image')}: copy the video again from where it was taken, or "
+            "convert it once."
         )
     # None were mapped as they came where every frame waited for the map: that says nothing.
     tracks, mapped = report["median_tracks_per_frame"], report["median_inliers_per_frame"]

@@ -7,10 +7,10 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from pliant import __version__
 from pliant.files import write_whole
 from pliant.formats.text import write_bytes
 from pliant.results.page.scene import Scene
+from pliant.version import __version__
 
 _TRUTH = "<!-- against the truth -->"
 

@@ -8,7 +8,7 @@ from typing import Any
 from pliant.results.page.chart import BLUE, ORANGE, Line, chart
 from pliant.results.page.page import bullets, canvas, fill_page, table_rows
 from pliant.results.page.surface import Surface
-from pliant.results.report import counted
+from pliant.wording import counted
 
 _TINTS = (
     '<p class="soft">The surface as it was in the last frame that was followed. Colours: how far '
