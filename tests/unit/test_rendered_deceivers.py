@@ -32,6 +32,16 @@ def test_no_part_of_a_chequered_floor_is_taken_for_another() -> None:
 @pytest.mark.slow
 def test_a_room_is_where_most_of_it_is_and_not_where_its_picture_hangs_now() -> None:
     """Most corners are the picture's, and agree with each other."""
-    one = next(one for _, one in run(room_with(0, "picture"), load_config(), 0))
+    came = dict(run(room_with(0, "picture"), load_config(), 0))
+    again, beside = came["the room again"], came["first a wall beside"]
+    assert again.wrong == beside.wrong == []
+    assert again.found >= 0.9 * again.frames
+    assert beside.joined == 0  # by the picture, which is all that both have in common at first
+
+
+@pytest.mark.slow
+def test_a_segment_joins_a_room_in_which_some_things_stand_elsewhere() -> None:
+    one = dict(run(room_with(0, "thing 1", "poster 0"), load_config(), 0))["first a wall beside"]
     assert one.wrong == []
-    assert one.found >= 0.9 * one.frames
+    assert one.joined == 1
+    assert one.found == one.frames

@@ -61,6 +61,7 @@ def ask(
         corners = np.random.default_rng(0).uniform(0, 600, (said[place.keyframe.id][0], 2))
         proposed = SimpleNamespace(
             T_world_camera=looking((3.0 * place.keyframe.id, 0.0, 0.0)),
+            place=place,
             corners=np.arange(len(corners)),
             corners_px=corners.astype(np.float32),
             xyz=np.zeros((len(corners), 3)),
@@ -70,7 +71,7 @@ def ask(
 
     def prove(T_world_camera: F64, *_: object) -> SimpleNamespace:
         count = said[round(T_world_camera[0, 3] / 3.0)][1]
-        return SimpleNamespace(T_world_camera=T_world_camera, inliers=np.ones(count, np.bool_))
+        return SimpleNamespace(T_world_camera=T_world_camera, rows=np.arange(count, dtype=np.int32))
 
     def share(*_: object, **__: object) -> float:
         return repeated

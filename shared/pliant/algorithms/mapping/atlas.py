@@ -162,8 +162,11 @@ class Atlas:
         else:
             segment.path.forget()
 
-    def remember(self, keyframe: Keyframe, grey: U8 | None) -> None:
-        """A new keyframe is a place to come back to, and may be one that was seen before."""
+    def remember(self, keyframe: Keyframe, grey: U8 | None, maxima: F32 | None = None) -> None:
+        """A new keyframe is a place to come back to, and may be one that was seen before.
+
+        grey (H, W), maxima (M, 3): of its image, the latter where another keyframe has told before.
+        """
         if grey is None or self.active is None:
             return
         segment, view = self.active.segment, self.calibration.view
@@ -173,6 +176,7 @@ class Atlas:
             [each for each in earlier if self._is_adjusted_whole(segment, each)],
             view, self._parameters,
             loops=self._is_adjusted_whole(segment) and not self.whole_map.closing,
+            image=None if maxima is None else (maxima, grey),
         )  # fmt: skip
         self.places.remember(keyframe, seen, [segment, *earlier], view)
 

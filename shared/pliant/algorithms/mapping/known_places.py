@@ -8,13 +8,19 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, U8
 from pliant.algorithms.corrected_view import CorrectedView
+from pliant.algorithms.geometry import move_by_similarity
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.mapping.kept_map import features_for
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.map_store import Keyframe, PointRows
 from pliant.algorithms.mapping.meetings import Meetings
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.relocalisation import Place, Recognised, relocalise
+from pliant.algorithms.mapping.relocalisation import (
+    Place,
+    Recognised,
+    relocalise,
+    rest_is_elsewhere,
+)
 from pliant.algorithms.mapping.revisits import Revisits
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
@@ -80,10 +86,12 @@ class KnownPlaces:
         parameters: MappingParameters,
         *,
         loops: bool,
+        image: tuple[F32, U8] | None = None,
     ) -> list[Loop]:
         """What a new keyframe, which sees these corners, shows again: returns the loops that it
         proves in its own segment, where these are asked for; what it has in common with earlier
-        ones waits in ``meetings``."""
+        ones waits in ``meetings``.   image: its maxima (M, 3), and itself (H, W).
+        """
         new = Place(keyframe=keyframe, features=seen, segment=segment.keyframes)
         rest = segment.points, view.camera, parameters
         found = self.revisits.look(new, self._like(seen, [segment], view), *rest) if loops else []
@@ -96,7 +104,19 @@ class KnownPlaces:
                 others = _showing_else(self._like(seen, of, view), near, segment.points, least)
                 yield from islice(others, _ELSEWHERE)
 
-            self.meetings.look(new, near, elsewhere, *rest)
+            def contradicts(loop: Loop) -> bool:
+                if image is None:
+                    return False
+                known = ((k, each.keyframes) for each in earlier for k in each.keyframes)
+                old, among = next(each for each in known if each[0].id == loop.old)
+                pose = move_by_similarity(loop.S_old_new, keyframe.T_world_camera)
+                # Its own, so that no frame is located otherwise because something was looked at.
+                generator = np.random.default_rng(keyframe.id)
+                return rest_is_elsewhere(
+                    pose, old, among, segment.points, *image, view.camera, parameters, generator
+                )
+
+            self.meetings.look(new, near, elsewhere, *rest, contradicts)
         return found
 
     def remember(

@@ -165,7 +165,7 @@ class Mapper:
                 self._changes.see_again([(self._recognised, hanging.id)])
                 self._recognised = None
             with self._timer("places"):
-                atlas.remember(hanging, grey)
+                atlas.remember(hanging, grey, tracks.maxima)
             with self._timer("passed frames"):
                 surplus = active.segment.passed.take_surplus()
                 self._correct(placed_again(surplus, active.points, self._camera, self._parameters))

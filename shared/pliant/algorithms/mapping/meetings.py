@@ -46,19 +46,23 @@ class Meetings:
         points: PointRows,
         camera: PinholeCamera,
         parameters: MappingParameters,
+        contradicts: Callable[[Loop], bool],
     ) -> None:
         """Compare a new keyframe with places of earlier segments, the most alike first.
 
-        elsewhere: others of a segment, which must not tell otherwise.
+        elsewhere: others of a segment, which must not tell otherwise.   contradicts: whether the
+        keyframe's image does, to what is proved.
         """
         by_segment: dict[int, list[Place]] = {}
         for place in places:
             by_segment.setdefault(place.keyframe.segment, []).append(place)
         for segment, some in by_segment.items():
             told = self.told.setdefault(segment, Revisits())
-            self.proved += told.look(
+            proved = told.look(
                 new, some, points, camera, parameters, tries=_TRIES, elsewhere=elsewhere(segment)
             )
+            if not any(contradicts(loop) for loop in proved if loop.new == new.keyframe.id):
+                self.proved += proved
 
 
 def join(

@@ -6,14 +6,15 @@ grows with the time since the last pose.  Of the many maxima in it a point takes
 fits best; P3P and RANSAC find the pose that the good ones among these agree on.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, move_by_similarity, so3_exp, so3_log
-from pliant.algorithms.mapping.localisation import Localisation, locate, refine
+from pliant.algorithms.mapping.localisation import locate, refine
 from pliant.algorithms.mapping.map_store import PointRows
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -31,11 +32,15 @@ _NEAR = 0.3
 
 @dataclass(kw_only=True)
 class Motion:
-    """How the camera moved last: T_world_camera (4, 4) of two frames, the newer one last."""
+    """How the camera moved last: T_world_camera (4, 4) of two frames, the newer one last.
+
+    inliers: points that support the newer one, as far as that is known.
+    """
 
     frames: tuple[int, int]
     stamps_ns: tuple[int, int]
     poses: tuple[F64, F64]
+    inliers: int = 0
 
     @staticmethod
     def at(frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
@@ -43,18 +48,19 @@ class Motion:
         twice = (T_world_camera, T_world_camera)
         return Motion(frames=(frame, frame), stamps_ns=(stamp_ns, stamp_ns), poses=twice)
 
-    def then(self, frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
+    def then(self, frame: int, stamp_ns: int, T_world_camera: F64, inliers: int = 0) -> "Motion":
         """The motion after one more pose."""
         return Motion(
             frames=(self.frames[1], frame),
             stamps_ns=(self.stamps_ns[1], stamp_ns),
             poses=(self.poses[1], T_world_camera),
+            inliers=inliers,
         )
 
     def moved(self, S: F64) -> "Motion":
         """The motion after the world has moved by a similarity (4, 4)."""
         before, last = (move_by_similarity(S, pose) for pose in self.poses)
-        return Motion(frames=self.frames, stamps_ns=self.stamps_ns, poses=(before, last))
+        return replace(self, poses=(before, last))
 
     def velocity(self) -> F64:
         """(6,) between the two, as of ``Path.motions``."""
@@ -114,31 +120,57 @@ def recover(
     motion: before.   stamp_ns: of the frame.   rows: of points that it may show.   maxima: (M, 3)
     of the frame.   grey: (H, W).
     """
-    own = parameters.recovery
     predictions = motion.predictions(stamp_ns)
-    radius_px = search_radius_px(motion.lost_s(stamp_ns), camera, own)
-    limits = parameters.localisation.model_copy(update={"ransac_samples": own.ransac_samples})
+    radius_px = search_radius_px(motion.lost_s(stamp_ns), camera, parameters.recovery)
     for radius in (_NEAR * radius_px, radius_px):
         grid = MaximaGrid.build(maxima, camera.width, camera.height, radius)
-        for T_world_camera in predictions:
-            found, points_px = match_widely(
-                T_world_camera, rows, points, grid, grey, camera, radius, own.points,
-                parameters.reacquisition.min_zncc,
-            )  # fmt: skip
-            if len(found) < own.min_agreeing:
-                continue
-            located = locate(
-                [T_world_camera], points.xyz[found], points_px, camera, limits, generator
+        for prediction in predictions:
+            T_world_camera = look_about(
+                prediction, rows, points, grid, grey, radius, camera, parameters, generator
             )
-            if located.inliers.sum() < own.min_agreeing:
+            if T_world_camera is None:
                 continue
             proved = prove(
-                located.T_world_camera, rows, points, maxima, grey, camera, parameters,
-                own.min_agreement,
+                T_world_camera, rows, points, maxima, grey, camera, parameters,
+                parameters.recovery.min_agreement,
             )  # fmt: skip
             if proved is not None:
                 return proved.T_world_camera
     return None
+
+
+def look_about(
+    T_world_camera: F64,
+    rows: I32,
+    points: PointRows,
+    grid: MaximaGrid,
+    grey: U8,
+    radius_px: float,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    generator: np.random.Generator,
+) -> F64 | None:
+    """The pose that points agree on which are looked for about where a pose shows them.
+
+    rows: of the points.   grid: the maxima of the image, for this radius.
+    """
+    own = parameters.recovery
+    limits = parameters.localisation.model_copy(update={"ransac_samples": own.ransac_samples})
+    found, points_px = match_widely(
+        T_world_camera, rows, points, grid, grey, camera, radius_px, own.points,
+        parameters.reacquisition.min_zncc,
+    )  # fmt: skip
+    if len(found) < own.min_agreeing:
+        return None
+    located = locate([T_world_camera], points.xyz[found], points_px, camera, limits, generator)
+    return located.T_world_camera if located.inliers.sum() >= own.min_agreeing else None
+
+
+class Proved(NamedTuple):
+    """A pose, and the rows of the points that prove it."""
+
+    T_world_camera: F64
+    rows: I32
 
 
 def prove(
@@ -150,7 +182,7 @@ def prove(
     camera: PinholeCamera,
     parameters: MappingParameters,
     min_agreement: float,
-) -> Localisation | None:
+) -> Proved | None:
     """The pose refined by all points found where it shows them, None if these are too few of them.
 
     min_agreement: least share of the points found that support it, see ``RecoveryParameters``.
@@ -169,4 +201,6 @@ def prove(
         parameters.recovery.min_support_share * len(found.visible),
         min_agreement * len(found.rows),
     )
-    return located if inliers >= enough else None
+    if inliers < enough:
+        return None
+    return Proved(located.T_world_camera, found.rows[located.inliers])

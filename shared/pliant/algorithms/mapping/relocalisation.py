@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.absolute_pose import pose_by_ransac
-from pliant.algorithms.arrays import F32, F64, I64, U8, BoolArray
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.mapping.covisibility import most_shared, rows_of
@@ -21,7 +21,7 @@ from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
-from pliant.algorithms.mapping.recovery import prove
+from pliant.algorithms.mapping.recovery import look_about, prove
 from pliant.algorithms.places.features import Features, match
 from pliant.algorithms.places.repetition import repeated_share
 
@@ -43,10 +43,11 @@ _MOST = 0.5
 
 
 class _Proposed(NamedTuple):
-    """A pose, the corners (n,) of the frame that agree on it, their pixels, where in the world they
-    are, and their share of those that look alike."""
+    """A pose, the place that proposes it, the corners (n,) of the frame that agree on it, their
+    pixels, where in the world they are, and their share of those that look alike."""
 
     T_world_camera: F64
+    place: "Place"
     corners: I64
     corners_px: F32
     xyz: F64
@@ -97,9 +98,7 @@ def relocalise(
     for number, place in enumerate(chain(places, elsewhere)):
         if number >= len(places) and best is None:
             break
-        near = most_shared(place.segment, [place.keyframe], points)[:_NEAR_KEYFRAMES]
-        rows = rows_of(near, np.zeros(0, np.int32), len(points.state))
-        rows = rows[points.state[rows] == MAPPED]
+        rows = _rows_near(place.keyframe, place.segment, points)
         for proposed in _propose(seen, place, points, camera, parameters, generator):
             proved = prove(
                 proposed.T_world_camera, rows, points, maxima, grey, camera, parameters,
@@ -110,7 +109,7 @@ def relocalise(
             found = Recognised(
                 keyframe=place.keyframe,
                 T_world_camera=proved.T_world_camera,
-                inliers=int(proved.inliers.sum()),
+                inliers=len(proved.rows),
                 corners=len(proposed.corners),
             )
             if best is None:
@@ -126,7 +125,57 @@ def relocalise(
     if any(_is_as_good(rival, best, points, parameters) for rival in rivals):
         return None
     here = transform(inverse(told.T_world_camera), told.xyz)
-    return None if repeats(seen, told.corners, here, camera, parameters) else best
+    if repeats(seen, told.corners, here, camera, parameters):
+        return None
+    moved = rest_is_elsewhere(
+        best.T_world_camera, told.place.keyframe, told.place.segment, points, maxima, grey, camera,
+        parameters, generator,
+    )  # fmt: skip
+    return None if moved else best
+
+
+def _rows_near(keyframe: Keyframe, segment: list[Keyframe], points: PointRows) -> I32:
+    """Rows of the points that may be seen from about a keyframe of a segment."""
+    near = most_shared(segment, [keyframe], points)[:_NEAR_KEYFRAMES]
+    rows = rows_of(near, np.zeros(0, np.int32), len(points.state))
+    return rows[points.state[rows] == MAPPED]
+
+
+def rest_is_elsewhere(
+    T_world_camera: F64,
+    keyframe: Keyframe,
+    segment: list[Keyframe],
+    points: PointRows,
+    maxima: F32,
+    grey: U8,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    generator: np.random.Generator,
+) -> bool:
+    """Whether half as many points prove another pose nearby, of those that this one leaves over.
+
+    keyframe: of a segment, which sees the place.   maxima (M, 3), grey (H, W): of the frame.
+    What shows a place may have been moved in it, and be nearly all that has corners; what stands
+    about it then is not where the pose shows it, but all a step aside.
+    """
+    rows, own = _rows_near(keyframe, segment, points), parameters.recovery
+    seen = prove(T_world_camera, rows, points, maxima, grey, camera, parameters, 0.0)
+    if seen is None:
+        return False
+    radius_px = camera.width * own.max_radius_share
+    grid = MaximaGrid.build(maxima, camera.width, camera.height, radius_px)
+    rest = np.setdiff1d(rows, seen.rows)
+    aside = look_about(
+        seen.T_world_camera, rest, points, grid, grey, radius_px, camera, parameters, generator
+    )
+    if aside is None:
+        return False
+    other = prove(aside, rest, points, maxima, grey, camera, parameters, own.min_agreement)
+    return (
+        other is not None
+        and len(other.rows) > _AS_GOOD * len(seen.rows)
+        and not _is_same_pose(seen.T_world_camera, other.T_world_camera, keyframe, points)
+    )
 
 
 def repeats(
@@ -193,8 +242,9 @@ def _propose(
         agree = found[1]
         T_world_camera = refine(found[0], xyz, points_px, camera, limits).T_world_camera
         yield _Proposed(
-            T_world_camera, pairs[agree, 0], points_px[agree], xyz[agree], agree.sum() / alike
-        )
+            T_world_camera, place, pairs[agree, 0], points_px[agree], xyz[agree],
+            agree.sum() / alike,
+        )  # fmt: skip
         pairs = pairs[~agree]
 
 
@@ -231,10 +281,13 @@ def _is_as_good(
 
 
 def _is_same(a: Recognised, b: Recognised, place: Place, points: PointRows) -> bool:
-    if a.keyframe.segment != b.keyframe.segment:
-        return False
-    between = inverse(a.T_world_camera) @ b.T_world_camera
-    rows = place.keyframe.rows[points.state[place.keyframe.rows] == MAPPED]
-    depth = np.median(transform(inverse(b.T_world_camera), points.xyz[rows])[:, 2])
+    same = a.keyframe.segment == b.keyframe.segment
+    return same and _is_same_pose(a.T_world_camera, b.T_world_camera, place.keyframe, points)
+
+
+def _is_same_pose(a: F64, b: F64, keyframe: Keyframe, points: PointRows) -> bool:
+    between = inverse(a) @ b
+    rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
+    depth = np.median(transform(inverse(b), points.xyz[rows])[:, 2])
     turn = float(np.linalg.norm(so3_log(between[:3, :3])))
     return turn < _SAME_TURN_RAD and float(np.linalg.norm(between[:3, 3])) < _SAME_SHIFT * depth
