@@ -1,5 +1,7 @@
 """A camera that was covered, or in the dark, goes on in its map as soon as it sees it again."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -113,6 +115,34 @@ def test_another_place_is_not_taken_for_the_map(seen):
     assert segments == [0] * 22 + [1] * len(after)
     assert published.states[22] == LOST
     assert published.states[-1] == TRACKING
+
+
+def test_a_few_tracks_that_a_cut_has_left_place_no_camera():
+    """Forty of hundreds agree on a pose: only where the image proves it the camera is there."""
+    scene, poses = Scene.box(2500, noise_px=0.1), sideways(20, step=0.04)
+    squares = textures(len(scene.points))
+    there = poses[-1] @ looking((0.4, 0.1, 0.0), (0.1, -0.2, 0.0))
+    *frames, last = scene.frames([*poses, there])
+    few = np.flatnonzero(np.isin(last.ids, frames[-1].ids))[::12][:40]
+    cut = {name: getattr(last, name)[few] for name in ("ids", "points_px", "ages", "kappas")}
+    cut = replace(last, **cut, states=last.states[few])
+    after = {
+        "what the pose shows": (cut, picture(scene, squares, there)),
+        "something else": (replace(cut, maxima=covered(cut)[0].maxima), covered(cut)[1]),
+    }
+    seen = {}
+    for what, shot in after.items():
+        mapper, published = Mapper(CAMERA, MappingParameters(), 0), Published()
+        for k, tracks in enumerate(frames):
+            grey = picture(scene, squares, poses[k])
+            published.apply(mapper.process(k, k * INTERVAL_NS, tracks, grey, None))
+        published.apply(mapper.process(len(frames), len(frames) * INTERVAL_NS, *shot, None))
+        seen[what] = published
+    assert seen["something else"].states[-1] == LOST
+    assert len(frames) not in seen["something else"].poses
+    assert seen["what the pose shows"].states[-1] == TRACKING
+    error, _ = trajectory_error(seen["what the pose shows"], [*poses, there])
+    assert error < 3e-3
 
 
 def test_time_not_frames_decides_how_far_the_camera_has_gone():

@@ -91,7 +91,7 @@ class Localiser:
             self._motion = Motion.at(frame, stamp_ns, located)
             self._changes.see_again([(self._hanging.id, -1)])
         else:
-            self._motion = self._motion.then(frame, stamp_ns, located)
+            self._motion = self._motion.then(frame, stamp_ns, located, support.inliers)
         self._changes.add_pose(frame, self._hanging, located, support.inliers)
         why = doubt(support, self._parameters.support)
         return self._publish(TRACKING, why, support.inliers, looks_anew=looks_anew)
