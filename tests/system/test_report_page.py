@@ -76,13 +76,15 @@ def test_the_scene_has_the_points_the_path_and_the_mesh(result: pliant.Result, p
     assert np.abs(points - result.points[inside]).max() < step.max()
 
 
-def in_browser(page: Path, profile: Path, what: str) -> subprocess.CompletedProcess[str]:
+def in_browser(
+    page: Path, profile: Path, what: str, size: str = "1000,900"
+) -> subprocess.CompletedProcess[str]:
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("chromium is not installed")
     return subprocess.run(
         [
-            *(browser, "--headless", "--no-sandbox", "--window-size=1000,900"),
+            *(browser, "--headless", "--no-sandbox", f"--window-size={size}"),
             *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
             *(f"--user-data-dir={profile / 'browser'}", "--virtual-time-budget=20000"),
             *(what, page.as_uri()),
@@ -104,6 +106,19 @@ def test_a_browser_draws_it(result: pliant.Result, tmp_path: Path) -> None:
     assert 0.03 < drawn.mean() < 0.99  # a map on its ground, not a blank canvas
     orange = (view[..., 2] > 180) & (view[..., 0] < 120)
     assert orange.sum() > 20  # the camera's path
+
+
+def test_on_a_telephone_the_map_is_whole_too(result: pliant.Result, tmp_path: Path) -> None:
+    picture = tmp_path / "page.png"
+    what = f"--screenshot={picture}"
+    done = in_browser(result.path / "report.html", tmp_path, what, "500,900")
+    assert picture.exists(), done.stderr
+    shown = cv2.imread(str(picture))
+    assert shown is not None
+    ground = np.array([24, 19, 16])
+    drawn = np.abs(shown[120:700, 20:465].astype(int) - ground).max(axis=2) > 8
+    assert drawn.mean() > 0.03
+    assert drawn[:, [0, -1]].mean() < 0.1  # nothing of it is cut off at its sides
 
 
 def test_the_truth_adds_the_error_over_time(result: pliant.Result, tmp_path: Path) -> None:

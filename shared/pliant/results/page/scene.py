@@ -10,13 +10,15 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.meshing.decimation import decimated
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
-from pliant.pictures.map import PATH_COLOUR, PLACES_COLOUR, choose_view
+from pliant.pictures.map import PATH_COLOUR, PLACES_COLOUR, MapView, choose_view
 
 MAX_POINTS = 40_000
 MAX_TRIANGLES = 60_000
 _LEVELS = 65535
-_BACK = 1.4
-"""Farther away than a picture is taken from: who wants to see more closely comes closer."""
+_HALF_SLOPES = np.array([4.0 / 3.0, 1.0]) / 2.4
+"""To the right and to the upper border of a canvas of 4 to 3, as viewer.js projects."""
+_FILLED = 0.92
+"""Share of the canvas that is filled at first."""
 _RIM = 0.005
 """Share of the points that may lie outside of the box that is drawn, at each side."""
 
@@ -48,11 +50,13 @@ def make_scene(
     low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
     size = np.maximum(high - low, 1e-9)
     block = _Block(low, size)
+    shown = cloud
     if mesh is not None and len(mesh.triangles):
         vertices, tints, triangles = decimated(*_outwards(mesh), MAX_TRIANGLES)
         inside = ((vertices >= low - size) & (vertices <= high + size)).all(axis=1)
         triangles = triangles[inside[triangles].all(axis=1)]
         block.add("mesh", vertices, tints, triangles)
+        shown = vertices[np.unique(triangles)] if len(triangles) else cloud
     inside = ((points >= low) & (points <= high)).all(axis=1)
     step = max(1, -(-int(inside.sum()) // MAX_POINTS))
     block.add("points", points[inside][::step], colours[inside][::step])
@@ -61,6 +65,7 @@ def make_scene(
         tints = np.tile(np.array(PLACES_COLOUR, np.uint8), (2 * len(places), 1))
         block.add("places", places.reshape(-1, 3), tints, line=True, pairs=True)
     view = choose_view(points, T_world_camera)
+    target, distance = _framed(shown, path, view)
     direction = view.T_world_view[:3, 2]
     up = view.up / np.linalg.norm(view.up)
     level = direction - (direction @ up) * up
@@ -68,13 +73,34 @@ def make_scene(
     header = {
         "low": low.tolist(),
         "size": size.tolist(),
-        "target": view.centre.tolist(),
-        "distance": _BACK * float(np.linalg.norm(view.T_world_view[:3, 3] - view.centre)),
+        "target": target.tolist(),
+        "distance": distance,
         "height": float(np.arcsin(np.clip(-direction @ up, -1.0, 1.0))),
         "axes": [np.cross(level, up).tolist(), up.tolist(), level.tolist()],
         "layers": block.layers,
     }
     return Scene(json.dumps(header), base64.b64encode(b"".join(block.parts)).decode())
+
+
+def _framed(places: F64, path: F64, view: MapView) -> tuple[F64, float]:
+    """Where to look, and from how far away, along a view, so that it is filled by the places
+    (N, 3), but for stray ones, and by the path (M, 3)."""
+    R, target = view.T_world_view[:3, :3], view.centre
+    distance = float(np.linalg.norm(view.T_world_view[:3, 3] - target))
+    for _ in range(8):
+        seen: list[F64] = []
+        for some, rim in ((places, _RIM), (path, 0.0)):
+            local = (some - target) @ R + (0.0, 0.0, distance)
+            ahead = local[local[:, 2] > 0.1 * distance]
+            if len(ahead):
+                seen.append(np.quantile(ahead[:, :2] / ahead[:, 2:], (rim, 1.0 - rim), axis=0))
+        if not seen:
+            break
+        low, high = np.min(seen, axis=0)[0], np.max(seen, axis=0)[1]
+        target = target + distance * R[:, :2] @ (0.5 * (low + high))
+        too_wide = float(np.max((high - low) / (2.0 * _FILLED * _HALF_SLOPES)))
+        distance *= min(max(too_wide, 0.5), 2.0)
+    return target, distance
 
 
 class _Block:
