@@ -1,12 +1,15 @@
 """``import pliant``: the numbers of the processes, as arrays."""
 
+import inspect
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import typer
 
 import pliant
 from pliant.algorithms.camera import PinholeCamera
@@ -16,6 +19,7 @@ from pliant.datasets.rectifier import decode
 from pliant.errors import CalibrationError, ConfigError, DatasetError, RecordingError, ResultError
 from pliant.formats.ply import read_ply
 from pliant.formats.tum import read_tum
+from pliant_services.cli import app
 
 TINY = "built-in:tiny"
 
@@ -101,6 +105,48 @@ def test_following_a_source_gives_the_numbers_of_the_processes(
     assert [frame.stamp_ns for frame in told] == causal.stamps_ns.tolist()
     poses = np.array([frame.T_world_camera for frame in told])
     np.testing.assert_allclose(poses, causal.T_world_camera, atol=1e-12)
+
+
+def test_a_run_takes_what_the_command_takes() -> None:
+    """But for what is for a terminal, and for runs that are resumed or read their settings."""
+    import_module("pliant_services.cli.commands")  # registers them
+    command = typer.main.get_command(app).commands["run"]  # type: ignore[attr-defined]
+    left = {"view", "save", "poses", "config", "set", "on_crash", "resume", "port"}
+    options = {option.opts[0].removeprefix("--").replace("-", "_") for option in command.params}
+    given = inspect.signature(pliant.run).parameters.keys()
+    assert options - given == left
+    assert given - options == {"settings", "on_frame", "quiet"}
+
+
+def test_a_run_tells_each_pose_as_it_is_known(tmp_path: Path) -> None:
+    told: list[tuple[int, object]] = []
+    part = pliant.run(
+        TINY, output=tmp_path / "part", start=0.2, every=2, sharpest=True, max_size=280,
+        settings={"meshing.enabled": False}, quiet=True,
+        on_frame=lambda frame, T_world_camera: told.append((frame, T_world_camera)),
+    )  # fmt: skip
+    assert part.camera.width == 280
+    assert [frame for frame, _ in told] == list(range(part.report["frames"]))
+    assert part.report["frames"] < 20
+    poses = [T for _, T in told if T is not None]
+    np.testing.assert_allclose(np.array(poses), part.causal_trajectory.T_world_camera, atol=1e-7)
+    assert 0 < len(poses) < len(told)  # a map begins once the camera has moved
+    found = list[object]()
+    within = pliant.run(
+        TINY, output=tmp_path / "within", end=0.3, map=part.path, localise=True, quiet=True,
+        on_frame=lambda frame, T_world_camera: found.append(T_world_camera),
+    )  # fmt: skip
+    located = np.array([T for T in found if T is not None])
+    assert len(located) > 3
+    np.testing.assert_allclose(located, within.causal_trajectory.T_world_camera, atol=1e-7)
+
+
+def test_a_callback_that_raises_ends_the_run(tmp_path: Path) -> None:
+    def refuse(frame: int, T_world_camera: object) -> None:
+        raise ValueError(f"frame {frame}")
+
+    with pytest.raises(ValueError, match="frame 0"):
+        pliant.run(TINY, output=tmp_path / "part", quiet=True, on_frame=refuse)
 
 
 def test_images_one_by_one_give_the_same(followed: list[pliant.Tracked]) -> None:

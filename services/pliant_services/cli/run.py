@@ -48,6 +48,13 @@ def run(
     sharpest: Annotated[
         bool, _everyday("--sharpest", help="With --every: the sharpest of them, not the first.")
     ] = False,
+    poses: Annotated[
+        bool,
+        _everyday(
+            "--poses",
+            help="Print each pose as it is known: pose FRAME SECONDS tx ty tz qx qy qz qw.",
+        ),
+    ] = False,
     view: Annotated[
         Literal["window", "web"] | None, _everyday(help="Look on in Rerun (pliant view).")
     ] = None,
@@ -172,6 +179,7 @@ def run(
         topic=topic,
         view=view,
         save=save,
+        poses=poses,
         port=port,
         on_crash=on_crash,
         resume=resume,

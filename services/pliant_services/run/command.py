@@ -5,7 +5,7 @@ import os
 import shutil
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -67,6 +67,7 @@ class RunRequest:
     port: int | None = None
     view: Literal["window", "web"] | None = None
     save: Path | None = None
+    poses: bool = False
     on_crash: Literal["stop", "restart"] = "stop"
     resume: bool = False
 
@@ -192,10 +193,11 @@ def _go_through(
             with announced(output, fleet.endpoint, fleet.session), progress:
                 if viewer is not None:
                     viewer.start(fleet)
-                fleet.start(lambda name: service_arguments(name, request, output))
-                look_on = f"; look on: pliant view {output}" if has_viewer() else ""
-                progress.say(f"services are up{look_on}")
-                interrupted = _wait(fleet, progress)
+                with _told_poses(request, fleet):
+                    fleet.start(lambda name: service_arguments(name, request, output))
+                    look_on = f"; look on: pliant view {output}" if has_viewer() else ""
+                    progress.say(f"services are up{look_on}")
+                    interrupted = _wait(fleet, progress)
                 if viewer is not None:
                     viewer.see_the_end(fleet)
                 return interrupted, None
@@ -205,6 +207,15 @@ def _go_through(
             return False, error
     finally:
         fleet.close()
+
+
+def _told_poses(request: RunRequest, fleet: Fleet) -> AbstractContextManager[None]:
+    if not request.poses:
+        return nullcontext()
+    from pliant_services.run.poses import told_poses  # it loads what other runs have no use for
+
+    known = None if request.known is None else MapFile(request.known)
+    return told_poses(fleet, known, deformable=request.profile == _DEFORMABLE)
 
 
 def resumed_config(output: Path, request: RunRequest) -> Config:

@@ -13,14 +13,17 @@ import threading
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import zenoh
 
+from pliant.bus.links import END, ENVELOPE
 from pliant.bus.peers import service_of
 from pliant.bus.session import LocalRouter
 from pliant.errors import BusError, MessageError, PliantError
 from pliant.messages import codec, topics
+from pliant.messages.topics import Topic
 from pliant.messages.types import Status
 from pliant_services.processes import BY_NAME
 from pliant_services.runtime.child import Child
@@ -41,6 +44,15 @@ class ServiceDiedError(PliantError):
     def __init__(self, text: str, *, crashed: bool) -> None:
         super().__init__(text)
         self.crashed = crashed
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A message of a service, still encoded."""
+
+    sequence: int
+    is_end: bool
+    data: bytes
 
 
 class Fleet:
@@ -113,6 +125,23 @@ class Fleet:
                 missing = sorted(set(self._services) - self._ready)
                 raise BusError(f"{', '.join(missing)} did not come up in {READY_TIMEOUT_S:.0f} s")
             time.sleep(_POLL_S)
+
+    @contextmanager
+    def listening(self, topic: Topic, on_message: Callable[[Heard], None]) -> Generator[None]:
+        """Hand on what a service says, as it comes, possibly twice; none is asked to wait."""
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            attachment = sample.attachment.to_bytes() if sample.attachment is not None else b""
+            if len(attachment) == ENVELOPE.size and len(sample.payload) <= topic.max_bytes:
+                sequence, _, kind = ENVELOPE.unpack(attachment)
+                on_message(Heard(sequence, kind == END, sample.payload.to_bytes()))
+
+        key = f"pliant/{self.session}/{topic.key}"
+        declared = self._router.declare_subscriber(key, on_sample)
+        try:
+            yield
+        finally:
+            declared.undeclare()
 
     def wait_for_viewer(self, timeout_s: float) -> bool:
         """Wait until somebody looks on, or the time is over."""

@@ -3,16 +3,23 @@
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.geometry import pose_to_matrix
 from pliant.api.result import Result
 from pliant.config import settings_of
 from pliant.errors import ResultError
 from pliant.recording import parts
 from pliant.results.folder import RECORDING_NAME, folder_name
 from pliant.results.verdict import DONE, INCOMPLETE
+
+OnFrame = Callable[[int, F64 | None], object]
+"""Is told the number of a frame and its pose T_world_camera (4, 4); None where it has none."""
 
 
 def run(
@@ -23,28 +30,57 @@ def run(
     calibration: str | Path | None = None,
     fov: float | None = None,
     mask: str | Path | None = None,
+    start: float | None = None,
+    end: float | None = None,
+    every: int | None = None,
+    sharpest: bool = False,
+    topic: str | None = None,
+    max_size: int | None = None,
+    mode: Literal["lossless", "live"] | None = None,
+    map: str | Path | None = None,
+    localise: bool = False,
     profile: Literal["rigid", "deformable"] = "rigid",
+    camera: Literal["static", "moving"] | None = None,
+    depth: Literal["sensor", "map", "flat"] | None = None,
+    depth_frames: Literal["first", "all"] | None = None,
+    images: bool = True,
     settings: Mapping[str, Any] | None = None,
     seed: int | None = None,
+    on_frame: OnFrame | None = None,
     quiet: bool = False,
 ) -> Result:
     """Run the whole pipeline on a source, and open what it leaves::
 
         result = pliant.run("clip.mp4", fov=70)
 
+    Arguments are the options of ``pliant run``: ``pliant run --help`` says more of each.
+
     output: result folder [results/<source>]; force: write into an existing one.    mask: an image
-    whose black parts are ignored in all frames, or a folder of them.    settings: as
-    ``{"tracking.max_tracks": 5000}``.    quiet: print nothing.    ``result.report["verdict"]``
-    says whether it went well.    Raises ResultError with what the command says.
+    whose black parts are ignored in all frames, or a folder of them.    start, end: seconds after
+    the first frame; every: one of so many frames; sharpest: of those, not the first.    max_size:
+    pixels along the longer side.    map: of an earlier run, to go on in; localise: only to find
+    the frames in it.    camera, depth, depth_frames: of the deformable profile.    settings: as
+    ``{"tracking.max_tracks": 5000}``.    quiet: print nothing.
+
+    on_frame: called in this thread with each frame's number and its pose (4, 4), as it is known
+    then (``result.causal_trajectory``), or None: ``on_frame(12, T_world_camera)``.  The run does
+    not wait for it; ``pliant.follow`` gives each frame with its image and tracks.
+
+    ``result.report["verdict"]`` says whether it went well.  Raises ResultError with what the
+    command says, and what ``on_frame`` raises, when the run has been stopped for it.
     """
     folder = Path("results") / folder_name(str(source)) if output is None else Path(output)
+    options: dict[str, object] = {
+        "output": folder, "force": force, "calibration": calibration, "fov": fov, "mask": mask,
+        "start": start, "end": end, "every": every, "sharpest": sharpest, "topic": topic,
+        "max-size": max_size, "mode": mode, "map": map, "localise": localise, "profile": profile,
+        "camera": camera, "depth": depth, "depth-frames": depth_frames, "no-images": not images,
+        "seed": seed, "poses": on_frame is not None,
+    }  # fmt: skip
     command = [sys.executable, "-m", "pliant_services.cli", "run", str(source)]
-    command += ["--output", str(folder), "--profile", profile]
-    command += ["--force"] if force else []
-    command += ["--calibration", str(calibration)] if calibration is not None else []
-    command += ["--fov", str(fov)] if fov is not None else []
-    command += ["--mask", str(mask)] if mask is not None else []
-    command += ["--seed", str(seed)] if seed is not None else []
+    for name, value in options.items():
+        if value is not None and value is not False:
+            command += [f"--{name}"] if value is True else [f"--{name}", str(value)]
     for setting in settings_of(settings or {}):
         command += ["--set", setting]
     said = ""
@@ -55,13 +91,22 @@ def run(
         assert process.stdout is not None
         try:
             for line in process.stdout:
+                if on_frame is not None and line.startswith("pose "):
+                    on_frame(*_told(line))
+                    continue
                 said = line.strip() or said
                 if not quiet:
                     print(line, end="", file=sys.stderr)  # a notebook's, too
-        except KeyboardInterrupt:
+        except BaseException:
             process.send_signal(signal.SIGINT)
             process.communicate()
             raise
     if process.returncode not in (DONE, INCOMPLETE) or not parts.exists(folder / RECORDING_NAME):
         raise ResultError(said.removeprefix("pliant: "))
     return Result(folder)
+
+
+def _told(line: str) -> tuple[int, F64 | None]:
+    """Of a line of ``--poses``: the number of a frame, and its pose (4, 4) where it has one."""
+    _, frame, _, *pose = line.split()
+    return int(frame), pose_to_matrix(np.array(pose, np.float64)) if pose else None

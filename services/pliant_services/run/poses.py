@@ -1,0 +1,80 @@
+"""``pliant run --poses``: each pose as it is known, for whoever reads along.
+
+    pose FRAME SECONDS tx ty tz qx qy qz qw        T_world_camera
+    pose FRAME SECONDS                             it has none, or none yet
+
+It is what trajectory_causal.txt has in the end.  Nobody waits for whoever reads them, but for the
+end of the run, which comes when all have been told.
+"""
+
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from queue import SimpleQueue
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.geometry import matrix_to_pose
+from pliant.errors import MessageError
+from pliant.formats.text import format_fixed, format_seconds
+from pliant.map_history import MapHistory
+from pliant.messages import codec, topics
+from pliant.messages.types import MapUpdate, Surfels
+from pliant.recording.map_file import MapFile
+from pliant_services.runtime.launcher import Fleet, Heard
+
+_LAST_S = 5.0
+"""For what is on the way when the service that said it has left."""
+
+
+@contextmanager
+def told_poses(fleet: Fleet, known: MapFile | None, *, deformable: bool) -> Generator[None]:
+    """Print them until the run is over.  known: the map in which it goes on."""
+    topic = topics.SURFELS if deformable else topics.MAP_UPDATE
+    heard: SimpleQueue[Heard | None] = SimpleQueue()
+    history = MapHistory()
+    for keyframe in known.keyframes() if known is not None else ():
+        history.know(keyframe)
+
+    def print_all() -> None:
+        following = 0
+        while (item := heard.get()) is not None:
+            if item.is_end:
+                return
+            if item.sequence < following:  # sent again
+                continue
+            following = item.sequence + 1
+            with suppress(MessageError):
+                message = codec.decode(topic.message, item.data, max_bytes=topic.max_bytes)
+                assert isinstance(message, MapUpdate | Surfels)
+                print(_line(message, history), flush=True)
+
+    def print_while_somebody_reads() -> None:
+        with suppress(OSError):
+            print_all()
+
+    thread = threading.Thread(target=print_while_somebody_reads, daemon=True)
+    thread.start()
+    try:
+        with fleet.listening(topic, heard.put):
+            yield
+            thread.join(_LAST_S)
+    finally:
+        heard.put(None)
+        thread.join()
+
+
+def _line(message: MapUpdate | Surfels, history: MapHistory) -> str:
+    words = ["pose", str(message.frame), format_seconds(message.stamp_ns)]
+    pose = _pose(message, history)
+    return " ".join(words + ([] if pose is None else [format_fixed(value) for value in pose]))
+
+
+def _pose(message: MapUpdate | Surfels, history: MapHistory) -> F64 | None:
+    """(7,) where there is one."""
+    if isinstance(message, Surfels):
+        lost = message.missing or message.lost
+        return None if lost else matrix_to_pose(message.T_world_camera)
+    with suppress(KeyError):  # its keyframe was in an update that did not come
+        history.apply(message, frame=message.frame, stamp_ns=message.stamp_ns)
+    found = history.causal.get(message.frame)
+    return None if found is None else found[1]
