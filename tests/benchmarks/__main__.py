@@ -64,6 +64,24 @@ def deceiving(
     _print(measure(load_config(None, overrides or []), seeds, only))
 
 
+@app.command()
+def rough(
+    folder: Annotated[Path, typer.Argument(help="Folder of sequences with a ground truth.")],
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Cases whose names have this.")
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Dark, blurred, covered and few frames, things that move, turns: is the camera followed?
+
+    scripts/bench rough ../shared/data/rigid --only black
+    """
+    from benchmarks.rough import measure
+    from pliant.config import load_config
+
+    _print(measure(folder, load_config(None, overrides or []), only or []))
+
+
 @app.command("kept-maps")
 def kept_maps(sources: Sources, overrides: Overrides = None) -> None:
     """Sources cut in two: the second half localised in the map of the first, and going on in it.

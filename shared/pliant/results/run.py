@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I64
+from pliant.algorithms.map_delta import MapDelta
 from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.topics import by_key
@@ -71,6 +72,14 @@ class Run:
         """That of the last segment which has one, and so saw what was known before."""
         return self.corrections[max(self.corrections)] if self.corrections else ()
 
+    def take_calibration(self, update: MapDelta) -> None:
+        """What an update of the map tells of the camera."""
+        for gone, _ in update.joined.tolist():
+            self.corrections.pop(gone, None)
+        if update.calibration_correction:
+            self.corrections[update.segment] = update.calibration_correction
+            self.calibration_sigmas = update.calibration_sigmas
+
     @property
     def scale_is_metric(self) -> bool:
         """Whether lengths of the longest segment are metres: measured, or those of a known map."""
@@ -120,11 +129,7 @@ def read_run(path: Path, scale: Scale | None = None) -> Run:
         elif isinstance(message, MapUpdate):
             final = recorded.topic.key == topics.MAP_FINAL.key
             run.history.apply(message, frame=message.frame, stamp_ns=message.stamp_ns, final=final)
-            for gone, _ in message.joined.tolist():
-                run.corrections.pop(gone, None)
-            if message.calibration_correction:
-                run.corrections[message.segment] = message.calibration_correction
-                run.calibration_sigmas = message.calibration_sigmas
+            run.take_calibration(message)
             if not final:
                 run.inliers[message.frame] = message.inliers
                 if message.reason == PASSED_OVER:
