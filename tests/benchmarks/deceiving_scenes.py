@@ -10,11 +10,11 @@ from functools import partial
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
-from pliant.rendering.atlas import FaceTexture, make_face, mip_pyramid
+from pliant.rendering.face_textures import FaceTexture, make_face, mip_pyramid
 from pliant.rendering.film import CameraOptions
 from pliant.rendering.paths import SplinePath
 from pliant.rendering.render import Renderer, SceneGeometry
-from pliant.rendering.scene import Material, Scene, Solid, Vector, face_sizes
+from pliant.rendering.solids import Material, Scene, Solid, Vector, face_sizes
 
 CAMERA = CameraOptions(width=320, height=240)
 _STEP_M = 0.06

@@ -23,7 +23,7 @@ from pliant.evaluation.result import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
 from pliant.offline import process
-from pliant.rendering.atlas import FaceTexture
+from pliant.rendering.face_textures import FaceTexture
 from pliant.rendering.paths import SampledPath
 from pliant.rendering.render import CameraOptions, Renderer, SceneGeometry
 

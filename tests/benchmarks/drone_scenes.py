@@ -3,7 +3,7 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.rendering.scene import Kind, Material, Scene, Solid
+from pliant.rendering.solids import Kind, Material, Scene, Solid
 
 _MARGIN_M = 3.0
 """Walls stand this far around all flights of a hall; half as far in a room."""

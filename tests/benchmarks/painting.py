@@ -1,6 +1,6 @@
 """The textures of a small scene, in this process."""
 
-from pliant.rendering.atlas import FaceTexture, make_face
+from pliant.rendering.face_textures import FaceTexture, make_face
 from pliant.rendering.render import SceneGeometry
 
 

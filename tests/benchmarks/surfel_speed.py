@@ -24,7 +24,7 @@ from pliant.errors import DatasetError
 from pliant.rendering.film import CameraOptions
 from pliant.rendering.paths import SampledPath
 from pliant.rendering.render import Renderer, SceneGeometry
-from pliant.rendering.scene import Material, Scene, Solid
+from pliant.rendering.solids import Material, Scene, Solid
 
 KINDS: dict[str, dict[str, Any]] = {
     "static camera, each on its own": {"neighbours": 0},

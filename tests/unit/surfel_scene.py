@@ -12,7 +12,7 @@ from pliant.algorithms.surfels.patch_sampling import A, B, Level, X, make_level
 from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.paths import SampledPath
 from pliant.rendering.render import Renderer, SceneGeometry
-from pliant.rendering.scene import Material, Scene, Solid
+from pliant.rendering.solids import Material, Scene, Solid
 
 WIDTH, HEIGHT = 320, 240
 

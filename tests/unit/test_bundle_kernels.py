@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from bundle_scene import cost, dense_normal_equations, make_scene, move, residuals
 
-from pliant.algorithms.bundle.layout import BLOCK, build_layout
+from pliant.algorithms.bundle.dense_layout import BLOCK, build_layout
 from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.projection import limits_of, move_camera, solve_camera
 from pliant.algorithms.bundle.subspace import squared_residuals, total_cost

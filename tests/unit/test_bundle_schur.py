@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pliant.algorithms.bundle.block_product import subtract_product3, subtract_product6
-from pliant.algorithms.bundle.layout import BLOCK
+from pliant.algorithms.bundle.dense_layout import BLOCK
 from pliant.algorithms.bundle.packed_layout import build_packed_layout
 from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.reduced import find_pattern, solve_reduced

@@ -12,7 +12,7 @@ from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.bus.inbox import Inbox
 from pliant.bus.outbox import Numbered, Outbox
 from pliant.bus.peers import Peers, token_key
-from pliant.bus.waiting import Waiting
+from pliant.bus.waits import Waiting
 from pliant.errors import BusError, SessionOverError
 from pliant.messages import topics
 

@@ -23,7 +23,7 @@ from pliant.messages import topics
 from pliant.messages.types import Header, MapUpdate
 from pliant.state import load_state, save_state
 from pliant.viewers.canvas import Canvas
-from pliant.viewers.scene import Scene as Viewed
+from pliant.viewers.drawn_scene import Scene as Viewed
 
 _DARK, _COUNT = 40, 1150
 PARAMETERS = MappingParameters(

@@ -9,7 +9,7 @@ from pliant.errors import RecordingError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import Extrema, Header, SourceImage, StreamEnd
-from pliant.recording.index import Index
+from pliant.recording.chunk_index import Index
 from pliant.recording.parts import RollingWriter
 from pliant.recording.playback import Playback
 
@@ -121,7 +121,7 @@ def test_damage_under_a_whole_index_is_one_line(tmp_path: Path) -> None:
 
 
 def test_seeking_reads_a_few_chunks_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pliant.recording import index as module
+    from pliant.recording import chunk_index as module
 
     path = tmp_path / "a.mcap"
     write(path)

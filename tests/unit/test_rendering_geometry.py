@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.rendering.atlas import face_frame
+from pliant.rendering.face_textures import face_frame
 from pliant.rendering.intersect import face_point, hit_solid
 from pliant.rendering.lens import NO_DISTORTION, pixel_rays
 from pliant.rendering.paths import look_at
 from pliant.rendering.render import SceneGeometry
-from pliant.rendering.scene import KINDS, Kind, Scene, Solid, Vector
 from pliant.rendering.scenes import SCENES
+from pliant.rendering.solids import KINDS, Kind, Scene, Solid, Vector
 
 CAMERA = PinholeCamera(width=70, height=50, fx=60.0, fy=60.0, cx=34.5, cy=24.5)
 RAYS = pixel_rays(CAMERA, NO_DISTORTION)

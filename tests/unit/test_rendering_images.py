@@ -8,7 +8,7 @@ from benchmarks.painting import paint_faces
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import matrix_to_pose, so3_exp
 from pliant.evaluation.visible_depth import DepthView
-from pliant.rendering.atlas import FaceTexture, make_face_colours
+from pliant.rendering.face_textures import FaceTexture, make_face_colours
 from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.lens import lens, pixel_rays
 from pliant.rendering.paths import CameraPath, SampledPath

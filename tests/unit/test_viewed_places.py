@@ -16,7 +16,7 @@ from pliant.messages import topics
 from pliant.messages.types import Header, MapUpdate
 from pliant.results.page.scene import make_scene
 from pliant.viewers.canvas import Canvas
-from pliant.viewers.scene import Scene
+from pliant.viewers.drawn_scene import Scene
 
 
 class Drawn:

@@ -23,8 +23,8 @@ from pliant.recording import parts
 from pliant.recording.reader import Recording
 from pliant.results.folder import RECORDING_NAME, files_read, keep_apart, running_session
 from pliant.viewers.canvas import Canvas
+from pliant.viewers.drawn_scene import Scene
 from pliant.viewers.rerun import RerunCanvas, Where
-from pliant.viewers.scene import Scene
 
 _ENVELOPE_BYTES = 17
 _WAITING = 512  # messages between the network and the drawing; the oldest give way

@@ -13,7 +13,7 @@ from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.bus.faults import FaultLog
 from pliant.bus.health import health_key, health_of
 from pliant.bus.links import IF_OLD, NOTHING, NOW, InLink, OutLink, Shared
-from pliant.bus.waiting import TICK_S, Waiting
+from pliant.bus.waits import TICK_S, Waiting
 from pliant.messages import codec
 
 _ASK_AGAIN_S = 0.1  # what was asked for takes a while, and whoever sends nonsense asks for nothing

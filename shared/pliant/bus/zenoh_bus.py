@@ -33,7 +33,7 @@ from pliant.bus.keeper import Keeper
 from pliant.bus.links import DATA, END, InLink, OutLink, Shared
 from pliant.bus.peers import Peers, token_key
 from pliant.bus.session import Identity, open_session
-from pliant.bus.waiting import Waits
+from pliant.bus.waits import Waits
 from pliant.errors import MessageError
 from pliant.messages import codec
 from pliant.messages.topics import Topic

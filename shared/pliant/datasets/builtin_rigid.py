@@ -21,7 +21,7 @@ from pliant.rendering.paths import CameraPath, SampledPath, TurnedPath
 from pliant.rendering.scenes import SCENES, BuiltinScene
 
 if TYPE_CHECKING:  # they have kernels, and a folder that is there needs none
-    from pliant.rendering.atlas import FaceColours, FaceTexture
+    from pliant.rendering.face_textures import FaceColours, FaceTexture
     from pliant.rendering.render import SceneGeometry
 
 # Raise it with every change that alters a single pixel: old caches are then passed over.
@@ -80,7 +80,7 @@ class RigidPlan:
 
     def render(self, folder: Path, progress: Progress) -> None:
         """Fill an empty folder, but for ``scene.json``."""
-        from pliant.rendering.atlas import make_face, make_face_colours
+        from pliant.rendering.face_textures import make_face, make_face_colours
         from pliant.rendering.render import Renderer, SceneGeometry
 
         geometry = SceneGeometry(self.builtin.scene)

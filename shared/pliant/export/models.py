@@ -15,9 +15,9 @@ from pliant.messages.types import SourceImage
 from pliant.recording.reader import Recording
 from pliant.results.run import read_run
 from pliant.viewers.canvas import Canvas
+from pliant.viewers.drawn_scene import Scene
 from pliant.viewers.foxglove import FoxgloveFile
 from pliant.viewers.rerun import RerunCanvas
-from pliant.viewers.scene import Scene
 
 MESH_NAME = "mesh.ply"
 

@@ -7,7 +7,7 @@ from pliant.errors import RecordingError
 from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import StreamEnd
-from pliant.recording.index import Index, IndexedChunk
+from pliant.recording.chunk_index import Index, IndexedChunk
 from pliant.recording.reader import Recorded
 
 _MARGIN_NS = 200_000_000

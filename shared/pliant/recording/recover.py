@@ -14,7 +14,7 @@ from pliant.errors import MessageError, RecordingError
 from pliant.files import put_in_place
 from pliant.messages import topics
 from pliant.messages.types import StreamEnd
-from pliant.recording.index import Index
+from pliant.recording.chunk_index import Index
 from pliant.recording.parts import PART_RECORD, folder_of_parts, number_of, parts_in
 from pliant.recording.reader import Recorded, Recording
 from pliant.recording.scan import Damage, NothingReadableError

@@ -6,7 +6,7 @@ A colour is said by how much more red and blue than its grey value it has, as sh
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
-from pliant.rendering.scene import Vector
+from pliant.rendering.solids import Vector
 
 LEAST, MOST = -1.0, 0.8
 """Shares of red and blue beyond which a colour would not fit into eight bits."""

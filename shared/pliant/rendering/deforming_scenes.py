@@ -11,8 +11,8 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import so3_exp
 from pliant.rendering.film import FilmOptions
 from pliant.rendering.paths import CameraPath, SplinePath
-from pliant.rendering.scene import Material
 from pliant.rendering.sheets import DeformingScene, Lamp, Sheet
+from pliant.rendering.solids import Material
 
 _DEPTH_M = 0.6
 _CELL_M = 0.01

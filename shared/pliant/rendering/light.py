@@ -7,7 +7,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64
 from pliant.compiler.kernel import kernel
 from pliant.rendering.intersect import hit_solid
-from pliant.rendering.scene import SolidArrays
+from pliant.rendering.solids import SolidArrays
 
 _LAMP_RADIUS_M = 0.25
 _LAMP_SAMPLES = 12

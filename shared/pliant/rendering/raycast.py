@@ -9,7 +9,7 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, U8
 from pliant.compiler.kernel import fast_kernel, kernel
 from pliant.rendering.colours import LEAST
 from pliant.rendering.intersect import Scalar, face_point, load_tile, meet_tile
-from pliant.rendering.scene import SolidArrays
+from pliant.rendering.solids import SolidArrays
 from pliant.rendering.view import TILE_PX, TILE_RAYS, Tiles, View
 
 

@@ -6,19 +6,19 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.geometry import so3_exp
-from pliant.rendering.atlas import (
+from pliant.rendering.colours import colour_image
+from pliant.rendering.face_textures import (
     FaceColours,
     FaceTexture,
     pack_atlas,
     pack_colours,
 )
-from pliant.rendering.colours import colour_image
 from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.lens import NO_DISTORTION, pixel_rays
 from pliant.rendering.paths import CameraPath
 from pliant.rendering.photometry import exposure_gain, sensor_image
 from pliant.rendering.raycast import Atlas, accumulate, cast, cast_depth
-from pliant.rendering.scene import Scene, SolidArrays, face_sizes, solid_arrays
+from pliant.rendering.solids import Scene, SolidArrays, face_sizes, solid_arrays
 from pliant.rendering.view import Tiles, View, tile_bounds, view_of, visible_tiles
 
 # Offsets of the sub-exposures within a pixel, in sixths: no two share a row or a column.

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pliant.rendering.paths import CameraPath, SplinePath
-from pliant.rendering.scene import Kind, Material, Scene, Solid, Vector
+from pliant.rendering.solids import Kind, Material, Scene, Solid, Vector
 
 
 @dataclass(frozen=True)

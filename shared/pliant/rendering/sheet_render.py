@@ -7,7 +7,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.rendering.atlas import FaceTexture, mip_pyramid, pack_atlas
+from pliant.rendering.face_textures import FaceTexture, mip_pyramid, pack_atlas
 from pliant.rendering.film import CameraOptions, RenderedFrame
 from pliant.rendering.lens import NO_DISTORTION, pixel_rays
 from pliant.rendering.photometry import exposure_gain, sensor_image

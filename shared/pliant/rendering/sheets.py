@@ -14,7 +14,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.rendering.paths import CameraPath
-from pliant.rendering.scene import Material, Vector
+from pliant.rendering.solids import Material, Vector
 
 Shape = Callable[[float], F64]
 """From a time in seconds to the (rows, columns, 3) vertices of a sheet, metres, world."""

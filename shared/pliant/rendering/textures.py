@@ -12,7 +12,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64
 from pliant.compiler.kernel import kernel
 from pliant.rendering.colours import shares
-from pliant.rendering.scene import Material
+from pliant.rendering.solids import Material
 
 # Smallest radius of a mark, texels: smaller ones would vanish at the texture's own resolution.
 _MIN_RADIUS = 1.3

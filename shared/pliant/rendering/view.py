@@ -5,7 +5,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32
-from pliant.rendering.scene import SolidArrays
+from pliant.rendering.solids import SolidArrays
 
 Reals: TypeAlias = F32 | F64
 

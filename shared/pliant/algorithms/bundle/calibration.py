@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, BoolArray
-from pliant.algorithms.bundle.layout import BLOCK
+from pliant.algorithms.bundle.dense_layout import BLOCK
 from pliant.algorithms.bundle.normal_equations import RECORD, SHARED
 from pliant.algorithms.bundle.packed_layout import PackedLayout, Slots
 from pliant.algorithms.bundle.problem import CalibrationUncertainty

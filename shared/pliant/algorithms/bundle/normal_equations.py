@@ -24,7 +24,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64
 from pliant.algorithms.bundle.block_product import subtract_product3
-from pliant.algorithms.bundle.layout import BLOCK
+from pliant.algorithms.bundle.dense_layout import BLOCK
 from pliant.algorithms.bundle.packed_layout import Places, Slots
 from pliant.algorithms.bundle.projection import (
     Cameras,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32, I64, BoolArray
-from pliant.algorithms.bundle.layout import (
+from pliant.algorithms.bundle.dense_layout import (
     BLOCK,
     Unknowns,
     columns_of,

@@ -12,7 +12,7 @@ from pliant.algorithms.bundle.calibration import (
     SharedCalibration,
     no_shared_blocks,
 )
-from pliant.algorithms.bundle.layout import points_of, poses_of
+from pliant.algorithms.bundle.dense_layout import points_of, poses_of
 from pliant.algorithms.bundle.normal_equations import (
     FACTOR,
     RECORD,

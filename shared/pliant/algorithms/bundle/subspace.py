@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, BoolArray
-from pliant.algorithms.bundle.layout import (
+from pliant.algorithms.bundle.dense_layout import (
     BLOCK,
     Layout,
     Table,

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, BoolArray
-from pliant.algorithms.bundle.layout import BLOCK, Table
+from pliant.algorithms.bundle.dense_layout import BLOCK, Table
 from pliant.algorithms.bundle.projection import (
     Cameras,
     Limits,

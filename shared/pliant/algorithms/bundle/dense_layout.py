@@ -1,4 +1,4 @@
-"""The dense, padded camera x point layout on which the solvers work.
+"""The dense, padded camera x point layout, on which the subspace method works.
 
 Points are padded to blocks of ``BLOCK`` columns, so that inner loops have a constant length and
 become SIMD code, and a table says which camera sees anything of which block.

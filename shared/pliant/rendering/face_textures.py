@@ -10,7 +10,7 @@ from pliant.compiler.kernel import kernel
 from pliant.rendering.colours import LEAST
 from pliant.rendering.light import light_at
 from pliant.rendering.raycast import SHARE, Atlas, ColourAtlas
-from pliant.rendering.scene import Scene, SolidArrays, face_sizes
+from pliant.rendering.solids import Scene, SolidArrays, face_sizes
 from pliant.rendering.textures import make_colours, make_texture, shrink
 
 LEVELS = 6
