@@ -277,7 +277,7 @@ def reference(
         bool, typer.Option("--refresh", help="Keep what the services make now.")
     ] = False,
 ) -> None:
-    """Replay the reference recording and compare; exit 1 where it differs.
+    """Replay the reference recording and compare; exit 1 where it differs.  And what is kept of it.
 
     scripts/bench reference --refresh
     """
@@ -288,7 +288,9 @@ def reference(
     if refresh:
         version = kept.keep_version(folder.parent / "recordings", folder / kept.INPUT)
         _print([f"a recording of this version: {version}"] if version else [])
-    elif changed:
+        kept.write_table(Path("docs/architecture.md"), folder)
+    _print([kept.table(folder)])
+    if changed and not refresh:
         raise typer.Exit(1)
 
 

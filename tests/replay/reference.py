@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarks.table import markdown
 
 from pliant import arithmetic
 from pliant.bus.replay_bus import ReplayBus
@@ -21,15 +22,18 @@ from pliant.config import config_yaml, load_config, recorded_config
 from pliant.datasets import open_source
 from pliant.errors import ResultError
 from pliant.messages import codec, topics
-from pliant.messages.types import Extrema, Header, MapUpdate
+from pliant.messages.types import Extrema, Header, MapUpdate, Surfels
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
+from pliant.wording import counted
 from pliant_services.nodes import ingest, recorder
 from pliant_services.replay.services import Replay, replayable
 from pliant_services.runtime.monitor import SilentMonitor
 
 INPUT, EXPECTED = "reference.mcap", "reference.json"
-SERVICES = ("tracking", "bundle_adjustment")
+SERVICES = ("tracking", "bundle_adjustment", "meshing", "surfels")
+SETTINGS = ("surfels.depth_from=flat", "surfels.max_surfels=200")
+"""The recording has no depth maps."""
 SOURCE = "built-in:tiny?frames=8"
 BAND = 0.05
 """By how much a median may differ on another machine."""
@@ -59,7 +63,8 @@ def make_input(path: Path) -> None:
 def replay(path: Path) -> dict[str, Any]:
     """Run the services on the recording: fingerprint, counts, hashes and medians by topic."""
     summary = summarise(path)
-    again = Replay(path, summary, replayable(SERVICES), recorded_config(summary.metadata, []))
+    config = recorded_config(summary.metadata, SETTINGS)
+    again = Replay(path, summary, replayable(SERVICES), config)
     with tempfile.TemporaryDirectory(prefix="pliant-reference-") as folder:
         made = Path(folder) / "recording.mcap"
         again.run(made, {})
@@ -77,7 +82,8 @@ def keep_version(folder: Path, input_recording: Path) -> Path | None:
     config = recorded_config(summary.metadata, ["tracking.max_tracks=100"])
     metadata = {"config": {"yaml": config_yaml(config)}}
     small = folder / "small.mcap"
-    Replay(input_recording, summary, replayable(SERVICES), config).run(small, metadata)
+    services = replayable(("tracking", "bundle_adjustment"))
+    Replay(input_recording, summary, services, config).run(small, metadata)
     logged: dict[topics.Topic, list[Header]] = {}
     for message in Recording(small).messages():
         short = not message.topic.per_frame or message.sequence < _VERSION_FRAMES
@@ -97,7 +103,7 @@ def _topic(recording: Recording, topic: topics.Topic) -> dict[str, Any]:
         data = codec.encode(decoded)  # however the recording holds it
         digest.update(len(data).to_bytes(8, "little") + data)
         count += 1
-        if isinstance(decoded, Extrema):
+        if isinstance(decoded, Extrema | Surfels):
             rows.append(len(decoded.ids))
         elif isinstance(decoded, MapUpdate):
             rows.append(decoded.inliers)
@@ -127,6 +133,25 @@ def check(folder: Path) -> list[str]:
     except (OSError, ValueError) as error:
         raise ResultError(f"{folder / EXPECTED}: cannot be read: {error}") from None
     return list(differences(expected, replay(folder / INPUT)))
+
+
+def table(folder: Path) -> str:
+    """What is kept: the fingerprint, and the first bytes of the hashes."""
+    kept = json.loads((folder / EXPECTED).read_text(encoding="utf-8"))
+    rows = [[key, value] for key, value in kept["fingerprint"].items()]
+    rows += [
+        [f"`{key}`", f"{counted(topic['messages'], 'message')}, {topic['sha256'][:16]}"]
+        for key, topic in kept["topics"].items()
+    ]
+    return markdown(["with, and of", "the reference is"], rows)
+
+
+def write_table(page: Path, folder: Path) -> None:
+    """Put the table in its place on a page that has it."""
+    before, first, rest = page.read_text(encoding="utf-8").partition("| with, and of |")
+    assert first, f"{page} has no such table"
+    after = rest[rest.index("\n\n") :]
+    page.write_text(before + table(folder) + after, encoding="utf-8")
 
 
 def refresh(folder: Path, *, new_input: bool = False) -> list[str]:

@@ -22,6 +22,11 @@ def test_the_services_make_of_the_reference_what_they_made() -> None:
     )
 
 
+def test_the_docs_have_the_fingerprints() -> None:
+    page = (DATA.parents[1] / "docs" / "architecture.md").read_text(encoding="utf-8")
+    assert reference.table(REFERENCE) in page, "scripts/bench reference --refresh writes it"
+
+
 def test_other_bytes_count_on_the_same_machine_alone_and_other_counts_everywhere() -> None:
     expected = json.loads((REFERENCE / reference.EXPECTED).read_text())
     assert list(reference.differences(expected, expected)) == []

@@ -45,7 +45,7 @@ def _answer(code: str, environment: dict[str, str]) -> str:
     """What a process prints that inherits nothing of what this one has set."""
     ours = arithmetic.VARIABLES
     kept = {name: value for name, value in os.environ.items() if name not in ours}
-    paths = os.pathsep.join(str(TESTS / folder) for folder in ("unit", "replay"))
+    paths = os.pathsep.join(str(TESTS / folder) for folder in ("", "unit", "replay"))
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={**kept, "PYTHONPATH": paths, **environment},
@@ -65,6 +65,7 @@ def test_threads_of_blas_change_nothing() -> None:
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="of one target on x86-64 alone")
 def test_a_lesser_processor_makes_the_same_of_the_reference() -> None:
+    """Tracks, map, mesh and surfels."""
     ours = json.dumps(reference.replay(_RECORDING))
     assert json.loads(_answer(_REFERENCE, _LESSER)) == json.loads(ours)
 
