@@ -82,7 +82,7 @@ def make_scene(
     return Scene(json.dumps(header), base64.b64encode(b"".join(block.parts)).decode())
 
 
-def _framed(places: F64, path: F64, view: MapView) -> tuple[F64, float]:
+def _framed(places: F64 | F32, path: F64, view: MapView) -> tuple[F64, float]:
     """Where to look, and from how far away, along a view, so that it is filled by the places
     (N, 3), but for stray ones, and by the path (M, 3)."""
     R, target = view.T_world_view[:3, :3], view.centre
