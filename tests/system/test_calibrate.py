@@ -21,13 +21,17 @@ def test_a_camera_is_found_without_a_board(tmp_path: Path) -> None:
     done = pliant("calibrate", TINY, "--fov", "50", "--output", file)
     assert done.returncode == 0, done.stderr
     assert "the focal length was found" in done.stdout
-    assert f"written: {file}" in done.stdout
+    picture = tmp_path / "found.png"
+    assert f"written: {file}, {picture}" in done.stdout
     found, true = read_calibration(file), read_calibration(builtin_folder(TINY) / "calib.yaml")
     guess = 0.5 * true.width / math.tan(math.radians(25.0))
     off = abs(math.log(found.fx / true.fx))
     assert off < 3.0 * found.focal_sigma
     assert off < 0.25 * abs(math.log(guess / true.fx))
-    assert [path.name for path in tmp_path.iterdir()] == ["found.yaml"]
+    assert {path.name for path in tmp_path.iterdir()} == {"found.yaml", "found.png"}
+    drawn = cv2.imread(str(picture))
+    assert drawn is not None
+    assert (drawn == (40, 60, 190)).all(axis=2).sum() > 500  # arrows
     black = np.zeros((48, 64), np.uint8)
     cv2.imwrite(str(tmp_path / "black.png"), black)
     for name, says in (("black.png", "is black all over"), ("none.png", "cannot be read")):

@@ -30,10 +30,13 @@ from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.excerpt import Excerpt
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import CalibrationError, DatasetError, ResultError
+from pliant.export.posed_images import INLIER_PX, IdealCamera
 from pliant.files import make_folder, write_whole
 from pliant.pictures.calibration import SeenCorners, coverage, draw_calibration
 from pliant.pictures.movie import write_image
-from pliant.results.folder import CALIBRATION_NAME, REPORT_NAME, keep_apart
+from pliant.recording.reader import Recording
+from pliant.results.folder import CALIBRATION_NAME, RECORDING_NAME, REPORT_NAME, keep_apart
+from pliant.results.run import read_run, seen_by_keyframes
 from pliant_services.calibrate.board import PrintedBoard
 from pliant_services.cli.progress import tell_progress
 from pliant_services.run.command import INTERRUPTED, RunRequest, run_pipeline
@@ -46,6 +49,10 @@ _KNOWN = 0.05
 """Standard deviation of the log focal length above which it counts as unknown."""
 _WORST = 2e-3
 """Share of the width that corners may be off by: more, and it is not that board."""
+_CELLS = 32
+"""Columns of cells in which the picture without a board says what is left over."""
+_MANY = 10
+"""Sights of points that a cell needs for that."""
 _WHOLE_PX = 1 << 20  # no images are this large: they are not made smaller
 
 
@@ -245,15 +252,54 @@ def calibrate_without_board(
         if not report["segments"]:
             raise CalibrationError(f"{source}: no map could start: {report['last_reason']}")
         calibration = read_calibration(Path(folder) / "run" / CALIBRATION_NAME)
+        left, count = left_over(Recording(Path(folder) / "run" / RECORDING_NAME))
     verdict = str(report["calibration_verdict"]).partition(":")[0]
     if calibration.focal_sigma > _KNOWN:
         raise CalibrationError(
             f"{source}: {verdict}: film sideways and with turns, or film a board "
             "(pliant calibrate --print-board board.pdf)"
         )
+    lines = [_said(calibration, calibration.focal_sigma), verdict]
+    picture = output.with_suffix(".png")
     make_folder(output.parent)
+    of = f"medians of what is left over of {count:,} sights of points, over the image"
+    words = [f"{source}: {lines[0]}", verdict, of]
+    size = calibration.width, calibration.height
+    write_image(picture, draw_calibration([left], *size, words))
     _write(output, calibration, [f"pliant calibrate {source}", verdict])
-    return [_said(calibration, calibration.focal_sigma), verdict, f"written: {output}"]
+    return [*lines, f"written: {output}, {picture}"]
+
+
+def left_over(recording: Recording) -> tuple[SeenCorners, int]:
+    """How far from where the final map has them keyframes see its points, over the image: the
+    median in each of its cells that has many.  And how many sights there are in all.
+
+    Noise is gone from medians: what is left is a lens that is none of the found one's.
+    """
+    run = read_run(recording.path)
+    ideal = IdealCamera(run)
+    told = seen_by_keyframes(recording, set(ideal.keyframes.values()))
+    places, offs = [np.zeros((0, 2))], [np.zeros((0, 2))]
+    for frame, number in ideal.keyframes.items():
+        if number not in told:
+            continue
+        rows, points = run.history.points_of(told[number].point_ids)
+        points_px, T = told[number].points_px[rows], ideal.poses[frame]
+        local = (points.positions - T[:3, 3]) @ T[:3, :3]
+        off = ideal.pixels(frame, points_px) - ideal.camera.project(local)
+        good = (local[:, 2] > 0.0) & (np.linalg.norm(off, axis=1) < INLIER_PX)
+        places.append(points_px[good].astype(np.float64))
+        offs.append(off[good])
+    at, off = np.concatenate(places), np.concatenate(offs)
+    assert run.stream is not None
+    side = run.stream.camera.width / _CELLS
+    _, cell, counts = np.unique(
+        np.floor((at + 0.5) / side), axis=0, return_inverse=True, return_counts=True
+    )
+    many = [np.flatnonzero(cell.reshape(-1) == n) for n in np.flatnonzero(counts >= _MANY)]
+    medians = [(at[rows].mean(axis=0), np.median(off[rows], axis=0)) for rows in many]
+    found = np.array(medians, np.float64).reshape(-1, 2, 2)
+    return SeenCorners(found[:, 0], found[:, 1]), len(at)
 
 
 def _said(calibration: Calibration, focal_sigma: float) -> str:

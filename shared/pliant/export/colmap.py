@@ -13,14 +13,18 @@ from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
 from pliant.export.images import camera_of, make_folder
-from pliant.export.posed_images import IdealCamera, PosedImage, write_posed_images
+from pliant.export.posed_images import (
+    INLIER_PX,
+    IdealCamera,
+    PosedImage,
+    write_posed_images,
+)
 from pliant.formats.colmap import ColmapImage, write_colmap
 from pliant.messages import topics
 from pliant.messages.types import Extrema
 from pliant.recording.reader import Recording
 from pliant.results.run import SeenKeyframe, read_run, seen_by_keyframes
 
-_NEAR_PX = 1.5  # an inlier of the mapper
 _SAME_PX = 0.1  # of a track that was observed, but for rounding
 
 
@@ -117,7 +121,7 @@ def _inliers(
     local = positions[rows] @ T[:3, :3].T + T[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = np.linalg.norm(ideal.camera.project(local) - pixels, axis=1)
-    good = np.flatnonzero((local[:, 2] > 0.0) & (errors < _NEAR_PX) & ideal.shows(pixels))
+    good = np.flatnonzero((local[:, 2] > 0.0) & (errors < INLIER_PX) & ideal.shows(pixels))
     good = good[np.lexsort((errors[good], rows[good]))]
     points, first = np.unique(rows[good], return_index=True)
     return pixels[good[first]], points

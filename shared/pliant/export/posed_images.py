@@ -35,6 +35,8 @@ from pliant.messages.types import CameraStream
 from pliant.recording.reader import Recording
 from pliant.results.run import Run
 
+INLIER_PX = 1.5
+"""Of the mapper."""
 _KEYFRAME = 1.1
 """A keyframe counts as so many times as sharp."""
 
