@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import select
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from collections.abc import Generator, Sequence
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import cv2
@@ -30,6 +32,22 @@ NO_MESH = ("--set", "meshing.enabled=false")
 """For tests of what does not end in a mesh: a process and a third of a run's work less."""
 FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
 """Of a run's results, those that depend on nothing but its input."""
+
+
+def undescribed(report: dict[str, Any]) -> set[str]:
+    """Fields of a report.json that docs/outputs.md does not tell, those within the ones that have
+    a set of their own included."""
+    outputs = (Path(__file__).parents[2] / "docs" / "outputs.md").read_text(encoding="utf-8")
+    section = re.split(r"^## ", outputs, flags=re.MULTILINE)
+    (told,) = (part for part in section if part.startswith("report.json"))
+    fields = set(report)
+    for name in ("known_map", "calibration_correction", "recorder"):
+        fields |= set(report.get(name) or {})
+    for name in ("segments", "mesh"):
+        fields |= {field for each in report.get(name, []) for field in each}
+    for stages in report["milliseconds_per_frame"].values():
+        fields |= {field for stage in stages.values() for field in stage}
+    return fields - set(re.findall(r"`(\w+)`", told))
 
 
 def digests(folder: Path) -> dict[str, str]:

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from running import TINY
+from running import TINY, undescribed
 from running import pliant as pliant_command
 
 import pliant
@@ -45,6 +45,12 @@ def test_it_says_what_the_report_says(result: pliant.Result, page: str) -> None:
     (listed,) = re.findall(r"<h2>Files</h2><table>(.*?)</table>", page, re.DOTALL)
     for name in re.findall(r"<th>(.*?)</th>", listed):
         assert (result.path / name).exists(), name
+
+
+def test_every_field_of_the_report_is_told_in_the_docs(result: pliant.Result) -> None:
+    report = json.loads((result.path / "report.json").read_text())
+    assert undescribed(report) == set()
+    assert undescribed({**report, "new": 1, "known_map": {"newer": 2}}) == {"new", "newer"}
 
 
 def test_nothing_in_it_points_elsewhere(page: str) -> None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from running import assert_one_line, in_this_process, pliant
+from running import assert_one_line, in_this_process, pliant, undescribed
 
 from pliant.export.export import export_result
 from pliant.formats.ply import read_ply
@@ -42,6 +42,7 @@ def test_a_run_leaves_everything_a_user_opens(result: Path) -> None:
     assert len(report["alive_per_frame"]) == FRAMES
     assert report["alive_per_frame"][0] == 60
     assert (report["verdict"], report["doubtful_frames"]) == ("good", [])
+    assert undescribed(report) == set()
     assert len(np.loadtxt(result / "trajectory.txt")) == FRAMES
     with np.load(result / "surfels.npz") as surfels:
         counts = surfels["counts"]
