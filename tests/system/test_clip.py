@@ -1,5 +1,6 @@
 """The clip of a telephone that was held upright, from the command line: run, recording, replay."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -32,6 +33,8 @@ def test_an_upright_clip_is_mapped_and_its_recording_replays_to_the_same_bytes(
     given = ("--calibration", sequence / "calib.yaml")
     done = pliant("run", clip, *given, *NO_MESH, "--output", folder)
     assert done.returncode == 0, done.stderr
+    # Where nothing draws nobody is told to look on (and in test_mesh.py, without Rerun).
+    assert (f"; look on: pliant view {folder}" in done.stderr) == bool(find_spec("rerun"))
     result = pliant_api.open(folder)
     assert result.image(20).shape[:2] == (height, width)
     assert len(result.trajectory) == len(upright)
