@@ -215,6 +215,21 @@ def clip(
     _print(measure(video))
 
 
+@app.command("phone-clip")
+def phone_clip(
+    sources: Sources,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Length of the clip.")] = 15.0,
+    keep: Annotated[Path | None, typer.Option(help="Folder for clips and results.")] = None,
+) -> None:
+    """Clips like a telephone's, 1920x1080, through `pliant run` without a calibration.
+
+    scripts/bench phone-clip path/to/tum_fr1_xyz
+    """
+    from benchmarks.phone_clip import measure
+
+    _print(measure(sources, seconds, keep))
+
+
 @app.command("recording-bytes")
 def recording_bytes(
     source: Annotated[

@@ -48,9 +48,9 @@ def measure(sources: Sequence[str]) -> Iterator[str]:
             folder = Path(name)
             stamps = _write_images(source, folder / "images")
             for by, once in (("Pliant", _pliant), ("COLMAP", _colmap)):
-                began, spent = time.monotonic(), _children_s()
+                began, spent = time.monotonic(), children_s()
                 found, points = once(source, folder, stamps)
-                wall, cpu = time.monotonic() - began, _children_s() - spent
+                wall, cpu = time.monotonic() - began, children_s() - spent
                 told = evaluate_trajectory(found, truth, frames=len(stamps))
                 yield markdown_row(
                     (
@@ -62,7 +62,8 @@ def measure(sources: Sequence[str]) -> Iterator[str]:
                 )
 
 
-def _children_s() -> float:
+def children_s() -> float:
+    """Processor time of what has been started here and has ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
