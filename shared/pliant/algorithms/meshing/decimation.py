@@ -32,14 +32,14 @@ def decimated(positions: F32, colours: U8, triangles: I32, most: int) -> tuple[F
     """
     places = positions.astype(np.float64)
     tints = np.column_stack([colours, np.ones(len(colours))]).astype(np.float64)
-    triangles = _proper(triangles.astype(np.int64))
-    quadrics = _quadrics(places, triangles)
+    faces = _proper(triangles.astype(np.int64))
+    quadrics = _quadrics(places, faces)
     blocked = np.zeros(0, np.int64)
-    while len(triangles) > most:
-        edges, _ = _edges(triangles, len(places))
+    while len(faces) > most:
+        edges, _ = _edges(faces, len(places))
         free = edges[~np.isin(edges, blocked)]
-        chosen, onto = _cheapest(free, places, quadrics, -(-(len(triangles) - most) // 2))
-        kept = _unfolded(chosen, onto, places, triangles)
+        chosen, onto = _cheapest(free, places, quadrics, -(-(len(faces) - most) // 2))
+        kept = _unfolded(chosen, onto, places, faces)
         blocked = np.concatenate([blocked, chosen[~kept]])
         if not kept.any():
             if not len(chosen):
@@ -51,8 +51,8 @@ def decimated(positions: F32, colours: U8, triangles: I32, most: int) -> tuple[F
         tints[u] += tints[v]
         becomes = np.arange(len(places))
         becomes[v] = u
-        triangles = _proper(becomes[triangles])
-    used, corners = np.unique(triangles, return_inverse=True)
+        faces = _proper(becomes[faces])
+    used, corners = np.unique(faces, return_inverse=True)
     means = np.rint(tints[used, :3] / tints[used, 3:]).astype(np.uint8)
     return places[used].astype(np.float32), means, corners.reshape(-1, 3).astype(np.int32)
 
