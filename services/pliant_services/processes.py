@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from pliant.messages import topics
 from pliant.messages.topics import Topic
+from pliant_services.profiles import PROFILES as PROFILES
 
 if TYPE_CHECKING:
     from pliant.config import Config
@@ -102,15 +103,6 @@ PROCESSES: tuple[Process, ...] = (
 
 BY_NAME = {process.name: process for process in PROCESSES}
 COMPILED = tuple(process.name for process in PROCESSES if process.kernels)
-
-PROFILES: dict[str, tuple[str, ...]] = {
-    "rigid": ("ingest", "tracking", "bundle_adjustment", "meshing", "recorder"),
-    "points": ("ingest", "tracking", "bundle_adjustment", "recorder"),
-    "deformable": ("ingest", "surfels", "recorder"),
-    "deformable-tracks": ("ingest", "tracking", "surfels", "recorder"),
-    "deformable-map": ("ingest", "tracking", "bundle_adjustment", "surfels", "recorder"),
-}
-"""``deformable`` becomes one of the others where surfels are configured to use what those make."""
 
 
 def reads_depth(fleet: Sequence[str], config: "Config") -> bool:

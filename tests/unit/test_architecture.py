@@ -124,9 +124,9 @@ def test_no_file_names_a_machine() -> None:
 
 
 CALLS_NO_KERNEL = (
+    "pliant_services.cli.commands",  # the first: without numpy, too
     "pliant.config",
     "pliant.datasets.builtin",
-    "pliant_services.cli.commands",
     "pliant_services.cli.router",
     "pliant_services.nodes.ingest",
     "pliant_services.nodes.recorder",
@@ -142,7 +142,8 @@ def test_what_calls_no_kernel_loads_none() -> None:
         "import importlib, sys\n"
         "for name in sys.argv[1:]:\n"
         "    importlib.import_module(name)\n"
-        "    if 'numba' in sys.modules: sys.exit(f'{name} loads kernels')"
+        "    if 'numba' in sys.modules: sys.exit(f'{name} loads kernels')\n"
+        "    if name.endswith('commands') and 'numpy' in sys.modules: sys.exit(f'{name}: numpy')"
     )
     command = [sys.executable, "-c", code, *CALLS_NO_KERNEL]
     done = subprocess.run(command, capture_output=True, text=True)

@@ -9,6 +9,7 @@ from pliant.config import Config
 from pliant.messages import topics
 from pliant_services import processes
 from pliant_services.processes import PROCESSES, PROFILES
+from pliant_services.profiles import NAMES
 from pliant_services.runtime.host import checkpoint_windows
 
 
@@ -31,6 +32,10 @@ def test_the_recorder_gets_everything_that_is_logged(profile: str) -> None:
     for name in fleet:
         for topic, readers in processes.readers_of(name, fleet).items():
             assert ("recorder" in readers) == topic.logged
+
+
+def test_profiles_name_all_services_and_no_other() -> None:
+    assert set(NAMES) == set(processes.BY_NAME)
 
 
 def test_every_topic_of_the_table_is_published_by_one_process() -> None:

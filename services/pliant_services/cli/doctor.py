@@ -5,7 +5,6 @@ import shutil
 import sys
 import time
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import Literal
 
 import typer
@@ -68,10 +67,12 @@ def _python() -> Finding:
 
 
 def _package(distribution: str, module: str) -> Finding:
+    from importlib.metadata import version  # which a help page does not need
+
     try:
         importlib.import_module(module)
         return Finding("ok", distribution, version(distribution))
-    except (ImportError, OSError, PackageNotFoundError) as error:
+    except (ImportError, OSError) as error:
         remedy = f"pip install --force-reinstall {distribution}"
         return Finding("error", distribution, f"{_line(error)}; {remedy}")
 

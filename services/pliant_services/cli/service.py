@@ -8,12 +8,12 @@ import typer
 
 from pliant.errors import PliantError
 from pliant_services.cli.options import Connect, TlsFolder, identity_in
-from pliant_services.processes import BY_NAME, PROFILES
+from pliant_services.profiles import NAMES, PROFILES
 
 if TYPE_CHECKING:
     from pliant.config import Config
 
-_NAMES, _PROFILES = ", ".join(BY_NAME), ", ".join(PROFILES)
+_NAMES, _PROFILES = ", ".join(NAMES), ", ".join(PROFILES)
 
 
 def service(
@@ -81,8 +81,8 @@ def service(
     if with_launcher:
         end_with_launcher()
 
-    if name not in BY_NAME:
-        raise PliantError(f"no service {name}: choose {', '.join(BY_NAME)}")
+    if name not in NAMES:
+        raise PliantError(f"no service {name}: choose {_NAMES}")
     if profile not in PROFILES:
         raise PliantError(f"--profile {profile}: choose {_PROFILES}")
     names = tuple(fleet.split(",")) if fleet else PROFILES[profile]

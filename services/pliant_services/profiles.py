@@ -1,0 +1,11 @@
+"""Which services a session has, by name alone: help pages need no topics, which load numpy."""
+
+PROFILES: dict[str, tuple[str, ...]] = {
+    "rigid": ("ingest", "tracking", "bundle_adjustment", "meshing", "recorder"),
+    "points": ("ingest", "tracking", "bundle_adjustment", "recorder"),
+    "deformable": ("ingest", "surfels", "recorder"),
+    "deformable-tracks": ("ingest", "tracking", "surfels", "recorder"),
+    "deformable-map": ("ingest", "tracking", "bundle_adjustment", "surfels", "recorder"),
+}
+"""``deformable`` becomes one of the others where surfels are configured to use what those make."""
+NAMES = tuple(dict.fromkeys(name for fleet in PROFILES.values() for name in fleet))
