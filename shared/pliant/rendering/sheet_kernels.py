@@ -66,6 +66,16 @@ def _area(a: F64, b: F64, c: F64) -> Scalar:
 
 
 @kernel
+def _half_cell(number: int, columns: int) -> tuple[int, int, int, int]:
+    """Row and column of its first corner, and the steps to the second; the third is across.
+
+    Upper: (0, 0), (1, 0), (1, 1) in steps of (column, row).  Lower: (0, 0), (0, 1), (1, 1).
+    """
+    i, j, half = number // 2 // (columns - 1), number // 2 % (columns - 1), number % 2
+    return i, j, 1 - half, half
+
+
+@kernel
 def rasterise(
     points: F64, number: int, offset_u: float, offset_v: float, nearness: F64, seen: I32, where: F32
 ) -> None:
@@ -78,9 +88,7 @@ def rasterise(
     height, width = nearness.shape
     rows, columns = points.shape[:2]
     for cell in range((rows - 1) * (columns - 1) * 2):
-        i, j, half = cell // 2 // (columns - 1), cell // 2 % (columns - 1), cell % 2
-        # Upper: (0, 0), (1, 0), (1, 1) in steps of (column, row).  Lower: (0, 0), (0, 1), (1, 1).
-        right, down = 1 - half, half
+        i, j, right, down = _half_cell(cell, columns)
         a, b, c = points[i, j], points[i + down, j + right], points[i + 1, j + 1]
         area = _area(a, b, c)
         if area == 0.0:
@@ -103,8 +111,7 @@ def pick(points: F64, number: int, pixels: F64, nearness: F64, seen: I32, where:
     """As ``rasterise``, at any (N, 2) pixels: nearness (N,), seen (N,), where (N, 2)."""
     rows, columns = points.shape[:2]
     for cell in range((rows - 1) * (columns - 1) * 2):
-        i, j, half = cell // 2 // (columns - 1), cell // 2 % (columns - 1), cell % 2
-        right, down = 1 - half, half
+        i, j, right, down = _half_cell(cell, columns)
         a, b, c = points[i, j], points[i + down, j + right], points[i + 1, j + 1]
         area = _area(a, b, c)
         if area == 0.0:

@@ -6,7 +6,7 @@ linearly in pixels is the perspective-correct interpolation of depth.
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
@@ -16,6 +16,13 @@ from pliant.compiler.kernel import kernel
 
 _NEAREST_SHARE = 1e-3
 """Triangles nearer than this share of the median depth are left out: there is no clipping."""
+
+Pinhole: TypeAlias = tuple[float, float, float, float]
+"""fx, fy, cx, cy, for the kernels."""
+
+
+def _pinhole(camera: PinholeCamera) -> Pinhole:
+    return camera.fx, camera.fy, camera.cx, camera.cy
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,7 @@ def render_depth(
     nearest, weights = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     _rasterise(
         triangles, points_px.astype(np.float64), inverse_depths.astype(np.float64),
-        sigmas.astype(np.float64), camera.fx, camera.fy, camera.cx, camera.cy, nearest, weights,
+        sigmas.astype(np.float64), _pinhole(camera), nearest, weights,
     )  # fmt: skip
     depths = np.zeros(shape, np.float32)
     np.divide(np.float32(1.0), nearest, out=depths, where=nearest > 0.0)
@@ -97,10 +104,11 @@ def _slopes(values: F64) -> F64:
 
 @kernel
 def _rasterise(
-    triangles: I32, pixels: F64, inverse: F64, sigmas: F64,
-    fx: float, fy: float, cx: float, cy: float, nearest: F32, weights: F32,
+    triangles: I32, pixels: F64, inverse: F64, sigmas: F64, pinhole: Pinhole,
+    nearest: F32, weights: F32,
 ) -> None:  # fmt: skip
     height, width = nearest.shape
+    fx, fy, cx, cy = pinhole
     for t in range(len(triangles)):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         if not (min(inverse[a], inverse[b], inverse[c]) > 0.0):
@@ -207,10 +215,8 @@ def view_mesh(points: F32, faces: I32, camera: PinholeCamera, T_world_camera: F6
     front = in_camera[:, 2][in_camera[:, 2] > 0.0]
     if len(front):
         near = _NEAREST_SHARE * float(np.median(front))
-        _draw(
-            np.ascontiguousarray(in_camera), faces, near,
-            camera.fx, camera.fy, camera.cx, camera.cy, nearest, triangles, shares,
-        )  # fmt: skip
+        points_in_camera = np.ascontiguousarray(in_camera)
+        _draw(points_in_camera, faces, near, _pinhole(camera), nearest, triangles, shares)
     depths = np.zeros(shape, np.float32)
     np.divide(1.0, nearest, out=depths, where=nearest > 0.0, casting="same_kind")
     return MeshView(depths, triangles, shares)
@@ -218,10 +224,11 @@ def view_mesh(points: F32, faces: I32, camera: PinholeCamera, T_world_camera: F6
 
 @kernel
 def _draw(
-    points: F64, faces: I32, near: float, fx: float, fy: float, cx: float, cy: float,
+    points: F64, faces: I32, near: float, pinhole: Pinhole,
     nearest: F64, triangles: I32, shares: F32,
 ) -> None:  # fmt: skip
     height, width = nearest.shape
+    fx, fy, cx, cy = pinhole
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         if min(points[a, 2], points[b, 2], points[c, 2]) < near:
