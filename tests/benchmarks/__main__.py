@@ -540,7 +540,7 @@ def mesh_live(
     ],
     overrides: Overrides = None,
 ) -> None:
-    """Two ways in which the live mesh can follow the corrections of the map, against true depth.
+    """The live mesh with and without following the corrections of the map, against true depth.
 
     scripts/bench mesh-live results/room --groundtruth built-in:room
     """

@@ -1,27 +1,37 @@
 """Meshes of the same keyframes beside each other: smoothing and fusion against the truth."""
 
+import time
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.poisson import poisson_mesh
 from benchmarks.table import markdown
-from pliant.algorithms.geometry import pose_to_matrix
-from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
-from pliant.config import recorded_config
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.geometry import pose_to_matrix, transform
+from pliant.algorithms.meshing.mesh_blocks import BlockMesh, TriangleMesh
+from pliant.config import Config, recorded_config
 from pliant.datasets.base import is_builtin
 from pliant.datasets.builtin import builtin_folder
 from pliant.errors import ResultError
 from pliant.evaluation.mesh_truth import Mesh
-from pliant.evaluation.recorded_mesh import compare_mesh
+from pliant.evaluation.recorded_mesh import compare_mesh, depth_camera
 from pliant.evaluation.result import evaluate_result
+from pliant.evaluation.surface_distance import share_within, thin_out
+from pliant.evaluation.truth import true_frames
+from pliant.fusion.keyframe_spool import KeyframeSpool
+from pliant.fusion.mesher import Mesher
 from pliant.map_history import MapHistory
+from pliant.messages import topics
 from pliant.messages.mesh_pieces import joined
+from pliant.messages.types import Keyframe, MapUpdate
 from pliant.recording.summary import summarise
 from pliant.results.folder import RECORDING_NAME
 from pliant.results.mesh import meshes_of
 from pliant.results.run import read_run
+from pliant.results.scale import MetricRecording
 from pliant_services.mesh.command import Meshing, mesh_recording
 from pliant_services.nodes.meshing import warm_up
 
@@ -31,13 +41,16 @@ _SMOOTHING = {
     "no smoothing": "none",
 }
 _CORRECTIONS = {
-    "live, in the end: a preview until it is settled": "settled",
-    "live, in the end: put in again where the map moves it": "moved",
+    "keyframes stay where they were put": "settled",
+    "keyframes follow the map": "moved",
 }
 _FIGURES = (
     "covered", "median error", "within 5 %", "with the scale that fits", "normals",
     "F-score (precision, recall)", "triangles",
 )  # fmt: skip
+_NEAR = ("voxel", "vertices within half of one", "within one", "within two", "triangles")
+_STRIDE_PX = 4
+"""Every so many pixels of the true depth."""
 
 
 def measure(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterator[str]:
@@ -57,22 +70,17 @@ def measure(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterato
 
 
 def measure_live(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterator[str]:
-    """A table of both ways in which the live mesh can follow the map, and of the final one."""
+    """A table of the live mesh with and without following the map, and of the final one."""
     compared = _Compared(result, groundtruth)
     warm_up()
     rows: list[list[str]] = []
-    for name, kind in _CORRECTIONS.items():
-        found = compared.make([*overrides, f"meshing.corrections={kind}"])
-        counts = found.counters
-        fusions = int(counts["fused"] + counts["settled"] + counts["again"])
-        # The last report comes after the final mesh.
-        spent = found.cpu_seconds[-2] - found.cpu_seconds[0]
-        spent_ms = 1e3 * spent / len(compared.history.keyframes)
-        figures = compared.figures(_mesh(found.live.mesh()))
-        rows.append([name, str(fusions), f"{spent_ms:.0f}", *figures])
-    coarse = meshes_of(found.pieces)[compared.segment, "coarse"]
-    rows.append(["the final coarse mesh", "", "", *compared.figures(_mesh(joined(coarse)))])
-    yield markdown(["coarse mesh", "fusions", "CPU ms a keyframe", *_FIGURES], rows)
+    for name, way in _CORRECTIONS.items():
+        for when, mesh, voxel, *costs in compared.live([*overrides, f"meshing.corrections={way}"]):
+            rows.append([f"{name}, {when}", *costs, *compared.near(mesh, voxel)])
+    coarse = meshes_of(compared.make(overrides).pieces)[compared.segment, "coarse"]
+    figures = compared.near(joined(coarse), coarse[0].voxel_size)
+    rows.append(["the final coarse mesh", "", "", *figures])
+    yield markdown(["coarse mesh", "fusions", "CPU ms a keyframe", *_NEAR], rows)
 
 
 class _Compared:
@@ -89,9 +97,74 @@ class _Compared:
         self.history = run.history
         self.segment = run.history.longest_segment()
 
+    def _config(self, overrides: Sequence[str]) -> Config:
+        return recorded_config(summarise(self._recording).metadata, overrides)
+
     def make(self, overrides: Sequence[str]) -> Meshing:
-        config = recorded_config(summarise(self._recording).metadata, overrides)
-        return mesh_recording(self._recording, config)
+        return mesh_recording(self._recording, self._config(overrides))
+
+    def live(self, overrides: Sequence[str]) -> Iterator[tuple[str, TriangleMesh, float, str, str]]:
+        """When, the live mesh of the last segment, its voxels, fusions, and CPU ms a keyframe: at
+        the last frame, and as after so many more frames where it was behind the map."""
+        recording, held = MetricRecording(self._recording), BlockMesh()
+        updates, keyframes = (recording.decoded(t) for t in (topics.MAP_UPDATE, topics.KEYFRAME))
+        with KeyframeSpool() as spool:
+            mesher = Mesher(self._camera, self._config(overrides).meshing, spool)
+            spent, segment, voxel = 0.0, -1, 0.0
+
+            def fuse() -> None:
+                nonlocal held, spent, segment, voxel
+                begun = time.process_time()
+                changes = mesher.fuse()
+                spent += time.process_time() - begun
+                for change in changes:
+                    held = held if change.segment == segment else BlockMesh()
+                    held.apply(change.blocks)
+                    segment, voxel = change.segment, change.voxel_size
+
+            def row(when: str) -> tuple[str, TriangleMesh, float, str, str]:
+                fusions = sum(int(mesher.counts[k]) for k in ("fused", "settled", "again"))
+                each_ms = 1e3 * spent / len(spool.keyframes())
+                return when, held.mesh(), voxel, str(fusions), f"{each_ms:.0f}"
+
+            for update, keyframe in zip(updates, keyframes, strict=True):
+                assert isinstance(update, MapUpdate)
+                assert isinstance(keyframe, Keyframe)
+                mesher.take(update, keyframe, keyframe.images(), update.frame, keyframe.masks())
+                fuse()
+            yield row("at the last frame")
+            if behind := mesher.behind:
+                while mesher.behind:
+                    fuse()
+                yield row(f"{behind} frames later")
+
+    def near(self, mesh: TriangleMesh, voxel: float) -> list[str]:
+        """One of each of _NEAR, for voxels in units of the map."""
+        alignment = self._evaluation.final.alignment
+        if alignment is None:
+            raise ResultError("without an aligned trajectory the mesh has no scale")
+        points = alignment.apply(mesh.positions.astype(np.float64))
+        voxel_m = alignment.scale * voxel
+        true = thin_out(self._true_surface, voxel_m / 8)
+        shares = [share_within(points, true, share * voxel_m) for share in (0.5, 1.0, 2.0)]
+        figures = [f"{100 * share:.1f} %" for share in shares]
+        return [f"{100 * voxel_m:.1f} cm", *figures, str(len(mesh.triangles))]
+
+    @cached_property
+    def _true_surface(self) -> F64:
+        """(N, 3) of what the keyframes show."""
+        frames, parts = true_frames(self._truth), [np.zeros((0, 3))]
+        camera = depth_camera(self._truth, self._camera)
+        for frame, (segment, _) in self.history.keyframe_poses().items():
+            if segment != self.segment:
+                continue
+            depth, T_world_camera = frames(frame)
+            v, u = np.nonzero(depth[::_STRIDE_PX, ::_STRIDE_PX])
+            pixels = _STRIDE_PX * np.stack([u, v], axis=1)
+            rays = np.column_stack([camera.normalise(pixels.astype(np.float64)), np.ones(len(u))])
+            z = depth[pixels[:, 1], pixels[:, 0], None]
+            parts.append(transform(T_world_camera, z * rays))
+        return np.concatenate(parts)
 
     def figures(self, mesh: Mesh) -> list[str]:
         """One of each of _FIGURES."""

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from pliant.algorithms.geometry import pose_to_matrix
-from pliant.algorithms.meshing.mesh_blocks import BlockMesh
 from pliant.config import Config, recorded_config
 from pliant.errors import RecordingError
 from pliant.files import write_whole
@@ -16,7 +15,7 @@ from pliant.fusion.memory import check_voxel_sizes
 from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.topics import Topic
-from pliant.messages.types import CameraStream, Header, MeshPiece, MeshUpdate, Status
+from pliant.messages.types import CameraStream, Header, MeshPiece, Status
 from pliant.recording.parts import parts_of
 from pliant.recording.summary import summarise
 from pliant.results.folder import keep_apart, written
@@ -32,33 +31,21 @@ _MESHING = BY_NAME["meshing"]
 
 @dataclass
 class Meshing:
-    """What meshing a recording gave.
-
-    seconds: total time of each stage.    live: the live mesh of the segment that was last, as a
-    viewer has it in the end.    cpu_seconds: of the process, at each report.
-    """
+    """What meshing a recording gave.  seconds: total time of each stage."""
 
     pieces: list[MeshPiece] = field(default_factory=list[MeshPiece])
     seconds: dict[str, float] = field(default_factory=dict[str, float])
     counters: dict[str, float] = field(default_factory=dict[str, float])
     notes: list[str] = field(default_factory=list[str])
-    live: BlockMesh = field(default_factory=BlockMesh)
-    live_segment: int = -1
-    cpu_seconds: list[float] = field(default_factory=list[float])
 
     def take(self, topic: Topic, message: Header) -> None:
         """What the service publishes."""
         if isinstance(message, MeshPiece):
             self.pieces.append(message)
-        elif isinstance(message, MeshUpdate):
-            if message.segment != self.live_segment:
-                self.live, self.live_segment = BlockMesh(), message.segment
-            self.live.apply(message)
         elif isinstance(message, Status):
             for stage, spent in zip(message.stages, message.seconds.tolist(), strict=True):
                 self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
             self.counters.update(zip(message.counters, message.values.tolist(), strict=True))
-            self.cpu_seconds.append(self.counters["cpu_seconds"])
             if message.note:
                 self.notes.append(message.note)
 

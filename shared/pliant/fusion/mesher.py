@@ -202,6 +202,11 @@ class Mesher:
             self._fuse_one(self._again[0], "again", timer)
 
     @property
+    def behind(self) -> int:
+        """Keyframes that the live mesh lacks, or has elsewhere than the map: ``fuse`` takes one."""
+        return len(self._again)
+
+    @property
     def memory(self) -> dict[str, float]:
         """Bytes of the live volume and of the spool on disk, and blocks of the volume."""
         live = self._live.volume if self._live is not None else None
