@@ -94,6 +94,20 @@ def kept_maps(sources: Sources, overrides: Overrides = None) -> None:
     _print(measure(sources, load_config(None, overrides or [])))
 
 
+@app.command("changed-places")
+def changed_places(
+    seeds: Annotated[int, typer.Option(min=1, help="Rooms.")] = 3, overrides: Overrides = None
+) -> None:
+    """How often rendered rooms are recognised: darker, exposed otherwise, rearranged, from afar.
+
+    scripts/bench changed-places --seeds 3
+    """
+    from benchmarks.changed_places import measure
+    from pliant.config import load_config
+
+    _print(measure(load_config(None, overrides or []), seeds))
+
+
 @app.command()
 def sessions(sources: Sources, overrides: Overrides = None) -> None:
     """Sources forth and back, whole and as two sessions with the dark between them.
@@ -101,6 +115,18 @@ def sessions(sources: Sources, overrides: Overrides = None) -> None:
     scripts/bench sessions path/to/7scenes_redkitchen400 built-in:corridor
     """
     from benchmarks.sessions import measure
+    from pliant.config import load_config
+
+    _print(measure(sources, load_config(None, overrides or [])))
+
+
+@app.command()
+def kidnappings(sources: Sources, overrides: Overrides = None) -> None:
+    """Sources whose camera is carried off ten times, in the dark and from image to image.
+
+    scripts/bench kidnappings built-in:room path/to/7scenes_redkitchen400
+    """
+    from benchmarks.sessions import kidnappings as measure
     from pliant.config import load_config
 
     _print(measure(sources, load_config(None, overrides or [])))
@@ -119,7 +145,12 @@ def merged_maps(sources: Sources, overrides: Overrides = None) -> None:
 
 
 @app.command("without-places")
-def without_places(sources: Sources, overrides: Overrides = None) -> None:
+def without_places(
+    sources: Sources,
+    lit: Annotated[bool, typer.Option(help="As they are.")] = True,
+    cut: Annotated[bool, typer.Option(help="And with the dark in the middle.")] = True,
+    overrides: Overrides = None,
+) -> None:
     """Sources with and without places, as they are and with two seconds in the dark.
 
     scripts/bench without-places path/to/7scenes_redkitchen400 built-in:court
@@ -127,7 +158,7 @@ def without_places(sources: Sources, overrides: Overrides = None) -> None:
     from benchmarks.without_places import measure
     from pliant.config import load_config
 
-    _print(measure(sources, load_config(None, overrides or [])))
+    _print(measure(sources, load_config(None, overrides or []), lit=lit, cut=cut))
 
 
 @app.command("surfel-speed")

@@ -140,6 +140,14 @@ def rooms(seed: int, *, both: bool, other: Sequence[str] = ("picture",)) -> Dece
 _MOVED_M = 0.4
 
 
+def furniture() -> list[str]:
+    """Names of what stands and hangs in a room."""
+    names = [solid.name for solid in _room("", 0.0, np.random.default_rng(0))]
+    return [
+        name.strip() for name in names if name.strip() not in ("floor", "left", "right", "back")
+    ]
+
+
 def room_with(seed: int, *moved: str) -> Deceiver:
     """A room in which some things hang or stand elsewhere after the dark."""
     solids = _room("first", 0.0, np.random.default_rng([seed, 1]))
@@ -222,11 +230,11 @@ def floor(seed: int) -> Deceiver:
 
 
 class Film:
-    """Films a deceiver, painted with this seed, way after way."""
+    """Films a deceiver, painted with this seed, way after way.   geometry: what there is."""
 
     def __init__(self, deceiver: Deceiver, seed: int) -> None:
         self._seed = seed
-        self._geometry, self._textures = _paint(deceiver, seed)
+        self.geometry, self._textures = _paint(deceiver, seed)
 
     def along(self, way: Way, first: int = 0) -> Iterator[tuple[U8, F64]]:
         """Images (H, W) and true T_world_camera.  first: number of the first frame."""
@@ -234,7 +242,7 @@ class Film:
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum() / _STEP_M
         path = SplinePath(positions, targets, duration_s=float(steps) / CAMERA.fps)
         options = CAMERA.model_copy(update={"seed": self._seed})
-        renderer = Renderer(self._geometry, self._textures, path, options)
+        renderer = Renderer(self.geometry, self._textures, path, options)
         for k in range(int(steps)):
             frame = renderer.frame(first + k, k / CAMERA.fps)
             yield frame.image, frame.T_world_camera

@@ -1,107 +1,98 @@
-"""A sequence forth and back, whole and as two sessions with the dark between them: one map?"""
+"""A sequence forth and back, as two sessions with the dark between them, and with kidnappings."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.played import Played, Reel
 from benchmarks.table import markdown_header, markdown_row
-from pliant.algorithms.geometry import align_umeyama
-from pliant.algorithms.mapping.trial import mapper_for
-from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.config import Config
-from pliant.datasets import open_source
-from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.evaluation.report import metres
-from pliant.formats.trajectory_files import read_trajectory
-from pliant.map_history import MapHistory
-from pliant.trajectory import associate
 
 _DARK_S = 1.5
 _AGAIN = 0.1
 """Of the first session's frames, the last ones: the second session comes back as far as these."""
-_DARK = -1
-_HEADER = ("source", "forth and back", "two sessions", "segments", "joined at", "poses")
+_HEADER = (
+    *("source", "places", "forth and back", "two sessions", "of the same frames", "segments"),
+    *("joined at", "poses"),
+)
 
-
-@dataclass
-class _Seen:
-    """ate_m: of the longest segment.    share: of its poses among the frames that are lit."""
-
-    ate_m: float
-    segments: int
-    joined: list[int]
-    share: float
-
-
-class _Sequence:
-    def __init__(self, name: str, config: Config) -> None:
-        self._config = config
-        dataset = open_source(name)
-        self._calibration = dataset.calibration
-        self._frames = list(dataset)
-        self._stamps_ns = np.array([frame.stamp_ns for frame in self._frames])
-        assert dataset.ground_truth_path is not None
-        truth = read_trajectory(Path(dataset.ground_truth_path))
-        mine, true = associate(self._stamps_ns, truth.stamps_ns)
-        self._truth = dict(zip(mine.tolist(), truth.positions[true], strict=True))
-        self.step_ns = int(np.median(np.diff(self._stamps_ns)))
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def run(self, order: list[int]) -> _Seen:
-        """Frames one after the other, at the sequence's rate."""
-        rectifier, config = Rectifier(self._calibration), self._config
-        camera = rectifier.camera
-        tracker = ExtremaTracker(camera.width, camera.height, config.tracking, config.seed)
-        mapper = mapper_for(
-            camera, config.bundle_adjustment, config.seed, self._calibration.focal_sigma
-        )
-        history, joined = MapHistory(), list[int]()
-        for number, source in enumerate(order):
-            image = rectified(self._frames[max(source, 0)], rectifier)
-            if source == _DARK:
-                dark = np.zeros_like(image.grey), np.zeros_like(image.colour)
-                image = replace(image, grey=dark[0], colour=dark[1])
-            colour = image.colour if image.colour.size else None
-            stamp_ns, tracks = number * self.step_ns, tracker.track(image.grey)
-            delta = mapper.process(number, stamp_ns, tracks, image.grey, colour)
-            mapper.publish_keyframes()
-            history.apply(delta, frame=number, stamp_ns=stamp_ns)
-            joined += [number] * len(delta.joined)
-        history.apply(mapper.finish(), frame=len(order) - 1, stamp_ns=0, final=True)
-        longest, final = history.longest_segment(), history.final()
-        poses = {n: pose for n, (segment, pose) in final.items() if segment == longest}
-        known = [n for n in poses if order[n] in self._truth]
-        mine = np.array([poses[n][:3] for n in known])
-        true = np.array([self._truth[order[n]] for n in known])
-        scale, R, t = align_umeyama(mine, true, with_scale=True)
-        errors = np.linalg.norm(scale * mine @ R.T + t - true, axis=1)
-        return _Seen(
-            ate_m=float(np.sqrt((errors**2).mean())),
-            segments=len({segment for segment, _ in final.values()}),
-            joined=joined,
-            share=len(poses) / sum(source != _DARK for source in order),
-        )
+_KIDNAPPINGS = 10
+_SEEN_S = 0.7
+"""After each."""
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+_KIDNAPPED = (
+    *("source", "kidnapped", "times", "found", "frames until found: median", "worst", "segments"),
+    *("poses", "ATE", "worst", "causal", "worst"),
+)
 
 
 def measure(sources: list[str], config: Config) -> Iterator[str]:
-    """A row for each source, whose frames have true poses."""
+    """Two rows for each source, with places and without.
+
+    The same frames: those that have a pose in the longest segment of both.
+    """
     yield markdown_header(_HEADER)
     for name in sources:
-        sequence = _Sequence(name, config)
-        count = len(sequence)
+        reel = Reel(name, config)
+        count = len(reel)
         middle = count // 2
         last = middle - round(_AGAIN * middle)
         back = list(range(count - 1, last - 1, -1))
-        whole = sequence.run([*range(count), *back])
-        dark = [_DARK] * round(1e9 * _DARK_S / sequence.step_ns)
-        cut = sequence.run([*range(middle), *dark, *back])
-        yield markdown_row(
-            (
-                *(Path(name).name, metres(whole.ate_m), metres(cut.ate_m), str(cut.segments)),
-                *(", ".join(map(str, cut.joined)) or "-", f"{100.0 * cut.share:.1f} %"),
+        orders = [*range(count), *back], [*range(middle), *reel.night(_DARK_S), *back]
+        played = {on: [reel.play(order, places=on) for order in orders] for on in (True, False)}
+        same = played[True][1].final.keys() & played[False][1].final.keys()
+        for on, (whole, cut) in played.items():
+            cells = (
+                *(Path(name).name, "on" if on else "off", metres(whole.ate_m(whole.final))),
+                *(metres(cut.ate_m(cut.final)), metres(cut.ate_m(cut.final, same))),
+                *(str(cut.segments), ", ".join(map(str, cut.joined)) or "-", cut.share),
             )
-        )
+            yield markdown_row(cells)
+
+
+def kidnappings(sources: list[str], config: Config) -> Iterator[str]:
+    """Two rows for each source: from the dark, and by a cut from image to image."""
+    yield markdown_header(_KIDNAPPED)
+    for name in sources:
+        reel = Reel(name, config)
+        for how, seconds in (("in the dark", _DARK_S), ("at once", 0.0)):
+            order, arrivals = kidnapped(reel, seconds, _KIDNAPPINGS)
+            came = reel.play(order)
+            until = frames_until_found(came, arrivals)
+            waited = [len(a) if n is None else n for n, a in zip(until, arrivals, strict=True)]
+            errors = [came.errors_m(poses) for poses in (came.final, came.causal)]
+            cells = (
+                *(Path(name).name, how, str(len(arrivals)), str(len(until) - until.count(None))),
+                *(f"{np.median(waited):g}", str(max(waited)), str(came.segments), came.share),
+                *(each for e in errors for each in (metres(_rms(e)), metres(float(e.max())))),
+            )
+            yield markdown_row(cells)
+
+
+def kidnapped(reel: Reel, dark_s: float, times: int) -> tuple[list[int], list[range]]:
+    """The whole sequence, and then a short stretch of it, and another, forwards and backwards.
+
+    dark_s: before each.   Returns the order of frames, and the numbers of the images of each
+    stretch.
+    """
+    length = round(1e9 * _SEEN_S / reel.step_ns)
+    order, arrivals = list(range(len(reel))), list[range]()
+    for k in range(times):
+        begin = int((k * _GOLDEN % 1.0) * (len(reel) - length))
+        stretch = range(begin, begin + length)
+        order += reel.night(dark_s)
+        arrivals.append(range(len(order), len(order) + length))
+        order += stretch if k % 2 == 0 else reversed(stretch)
+    return order, arrivals
+
+
+def frames_until_found(came: Played, arrivals: list[range]) -> list[int | None]:
+    """After each kidnapping, 1: at once.   None: never in its stretch."""
+    first = [next((n for n in seen if n in came.causal), None) for seen in arrivals]
+    return [None if n is None else n - seen[0] + 1 for n, seen in zip(first, arrivals, strict=True)]
+
+
+def _rms(errors: np.ndarray) -> float:
+    return float(np.sqrt((errors**2).mean()))

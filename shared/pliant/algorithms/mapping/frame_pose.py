@@ -2,6 +2,7 @@
 found again, then adjusted together with the window (VITAMIN-E section 3.2, Eq. 6)."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,9 +27,16 @@ from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 _TELLING = 500
 """Points at the least that tell whether a camera stands where it stood."""
 
-_FEW = 0.05
+_FEW, _FIRM = 0.05, 0.2
 """Of the points that placed the last frame: where a film is cut, 0.3 to 2 % agree on a pose by
-chance; a fast turn with blur leaves a tenth."""
+chance, and 9 % where the views overlap; the fastest turns with blur leave 11 to 20 %."""
+
+
+class Located(NamedTuple):
+    """T_world_camera of a frame.   is_firm: so much leads there that the view has not been cut."""
+
+    T_world_camera: F64
+    is_firm: bool
 
 
 def directions_of(active: ActiveMap) -> I64:
@@ -44,9 +52,9 @@ def localise(
     seen: FrameExtrema,
     grey: U8 | None,
     generator: np.random.Generator,
-) -> F64 | None:
-    """T_world_camera of the frame from the tracks of mapped points, or else from the map's points
-    in the image; None where both fail.
+) -> Located | None:
+    """The frame from the tracks of mapped points, or else from the map's points in the image; None
+    where both fail.
 
     Few tracks prove nothing by themselves: where the view changes at once, those that some extremum
     carries on have all been moved alike, as if by a camera.
@@ -69,19 +77,20 @@ def localise(
         inliers = int(located.inliers.sum())
         if inliers >= limits.min_inliers:
             if grey is None or inliers >= _FEW * motion.inliers:
-                return located.T_world_camera
+                return Located(located.T_world_camera, inliers >= _FIRM * motion.inliers)
             proved = prove(
                 located.T_world_camera, active.nearby(), points, seen.maxima, grey, active.camera,
                 parameters, parameters.recovery.min_agreement,
             )  # fmt: skip
             if proved is not None:
-                return proved.T_world_camera
+                return Located(proved.T_world_camera, True)
     if grey is None:
         return None
-    return recover(
+    recovered = recover(
         motion, stamp_ns, active.nearby(), points, seen.maxima, grey, active.camera, parameters,
         generator,
     )  # fmt: skip
+    return None if recovered is None else Located(recovered, True)
 
 
 def at_once(

@@ -23,7 +23,7 @@ from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.recovery import Motion
-from pliant.algorithms.mapping.relocalisation import Recognised
+from pliant.algorithms.mapping.relocalisation import Recognised, is_same_pose
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.support import Support, doubt, support_of
 from pliant.algorithms.mapping.whole_map import WholeMap
@@ -133,20 +133,26 @@ class Localiser:
     def _locate(
         self, stamp_ns: int, tracks: FrameExtrema, grey: U8 | None, timer: StageTimer
     ) -> F64 | None:
+        there = None
         if self._map is not None and self._motion is not None:
             with timer("localisation"):
                 located = localise(
                     self._map, self.calibration, self._motion, stamp_ns, tracks, grey,
                     self._generator,
                 )  # fmt: skip
-            if located is not None:
-                return located
+            there = None if located is None else located.T_world_camera
+            if located is not None and located.is_firm:
+                return there
         if grey is None:
-            return None
+            return there
         with timer("places"):
             found = self.recognise(tracks.maxima, grey, self._generator)
         if found is None:
-            return None
+            return there
+        if there is not None and self._map is not None:
+            same = found.keyframe.segment == self._map.segment.id
+            if same and is_same_pose(there, found.T_world_camera, found.keyframe, self._points):
+                return there
         self._hanging, self._motion = found.keyframe, None
         segment = next(each for each in self._segments if each.id == found.keyframe.segment)
         self._map = ActiveMap(segment, 0, self.calibration.view.camera, self._parameters)

@@ -17,6 +17,7 @@ from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, 
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.atlas import Atlas
 from pliant.algorithms.mapping.frame_pose import (
+    Located,
     adjust,
     at_once,
     directions_of,
@@ -30,6 +31,7 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import EarlierPose, placed_again
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.recovery import Motion
+from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of
 from pliant.algorithms.mapping.start import Start
@@ -281,26 +283,42 @@ class Mapper:
         self, frame: int, stamp_ns: int, tracks: FrameExtrema, grey: U8 | None
     ) -> F64 | None:
         """T_world_camera of the frame where it goes on, or else where it was seen before."""
-        active = self.atlas.active
+        active, located = self.atlas.active, None
         if active is not None:
             with self._timer("localisation"):
                 located = localise(
                     active, self.calibration, self._motion, stamp_ns, tracks, grey, self._generator
                 )
-            if located is not None:
-                return located
+            if located is not None and located.is_firm:
+                return located.T_world_camera
         with self._timer("places"):
-            return self._recognise(frame, stamp_ns, tracks, grey)
+            return self._recognise(frame, stamp_ns, tracks, grey, located)
 
     def _recognise(
-        self, frame: int, stamp_ns: int, tracks: FrameExtrema, grey: U8 | None
+        self,
+        frame: int,
+        stamp_ns: int,
+        tracks: FrameExtrema,
+        grey: U8 | None,
+        located: Located | None,
     ) -> F64 | None:
-        """T_world_camera in the segment that the image shows, which then goes on."""
+        """T_world_camera in the segment that the image shows, which then goes on.
+
+        located: where a few tracks lead, which counts where the image shows no other place.
+        """
+        there = None if located is None else located.T_world_camera
         if grey is None:
-            return None
+            return there
         found = self.atlas.recognise(grey, tracks.maxima, self._generator)
         if found is None:
-            return None
+            return there
+        keyframe, pose = found.keyframe, found.T_world_camera
+        if (
+            there is not None
+            and keyframe.segment == self.atlas.segment
+            and is_same_pose(there, pose, keyframe, self.atlas.points)
+        ):
+            return there
         if self.atlas.active is not None:
             self._keyframe_changes.settle(self.atlas.active.keyframes)
         self.atlas.go_on(found.keyframe, tracks.ids)

@@ -174,7 +174,7 @@ def rest_is_elsewhere(
     return (
         other is not None
         and len(other.rows) > _AS_GOOD * len(seen.rows)
-        and not _is_same_pose(seen.T_world_camera, other.T_world_camera, keyframe, points)
+        and not is_same_pose(seen.T_world_camera, other.T_world_camera, keyframe, points)
     )
 
 
@@ -282,10 +282,11 @@ def _is_as_good(
 
 def _is_same(a: Recognised, b: Recognised, place: Place, points: PointRows) -> bool:
     same = a.keyframe.segment == b.keyframe.segment
-    return same and _is_same_pose(a.T_world_camera, b.T_world_camera, place.keyframe, points)
+    return same and is_same_pose(a.T_world_camera, b.T_world_camera, place.keyframe, points)
 
 
-def _is_same_pose(a: F64, b: F64, keyframe: Keyframe, points: PointRows) -> bool:
+def is_same_pose(a: F64, b: F64, keyframe: Keyframe, points: PointRows) -> bool:
+    """Whether two poses of a frame are one, before what a keyframe sees."""
     between = inverse(a) @ b
     rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
     depth = np.median(transform(inverse(b), points.xyz[rows])[:, 2])
