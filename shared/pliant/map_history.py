@@ -268,6 +268,12 @@ class MapHistory(CurrentMap):
             if pose.inliers >= MIN_INLIERS and pose.keyframe in self.keyframes
         ]
 
+    def same_places_in(self, segment: int) -> F64:
+        """(L, 2, 3) where the keyframes of a segment stand that show one place, two by two."""
+        at = {n: k.pose_world_camera[:3] for n, k in self.keyframes.items() if k.segment == segment}
+        lines = [(at[a], at[b]) for a, b in self.same_places if {a, b} <= at.keys()]
+        return np.array(lines, np.float64).reshape(-1, 2, 3)
+
     def longest_segment(self) -> int:
         """The segment with the most supported frames (the earliest of equals); -1 without any."""
         counts: dict[int, int] = {}

@@ -174,6 +174,11 @@ def test_map_is_seen_from_above_and_behind() -> None:
     assert picture.shape == (120, 160, 3)
     assert np.array_equal(picture, render_map(points, colours, T, view=view, size=(160, 120)))
     assert (picture.astype(int).sum(axis=2) > 200).mean() > 0.05
+    one_place = np.stack([T[0, :3, 3], T[-1, :3, 3]])[None]
+    with_places = render_map(points, colours, T, view=view, size=(160, 120), places=one_place)
+    changed = with_places[(with_places != picture).any(axis=2)].astype(int)
+    assert len(changed) > 10
+    assert (changed.argmax(axis=1) == 1).mean() > 0.8  # green
 
 
 @pytest.mark.parametrize("aspect", [0.5, 4 / 3, 3.0])

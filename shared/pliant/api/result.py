@@ -167,12 +167,16 @@ class Result(Mapped):
         return recorded_surfels(self._recording.path)
 
     def picture(self, width: int = 960, height: int = 720) -> U8:
-        """(height, width, 3) RGB of the points and the camera's path."""
+        """(height, width, 3) RGB of the points, the camera's path, and lines between keyframes that
+        show one place."""
         poses = self.trajectory.T_world_camera
         if not len(poses):
             raise ResultError(f"{self.path}: the run has no map to draw")
         view = choose_view(self.points, poses)
-        return render_map(self.points, self.colours, poses, view=view, size=(width, height))
+        places = self.history.same_places_in(self.history.longest_segment())
+        return render_map(
+            self.points, self.colours, poses, view=view, size=(width, height), places=places
+        )
 
     def __repr__(self) -> str:
         return f"<pliant.Result {str(self.path)!r}: {len(self.trajectory)} poses>"

@@ -12,6 +12,8 @@ BACKGROUND = (16, 19, 24)
 PATH_COLOUR = (255, 150, 40)
 PLACES_COLOUR = (90, 220, 110)
 """Of lines between what shows one place."""
+_DOT = 0.008
+"""Of the picture's rows: radius of the dots at their ends, which may lie in one place."""
 
 FOCAL = 1.2  # of the height of the picture
 _ASPECT = 4.0 / 3.0
@@ -157,13 +159,15 @@ def render_map(
     view: MapView,
     size: tuple[int, int] = (960, 720),
     splat: float = 0.003,
+    places: F64 | None = None,
 ) -> U8:
     """Draw points and the camera's path; returns (height, width, 3) RGB.
 
     points: (P, 3); those of surfaces that turn away from the eye are left out, so that one looks
     into a room through its walls.      colours: (P, 3) RGB.      T_world_camera: (N, 4, 4), drawn
     as a line with the last camera's pyramid.      size: columns and rows.      splat: radius of a
-    point at the middle distance, as a share of the rows.
+    point at the middle distance, as a share of the rows.      places: (L, 2, 3) from where one
+    place was seen: dots with a line between.
     """
     width, height = size[0] * _SUPERSAMPLE, size[1] * _SUPERSAMPLE
     shown = (points @ view.up <= view.ceiling) & _towards(points, T_world_camera, view)
@@ -171,6 +175,8 @@ def render_map(
     image, depth = _splat(px, z, colours[shown], (width, height), splat * height, view.reach)
     image = _shade(image, depth, view.reach)
     _draw_path(image, T_world_camera, view)
+    if places is not None:
+        _draw_places(image, places, view)
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8)
 
@@ -251,18 +257,33 @@ def _shade(image: F32, depth: F32, reach: float) -> U8:
     return np.clip(np.round(shaded), 0, 255).astype(np.uint8)
 
 
-def _draw_path(image: U8, T_world_camera: F64, view: MapView) -> None:
-    if not len(T_world_camera):
-        return
+def _draw_line(image: U8, points: F64, view: MapView, colour: tuple[int, int, int]) -> None:
     height, width = image.shape[:2]
-    corners, z = _project(T_world_camera[:, :3, 3], view, width, height)
+    corners, z = _project(points, view, width, height)
     fixed = np.round(corners * (1 << _SHIFT)).astype(np.int32)
     front = z > 1e-9
     # Parts behind the eye interrupt the line.
     for part in np.split(np.arange(len(fixed)), np.flatnonzero(~front)):
         line = fixed[part[front[part]]]
         if len(line) > 1:
-            cv2.polylines(image, [line], False, PATH_COLOUR, _SUPERSAMPLE + 1, cv2.LINE_AA, _SHIFT)
+            cv2.polylines(image, [line], False, colour, _SUPERSAMPLE + 1, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_places(image: U8, places: F64, view: MapView) -> None:
+    height, width = image.shape[:2]
+    for line in places:
+        _draw_line(image, line, view, PLACES_COLOUR)
+        centres, z = _project(line, view, width, height)
+        for u, v in np.round(centres[z > 1e-9] * (1 << _SHIFT)).astype(int).tolist():
+            radius = round(_DOT * height * (1 << _SHIFT))
+            cv2.circle(image, (u, v), radius, PLACES_COLOUR, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_path(image: U8, T_world_camera: F64, view: MapView) -> None:
+    if not len(T_world_camera):
+        return
+    _draw_line(image, T_world_camera[:, :3, 3], view, PATH_COLOUR)
+    height, width = image.shape[:2]
     size = 0.02 * view.reach
     corners_x, corners_y = np.array([0, -1, 1, 1, -1]), np.array([0, -0.75, -0.75, 0.75, 0.75])
     local = size * np.stack([corners_x, corners_y, np.array([0, 1.3, 1.3, 1.3, 1.3])], axis=1)

@@ -55,14 +55,10 @@ def _map(run: Run, final: dict[int, tuple[int, F64]]) -> str:
     if not len(poses):
         return ""
     points = run.history.points_in(longest)
-    at = {
-        n: k.pose_world_camera[:3] for n, k in run.history.keyframes.items() if k.segment == longest
-    }
-    lines = [(at[a], at[b]) for a, b in run.history.same_places if {a, b} <= at.keys()]
     return canvas(
         make_scene(
             points.positions, points.colours, pose_to_matrix(poses), mesh_of(run.mesh, longest),
-            np.array(lines),
+            run.history.same_places_in(longest),
         )
     )  # fmt: skip
 
