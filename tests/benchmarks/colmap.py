@@ -5,6 +5,7 @@ whole command with its mesh, start-up included, and COLMAP's features, sequentia
 incremental mapping of undistorted images that are ready for it, with its defaults for a video.
 """
 
+import os
 import resource
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import cv2
 import numpy as np
 
 from benchmarks.table import markdown_header, markdown_row
+from pliant import arithmetic
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
@@ -145,7 +147,12 @@ def map_by_colmap(images: Path, folder: Path, camera: PinholeCamera | None = Non
 
 
 def main() -> None:
-    """In a process of its own, whose processor time is COLMAP's."""
+    """In a process of its own, whose processor time is COLMAP's.
+
+    Its libraries choose as from a shell: what fixes our arithmetic would leave them one thread.
+    """
+    for name in arithmetic.VARIABLES:
+        os.environ.pop(name, None)
     folder, numbers = Path(sys.argv[1]), sys.argv[2]
     images = folder / "images"
     first: Any = cv2.imread(str(next(images.iterdir())), cv2.IMREAD_GRAYSCALE)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from running import (
+    AS_FROM_A_SHELL,
     NO_MESH,
     TIMEOUT_S,
     TINY,
@@ -46,7 +47,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Generator[str]:
     with (
         (folder / "log").open("w") as log,
         subprocess.Popen(
-            [sys.executable, "cluster.py"], cwd=folder, text=True, stderr=log,
+            [*AS_FROM_A_SHELL, sys.executable, "cluster.py"], cwd=folder, text=True, stderr=log,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         ) as process,
     ):  # fmt: skip

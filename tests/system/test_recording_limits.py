@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks.recorder_kills import measure
-from running import NO_MESH, TINY, pliant
+from running import AS_FROM_A_SHELL, NO_MESH, TINY, pliant
 
 from pliant.config import config_yaml, load_config
 from pliant.messages import topics
@@ -75,7 +75,7 @@ def test_a_full_disk_is_one_line_and_what_was_written_is_readable(tmp_path: Path
     )
     run = ["run", f"{TINY}?frames=30", "--output", str(tmp_path / "r")]
     done = subprocess.run(
-        [sys.executable, "-c", code, *run],
+        [*AS_FROM_A_SHELL, sys.executable, "-c", code, *run],
         capture_output=True,
         text=True,
         timeout=300,
