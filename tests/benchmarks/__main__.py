@@ -573,7 +573,7 @@ def mesh_live(
 ) -> None:
     """The live mesh with and without following the corrections of the map, against true depth.
 
-    scripts/bench mesh-live results/room --groundtruth built-in:room
+    scripts/bench mesh-live results/court --groundtruth built-in:court
     """
     from benchmarks.mesh import measure_live
 
