@@ -161,6 +161,37 @@ def without_places(
     _print(measure(sources, load_config(None, overrides or []), lit=lit, cut=cut))
 
 
+@app.command("unknown-lens")
+def unknown_lens(
+    sources: Sources,
+    frames: Annotated[int | None, typer.Option(min=2, help="First frames [all].")] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Sources without a calibration and with wrong ones: the lens that is found, and the error.
+
+    scripts/bench unknown-lens path/to/tsukuba150 built-in:room --frames 200
+    """
+    from benchmarks.unknown_lens import measure
+
+    _print(measure(sources, frames, overrides or []))
+
+
+@app.command("any-size")
+def any_size(
+    sources: Sources,
+    sizes: Annotated[list[str], typer.Option("--size", help="WIDTHxHEIGHT; may be repeated.")],
+    frames: Annotated[int, typer.Option(min=2, help="First frames.")] = 60,
+    overrides: Overrides = None,
+) -> None:
+    """The same frames at several sizes, rendered, enlarged or made smaller: the map of each.
+
+    scripts/bench any-size built-in:room --size 320x240 --size 640x480 --size 1920x1440
+    """
+    from benchmarks.any_size import measure
+
+    _print(measure(sources, sizes, frames, overrides or []))
+
+
 @app.command("surfel-speed")
 def surfel_speed(
     source: Annotated[
