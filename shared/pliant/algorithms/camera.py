@@ -4,6 +4,7 @@ Pixels are (u, v) with (0, 0) at the centre of the top-left pixel; the camera fr
 y down, z forward.  Everything behind the ingest works on rectified images and ``PinholeCamera``.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,3 +36,8 @@ class PinholeCamera:
     def normalise(self, points_px: F32 | F64) -> F64:
         """(N, 2) pixels to (N, 2) coordinates on the plane z = 1."""
         return (np.asarray(points_px, np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+
+
+def size_unit(width: int, height: int) -> float:
+    """How many times as large as 640x480 images are, by the diagonal: however they are held."""
+    return math.hypot(width, height) / math.hypot(640.0, 480.0)

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
-from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.camera import PinholeCamera, size_unit
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
@@ -363,7 +363,7 @@ class Mapper:
         limits = self._parameters.keyframe
         least = CANDIDATE if len(directions_of(active)) else MAPPED
         share, flow = active.window.flow_since_keyframe(least)
-        unit = self._camera.width / 640.0
+        unit = size_unit(self._camera.width, self._camera.height)
         if share < limits.min_shared_share or flow > limits.max_flow_px * unit:
             return True
         late = stamp_ns - self._keyframe_ns > 1e9 * limits.max_s

@@ -149,7 +149,7 @@ class KeyframeParameters(Parameters):
         default=20.0,
         gt=0.0,
         description="A keyframe is due when the median point moved by this since the last, beside "
-        "the turn of the camera, px at an image width of 640",
+        "the turn of the camera, px at 640x480",
     )
     max_s: float = Field(
         default=0.65,
@@ -157,7 +157,7 @@ class KeyframeParameters(Parameters):
         description="A keyframe is due after this many seconds with any motion",
     )
     min_flow_px: float = Field(
-        default=3.0, gt=0.0, description="Motion under which no keyframe is made, px at 640"
+        default=3.0, gt=0.0, description="Motion under which no keyframe is made, px at 640x480"
     )
 
 
