@@ -1,4 +1,4 @@
-"""A source of any kind through the rigid pipeline in this process, with what it found of its lens."""
+"""A source through the rigid pipeline in this process, and what it found of its lens."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,8 @@ from pliant.offline import Pipeline
 
 @dataclass(frozen=True)
 class Mapped:
-    """ate_m, causal_m: of the longest segment; inf where less than 90 % of the frames are in it.
+    """ate_m, causal_m: of the longest segment; the first is inf where it has less than 90 % of the
+    frames.
     share: of the frames with a pose in it.   tracks, inliers: medians over the frames.
     correction, sigmas: of the calibration, as of ``MapDelta``.
     """
@@ -62,11 +63,11 @@ def run(dataset: Dataset, overrides: Sequence[str] = (), frames: int | None = No
     truth = read_trajectory(Path(dataset.ground_truth_path))
     errors: list[float] = []
     share = 0.0
-    for poses in (history.causal, final):
+    for poses, of in ((history.causal, None), (final, len(counts))):
         chosen = {frame: pose for frame, pose in poses.items() if pose[0] == longest}
         share = len(chosen) / len(counts)
         mine = history.trajectory(chosen)
-        found = evaluate_trajectory(mine, truth, frames=len(counts)) if chosen else None
+        found = evaluate_trajectory(mine, truth, frames=of) if chosen else None
         errors.append(found.ate_m.rmse if found and found.ate_m else np.inf)
     return Mapped(
         ate_m=errors[1],

@@ -15,12 +15,12 @@ from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import readout_flow
-from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_guess
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.triangulation import spread_of_rays
 
 _FREE_LENS = 2.0
 """Times the lens radius where focal length and k1 are adjusted, too: what these explain is no error
-of the calibration any more.  Not under a guess: far from the truth the lens is no small error
+of the calibration any more.  Not while it is a guess: far from the truth the lens is no small error
 that the images explain step by step, and the border would lead it astray."""
 
 _CHUNK = 4096
@@ -67,7 +67,7 @@ def adjust_keyframes(
     ``Path``.    Returns what is known now, and the rows of points that too few keyframes see.
     """
     before = known.view
-    seen = list_map(keyframes, points, before.camera, parameters)
+    seen = list_map(keyframes, points, known, parameters)
     seen.px = before.seen(seen.px)
     if parameters.calibration.sigmas.any():
         seen.flow = readout_flow(
@@ -119,10 +119,12 @@ def adjust_listed(
 def list_map(
     keyframes: list[Keyframe],
     points: PointRows,
-    camera: PinholeCamera,
+    known: SelfCalibration,
     parameters: MappingParameters,
 ) -> ListedMap:
-    """px: as the rolling shutter saw them.   parameters: of the adjustment that follows."""
+    """px: as the rolling shutter saw them.   known: of the camera, whose pixels the keyframes have.
+    parameters: of the adjustment that follows.
+    """
     mapped = [points.state[keyframe.rows] == MAPPED for keyframe in keyframes]
     pairs = list(zip(keyframes, mapped, strict=True))
     listed = [k.rows[each] for k, each in pairs]
@@ -141,14 +143,14 @@ def list_map(
         camera=np.repeat(np.arange(len(keyframes), dtype=np.int32), sizes),
         point=rank[point],
         px=px,
-        weights=weigh(px, camera, _lens_radius(parameters)),
+        weights=weigh(px, known.view.camera, _lens_radius(parameters, known)),
         fixed=np.array([k.turned for k in keyframes]) | (np.arange(len(keyframes)) == 0),
     )
 
 
-def _lens_radius(parameters: MappingParameters) -> float:
+def _lens_radius(parameters: MappingParameters, known: SelfCalibration) -> float:
     uncertain = parameters.calibration
-    free = uncertain.focal > 0.0 and uncertain.k1 > 0.0 and not is_guess(uncertain)
+    free = uncertain.focal > 0.0 and uncertain.k1 > 0.0 and not known.is_guess
     return parameters.window.lens_radius * (_FREE_LENS if free else 1.0)
 
 

@@ -83,6 +83,11 @@ class SelfCalibration:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     @property
+    def is_guess(self) -> bool:
+        """Whether the focal length is so uncertain still."""
+        return bool(self.sigmas[0] > _GUESS)
+
+    @property
     def readout(self) -> float:
         """Share of the frame interval that frames are read out in, as they are mapped: 0 where
         nothing says that the shutter rolls."""

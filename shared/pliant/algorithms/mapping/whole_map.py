@@ -105,7 +105,7 @@ class WholeMap:
         self.due = (1.0 + growth) * count
         loops, self.loops = self.loops, []
         points = segment.points
-        seen = list_map(segment.keyframes, points, camera, parameters)
+        seen = list_map(segment.keyframes, points, calibration, parameters)
         seen.px = calibration.view.seen(seen.px)
         if parameters.calibration.readout > 0.0:
             seen.flow = readout_flow(
