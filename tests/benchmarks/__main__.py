@@ -387,6 +387,21 @@ def bundle(
     _print(measure(folder, plot))
 
 
+@app.command("map-sizes")
+def map_sizes(
+    keyframes: Annotated[list[int], typer.Argument(min=10, help="Numbers of keyframes.")],
+    points: Annotated[int, typer.Option(min=1, help="New ones in each keyframe.")] = 300,
+    seen: Annotated[int, typer.Option(min=2, help="Keyframes that see each.")] = 10,
+) -> None:
+    """The final adjustment of synthetic maps: CPU time and memory, by their size.
+
+    scripts/bench map-sizes 200 400 1000 3000
+    """
+    from benchmarks.map_sizes import measure
+
+    _print(measure(keyframes, points, seen))
+
+
 @app.command("mesh-parts")
 def mesh_parts(
     vertices: Annotated[int, typer.Option(min=100, help="Of the keyframe.")] = 10_000,

@@ -116,7 +116,7 @@ def test_the_last_line_says_what_the_run_is_worth(tmp_path: Path) -> None:
     assert (report["verdict"], report["doubtful_frames"]) == ("bad", [])
 
 
-def test_of_a_clip_that_waited_for_its_map_no_inliers_are_told() -> None:
+def test_what_a_map_cannot_tell_is_left_out_and_what_it_gave_up_is_told() -> None:
     report: dict[str, Any] = {
         **dict.fromkeys(("frames", "frames_with_pose", "keyframes", "points"), 60),
         **dict.fromkeys(("ended_early", "verdict", "verdict_reason"), ""),
@@ -132,6 +132,11 @@ def test_of_a_clip_that_waited_for_its_map_no_inliers_are_told() -> None:
     assert waited in summary(report)
     report["median_inliers_per_frame"] = 700.0
     assert "median per frame: 900 tracks, 700 mapped inliers" in summary(report)
+    assert not any("kept_observations" in line for line in summary(report))
+    counted = {"given_up_keyframes": 1.0, "given_up_points": 5200.0}
+    report["counters"] = {"bundle_adjustment": counted}
+    told = "kept_observations: 1 keyframe and 5200 points move with what is kept"
+    assert any(line.endswith(told) for line in summary(report))
 
 
 def test_one_is_not_many(tmp_path: Path) -> None:

@@ -292,13 +292,16 @@ def test_a_segment_is_adjusted_as_if_it_were_alone(again):
     assert any(abs(given_up.pose(k) - alone.pose(k)).max() > 1e-6 for k in first)
 
 
-def test_segments_are_given_back_beyond_the_most_keyframes():
-    """The oldest first: they stay as they were published."""
-    frames = cut(sideways(40), 20)
-    window = WindowParameters(final_max_keyframes=5)
+@pytest.mark.parametrize(("room", "adjusted"), [(6000, {0, 1}), (1000, {1})])
+def test_segments_share_what_room_there_is(room, adjusted):
+    """What has no more room stays as it was published: the oldest, where nothing else does."""
+    poses = sideways(40)
+    frames = cut(poses, 20)
+    window = WindowParameters(kept_observations=room, kept_per_keyframe=100)
     published, deltas = run(frames, MappingParameters(window=window))
     told = deltas[-1].keyframe_segments.tolist()
-    assert set(told) == {1}
+    assert set(told) == adjusted
+    assert told.count(0) < sum(delta.keyframe_segments.tolist().count(0) > 0 for delta in deltas)
     assert {segment for _, _, segment in published.poses.values()} == {0, 1}
 
 

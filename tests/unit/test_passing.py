@@ -70,8 +70,8 @@ def test_what_finds_no_room_goes_first(points, monkeypatch):
     for number in (24, 25, 26):
         T_world_camera = only.keyframe.T_world_camera @ only.T_keyframe_camera
         frames.add(number, only.keyframe, T_world_camera, only.rows, only.points_px)
-    assert [each.frame for each in frames.take_surplus()] == [23, 24]
-    assert frames.take_surplus() == []
+    assert [each.frame for each in frames.take_surplus(PARAMETERS)] == [23, 24]
+    assert frames.take_surplus(PARAMETERS) == []
     assert [each.frame for each in frames.take_all()] == [25, 26]
 
 

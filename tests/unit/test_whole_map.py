@@ -17,6 +17,7 @@ from pliant.algorithms.geometry import (
     transform,
 )
 from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.final_adjustment import _spread_out
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -32,7 +33,7 @@ from pliant_services.nodes.bundle_adjustment import Beside
 FRAMES = 150
 GROWING = MappingParameters(
     window=WindowParameters(keyframes=6, keyframe_iterations=2),
-    whole_map=WholeMapParameters(growth=0.2, distance_frames=7),
+    whole_map=WholeMapParameters(growth=0.2, distance_frames=7, observations_per_frame=1000),
 )
 AT_THE_END = GROWING.model_copy(update={"whole_map": WholeMapParameters(growth=0.0)})
 
@@ -133,6 +134,38 @@ def test_a_drifted_map_comes_back():
     assert error(active) < 0.1 * drifted
 
 
+def test_a_large_map_is_taken_over_later():
+    """By what it has, not by how long it took; and no sooner where it is small."""
+    mapper, _, _ = fold(AT_THE_END, frames=60)
+    active = mapper.atlas.active
+    mapper.whole_map.ask(60, active.segment, mapper.calibration, GROWING)
+    question = mapper.whole_map.question
+    observations, keyframes = len(question.seen.px), len(question.keyframe_ids)
+    assert keyframes > 7
+    for per_frame, distance in (
+        (observations, 7),
+        (observations // 20, 20),
+        (observations // 90, 90),
+    ):
+        limits = WholeMapParameters(distance_frames=7, observations_per_frame=per_frame)
+        parameters = GROWING.model_copy(update={"whole_map": limits})
+        mapper.whole_map.question = replace(question, parameters=parameters)
+        assert not mapper.whole_map.is_due(60 + distance - 1)
+        assert mapper.whole_map.is_due(60 + distance)
+
+
+def test_a_point_that_many_keyframes_see_is_told_of_by_some_of_all_of_the_time():
+    """So that a room that is seen again and again takes no more time than a path as long."""
+    seen = np.array([3, 10, 200, 201])
+    point = np.concatenate([np.flatnonzero(seen > k) for k in range(201)]).astype(np.int32)
+    kept = _spread_out(point, seen, 10)
+    assert np.bincount(point[kept]).tolist() == [3, 10, 10, 10]
+    for number in (2, 3):
+        at = np.flatnonzero(kept[point == number])
+        assert set(np.diff(at).tolist()) <= {20, 21}
+    assert not np.array_equal(kept[point == 2], kept[point == 3][:200])
+
+
 def error(active):
     return error_of(active, path(FRAMES))
 
@@ -230,7 +263,8 @@ def test_readers_have_the_map_under_another_lens(mistaken):
 
 @pytest.mark.parametrize("how", ["beside", "killed"])
 def test_where_the_answer_was_found_changes_nothing(mistaken, how):
-    """Of a question whose answer moves keyframes, and of one that finds a lens."""
+    """Of a question whose answer moves keyframes, and of one that finds a lens; large ones wait for
+    longer than the others."""
     _, deltas, _ = mistaken
     assert sum(len(delta.moved_keyframes) > 0 for delta in deltas) > len(
         {delta.calibration_correction for delta in deltas} - {()}

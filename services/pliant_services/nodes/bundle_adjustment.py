@@ -32,8 +32,9 @@ from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.map_store import Keyframe as KeyframeOfMap
 from pliant.algorithms.mapping.map_store import PointRows
 from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.parameters import MappingParameters, WindowParameters
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.mapping.thinning import thin
 from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
 from pliant.algorithms.mapping.whole_map import Answer, Question, WholeMap, find_moves
 from pliant.algorithms.places.features import describe, match
@@ -120,7 +121,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     for number, kept in enumerate(mapper.kept()):
         header = Header(frame=number, stamp_ns=0, frame_id=WORLD_FRAME_ID)
         bus.publish(topics.MAP_KEPT, MapKeyframe.of(header, kept))
-    monitor.report(last, points=mapper.point_count)
+    monitor.report(last, note="", points=mapper.point_count, **mapper.given_up)
 
 
 class Beside:
@@ -219,6 +220,10 @@ def warm_up() -> None:
         points_px=px[:1], rolled_px=px[:1],
     )  # fmt: skip
     keyframe.follow_aliases(PointRows())
+    assert mapper.atlas.active is not None
+    segment, none = mapper.atlas.active.segment, np.zeros(0, np.int32)
+    thin(segment, 1000, WindowParameters(kept_per_keyframe=1), none, whole=1)
+    thin(segment, 1, WindowParameters(kept_per_keyframe=n), none, whole=1)
     maxima_of(grey, TrackingParameters())
     seen, places = describe(grey), PlaceIndex()
     places.add(0, seen)

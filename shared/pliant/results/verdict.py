@@ -36,6 +36,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         f"median per frame: {report['median_tracks_per_frame']:.0f} tracks, {_mapped(report)}",
     ]
     lines += _told_of_map(report)
+    lines += _given_up(report.get("counters", {}).get("bundle_adjustment", {}))
     lines += [
         f"{mesh['level']} mesh: {mesh['triangles']} triangles "
         f"from {counted(mesh['keyframes'], 'keyframe')}"
@@ -76,6 +77,17 @@ def _told_of_map(report: dict[str, Any]) -> list[str]:
     return [
         f"{counted(known['frames_in_it'], 'frame')} ({share:.1%}) in {there}, recognised after "
         f"{counted(known['looked'], 'frame')}"
+    ]
+
+
+def _given_up(counters: Mapping[str, float]) -> list[str]:
+    """What a map had no more room for."""
+    if "given_up_points" not in counters:
+        return []
+    keyframes, points = (int(counters[f"given_up_{name}"]) for name in ("keyframes", "points"))
+    return [
+        "the map is larger than bundle_adjustment.window.kept_observations: "
+        f"{counted(keyframes, 'keyframe')} and {counted(points, 'point')} move with what is kept"
     ]
 
 

@@ -1,5 +1,7 @@
 """The segment that the camera is in: tracks linked to its points, a window over its keyframes."""
 
+import bisect
+
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
@@ -9,7 +11,6 @@ from pliant.algorithms.mapping.covisibility import (
     MAX_MISSES,
     collect_garbage,
     missing_rows,
-    most_redundant,
     most_shared,
     near_keyframes,
     rows_of,
@@ -29,6 +30,7 @@ from pliant.algorithms.mapping.reacquisition import MaximaGrid, Reacquired, cut_
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.start import Start, WaitingFrame
+from pliant.algorithms.mapping.thinning import thin
 from pliant.algorithms.mapping.window import Window
 from pliant.algorithms.tracks import FrameExtrema
 
@@ -41,6 +43,9 @@ _SAME_DEPTH_SHARE = 0.05
 _NEAR_KEYFRAMES = 24
 """Keyframes older than the window whose points are looked for: bounds the work of long runs."""
 
+_MOST_UNADJUSTED = 1.5
+"""Times the room that is taken before what has not been adjusted with the whole map goes."""
+
 _MAX_STRIKES = 3
 """Bad frames in a row after which a track is taken from its point."""
 
@@ -50,6 +55,7 @@ class ActiveMap:
 
     points: rows shared by all segments.   next_keyframe_id: of the keyframe to come.
     links: rows of the living tracks.   window: the keyframes under adjustment.
+    room: observations that it may have.
     """
 
     def __init__(
@@ -64,6 +70,7 @@ class ActiveMap:
         self.next_keyframe_id = next_keyframe_id
         self.camera = camera
         self.parameters = parameters
+        self.room = parameters.window.kept_observations
         self.links = TrackLinks()
         self.window = self._window([], fixed=0, outside=0)
         self._nearby: I32 = np.zeros(0, np.int32)
@@ -325,18 +332,30 @@ class ActiveMap:
         sizes, segment = self.parameters.window, self.segment
         first = segment.first_of_window(sizes.keyframes)
         moving = self.keyframes[first:]
-        outside = self.keyframes[:first]
         if first > segment.since:
-            segment.leave_window(outside[-1])
-        if len(self.keyframes) > max(sizes.kept_keyframes, sizes.final_max_keyframes):
-            # Not the one that has just left: it is not published yet.
-            segment.cull(most_redundant(outside[:-1]), self.links.rows)
-            outside = self.keyframes[: -len(moving)]
+            segment.leave_window(self.keyframes[first - 1])
+        self._make_room(first)
+        outside = self.keyframes[: len(self.keyframes) - len(moving)]
         older = near_keyframes(outside, moving[-1].T_world_camera, _NEAR_KEYFRAMES)
         # What was there before the camera was recognised takes the place of what will be.
         count = max(sizes.fixed, sizes.keyframes - len(moving))
         fixed = most_shared(older, moving, self.points)[:count] if older else []
         self._look_at(older, fixed, moving)
+
+    def _make_room(self, first: int) -> None:
+        """Thin what has left the window, as soon as it has been adjusted with the whole map: as it
+        is found then, it stays.   first: index of the first keyframe of the window."""
+        segment, room = self.segment, self.room
+        settled = first - 1  # not the one that has just left: it is not published yet
+        if segment.adjusted >= 0:
+            ids = [keyframe.id for keyframe in self.keyframes]
+            newest = min(segment.adjusted, segment.passed.first_keyframe - 1)
+            settled = min(settled, bisect.bisect_right(ids, newest))
+        else:
+            room = int(_MOST_UNADJUSTED * room)
+        whole = len(self.keyframes) - max(settled, 0)
+        thin(segment, room, self.parameters.window, self.links.rows, whole=whole)
+        segment.adjusted = -1
 
     def _look_at(
         self, older: list[Keyframe], fixed: list[Keyframe], moving: list[Keyframe]
@@ -364,12 +383,12 @@ class ActiveMap:
         self.window.move(S)
         return S
 
-    def adjust_all(self, known: SelfCalibration) -> SelfCalibration:
+    def adjust_all(self, known: SelfCalibration) -> tuple[SelfCalibration, MapMoves | None]:
         """As ``Segment.adjust``."""
-        known = self.segment.adjust(known, self.parameters)
+        known, moves = self.segment.adjust(known, self.parameters)
         self.camera = known.view.camera
         self.rebuild_window()
-        return known
+        return known, moves
 
     def close(self) -> None:
         """The camera is not followed here any more: what could only have become a part of the

@@ -57,6 +57,7 @@ class Atlas:
         self._next_segment = 1 + max((each.segment for each in known), default=-1)
         self._next_keyframe = known[-1].id + 1 if known else 0
         self._adjusted = False  # all of the active segment, and nobody has been told
+        self._adjusts = parameters.window.final_adjustment
         for segment in take_in(known, self.points, calibration):
             self._earlier.keep(segment, calibration, known=True)
         self.places.know(known, calibration)
@@ -83,6 +84,13 @@ class Atlas:
         """Points of the map now, of all segments."""
         return self.points.culled + int(np.count_nonzero(self.points.state == MAPPED))
 
+    @property
+    def given_up(self) -> dict[str, int]:
+        """How many keyframes and points the map had no more room for, where it had not."""
+        keyframes = sum(len(segment.given_up) for segment, _ in self.everything())
+        counts = {"given_up_keyframes": keyframes, "given_up_points": self.points.culled}
+        return counts if self.points.culled or keyframes else {}
+
     def begin(
         self,
         start: Start,
@@ -93,9 +101,6 @@ class Atlas:
     ) -> ActiveMap:
         """A segment begins.  calibration: as the start tells it.   The images are those of the
         newest of the frames that waited."""
-        limits = self._parameters.window
-        kept = limits.final_max_keyframes if limits.final_adjustment else 0
-        self._earlier.make_room(self.points, kept)
         self.calibration = calibration
         active = self._enter(Segment(id=self._next_segment, points=self.points))
         self._next_segment += 1
@@ -109,6 +114,7 @@ class Atlas:
         """The camera is in a segment."""
         camera = self.calibration.view.camera
         self.active = ActiveMap(segment, self._next_keyframe, camera, self._parameters)
+        self.active.room = self._earlier.share_room(self.points, self._parameters.window)
         self.segment = segment.id
         self._spans.append((self._next_keyframe, segment.id))
         return self.active
@@ -156,11 +162,8 @@ class Atlas:
     def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64) -> None:
         """A frame has a pose, which hangs on a keyframe of the segment that the camera is in."""
         assert self.active is not None
-        segment = self.active.segment
-        if self._is_adjusted_whole(segment):
-            segment.path.add(frame, keyframe, T_world_camera)
-        else:
-            segment.path.forget()
+        if self._adjusts:
+            self.active.segment.path.add(frame, keyframe, T_world_camera)
 
     def remember(self, keyframe: Keyframe, grey: U8 | None, maxima: F32 | None = None) -> None:
         """A new keyframe is a place to come back to, and may be one that was seen before.
@@ -173,16 +176,15 @@ class Atlas:
         seen, earlier = describe(grey), self._earlier.like(self.calibration)
         self.whole_map.loops += self.places.compare(
             keyframe, seen, segment,
-            [each for each in earlier if self._is_adjusted_whole(segment, each)],
-            view, self._parameters,
-            loops=self._is_adjusted_whole(segment) and not self.whole_map.closing,
+            earlier if self._adjusts else [], view, self._parameters,
+            loops=self._adjusts and not self.whole_map.closing,
             image=None if maxima is None else (maxima, grey),
         )  # fmt: skip
         self.places.remember(keyframe, seen, [segment, *earlier], view)
 
     def ask(self, frame: int) -> None:
         """Ask for the adjustment of the map as it is after a frame, where that is due."""
-        if self.active is not None and self._is_adjusted_whole(self.active.segment):
+        if self.active is not None and self._adjusts:
             self._ask(frame, self.active)
 
     def _ask(self, frame: int, active: ActiveMap) -> None:
@@ -209,6 +211,7 @@ class Atlas:
         spans = [(k, self.segment if of == moved.gone else of) for k, of in self._spans]
         self._spans = spans
         self.places.enter()
+        self.active.room = self._earlier.share_room(self.points, self._parameters.window)
         assert moved.moves is not None
         self.whole_map.move(moved.moves)
         self._ask(frame, self.active)
@@ -220,7 +223,9 @@ class Atlas:
         moved: list[Moved] = []
         if answer.moves is not None:
             told = tuple((loop.old, loop.new) for loop in answer.loops)
-            at_end = self.move(held(answer.moves, self._spans, self.segment))
+            moves = self.active.segment.given_up.told_with(answer.moves)
+            at_end = self.move(held(moves, self._spans, self.segment))
+            self.active.segment.adjusted = int(answer.moves.keyframe_ids[-1])
             moved = [at_end._replace(same_places=told)]
             for loop in answer.loops:
                 self.active.join(loop)
@@ -262,17 +267,18 @@ class Atlas:
         if active is None or not is_guess(self._parameters.calibration):
             return []
         due = len(active.keyframes) >= self.calibration.next_keyframes
-        if not (due and self._is_adjusted_whole(active.segment)):
+        if not (due and self._adjusts):
             return []
+        self.whole_map = WholeMap()  # what was asked is of another map
+        return [self._adjust(active)]
+
+    def _adjust(self, active: ActiveMap) -> Moved:
         newest = active.keyframes[-1]
         before = newest.T_world_camera
-        self._adjust(active)
-        self.whole_map = WholeMap()  # what was asked is of another map
-        return [Moved(newest.T_world_camera @ inverse(before))]
-
-    def _adjust(self, active: ActiveMap) -> None:
-        self.calibration = active.adjust_all(self.calibration)
+        self.calibration, moves = active.adjust_all(self.calibration)
         self._adjusted = True
+        told = None if moves is None else held(moves, self._spans, self.segment)
+        return Moved(newest.T_world_camera @ inverse(before), told)
 
     def stay(self) -> None:
         """Forget what is about to move the map: nobody has it yet."""
@@ -281,24 +287,20 @@ class Atlas:
     def finish(self) -> list[Moved]:
         """What is still to be corrected at the end of the stream."""
         moved = self._join_met(0)
-        self._earlier.adjust(self._parameters)
         active = self.active
+        if self._adjusts:
+            moves = self._earlier.adjust(self._parameters)
+            moved += [Moved(np.eye(4), held(each, self._spans, of)) for of, each in moves]
         if active is None:
             return moved
         while self.whole_map.loops or self.whole_map.closing:
             self._ask(0, active)
             if (answer := self.whole_map.settle()) is not None:
                 moved += self.take_over(answer)
-        if self._is_adjusted_whole(active.segment):
+        if self._adjusts:
             active.collect_garbage()
-            self._adjust(active)
+            moved.append(self._adjust(active))
         return moved
-
-    def _is_adjusted_whole(self, *segments: Segment) -> bool:
-        """Whether segments are few enough keyframes to be adjusted as a whole, as one."""
-        limits = self._parameters.window
-        few = sum(len(s.keyframes) + s.culled for s in segments) <= limits.final_max_keyframes
-        return limits.final_adjustment and few
 
     def take_changed(self, *, everything: bool) -> tuple[list[Keyframe], I32]:
         """The keyframes, and rows of the points, of which readers may have to be told.

@@ -2,10 +2,6 @@
 
 Points are looked for only where they are seen by keyframes of the window and near it, so that the
 work for a frame does not grow with the length of the run.
-
-Nor does the memory of the active map.  Keyframes and the points that only they see have been
-published, and what is published is the product; the active map only keeps what a camera may come
-back to.  Where a place is visited many times that is one view of it, not one of each visit.
 """
 
 import numpy as np
@@ -95,39 +91,6 @@ def missing_rows(rows: I32, linked: I32, state: U8, misses: U8, marks: I64, fram
             wanted[count] = row
             count += 1
     return wanted[:count].copy()
-
-
-def most_redundant(keyframes: list[Keyframe]) -> int:
-    """Index of the newer one of the two keyframes that look most alike.
-
-    Alike: as in ``near_keyframes``, by the places looked at and half of how far the cameras are
-    apart.  The older one stays: the map as it was first seen drifted least.  At least two.
-    """
-    centres = np.array([k.T_world_camera[:3, 3] for k in keyframes])
-    places = np.array([_place(k) for k in keyframes])
-    return int(_newer_of_nearest(places, centres))
-
-
-def _place(keyframe: Keyframe) -> F64:
-    focus = keyframe.focus
-    if focus is None or not np.isfinite(focus).all():
-        return keyframe.T_world_camera[:3, 3]
-    return focus
-
-
-@kernel
-def _newer_of_nearest(places: F64, centres: F64) -> int:
-    newer, least = 1, np.inf
-    for j in range(1, len(places)):
-        for i in range(j):
-            focus2, centre2 = 0.0, 0.0
-            for k in range(3):
-                focus2 += (places[i, k] - places[j, k]) ** 2
-                centre2 += (centres[i, k] - centres[j, k]) ** 2
-            apart = np.sqrt(focus2) + 0.5 * np.sqrt(centre2)
-            if apart < least:
-                newer, least = j, apart
-    return newer
 
 
 def seen_by_none(rows: I32, keyframes: list[Keyframe], linked: I32, points: PointRows) -> I32:

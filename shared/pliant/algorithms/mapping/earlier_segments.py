@@ -3,11 +3,15 @@ when each is adjusted as a whole."""
 
 from typing import NamedTuple
 
+import numpy as np
+
+from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.lens_change import see_by
 from pliant.algorithms.mapping.map_store import PointRows
-from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.parameters import MappingParameters, WindowParameters
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.mapping.thinning import observations_of, thin
 
 
 class _Earlier(NamedTuple):
@@ -56,23 +60,50 @@ class EarlierSegments:
 
     def segment_of(self, keyframe: int) -> int:
         """That of a keyframe of one of them."""
-        known = (k for each in self._kept for k in each.segment.keyframes)
-        return next(k.segment for k in known if k.id == keyframe)
+        for segment in (each.segment for each in self._kept):
+            known = {k.id for k in segment.keyframes}
+            if keyframe in known or keyframe in segment.given_up.ids:
+                return segment.id
+        raise ValueError(f"keyframe {keyframe} is in no earlier segment")
 
-    def make_room(self, points: PointRows, max_keyframes: int) -> None:
-        """Give back the oldest segments, which have been published, beyond so many keyframes of
-        all together."""
+    def share_room(self, points: PointRows, limits: WindowParameters) -> int:
+        """Observations that the segment that the camera is in may have.
+
+        At least half of all that there is room for: the others are thinned beyond the rest, each to
+        the same size, and where even that does not do, the oldest are as they were published.
+        """
+        room = limits.kept_observations // 2
         own = [each for each in self._kept if not each.known]
-        while sum(len(e.segment.keyframes) + e.segment.culled for e in own) > max_keyframes:
+        size, rest = float(room), room
+        sizes = sorted(observations_of([each.segment]) for each in own)
+        for n, some in enumerate(sizes):
+            size = rest / (len(sizes) - n)
+            if some > size:
+                break
+            rest -= some
+        for each in own:
+            thin(each.segment, int(size), limits, np.zeros(0, np.int32), whole=1)
+        while self._observations(own) > room:
             oldest = own.pop(0)
             points.cull(oldest.segment.mapped_rows())
             self._kept = [each for each in self._kept if each is not oldest]
+        return limits.kept_observations - self._observations(own)
 
-    def adjust(self, parameters: MappingParameters) -> None:
+    @staticmethod
+    def _observations(some: list[_Earlier]) -> int:
+        return observations_of([each.segment for each in some])
+
+    def adjust(self, parameters: MappingParameters) -> list[tuple[int, MapMoves]]:
         """Adjust each of them, no earlier than the end of the stream; what nobody has gone on in
-        is as an earlier session left it."""
+        is as an earlier session left it.
+
+        Returns how that moves what segments, by their number, have given up.
+        """
+        moves: list[tuple[int, MapMoves]] = []
         for n, earlier in enumerate(self._kept):
             if not earlier.known:
-                found = earlier.segment.adjust(earlier.calibration, parameters)
+                found, moved = earlier.segment.adjust(earlier.calibration, parameters)
                 self._kept[n] = earlier._replace(calibration=found)
+                moves += [] if moved is None else [(earlier.segment.id, moved)]
         self.adjusted = [earlier.segment for earlier in self._kept if not earlier.known]
+        return moves

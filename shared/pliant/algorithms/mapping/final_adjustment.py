@@ -11,12 +11,15 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.problem import BundleProblem, BundleResult, shared_intrinsics
 from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse, matrix_to_pose
+from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import readout_flow
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.triangulation import spread_of_rays
+from pliant.compiler.kernel import kernel
 
 _FREE_LENS = 2.0
 """Times the lens radius where focal length and k1 are adjusted, too: what these explain is no error
@@ -25,6 +28,15 @@ that the images explain step by step, and the border would lead it astray."""
 
 _CHUNK = 4096
 """Points whose rays are compared at a time: bounds a dense table of keyframes x points."""
+
+_MOST_SEEN = 32
+"""Keyframes that tell where a point is.  Each pair of them costs time, so that a room that is seen
+again and again would take the square of it, and the mean of 32 is known as well as need be."""
+
+_AT_ONCE = 1 << 16
+"""Observations whose poses are looked up at a time: 128 bytes each."""
+
+_MIN_DEPTH = 1e-6
 
 
 @dataclass(kw_only=True)
@@ -47,8 +59,39 @@ class ListedMap:
 
     def depths(self) -> F64:
         """(O,) of each observed point in the camera that observes it."""
-        T = self.T_world_camera[self.camera]
-        return np.einsum("oi,oi->o", self.xyz[self.point] - T[:, :3, 3], T[:, :3, 2])
+        depths = np.empty(len(self.camera))
+        for lo in range(0, len(depths), _AT_ONCE):
+            some = slice(lo, lo + _AT_ONCE)
+            T = self.T_world_camera[self.camera[some]]
+            rays = self.xyz[self.point[some]] - T[:, :3, 3]
+            depths[some] = np.einsum("oi,oi->o", rays, T[:, :3, 2])
+        return depths
+
+    def scales(self, before: F64) -> F64:
+        """(M,) by how much what each keyframe sees has grown: the median.
+
+        before: (O,) depths.
+        """
+        after = self.depths()
+        usable = (before > _MIN_DEPTH) & (after > _MIN_DEPTH)
+        ratios = after[usable] / before[usable]
+        ends = np.searchsorted(self.camera[usable], np.arange(len(self.T_world_camera) + 1))
+        scales = np.ones(len(self.T_world_camera))
+        for slot in range(len(scales)):
+            some = ratios[ends[slot] : ends[slot + 1]]
+            if len(some):
+                scales[slot] = np.median(some)
+        return scales
+
+
+def moves_between(keyframe_ids: I64, before: F64, after: F64, scales: F64) -> MapMoves:
+    """What hangs on keyframes (M,) moves as they do, from poses (M, 4, 4) to others, and scales by
+    (M,) about them."""
+    moved = after @ inverse(before)
+    turned = (moved[:, :3, :3] @ before[:, :3, 3, None])[:, :, 0]
+    moved[:, :3, 3] = after[:, :3, 3] - scales[:, None] * turned
+    moves = np.column_stack([matrix_to_pose(moved), scales])
+    return MapMoves(keyframe_ids=keyframe_ids, moves=moves)
 
 
 def adjust_keyframes(
@@ -57,14 +100,15 @@ def adjust_keyframes(
     known: SelfCalibration,
     parameters: MappingParameters,
     motions: F64,
-) -> tuple[SelfCalibration, I32]:
+) -> tuple[SelfCalibration, I32, MapMoves]:
     """Schur LM over all but the first keyframe, their points and the calibration.
 
     Observations that then miss their point are forgotten, and what is said of the points is
     brought up to date.  The keyframes' pixels become those of the camera that is found, but for the
     readout.
     known: of the camera, whose pixels the keyframes have.    motions: (M, 6) of the keyframes, see
-    ``Path``.    Returns what is known now, and the rows of points that too few keyframes see.
+    ``Path``.    Returns what is known now, the rows of points that too few keyframes see, and how
+    what hangs on each keyframe moves.
     """
     before = known.view
     seen = list_map(keyframes, points, known, parameters)
@@ -74,9 +118,12 @@ def adjust_keyframes(
             seen.T_world_camera, motions, seen.xyz, seen.camera, seen.point, seen.px, before.camera
         )
     iterations = parameters.window.final_iterations
+    poses, depths = seen.T_world_camera.copy(), seen.depths()
     found = adjust_listed(seen, known, parameters, iterations=iterations, start=known.correction)
     known = known.corrected(found.correction, found.covariance, len(keyframes))
     view = known.view
+    ids = np.array([keyframe.id for keyframe in keyframes], np.int64)
+    moves = moves_between(ids, poses, seen.T_world_camera, seen.scales(depths))
     if seen.flow is not None:
         seen.px = seen.px - (found.correction[3] * seen.flow).astype(np.float32)
     seen.px = view.pixels(seen.px)
@@ -89,7 +136,7 @@ def adjust_keyframes(
     for keyframe in keyframes:
         keyframe.points_px = view.pixels(before.seen(keyframe.points_px + keyframe.rolled_px))
         keyframe.rolled_px = np.zeros_like(keyframe.points_px)
-    return known, seen.rows[count < 2]
+    return known, seen.rows[count < 2], moves
 
 
 def adjust_listed(
@@ -105,11 +152,13 @@ def adjust_listed(
     ``seen`` is changed, but for its observations, which are pixels of the rectified image.
     known: of the camera.   start: (6,) correction of the calibration to begin from.
     """
-    chosen = np.bincount(seen.point, minlength=len(seen.rows)) >= 2
+    counts = np.bincount(seen.point, minlength=len(seen.rows))
+    chosen = counts >= 2
     bundle = parameters.bundle.model_copy(update={"max_iterations": iterations})
     uncertain = parameters.calibration.sigmas.any()
     uncertainty = known.prior(parameters.calibration, start) if uncertain else None
-    problem = _problem(seen, chosen, known.given)
+    kept = chosen[seen.point] & _spread_out(seen.point, counts, _MOST_SEEN)
+    problem = _problem(seen, chosen, kept, known.given)
     found = solve_schur(problem, bundle, uncertainty=uncertainty, start=start, with_covariance=True)
     seen.xyz[chosen] = found.points_world
     seen.T_world_camera = found.T_world_camera
@@ -130,18 +179,20 @@ def list_map(
     listed = [k.rows[each] for k, each in pairs]
     px = np.concatenate([(k.points_px + k.rolled_px)[each] for k, each in pairs])
     sizes = np.array([len(rows) for rows in listed])
-    rows, point = np.unique(np.concatenate(listed), return_inverse=True)
+    seen = np.concatenate(listed)
+    number = np.zeros(len(points.state), np.int32)
+    number[seen] = 1
+    rows = np.flatnonzero(number).astype(np.int32)
     # Oldest first, which decides among points that are observed as often.
     order = np.argsort(points.first_keyframe[rows], kind="stable")
-    rank = np.empty(len(rows), np.int32)
-    rank[order] = np.arange(len(rows), dtype=np.int32)
     rows = rows[order]
+    number[rows] = np.arange(len(rows), dtype=np.int32)
     return ListedMap(
         rows=rows,
         xyz=points.xyz[rows],
         T_world_camera=np.array([keyframe.T_world_camera for keyframe in keyframes]),
         camera=np.repeat(np.arange(len(keyframes), dtype=np.int32), sizes),
-        point=rank[point],
+        point=number[seen],
         px=px,
         weights=weigh(px, known.view.camera, _lens_radius(parameters, known)),
         fixed=np.array([k.turned for k in keyframes]) | (np.arange(len(keyframes)) == 0),
@@ -154,9 +205,25 @@ def _lens_radius(parameters: MappingParameters, known: SelfCalibration) -> float
     return parameters.window.lens_radius * (_FREE_LENS if free else 1.0)
 
 
-def _problem(seen: ListedMap, chosen: BoolArray, camera: PinholeCamera) -> BundleProblem:
-    """Of the chosen points; the first keyframe does not move."""
-    kept = chosen[seen.point]
+@kernel
+def _spread_out(point: I32, counts: I64, most: int) -> BoolArray:
+    """(O,) which observations of each point tell where it is: no more than so many, from all of the
+    time that it was seen.   counts: (N,) observations of each."""
+    kept = np.ones(point.size, np.bool_)
+    rank = np.zeros(counts.size, np.int64)
+    for o in range(point.size):
+        n = counts[point[o]]
+        if n > most:
+            at = most * rank[point[o]] + point[o] % n  # not of all points the same keyframes
+            kept[o] = at // n != (at - most) // n
+            rank[point[o]] += 1
+    return kept
+
+
+def _problem(
+    seen: ListedMap, chosen: BoolArray, kept: BoolArray, camera: PinholeCamera
+) -> BundleProblem:
+    """Of the chosen points and kept observations; the first keyframe does not move."""
     number = np.cumsum(chosen, dtype=np.int32) - 1
     M = len(seen.T_world_camera)
     return BundleProblem(
@@ -204,10 +271,16 @@ def _update_statistics(
     for lo in range(0, N, _CHUNK):
         hi = min(lo + _CHUNK, N)
         some = order[(ends[lo - 1] if lo else 0) : ends[hi - 1]]
-        table = np.zeros((len(seen.T_world_camera), hi - lo), np.bool_)
-        table[seen.camera[some], seen.point[some] - lo] = True
+        # Only the keyframes that see some of them: all of them would be the square of a long map.
+        cameras, slots = np.unique(seen.camera[some], return_inverse=True)
+        table = np.zeros((len(cameras), hi - lo), np.bool_)
+        table[slots, seen.point[some] - lo] = True
         parallax, sigmas = spread_of_rays(
-            seen.T_world_camera, table, np.arange(hi - lo), seen.xyz[lo:hi], focal_px=camera.fx
+            seen.T_world_camera[cameras],
+            table,
+            np.arange(hi - lo),
+            seen.xyz[lo:hi],
+            focal_px=camera.fx,
         )
         points.parallax_rad[rows[lo:hi]] = parallax
         known = np.isfinite(sigmas)

@@ -118,6 +118,11 @@ class Localiser:
         """Points of the map."""
         return int(np.count_nonzero(self._points.state == MAPPED))
 
+    @property
+    def given_up(self) -> dict[str, int]:
+        """Nothing: the map is as it was."""
+        return {}
+
     def kept(self) -> list[KeptKeyframe]:
         """Nothing: the map is as it was."""
         return []

@@ -102,6 +102,11 @@ class Mapper:
         """As of the atlas."""
         return self.atlas.point_count
 
+    @property
+    def given_up(self) -> dict[str, int]:
+        """As of the atlas."""
+        return self.atlas.given_up
+
     def kept(self) -> Iterator[KeptKeyframe]:
         """As of the atlas."""
         return self.atlas.kept()
@@ -169,7 +174,7 @@ class Mapper:
             with self._timer("places"):
                 atlas.remember(hanging, grey, tracks.maxima)
             with self._timer("passed frames"):
-                surplus = active.segment.passed.take_surplus()
+                surplus = active.segment.passed.take_surplus(self._parameters)
                 self._correct(placed_again(surplus, active.points, self._camera, self._parameters))
         else:
             active.pass_by(frame, T_world_camera, tracks.points_px, found)

@@ -161,4 +161,4 @@ class _Merging:
             for loop in answer.loops:
                 active.join(loop)
         active.collect_garbage()
-        return segment.adjust(self._calibration, self._parameters)
+        return segment.adjust(self._calibration, self._parameters)[0]

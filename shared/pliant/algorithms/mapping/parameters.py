@@ -191,14 +191,17 @@ class WindowParameters(Parameters):
     final_iterations: int = Field(
         default=50, ge=1, description="Most iterations of Schur LM at the end of the stream"
     )
-    final_max_keyframes: int = Field(
-        default=1000, ge=3, description="Keyframes above which the final adjustment is left out"
+    kept_observations: int = Field(
+        default=6_000_000,
+        ge=1000,
+        description="Observations that the adjustments of the whole map have room for, some 200 "
+        "bytes each: beyond, points that few keyframes see hang on a keyframe, as they were found",
     )
-    kept_keyframes: int = Field(
-        default=1000,
-        ge=30,
-        description="Keyframes to come back to: beyond (and beyond final_max_keyframes) those most "
-        "like another leave the active map, which bounds its memory; they stay in the results",
+    kept_per_keyframe: int = Field(
+        default=500,
+        ge=1,
+        description="Observations that a keyframe keeps of these: where there would be less, "
+        "keyframes hang on another one that sees the same points",
     )
 
 
@@ -214,7 +217,14 @@ class WholeMapParameters(Parameters):
     distance_frames: int = Field(
         default=30,
         ge=1,
-        description="Frames after which the result is taken over; who has not found it waits",
+        description="Frames after which the result is taken over, or more of a large map; who has "
+        "not found it waits",
+    )
+    observations_per_frame: int = Field(
+        default=4000,
+        ge=1,
+        description="Observations for which that is a frame at least: it takes some 4 us of one "
+        "core for each of them, so 16 ms a frame",
     )
     iterations: int = Field(
         default=20, ge=1, description="Most iterations of Schur LM; the next adjustment goes on"

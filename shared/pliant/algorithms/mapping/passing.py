@@ -22,7 +22,12 @@ from pliant.algorithms.mapping.observation_table import weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
 
 _ROOM = 2_000_000
-"""Observations that are kept, 24 MB: some 250 frames of 8000."""
+"""Most observations that are kept, 24 MB: some 250 frames of 8000."""
+
+_ROOM_SHARE = 1 / 3
+"""And of those that the map has room for."""
+
+_NONE = np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,10 +85,20 @@ class PassedFrames:
         """Those of an earlier segment are of this one, too."""
         self._frames = [*earlier._frames, *self._frames]
 
-    def take_surplus(self) -> list[_Passed]:
+    @property
+    def first_keyframe(self) -> int:
+        """Id of the oldest keyframe on which one hangs; a huge one where there is none."""
+        return min((each.keyframe.id for each in self._frames), default=_NONE)
+
+    def take_surplus(self, parameters: MappingParameters) -> list[_Passed]:
         """The oldest, of which there is no more room for what they saw."""
+        room = min(_ROOM, int(_ROOM_SHARE * parameters.window.kept_observations))
         seen = np.cumsum([len(each.rows) for each in reversed(self._frames)])
-        return self._take(len(seen) - int(np.searchsorted(seen, _ROOM, side="right")))
+        return self._take(len(seen) - int(np.searchsorted(seen, room, side="right")))
+
+    def leave(self, keyframes: set[int]) -> None:
+        """Those that hang on one of the keyframes, by id, stay where they are."""
+        self._frames = [each for each in self._frames if each.keyframe.id not in keyframes]
 
     def take_all(self) -> list[_Passed]:
         """All of them."""

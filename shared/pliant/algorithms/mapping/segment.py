@@ -12,8 +12,9 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I32, U8
 from pliant.algorithms.geometry import move_by_similarity
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.covisibility import focus_of, seen_by_none
+from pliant.algorithms.mapping.covisibility import focus_of
 from pliant.algorithms.mapping.final_adjustment import adjust_keyframes
+from pliant.algorithms.mapping.given_up import GivenUp
 from pliant.algorithms.mapping.map_store import FREE, MAPPED, UNLINKED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import PassedFrames
@@ -43,8 +44,10 @@ class Segment:
     """points: rows shared by all segments.    keyframes: oldest first.   path: of its frames.
     passed: those that are no keyframes.
     since: index of the first keyframe after the camera was last recognised: older ones do not move
-    with the window.   culled: keyframes that it has forgotten.   inverse_distance: median of its
-    points from the newest keyframe.
+    with the window.   adjusted: newest keyframe of an adjustment of all of it that was taken over
+    since the last keyframe was made, by id, or -1.   thinned: whether keyframes or points have been
+    given up (``thinning``).   given_up: those keyframes.   inverse_distance: median of its points
+    from the newest keyframe.
     """
 
     id: int
@@ -53,7 +56,9 @@ class Segment:
     path: Path = field(default_factory=Path)
     passed: PassedFrames = field(default_factory=PassedFrames)
     since: int = 0
-    culled: int = 0
+    adjusted: int = -1
+    thinned: bool = False
+    given_up: GivenUp = field(default_factory=GivenUp)
     inverse_distance: float = 1.0
 
     @property
@@ -76,16 +81,6 @@ class Segment:
         for keyframe in self.keyframes[self.first_of_window(window) :]:
             self.leave_window(keyframe)
         self.since = len(self.keyframes)
-
-    def cull(self, index: int, linked: I32) -> None:
-        """The map forgets a keyframe, and the points that only this one saw.
-
-        linked: row of each living track, negative where it has none.
-        """
-        gone = self.keyframes.pop(index)
-        self.since -= index < self.since
-        self.culled += 1
-        self.points.cull(seen_by_none(gone.rows, self.keyframes, linked, self.points))
 
     def mapped_rows(self) -> I32:
         """Rows of all its points, oldest first."""
@@ -138,6 +133,7 @@ class Segment:
         turned = moves.matrices(hosts)[:, :3, :3] @ points.spread[rows][:, :, None]
         points.spread[rows] = turned[:, :, 0]
         self.path.scale(moves)
+        self.given_up.move(moves)
         return S[-1]
 
     def take_in(self, earlier: "Segment", id: int) -> None:
@@ -154,20 +150,35 @@ class Segment:
         for keyframe in self.keyframes:
             keyframe.segment = id
         self.since = len(older)
-        self.culled += earlier.culled
+        self.thinned |= earlier.thinned
+        self.given_up.take_in(earlier.given_up)
         self.path.take_in(earlier.path)
         self.passed.take_in(earlier.passed)
 
-    def adjust(self, known: SelfCalibration, parameters: MappingParameters) -> SelfCalibration:
-        """Adjust all but the first keyframe and the calibration, from what is known of it."""
+    def adjust(
+        self, known: SelfCalibration, parameters: MappingParameters
+    ) -> tuple[SelfCalibration, MapMoves | None]:
+        """Adjust all but the first keyframe and the calibration, from what is known of it.
+
+        Returns what is known now, and how what has been given up moves: None where that is nothing.
+        """
         motions = self.path.motions(self.keyframes)
-        found, gone = adjust_keyframes(self.keyframes, self.points, known, parameters, motions)
+        found, gone, moves = adjust_keyframes(
+            self.keyframes, self.points, known, parameters, motions
+        )
         self.points.remove(gone)
         self.unroll(self.keyframes, found)
         self.passed.seen_by(known.view, found.view)
         if found.readout and not known.readout:
             self.passed.forget()
-        return found
+        if not self.thinned:
+            return found, None
+        moves = self.given_up.told_with(moves)
+        self.given_up.move(moves)
+        rows = self.mapped_rows()
+        hosts = self.points.first_keyframe[rows].astype(np.int64)
+        self.points.published_xyz[rows] = moves.points(self.points.published_xyz[rows], hosts)
+        return found, moves
 
 
 @kernel

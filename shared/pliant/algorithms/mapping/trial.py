@@ -110,6 +110,11 @@ class TrialMapper:
         """As ``Mapper.point_count``."""
         return 0 if self._on_trial else self._mapper.point_count
 
+    @property
+    def given_up(self) -> dict[str, int]:
+        """As ``Mapper.given_up``."""
+        return self._mapper.given_up
+
     def finish(self) -> MapDelta:
         """As ``Mapper.finish``; a trial that lasts until then ends with it."""
         begun = self._begin(no_stages) if self._on_trial and self._first is not None else None

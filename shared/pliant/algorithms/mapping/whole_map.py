@@ -16,22 +16,25 @@ A place that is recognised asks at once.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
-from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.final_adjustment import ListedMap, adjust_listed, list_map
+from pliant.algorithms.mapping.final_adjustment import (
+    ListedMap,
+    adjust_listed,
+    list_map,
+    moves_between,
+)
 from pliant.algorithms.mapping.loops import Loop, close_loops
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import readout_flow
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-
-_MIN_DEPTH = 1e-6
 
 _LEAST_TOLD = 0.2
 """Share of what is known of the readout that the images must tell, and not the prior."""
@@ -54,6 +57,15 @@ class Question:
     hosts: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))
 
+    @property
+    def distance_frames(self) -> int:
+        """Frames after which the answer is taken over: the time that it takes to find grows with
+        the observations."""
+        limits = self.parameters.whole_map
+        # Few keyframes take little time, and say what those that follow wait for.
+        least = min(limits.distance_frames, len(self.keyframe_ids))
+        return max(least, len(self.seen.px) // limits.observations_per_frame)
+
 
 class Answer(NamedTuple):
     """How the map moves, None where it does not; the loops that were closed, whose points are to be
@@ -69,7 +81,7 @@ class WholeMap:
     """Asks for an adjustment whenever the segment has grown by a share: all of them together cost
     a small multiple of the last.
 
-    due: keyframes at which it asks again.    question: asked, and not yet taken over.
+    due: keyframes made at which it asks again.    question: asked, and not yet taken over.
     answer: of the question, where somebody has found it already.    loops: to be closed by the
     next question.
     """
@@ -97,12 +109,13 @@ class WholeMap:
         count = len(segment.keyframes)
         # While the window has half of the map it does well by itself, but for the calibration.
         least = parameters.start.keyframes if parameters.calibration.sigmas.any() else 2 * window
-        early = growth == 0.0 or count < max(least, self.due)
+        made = count + len(segment.given_up)
+        early = growth == 0.0 or count < least or made < self.due
         # The window would move with what was there before the camera was recognised.
         early = early or (segment.since > 0 and count - segment.since <= window)
         if self.question is not None or (early and not self.loops):
             return
-        self.due = (1.0 + growth) * count
+        self.due = (1.0 + growth) * count + (made - count)
         loops, self.loops = self.loops, []
         points = segment.points
         seen = list_map(segment.keyframes, points, calibration, parameters)
@@ -113,7 +126,10 @@ class WholeMap:
                 seen.point, seen.px, camera,
             )  # fmt: skip
         keyframe_ids = np.array([keyframe.id for keyframe in segment.keyframes], np.int64)
+        kept = partial(segment.given_up.host_of, kept=keyframe_ids)
+        loops = [loop._replace(old=kept(loop.old), new=kept(loop.new)) for loop in loops]
         loops = [loop for loop in loops if np.isin((loop.old, loop.new), keyframe_ids).all()]
+        loops = [loop for loop in loops if loop.old != loop.new]
         hosts = np.searchsorted(keyframe_ids, points.first_keyframe[seen.rows], side="right") - 1
         self.question = Question(
             frame=frame,
@@ -137,9 +153,7 @@ class WholeMap:
         question = self.question
         if question is None:
             return False
-        # Few keyframes take little time, and say what those that follow wait for.
-        distance = question.parameters.whole_map.distance_frames
-        return frame >= question.frame + min(distance, len(question.keyframe_ids))
+        return frame >= question.frame + question.distance_frames
 
     def take(self, frame: int) -> Answer | None:
         """What was found, where it is taken over before a frame is worked on."""
@@ -215,18 +229,12 @@ def _without_prior(
 
 def _moves(question: Question, seen: ListedMap, before: F64, depths: F64) -> MapMoves:
     """before: (M, 4, 4) poses and depths: (O,) of the observations until now."""
-    scales = _scales(seen, depths)
+    scales = seen.scales(depths)
     T = seen.T_world_camera.copy()
     # Nothing holds the scale of a map: that of its beginning stays.
     T[:, :3, 3] = T[0, :3, 3] + (T[:, :3, 3] - T[0, :3, 3]) / scales[0]
     scales /= scales[0]
-    moved = T @ inverse(before)
-    turned = (moved[:, :3, :3] @ before[:, :3, 3, None])[:, :, 0]
-    moved[:, :3, 3] = T[:, :3, 3] - scales[:, None] * turned
-    return MapMoves(
-        keyframe_ids=question.keyframe_ids,
-        moves=np.column_stack([matrix_to_pose(moved), scales]),
-    )
+    return moves_between(question.keyframe_ids, before, T, scales)
 
 
 def held(moves: MapMoves, spans: list[tuple[int, int]], segment: int) -> MapMoves:
@@ -244,19 +252,3 @@ def held(moves: MapMoves, spans: list[tuple[int, int]], segment: int) -> MapMove
         row = rows[min(at, len(rows) - 1)] if of == segment else still
         ids, rows = np.insert(ids, at, first), np.insert(rows, at, row, axis=0)
     return MapMoves(keyframe_ids=ids, moves=rows)
-
-
-def _scales(seen: ListedMap, before: F64) -> F64:
-    """(M,) by how much what each keyframe sees has grown: the median."""
-    count = len(seen.T_world_camera)
-    after = seen.depths()
-    usable = (before > _MIN_DEPTH) & (after > _MIN_DEPTH)
-    cameras = seen.camera[usable]
-    ratios = after[usable] / before[usable]
-    ends = np.searchsorted(cameras, np.arange(count + 1))
-    scales = np.ones(count)
-    for slot in range(count):
-        some = ratios[ends[slot] : ends[slot + 1]]
-        if len(some):
-            scales[slot] = np.median(some)
-    return scales

@@ -1,0 +1,230 @@
+"""What a map gives up that has more observations than room: nothing that adjusts it stops."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
+from test_loops import drifted, drifted_once, recognised, there_and_back, world
+from test_mapper import Published, trajectory_error
+from test_whole_map import similarity
+
+from pliant.algorithms.map_delta import TRACKING, MapMoves
+from pliant.algorithms.mapping.covisibility import seen_by_none
+from pliant.algorithms.mapping.given_up import GivenUp
+from pliant.algorithms.mapping.map_store import FREE, MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import (
+    MappingParameters,
+    WholeMapParameters,
+    WindowParameters,
+)
+from pliant.algorithms.mapping.segment import Segment
+from pliant.algorithms.mapping.thinning import observations_of, thin
+from pliant.state import load_state, save_state
+
+__all__ = ["drifted", "drifted_once", "world"]  # fixtures
+
+NO_TRACK = np.zeros(0, np.int32)
+
+
+def keyframe(number: int, rows: list[int]) -> Keyframe:
+    return Keyframe(
+        id=number,
+        frame=number,
+        segment=0,
+        T_world_camera=np.eye(4),
+        rows=np.array(rows, np.int32),
+        points_px=np.zeros((len(rows), 2), np.float32),
+        rolled_px=np.zeros((len(rows), 2), np.float32),
+    )
+
+
+def segment(seen: list[list[int]]) -> Segment:
+    points = PointRows()
+    rows = points.allocate(1 + max(max(rows) for rows in seen))
+    points.promote(rows)
+    points.first_keyframe[rows] = [
+        next((k for k, some in enumerate(seen) if row in some), 0) for row in rows
+    ]
+    keyframes = [keyframe(k, rows) for k, rows in enumerate(seen)]
+    return Segment(id=0, points=points, keyframes=keyframes)
+
+
+def limits(room: int, least: int) -> WindowParameters:
+    return WindowParameters(kept_observations=max(room, 1000), kept_per_keyframe=least)
+
+
+def test_points_go_that_no_keyframe_and_no_track_sees() -> None:
+    points = PointRows()
+    rows = points.allocate(6)
+    points.promote(rows[:5])  # the last one is a candidate
+    kept = [keyframe(1, [1, 2])]
+    gone = seen_by_none(rows, kept, np.array([3, -1], np.int32), points)
+    assert gone.tolist() == [0, 4]
+    points.cull(gone)
+    assert points.culled == 2
+    assert (points.state == MAPPED).sum() == 3
+    again = points.allocate(2)
+    assert sorted(again.tolist()) == [0, 4]  # no new memory
+    points.promote(again)
+    assert len(set(points.ids[[0, 1, 2, 3, 4]].tolist())) == 5  # ids are never reused
+
+
+def test_points_that_few_keyframes_see_go_first_and_every_keyframe_keeps_its_share() -> None:
+    long, short = list(range(10)), [list(range(10 + 20 * k, 40 + 20 * k)) for k in range(6)]
+    some = segment([long + each for each in short])
+    linked = np.array([35, -1], np.int32)  # of a point that only the first two see
+    before = observations_of([some])
+    thin(some, 180, limits(180, 10), linked, whole=1)
+    assert observations_of([some]) <= 180 < before
+    assert all(set(long) <= set(k.rows.tolist()) for k in some.keyframes)
+    assert all(len(k.rows) >= 20 for k in some.keyframes)
+    assert len(some.keyframes[-1].rows) == 40
+    assert some.points.state[35] == MAPPED
+    assert len(some.given_up) == 0
+    assert some.points.culled == (some.points.state[:140] == FREE).sum() > 0
+    assert some.thinned
+
+
+def test_a_map_that_has_room_stays_as_it_is() -> None:
+    some = segment([[0, 1, 2], [1, 2, 3]])
+    thin(some, 6, limits(6, 1), NO_TRACK, whole=1)
+    assert observations_of([some]) == 6
+    assert not some.thinned
+
+
+def test_a_visit_of_a_place_leaves_and_moves_as_another_one() -> None:
+    place, way = list(range(30)), [list(range(30 + 15 * k, 60 + 15 * k)) for k in range(5)]
+    some = segment([place, *way[:2], place, *way[2:4], place, way[4], way[4]])
+    some.since = 5
+    thin(some, 268, limits(268, 30), NO_TRACK, whole=1)
+    assert [k.id for k in some.keyframes] == [0, 1, 2, 4, 5, 6, 7, 8]
+    assert some.given_up.ids.tolist() == [3]
+    assert some.given_up.hosts.tolist() == [0]
+    assert some.since == 4
+
+
+def test_what_has_been_given_up_moves_as_what_is_near_it() -> None:
+    """In time, or in what it saw; also where that was given up later."""
+    here = GivenUp()
+    for ids, hosts in (([4, 7], [0, 0]), ([2, 8], [2, 4]), ([5], [5])):
+        centres = np.column_stack([ids, np.zeros((len(ids), 2))])
+        here.take_in(GivenUp(ids=np.array(ids), hosts=np.array(hosts), centres=centres))
+    assert here.hosts.tolist() == [2, 0, 5, 0, 0]
+    moves = MapMoves(
+        keyframe_ids=np.array([0, 1, 3, 6, 9]),
+        moves=np.array([similarity(1.0 + 0.3 * k, (0, 0, 0), (k, 0, 0)) for k in range(5)]),
+    )
+    told = here.told_with(moves)
+    assert told.keyframe_ids.tolist() == list(range(10))
+    S = told.matrices(np.arange(10))
+    for kept in (0, 1, 3, 6, 9):
+        np.testing.assert_array_equal(S[kept], moves.matrices(np.array([kept]))[0])
+    for hosted in (4, 7, 8):
+        np.testing.assert_array_equal(S[hosted], S[0])
+    for gone, share in ((2, 0.5), (5, 2 / 3)):
+        at = np.array([gone, 0, 0, 1])
+        first, last = S[{2: 1, 5: 3}[gone]], S[{2: 3, 5: 6}[gone]]
+        np.testing.assert_allclose(S[gone] @ at, (1 - share) * first @ at + share * last @ at)
+    assert [here.host_of(k, moves.keyframe_ids) for k in (6, 2, 5, 8)] == [6, 1, 3, 0]
+
+
+def test_the_map_keeps_its_size_where_the_camera_comes_back():
+    """The same views many times: the state is bounded, poses are right, all published stays."""
+    room = WindowParameters(keyframes=6, kept_observations=9000, kept_per_keyframe=100)
+    once = sideways(45)
+    poses = [*once, *once[-2:0:-1]] * 4
+    mapper, published = Mapper(CAMERA, MappingParameters(window=room), 0), Published()
+    rows, most = [], 0
+    for frame, tracks in enumerate(Scene.box(death=0.01).frames(poses)):
+        published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+        mapper.publish_keyframes()
+        if mapper.atlas.active is not None:
+            most = max(most, observations_of([mapper.atlas.active.segment]))
+        rows.append(mapper.atlas.points.count)
+    published.apply(mapper.finish())
+    kept = mapper.atlas.active.segment
+    assert len(kept.keyframes) + len(kept.given_up) == len(published.keyframes)
+    assert len(kept.given_up) > len(kept.keyframes)
+    assert most < 1.6 * room.kept_observations
+    assert max(rows[len(rows) // 2 :]) <= 1.1 * max(rows[: len(rows) // 2])
+    assert mapper.point_count == len(published.points)
+    counts = {"given_up_keyframes": len(kept.given_up), "given_up_points": kept.points.culled}
+    assert mapper.given_up == counts
+    again = load_state(save_state(mapper)).atlas.active.segment
+    np.testing.assert_array_equal(again.given_up.centres, kept.given_up.centres)
+    assert trajectory_error(published, poses)[0] < 1e-3
+    assert set(published.states[10:]) == {TRACKING}
+
+
+def along(poses, window):
+    """A camera along a wall of points, with noise: the mapper, what readers have at the end, and
+    the keyframes that each adjustment moved once the map had given something up."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform((-4.0, -3.0, 3.0), (11.0, 3.0, 9.0), (1500, 3))
+    kappas = generator.uniform(5.0, 500.0, len(points)).astype(np.float32)
+    parameters = MappingParameters(window=window, whole_map=WholeMapParameters(distance_frames=7))
+    mapper, published, moved = Mapper(CAMERA, parameters, 0), Published(), []
+    for frame, tracks in enumerate(Scene(points, kappas, death=0.02).frames(poses)):
+        px = tracks.points_px + generator.normal(0.0, 0.3, tracks.points_px.shape)
+        seen = replace(tracks, points_px=px.astype(np.float32))
+        thinned = mapper.atlas.active is not None and mapper.atlas.active.segment.thinned
+        delta = mapper.process(frame, frame * INTERVAL_NS, seen, None, None)
+        published.apply(delta)
+        moved += [delta.moved_keyframes] if thinned and len(delta.moved_keyframes) else []
+    published.apply(mapper.finish())
+    return mapper, published, moved
+
+
+WINDOW = WindowParameters(keyframes=6)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return along(there_and_back(), WINDOW)
+
+
+@pytest.mark.parametrize(("room", "least"), [(14000, 60), (14000, 400), (9000, 100)])
+def test_beyond_its_room_the_map_is_adjusted_as_before(whole, room, least):
+    """While it grows and at the end, and what has been given up moves, too."""
+    poses, (unbounded, all_of_it, _) = there_and_back(), whole
+    assert observations_of([unbounded.atlas.active.segment]) > 1.5 * room
+    some = {"kept_observations": room, "kept_per_keyframe": least}
+    mapper, published, moved = along(poses, WINDOW.model_copy(update=some))
+    kept = mapper.atlas.active.segment
+    assert len(kept.given_up) > 0
+    assert kept.points.culled > 0
+    assert len(published.keyframes) == len(kept.keyframes) + len(kept.given_up)
+    assert len(moved) >= 1
+    assert np.isin(kept.given_up.ids, moved[-1]).any()
+    assert len(published.poses) == len(poses)
+    assert trajectory_error(published, poses)[0] < 2.5 * trajectory_error(all_of_it, poses)[0]
+
+
+def test_a_loop_is_closed_in_a_map_that_has_given_up_some(drifted):
+    """Frames that hang on what is no more gain from it, too."""
+    scene, _, mapper, published = drifted
+    active = mapper.atlas.active
+    before = observations_of([active.segment])
+    thin(active.segment, before // 2, limits(1000, 200), active.links.rows, whole=6)
+    assert len(active.segment.given_up) > 10
+    loop = recognised(scene, mapper)
+    mapper.whole_map.loops.append(loop)
+    last = mapper.finish()
+    assert last.same_places.tolist() == [[loop.old, loop.new]]
+    assert np.isin(active.segment.given_up.ids, last.moved_keyframes).all()
+    assert trajectory_error(published.apply(last), there_and_back())[0] < 3e-3
+
+
+def test_a_loop_to_what_was_given_up_is_one_to_its_host(drifted):
+    scene, _, mapper, _ = drifted
+    active, loop = mapper.atlas.active, recognised(scene, mapper)
+    thin(active.segment, 12_000, limits(1000, 200), active.links.rows, whole=6)
+    gone = active.segment.given_up
+    mapper.whole_map.loops += [loop._replace(old=int(k)) for k in gone.ids[:2]]
+    mapper.atlas.ask(0)
+    kept = np.array([keyframe.id for keyframe in active.keyframes])
+    asked = [each.old for each in mapper.whole_map.question.loops]
+    assert asked == [gone.host_of(int(k), kept) for k in gone.ids[:2]]
+    assert np.isin(asked, kept).all()
