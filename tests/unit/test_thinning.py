@@ -10,6 +10,7 @@ from test_mapper import Published, trajectory_error
 from test_whole_map import similarity
 
 from pliant.algorithms.map_delta import TRACKING, MapMoves
+from pliant.algorithms.mapping import thinning
 from pliant.algorithms.mapping.covisibility import seen_by_none
 from pliant.algorithms.mapping.given_up import GivenUp
 from pliant.algorithms.mapping.map_store import FREE, MAPPED, Keyframe, PointRows
@@ -103,6 +104,16 @@ def test_a_visit_of_a_place_leaves_and_moves_as_another_one() -> None:
     assert some.given_up.ids.tolist() == [3]
     assert some.given_up.hosts.tolist() == [0]
     assert some.since == 4
+
+
+def test_keyframes_go_where_their_pairs_take_more_room_than_what_they_see(monkeypatch):
+    some = segment([[0, k // 2 + 1] for k in range(30)])
+    room = observations_of([some])
+    thin(some, room, limits(room, 1), NO_TRACK, whole=1)
+    assert len(some.keyframes) == 30
+    monkeypatch.setattr(thinning, "_PAIRS", 10)
+    thin(some, room, limits(room, 1), NO_TRACK, whole=1)
+    assert len(some.keyframes) == int(0.9 * int(np.sqrt(10 * room)))
 
 
 def test_what_has_been_given_up_moves_as_what_is_near_it() -> None:

@@ -198,7 +198,7 @@ class WindowParameters(Parameters):
         "bytes each: beyond, points that few keyframes see hang on a keyframe, as they were found",
     )
     kept_per_keyframe: int = Field(
-        default=500,
+        default=150,
         ge=1,
         description="Observations that a keyframe keeps of these: where there would be less, "
         "keyframes hang on another one that sees the same points",

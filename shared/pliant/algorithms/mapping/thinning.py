@@ -6,7 +6,8 @@ the adjustment any more how the map lies, and hangs on a keyframe that moves it.
 
 First go points.  A keyframe sees thousands, and a fraction of them holds it as well; those seen by
 the most keyframes hold the most and stay.  Of each keyframe an equal share is left.  Where that
-becomes less than a place needs, keyframes go: the one of which the least is lost.  Of what a point
+becomes less than a place needs, or pairs of keyframes are too many, keyframes go: the one of which
+the least is lost.  Of what a point
 seen by n keyframes tells, one of these is a share of 1 / (n - 1), and all of it where n = 1; the
 mean over the points that it sees is what is lost with a keyframe.  Where a place was visited many
 times, that is one visit of many; on a path, every other keyframe of where the camera was slow.
@@ -30,6 +31,10 @@ _SPARE = 0.1
 _LESS = 0.8
 """Of one try to the next, what keyframes are to keep: many see points that others need."""
 
+_PAIRS = 25
+"""Pairs of keyframes that there may be for each observation that there is room for: adjustments
+have a table of 6 bytes for each pair, and some 150 for each observation."""
+
 _NEAR = 0.5
 """Share of what others see of what a keyframe saw that makes its neighbours in time near."""
 
@@ -48,13 +53,15 @@ def thin(segment: Segment, room: int, limits: WindowParameters, linked: I32, *, 
     linked: row of each living track, negative where it has none.   whole: newest keyframes that
     stay as they are, with the points that they see: nobody may have been told of them yet.
     """
-    if observations_of([segment]) <= room:
-        return
-    room = int((1.0 - _SPARE) * room)
-    _give_up_points(segment, room, limits.kept_per_keyframe, linked, whole)
-    surplus = observations_of([segment]) - room
-    if surplus > 0:
-        _give_up_keyframes(segment, surplus, linked, whole)
+    most = int(np.sqrt(_PAIRS * room))
+    if observations_of([segment]) > room:
+        room = int((1.0 - _SPARE) * room)
+        _give_up_points(segment, room, limits.kept_per_keyframe, linked, whole)
+    if len(segment.keyframes) > most:
+        most = int((1.0 - _SPARE) * most)
+    surplus, count = observations_of([segment]) - room, len(segment.keyframes) - most
+    if surplus > 0 or count > 0:
+        _give_up_keyframes(segment, surplus, count, linked, whole)
 
 
 def _give_up_points(segment: Segment, room: int, floor: int, linked: I32, whole: int) -> None:
@@ -82,8 +89,9 @@ def _give_up_points(segment: Segment, room: int, floor: int, linked: I32, whole:
     segment.thinned = True
 
 
-def _give_up_keyframes(segment: Segment, surplus: int, linked: I32, whole: int) -> None:
-    """All but the first and the newest may go."""
+def _give_up_keyframes(segment: Segment, surplus: int, count: int, linked: I32, whole: int) -> None:
+    """All but the first and the newest may go, until so many observations and so many keyframes
+    have."""
     points = segment.points
     start, slots = _seen_by(segment)
     counts = np.diff(start)
@@ -92,14 +100,14 @@ def _give_up_keyframes(segment: Segment, surplus: int, linked: I32, whole: int) 
     queue = [(_loss(counts[known[slot].rows]), slot) for slot in may]
     heapq.heapify(queue)
     alive, hosts = np.ones(len(known), np.bool_), np.arange(len(known))
-    while queue and surplus > 0:
+    while queue and (surplus > 0 or count > 0):
         _, slot = heapq.heappop(queue)
         rows = known[slot].rows
         loss = _loss(counts[rows])  # it only grows as others go
         if queue and (loss, slot) > queue[0]:
             heapq.heappush(queue, (loss, slot))
             continue
-        alive[slot] = False
+        alive[slot], count = False, count - 1
         counts[rows] -= 1
         surplus -= len(rows)
         shared = _shared(rows, start, slots, len(known))
