@@ -223,8 +223,8 @@ class WholeMapParameters(Parameters):
     observations_per_frame: int = Field(
         default=4000,
         ge=1,
-        description="Observations for which that is a frame at least: it takes some 4 us of one "
-        "core for each of them, so 16 ms a frame",
+        description="Observations for which that is a frame at least: it takes 4 to 6 us of one "
+        "core for each of them, so 16 to 24 ms a frame",
     )
     iterations: int = Field(
         default=20, ge=1, description="Most iterations of Schur LM; the next adjustment goes on"
