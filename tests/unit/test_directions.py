@@ -7,7 +7,12 @@ from test_mapper import run, trajectory_error
 
 from pliant.algorithms.bundle.projection import move_camera
 from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
-from pliant.algorithms.mapping.directions import linearise, place, refine_pose_spread
+from pliant.algorithms.mapping.directions import (
+    linearise,
+    off_epipolar_line,
+    place,
+    refine_pose_spread,
+)
 
 K = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
 
@@ -53,6 +58,30 @@ def test_parallax_tells_the_distance_and_how_well_it_is_known():
     share = np.linalg.norm(spread, axis=1) / np.linalg.norm(xyz, axis=1)
     assert share[0] < share[1] < 0.1
     assert xyz[2, 2] > 50.0
+
+
+def test_no_depth_is_off_the_epipolar_line_and_what_moves_by_itself_is():
+    generator = np.random.default_rng(2)
+    X = generator.uniform((-2, -2, 3), (2, 2, 8), (200, 3))
+    T = looking((0.3, -0.2, 0.1), (0.02, -0.03, 0.01))
+    px = CAMERA.project(transform(inverse(T), X))
+    placed = X * generator.uniform(0.6, 2.0, (200, 1))  # as the first camera sees it, elsewhere
+    spread = 0.5 * placed
+    off = off_epipolar_line(T, placed, spread, px.astype(np.float32), CAMERA)
+    assert off.max() < 0.5
+    lines = CAMERA.project(transform(inverse(T), 1.01 * X)) - px
+    across = np.stack([-lines[:, 1], lines[:, 0]], axis=1)
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    moved = (px + 5.0 * across).astype(np.float32)
+    off = off_epipolar_line(T, placed, spread, moved, CAMERA)
+    np.testing.assert_allclose(off, 5.0, atol=0.5)
+    turned = looking((0, 0, 0), (0.02, -0.03, 0.01))
+    moved = (CAMERA.project(transform(inverse(turned), X)) + np.array([3.0, 4.0])).astype(
+        np.float32
+    )
+    np.testing.assert_allclose(
+        off_epipolar_line(turned, placed, spread, moved, CAMERA), 5.0, atol=1e-2
+    )
 
 
 def uncertain_view(seed=0):

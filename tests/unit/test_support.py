@@ -16,14 +16,7 @@ from pliant.results.judgement import BAD, DOUBTFUL, GOOD, judge, judge_surfels, 
 
 def doubt_of(points, inliers, settled):
     """settled: where tracks are that had time to become points."""
-    n, parameters = len(settled), SupportParameters()
-    tracks = FrameExtrema(
-        ids=np.arange(n), points_px=settled, ages=np.full(n, 30, np.int32),
-        kappas=np.ones(n, np.float32), states=np.zeros(n, np.uint8),
-        maxima=np.zeros((0, 3), np.float32), dominant_flow=np.eye(2, 3),
-    )  # fmt: skip
-    found = support_of(tracks, 1e-9 * INTERVAL_NS, points, inliers, CAMERA, parameters)
-    return doubt(found, parameters)
+    return doubt(support_of(points, inliers, settled, CAMERA), SupportParameters())
 
 
 def places(count, left=0.0, right=1.0, seed=0):

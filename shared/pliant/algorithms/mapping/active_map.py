@@ -73,6 +73,7 @@ class ActiveMap:
         self.room = parameters.window.kept_observations
         self.links = TrackLinks()
         self.window = self._window([], fixed=0, outside=0)
+        self.candidates_agree = True  # with the points of the map, in the current frame
         self._nearby: I32 = np.zeros(0, np.int32)
         self._marks: I64 = np.zeros(0, np.int64)
 

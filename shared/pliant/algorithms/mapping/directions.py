@@ -44,6 +44,9 @@ MAPPED_SHARE = 0.25
 _COMMON_PX = 0.1
 """Error that all tracks may have in common: a gain within it is no sign of a translation."""
 
+_ANY_DEPTH = 10.0
+"""Standard deviations of an inverse depth that leave it open: near is far from the prior."""
+
 _STEPS = 3
 _ITERATIONS = 10
 _MIN_DEPTH = 1e-6
@@ -179,6 +182,31 @@ def _residual(T: F64, X: F64, u: float, v: float, K: F64) -> tuple[float, float]
     x = (T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2] + T[0, 3]) / z
     y = (T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2] + T[1, 3]) / z
     return u - K[0] * x - K[2], v - K[1] * y - K[3]
+
+
+def off_epipolar_line(
+    T_world_camera: F64, points_world: F64, spread: F64, points_px: F32, camera: PinholeCamera
+) -> F64:
+    """(N,) px by which observations points_px (N, 2) miss the epipolar lines of provisional points,
+    which no depth explains; 0 for what is behind the camera.   points_world, spread: (N, 3).
+    """
+    K = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    off = np.empty(len(points_px))
+    _off_lines(inverse(T_world_camera)[:3], points_world, spread, points_px, K, off)
+    return off
+
+
+@kernel
+def _off_lines(T: F64, X: F64, spread: F64, px: F32, K: F64, off: F64) -> None:
+    shift = np.empty(2)
+    for n in range(X.shape[0]):
+        off[n] = 0.0
+        if _project(T, X[n], spread[n], K, shift) > _MIN_DEPTH:
+            du, dv = _residual(T, X[n], px[n, 0], px[n, 1], K)
+            along = du * shift[0] + dv * shift[1]
+            uncertain = shift[0] ** 2 + shift[1] ** 2
+            share = _ANY_DEPTH**2 / (1.0 + _ANY_DEPTH**2 * uncertain)
+            off[n] = np.sqrt(max(du * du + dv * dv - share * along * along, 0.0))
 
 
 def refine_pose_spread(

@@ -6,16 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, I64, U8
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.directions import (
     Spread,
     helping_candidates,
+    off_epipolar_line,
     placed_candidates,
     spread_of,
 )
-from pliant.algorithms.mapping.localisation import locate, refine
-from pliant.algorithms.mapping.map_store import MAPPED, Observations
+from pliant.algorithms.mapping.localisation import Localisation, locate, refine
+from pliant.algorithms.mapping.map_store import MAPPED, UNLINKED, Observations
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.reacquisition import reacquire
 from pliant.algorithms.mapping.recovery import Motion, prove, recover
@@ -23,6 +24,13 @@ from pliant.algorithms.mapping.rolling_shutter import RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.support import Support, support_of
 from pliant.algorithms.tracks import FrameExtrema, FrameTracks
+
+_AGREEING = 0.5
+"""Share of the points of the map that place a frame alone and still fit once candidates help: with
+fewer, what these are on moves by itself."""
+
+_OFF = 2.0
+"""Of the error of an inlier: a track that is farther from its epipolar line contradicts a pose."""
 
 _TELLING = 500
 """Points at the least that tell whether a camera stands where it stood."""
@@ -41,7 +49,8 @@ class Located(NamedTuple):
 
 def directions_of(active: ActiveMap) -> I64:
     """Indices of the tracks of candidates that help to place the frame."""
-    return helping_candidates(active.points, active.links.rows)
+    directions = helping_candidates(active.points, active.links.rows)
+    return directions if active.candidates_agree else directions[:0]
 
 
 def localise(
@@ -61,6 +70,7 @@ def localise(
     """
     points, parameters = active.points, active.parameters
     predictions = motion.predictions(stamp_ns)
+    active.candidates_agree = True
     directions = directions_of(active)
     linked = np.concatenate([active.linked(MAPPED), directions])
     limits = parameters.localisation
@@ -70,10 +80,7 @@ def localise(
             rolled = active.segment.rolled(calibration, motion.velocity())
             depths = active.segment.inverse_depths(rows, predictions[0])
             points_px = points_px - rolled.shifts(points_px, depths)
-        located = locate(
-            predictions, points.xyz[rows], points_px, active.camera, limits, generator,
-            _spread(active, rows, directions),
-        )  # fmt: skip
+        located = _by_tracks(active, predictions, rows, points_px, directions, generator)
         inliers = int(located.inliers.sum())
         if inliers >= limits.min_inliers:
             if grey is None or inliers >= _FEW * motion.inliers:
@@ -91,6 +98,33 @@ def localise(
         generator,
     )  # fmt: skip
     return None if recovered is None else Located(recovered, True)
+
+
+def _by_tracks(
+    active: ActiveMap,
+    predictions: list[F64],
+    rows: I32,
+    points_px: F32,
+    directions: I64,
+    generator: np.random.Generator,
+) -> Localisation:
+    """The pose that tracks tell: those of points, which come first, have the last word."""
+    limits, mapped = active.parameters.localisation, len(rows) - len(directions)
+
+    def located(count: int, spread: Spread | None) -> Localisation:
+        return locate(
+            predictions, active.points.xyz[rows[:count]], points_px[:count], active.camera, limits,
+            generator, spread,
+        )  # fmt: skip
+
+    together = located(len(rows), _spread(active, rows, directions))
+    if len(directions) and mapped >= limits.min_inliers:
+        alone = located(mapped, None)
+        fitting, still = alone.inliers.sum(), together.inliers[:mapped].sum()
+        if fitting >= limits.min_inliers and still < _AGREEING * fitting:
+            active.candidates_agree = False
+            return alone
+    return together
 
 
 def at_once(
@@ -162,10 +196,31 @@ def adjust(
         T_world_camera = active.window.sweep_current(parameters)
     rows, points_px = active.observed(tracks.points_px, found, directions)
     errors = reprojection_errors(T_world_camera, points.xyz[rows], points_px, camera)
-    return T_world_camera, support_of(
-        tracks, motion.interval_s(), points_px, errors < parameters.localisation.inlier_px,
-        camera, parameters.support,
-    )  # fmt: skip
+    inliers = errors < parameters.localisation.inlier_px
+    telling = _settled(active, motion, tracks)
+    telling[_contradicting(active, T_world_camera, tracks.points_px)] = True
+    return T_world_camera, support_of(points_px, inliers, tracks.points_px[telling], camera)
+
+
+def _settled(active: ActiveMap, motion: Motion, tracks: FrameTracks) -> BoolArray:
+    """Which tracks (N,) had time to become points, and keyframes enough that saw them."""
+    points, parameters = active.points, active.parameters
+    rows = active.links.rows
+    newest = active.keyframes[-1].id
+    seen_by = np.where(rows != UNLINKED, newest + 1 - points.first_keyframe[rows], 0)
+    old = tracks.ages * motion.interval_s() >= parameters.support.settled_s
+    return old & (seen_by >= parameters.point.min_observations)
+
+
+def _contradicting(active: ActiveMap, T_world_camera: F64, points_px: F32) -> I64:
+    """Indices of the tracks of candidates that are where the pose has them at no depth."""
+    points = active.points
+    candidates = placed_candidates(points, active.links.rows)
+    rows = active.links.rows[candidates]
+    off = off_epipolar_line(
+        T_world_camera, points.xyz[rows], points.spread[rows], points_px[candidates], active.camera
+    )
+    return candidates[off > _OFF * active.parameters.localisation.inlier_px]
 
 
 def stand(

@@ -203,10 +203,9 @@ class Localiser:
         errors = reprojection_errors(T_world_camera, self._points.xyz[rows], points_px, camera)
         active.judge_tracks(linked, errors[: len(linked)])
         interval_s = 0.0 if self._motion is None else self._motion.interval_s()
-        return T_world_camera, support_of(
-            tracks, interval_s, points_px, errors < parameters.localisation.inlier_px, camera,
-            parameters.support,
-        )  # fmt: skip
+        settled = tracks.ages * interval_s >= parameters.support.settled_s
+        inliers = errors < parameters.localisation.inlier_px
+        return T_world_camera, support_of(points_px, inliers, tracks.points_px[settled], camera)
 
     def _publish(
         self, state: int, reason: str, inliers: int, *, looks_anew: bool = False

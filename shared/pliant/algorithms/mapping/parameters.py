@@ -117,7 +117,10 @@ class SupportParameters(Parameters):
     """When a pose is told as doubtful."""
 
     settled_s: float = Field(
-        default=0.5, ge=0.0, description="Age at which a track should belong to a point, seconds"
+        default=0.5,
+        ge=0.0,
+        description="Age at which a track that enough keyframes saw should belong to a point, "
+        "seconds",
     )
     max_contrary_share: float = Field(
         default=0.12,

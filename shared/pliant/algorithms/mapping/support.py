@@ -2,7 +2,8 @@
 
 A few dozen inliers always agree with some motion, and those of a large moving object agree well.
 What does not belong to them shows it: parts of the image where tracks live on and no point of the
-map is.  They are counted by area, so that the texture of a thing does not decide how large it is.
+map is, or where no depth lets tracks be where the pose has them.  They are counted by area, so that
+the texture of a thing does not decide how large it is.
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,6 @@ import numpy as np
 from pliant.algorithms.arrays import F32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping.parameters import SupportParameters
-from pliant.algorithms.tracks import FrameTracks
 from pliant.compiler.kernel import kernel
 
 _COLUMNS, _LINES = 8, 6
@@ -41,28 +41,21 @@ class Support:
 
 
 def support_of(
-    tracks: FrameTracks,
-    interval_s: float,
-    points_px: F32,
-    inliers: BoolArray,
-    camera: PinholeCamera,
-    parameters: SupportParameters,
+    points_px: F32, inliers: BoolArray, telling_px: F32, camera: PinholeCamera
 ) -> Support:
-    """tracks: of the frame.   interval_s: between two frames.   points_px: (N, 2) of the points
-    seen, of which ``inliers`` (N,) fit.
+    """points_px: (N, 2) of the points seen, of which ``inliers`` (N,) fit.   telling_px: (M, 2) of
+    the tracks that belong to points if the pose is right, or contradict it.
     """
-    # Those that had time to become points.
-    settled_px = tracks.points_px[tracks.ages * interval_s >= parameters.settled_s]
     count = int(np.count_nonzero(inliers))
     fitting = points_px[inliers]
     width, height = camera.width, camera.height
-    supported, settled = _per_cell(fitting, width, height), _per_cell(settled_px, width, height)
-    telling = settled >= _LEAST_SEEN
+    supported, tracks = _per_cell(fitting, width, height), _per_cell(telling_px, width, height)
+    telling = tracks >= _LEAST_SEEN
     size = np.array([width, height])
     return Support(
         inliers=count,
         share=count / max(len(points_px), 1),
-        contrary=float((supported < _FEW * settled)[telling].mean()) if telling.any() else 0.0,
+        contrary=float((supported < _FEW * tracks)[telling].mean()) if telling.any() else 0.0,
         spread=float(np.min(fitting.std(axis=0) / size)) if count else 0.0,
     )
 
