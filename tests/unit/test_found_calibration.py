@@ -15,7 +15,11 @@ from pliant.datasets.calibration import (
     calibration_yaml,
 )
 from pliant.messages.types import CameraStream
-from pliant.results.calibration import calibration_verdict, found_calibration
+from pliant.results.calibration import (
+    calibration_doubt,
+    calibration_verdict,
+    found_calibration,
+)
 from pliant.results.run import Run
 
 PINHOLE = Calibration(model="pinhole", width=640, height=480, fx=520, fy=510, cx=310, cy=250)
@@ -100,6 +104,18 @@ def test_a_calibration_that_the_images_contradict_is_told_and_by_how_much():
     assert "1.200 times what was given (+-0.3 %)" in told
     assert not calibration_verdict(run_with(PINHOLE, (0.008, 0.004, 0.0, 0.0), (1e-3,) * 4), {})
     assert not calibration_verdict(run_with(PINHOLE, correction, (0.2,) * 4), {})
+
+
+def test_what_bends_the_map_is_a_doubt_and_what_was_corrected_is_none():
+    guess = calibration_from_fov(640, 480, 60.0)
+    open_still = run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.09,) * 4)
+    assert calibration_doubt(open_still, {}).startswith("the focal length stays unknown")
+    assert not calibration_doubt(run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.004,) * 4), {})
+    far = run_with(PINHOLE, (math.log(0.89), 0.12, 0.0, 0.0), (0.003,) * 4)
+    assert "focal length 0.890 times what was given" in calibration_doubt(far, {})
+    assert not calibration_doubt(run_with(PINHOLE, (0.05, 0.0, 0.0, 0.0), (0.003,) * 4), {})
+    assert not calibration_doubt(run_with(PINHOLE, (0.0, 0.0, 0.0, 0.0), (0.003,) * 4), {})
+    assert not calibration_doubt(Run(), {})
 
 
 def test_a_lens_that_no_calibration_can_have_leaves_the_focal_length():

@@ -93,6 +93,13 @@ def test_of_frames_that_were_not_used_no_verdict_speaks() -> None:
         assert judged == (GOOD, f"all {which} have a pose in one segment")
 
 
+def test_a_run_whose_calibration_bends_the_map_is_doubtful() -> None:
+    known = "the focal length stays unknown"
+    judged = judge(frames=100, in_segments=[100], doubtful=0, calibration=known)
+    assert judged == (DOUBTFUL, known)
+    assert judge(frames=100, in_segments=[20], doubtful=0, calibration=known)[0] == BAD
+
+
 def test_a_run_of_which_many_images_are_broken_is_doubtful() -> None:
     few = judge(frames=95, in_segments=[95], doubtful=0, unused=5, broken=5)
     many = judge(frames=60, in_segments=[60], doubtful=0, unused=40, broken=40)

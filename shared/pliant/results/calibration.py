@@ -28,6 +28,10 @@ _KNOWN = 0.05
 _CONTRADICTED = 2.0
 """Standard deviations of the calibration's prior from which on the images contradict it."""
 
+_BENDS = 0.1
+"""Correction of the log focal length from which on a map may stay bent though the lens is found: it
+began with the wrong one (two standard deviations of what draws adjustments that refute theirs)."""
+
 _SURE = 3.0
 """Standard deviations of what was found that must lie between the two as well."""
 
@@ -125,6 +129,17 @@ def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
         f"what was given (+-{100.0 * sigmas[0]:.1f} %), k1 {correction[1]:+.3f}, "
         f"{_corner_px(camera, correction):.0f} px at the corner; run again with calibration.yaml"
     )
+
+
+def calibration_doubt(run: Run, final: dict[int, Any]) -> str:
+    """As ``calibration_verdict`` where the map is bent by what is not known of the camera, as far
+    as the run can tell; else ""."""
+    correction, sigmas = run.calibration_correction, run.calibration_sigmas
+    if run.stream is None or len(correction) < 3 or len(sigmas) < 3:
+        return ""
+    guessed = run.stream.focal_sigma > 0.0
+    bent = sigmas[0] > _KNOWN if guessed else abs(correction[0]) > _BENDS and _is_contradicted(run)
+    return calibration_verdict(run, final) if bent else ""
 
 
 def _is_contradicted(run: Run) -> bool:

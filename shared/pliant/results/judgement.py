@@ -30,13 +30,15 @@ def doubtful_frames(history: MapHistory) -> list[int]:
 
 
 def judge(
-    *, frames: int, in_segments: list[int], doubtful: int, unused: int = 0, broken: int = 0
-) -> tuple[str, str]:
+    *, frames: int, in_segments: list[int], doubtful: int, unused: int = 0, broken: int = 0,
+    calibration: str = "",
+) -> tuple[str, str]:  # fmt: skip
     """Good, doubtful or bad, and why.
 
     frames: of the sequence that were used.   in_segments: poses in each segment of the map.
     doubtful: poses told as such.   unused: frames that were broken, dropped or passed over.
-    broken: those of them that no frame could be made of, as nobody wanted it.
+    broken: those of them that no frame could be made of, as nobody wanted it.   calibration: why it
+    bends the map; "" where it does not.
     """
     longest, posed = max(in_segments, default=0), sum(in_segments)
     if not longest:
@@ -52,6 +54,8 @@ def judge(
         return DOUBTFUL, told
     if broken > (1.0 - _WHOLE) * (frames + broken):
         return DOUBTFUL, f"{broken / (frames + broken):.0%} of the images are broken"
+    if calibration:
+        return DOUBTFUL, calibration
     return GOOD, told if longest < frames else f"all {which} have a pose in one segment"
 
 

@@ -10,7 +10,7 @@ from pliant.algorithms.corrected_view import parts_of
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_density import count_distinct, well_observed
 from pliant.messages.types import DROPPED, MASKED
-from pliant.results.calibration import calibration_verdict
+from pliant.results.calibration import calibration_doubt, calibration_verdict
 from pliant.results.judgement import doubtful_frames, judge
 from pliant.results.mesh import mesh_report
 from pliant.results.run import Run
@@ -43,6 +43,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         broken=len(broken_images(run.missing)),
         in_segments=[len(members) for members in by_segment.values()],
         doubtful=len(doubtful),
+        calibration=calibration_doubt(run, final),
     )
     return {
         "verdict": word,
