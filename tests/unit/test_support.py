@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
+from test_mapper import run, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.mapping.mapper import Mapper
@@ -66,6 +67,38 @@ def test_a_large_moving_thing_is_told_of():
                 reasons.setdefault(other, []).append(delta.reason)
     assert not any(reasons[False])
     assert sum(r.startswith("doubtful") for r in reasons[True]) > 0.5 * len(reasons[True])
+
+
+def with_a_thing(tracks: FrameExtrema, since: int) -> FrameExtrema:
+    """The same image some frames after a thing full of texture has come before its middle."""
+    low, high = np.array([160.0, 40.0]), np.array([480.0, 440.0])
+    generator = np.random.default_rng(4)
+    own = generator.uniform(low, high, (4000, 2)) + np.array([2.5, -2.0]) * since
+    px = tracks.points_px
+    seen = ((px < own.min(axis=0)) | (px > own.max(axis=0))).any(axis=1)
+    points_px = np.concatenate([px[seen], own]).astype(np.float32)
+    kappas = np.concatenate([tracks.kappas[seen], np.full(len(own), 50.0, np.float32)])
+    return FrameExtrema(
+        ids=np.concatenate([tracks.ids[seen], 10_000_000 + np.arange(len(own))]),
+        points_px=points_px,
+        ages=np.concatenate([tracks.ages[seen], np.full(len(own), since, np.int32)]),
+        kappas=kappas, states=np.zeros(len(kappas), np.uint8),
+        maxima=np.column_stack([points_px, kappas]), dominant_flow=np.eye(2, 3),
+    )  # fmt: skip
+
+
+def test_a_thing_that_takes_most_of_the_tracks_does_not_carry_the_camera_along():
+    """They have no place in the map yet: its own points have the last word."""
+    poses, scene, first = sideways(34), Scene.box(1500, noise_px=0.1), 20
+    frames = [
+        with_a_thing(tracks, k - first) if k >= first else tracks
+        for k, tracks in enumerate(scene.frames(poses))
+    ]
+    published, deltas = run(frames)
+    assert {*range(len(poses))} == {*published.poses}
+    error, _ = trajectory_error(published, poses)
+    assert error < 2e-3
+    assert all(delta.reason.startswith("doubtful") for delta in deltas[first + 2 : len(poses)])
 
 
 @pytest.mark.parametrize(
