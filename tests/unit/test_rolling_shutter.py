@@ -123,6 +123,28 @@ def test_what_a_readout_has_moved_is_moved_back():
     np.testing.assert_allclose(points_px + shifts, p, atol=0.01)
 
 
+def test_an_upright_image_is_read_out_across():
+    """A camera and a world with x and y in turned places, which also mirrors them."""
+    upright = PinholeCamera(width=480, height=640, fx=520.0, fy=500.0, cx=240.0, cy=320.0)
+    rng, swapped = np.random.default_rng(2), np.array([1, 0, 2])
+    world = rng.uniform((-1.5, -1.0, 3.0), (1.5, 1.0, 6.0), (50, 3))
+    turned = np.concatenate([-OMEGA[swapped], NU[swapped]])
+    px = CAMERA.project(world).astype(np.float32)
+    other_px = np.ascontiguousarray(px[:, ::-1])
+    number, camera = np.arange(50, dtype=np.int32), np.zeros(50, np.int32)
+    at = np.eye(4)[None], camera, number
+    flow = readout_flow(at[0], MOTION[None], world, *at[1:], px, CAMERA)
+    other = readout_flow(at[0], turned[None], world[:, swapped], *at[1:], other_px, upright)
+    np.testing.assert_allclose(other, flow[:, ::-1], atol=1e-4)
+    shifts = RolledFrame(CAMERA, READOUT, MOTION, 0.25).shifts(px)
+    other = RolledFrame(upright, READOUT, turned, 0.25)
+    np.testing.assert_allclose(other.shifts(other_px), shifts[:, ::-1], atol=1e-4)
+    image = rng.integers(0, 255, (480, 640), np.uint8)
+    at_once = RolledFrame(CAMERA, READOUT, MOTION, 0.25).image(image)
+    swapped_image = other.image(np.ascontiguousarray(image.T)).T
+    assert np.abs(swapped_image.astype(int) - at_once).max() <= 1
+
+
 def test_an_image_is_as_if_taken_at_once():
     rolled = RolledFrame(CAMERA, READOUT, MOTION, 0.25)
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))

@@ -3,7 +3,8 @@
 The pose of a frame is that of its middle row.  With the readout as a share of the frame interval,
 row v is taken ``readout (v - middle) / height`` frame intervals later, when the camera has moved on
 by as much of its motion.  A map that is built without regard to this bends and drifts in scale, at
-residuals that hardly grow.
+residuals that hardly grow.  Rows lie along the longer side of a sensor: an upright image has been
+turned and is read out across, so that u and the width take the place of v and the height.
 
 Once the readout is known, everything is mapped as if each frame had been taken at once: what is
 seen at p was, when the middle row was taken, at the q with
@@ -38,6 +39,12 @@ _STEPS = 2
 
 _GRID_PX = 16
 """Between these the shift of an image is interpolated: it is nearly quadratic."""
+
+
+def _read_out_along(camera: PinholeCamera) -> tuple[int, float]:
+    """The axis of the image along which rows are read out, 0 across and 1 down, and its px."""
+    upright = camera.height > camera.width
+    return (0, float(camera.width)) if upright else (1, float(camera.height))
 
 
 class Path:
@@ -154,11 +161,12 @@ class RolledFrame:
 
     def _shifts(self, points_px: F32, inverse_depths: F64 | None, *, seen: bool) -> F32:
         camera = self.camera
-        K = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.height])
+        axis, length = _read_out_along(camera)
+        K = np.array([camera.fx, camera.fy, camera.cx, camera.cy, length])
         if inverse_depths is None:
             inverse_depths = np.full(len(points_px), self.inverse_depth)
         shifts = np.empty((len(points_px), 2), np.float32)
-        _shifts(points_px, inverse_depths, self.readout * self.motion, K, shifts, seen)
+        _shifts(points_px, inverse_depths, self.readout * self.motion, K, axis, shifts, seen)
         return shifts
 
 
@@ -178,8 +186,11 @@ def readout_flow(
     """
     flow = np.zeros((len(points_px), 2), np.float32)
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:, :3])
-    K = np.array([camera.fx, camera.fy, camera.height])
-    _flow(T_camera_world, motions, points_world, camera_index, point_index, points_px, K, flow)
+    axis, length = _read_out_along(camera)
+    K = np.array([camera.fx, camera.fy, length])
+    _flow(
+        T_camera_world, motions, points_world, camera_index, point_index, points_px, K, axis, flow
+    )
     return flow
 
 
@@ -192,6 +203,7 @@ def _flow(
     point: I32,
     points_px: F32,
     K: F64,
+    axis: int,
     flow: F32,
 ) -> None:
     middle = 0.5 * (K[2] - 1.0)
@@ -202,7 +214,7 @@ def _flow(
             continue
         x = (T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2] + T[0, 3]) / z
         y = (T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2] + T[1, 3]) / z
-        share = (points_px[o, 1] - middle) / K[2]
+        share = (points_px[o, axis] - middle) / K[2]
         a, b = _velocity(motion, x, y, 1.0 / z)
         flow[o, 0], flow[o, 1] = share * K[0] * a, share * K[1] * b
 
@@ -218,7 +230,7 @@ def _velocity(motion: F64, x: float, y: float, inverse_depth: float) -> tuple[fl
 
 @kernel
 def _shifts(
-    points_px: F32, inverse_depths: F64, motion: F64, K: F64, shifts: F32, seen: bool
+    points_px: F32, inverse_depths: F64, motion: F64, K: F64, axis: int, shifts: F32, seen: bool
 ) -> None:
     """Write p - q of the points p, where they are seen; or else of the points q."""
     middle = 0.5 * (K[4] - 1.0)
@@ -227,9 +239,11 @@ def _shifts(
         du, dv = 0.0, 0.0
         for _ in range(_STEPS):
             if seen:
-                x, y, row = (u - du - K[2]) / K[0], (v - dv - K[3]) / K[1], v
+                x, y = (u - du - K[2]) / K[0], (v - dv - K[3]) / K[1]
+                row = v if axis else u
             else:
-                x, y, row = (u - K[2]) / K[0], (v - K[3]) / K[1], v + dv
+                x, y = (u - K[2]) / K[0], (v - K[3]) / K[1]
+                row = v + dv if axis else u + du
             share = (row - middle) / K[4]
             a, b = _velocity(motion, x, y, inverse_depths[n])
             du, dv = share * K[0] * a, share * K[1] * b
