@@ -46,6 +46,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     builtin_folder(TINY)  # on a new machine it would be rendered, and say so
     (tmp_path / "file").write_text("hello\n")
     (tmp_path / "empty").mkdir()
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / "notes.txt").write_text("hello\n")
     (tmp_path / "misspelt.yaml").write_text("tracking:\n  min_curvatur: 8\n")
     (tmp_path / "binary.yaml").write_bytes(b"\0\xff\xfe")
     (tmp_path / "broken.yaml").write_text("bus: [1\n")
@@ -72,7 +74,8 @@ MISTAKES: list[tuple[Sequence[str], int, Sequence[str]]] = [
     (["run", "backwards"], 1, ["backwards/rgb.txt", "line 3", "runs backwards"]),
     (["run", "not_images"], 1, ["not_images/images/0000.png", "decode"]),
     (["run", "empty"], 1, ["empty: is an empty folder", "rgb.txt"]),
-    (["run", "."], 1, ["holds none of the sources"]),
+    (["run", "."], 1, [".: is no source, but holds some", "pliant batch ."]),
+    (["run", "others"], 1, ["others: holds none of the sources", "rgb.txt"]),
     (["run", "nowhere"], 1, ["nowhere: no such file or folder"]),
     (["run", LONG], 1, ["too long"]),
     (["run", "/dev/null"], 1, ["neither a file nor a folder"]),
@@ -180,7 +183,7 @@ def test_broken_frames_are_counted_named_and_passed_over(tmp_path: Path) -> None
     assert sorted(missing) == ["4", "6", "8"]
     assert "empty" in missing["4"]
     assert "cut off" in missing["6"]
-    assert "the calibration is for" in missing["8"]
+    assert "320x220 px, but the camera has 320x240" in missing["8"]
     assert report["counters"]["ingest"]["broken"] == 3
     (line,) = [line for line in done.stdout.splitlines() if " broken images: " in line]
     assert line.startswith("3 broken images: frame 4: ")
