@@ -39,9 +39,7 @@ class TrackingParameters(Parameters):
         default=300, ge=20, le=4000, description="Most BRIEF points for the dominant flow."
     )
     flow_max_shift_px: float = Field(
-        default=180.0,
-        gt=0.0,
-        description="Longest displacement between matched BRIEF points, px at 640x480.",
+        default=180.0, gt=0.0, description="Longest displacement between matched BRIEF points, px."
     )
     prediction_weight: float = Field(
         default=1.0,

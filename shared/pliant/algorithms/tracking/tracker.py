@@ -3,7 +3,6 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, with_bits
-from pliant.algorithms.camera import size_unit
 from pliant.algorithms.image.masks import filled
 from pliant.algorithms.image.patch_sums import TEMPLATE_FLOATS
 from pliant.algorithms.image.pixels import halve, pixels_of
@@ -111,7 +110,7 @@ class ExtremaTracker:
             self._features,
             features,
             max_distance_bits=MAX_BRIEF_DISTANCE_BITS,
-            max_shift_px=self._parameters.flow_max_shift_px * size_unit(*self._shape),
+            max_shift_px=self._parameters.flow_max_shift_px,
         )
         return fit_affine(sources, targets, sigma_px=self._parameters.flow_sigma_px)
 
