@@ -224,10 +224,10 @@ class WholeMapParameters(Parameters):
         "not found it waits",
     )
     observations_per_frame: int = Field(
-        default=4000,
+        default=8000,
         ge=1,
         description="Observations for which that is a frame at least: it takes 4 to 6 us of one "
-        "core for each of them, so 16 to 24 ms a frame",
+        "core for each of them, so 32 to 48 ms a frame",
     )
     iterations: int = Field(
         default=20, ge=1, description="Most iterations of Schur LM; the next adjustment goes on"
