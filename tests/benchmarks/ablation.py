@@ -3,8 +3,9 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from benchmarks.in_process import run, shown_ate
+from benchmarks.in_process import run
 from benchmarks.table import markdown
+from pliant.datasets import open_source
 
 _OFF = {
     "mutual check": ["tracking.mutual_check=false"],
@@ -43,7 +44,5 @@ def measure(sources: Sequence[str]) -> Iterator[str]:
 
 
 def _cell(source: str, overrides: Sequence[str]) -> str:
-    found = run(source, overrides)
-    rate = 100.0 * (found.final.success_rate or 0.0)
-    at = f" at {rate:.0f} %" if rate < 99.0 else ""
-    return f"{shown_ate(found.final)}{at} / {found.median_inliers:.0f}"
+    found = run(open_source(source), overrides)
+    return f"{found.ate} / {found.inliers:.0f}"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks.mapped import run
+from benchmarks.in_process import run
 from benchmarks.table import markdown
 from pliant.datasets import open_source
 from pliant.datasets.base import Dataset, SourceFrame, is_builtin
@@ -66,7 +66,7 @@ def measure(
             else:
                 source = open_source(name, longest_side_px=4096)
             source = at_working_size(_Sized(source, width, height))
-            found.append((size, source.calibration, run(source, overrides, frames)))
+            found.append((size, source.calibration, run(source, overrides, frames=frames)))
         best = min(mapped.ate_m for _, _, mapped in found)
         rows = [
             [

@@ -1,14 +1,16 @@
-"""The rigid pipeline in one process on several sources: ATE of the final and the causal poses."""
+"""The rigid pipeline in this process: ATE of the final and the causal poses, and what it found."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.table import markdown_header, markdown_row
 from pliant.config import load_config
-from pliant.datasets import open_source
+from pliant.datasets import Calibration, open_source
+from pliant.datasets.base import Dataset
 from pliant.errors import DatasetError
 from pliant.evaluation.report import metres
 from pliant.evaluation.result import TrajectoryEvaluation, evaluate_trajectory
@@ -20,54 +22,90 @@ _HEADER = ("sequence", "seed", "ATE, final", "ATE, causal", "frames with a pose"
 
 
 @dataclass(frozen=True)
-class Run:
-    """What a run came to: its longest segment against the true poses."""
+class Mapped:
+    """What a run came to.
+
+    final, causal: its longest segment against the true poses.   share: of the frames with a pose in
+    it.   tracks, inliers: medians over the frames.   correction, sigmas: of the calibration, as of
+    ``MapDelta``; empty where nothing was told.
+    """
 
     final: TrajectoryEvaluation
     causal: TrajectoryEvaluation
-    median_inliers: float
+    share: float
+    tracks: float
+    inliers: float
+    correction: tuple[float, ...]
+    sigmas: tuple[float, ...]
+
+    @property
+    def ate_m(self) -> float:
+        """The final error; inf where there is none."""
+        return self.final.ate_m.rmse if self.final.ate_m else np.inf
+
+    @property
+    def ate(self) -> str:
+        """The final error, and the share of frames where some are missing."""
+        missing = f" at {100.0 * self.share:.0f} %" if self.share < 0.99 else ""
+        return shown_ate(self.final) + missing
+
+    @property
+    def both(self) -> str:
+        """The final error, and the causal one."""
+        return f"{self.ate} / {shown_ate(self.causal)}"
 
 
-def run(source: str, overrides: Sequence[str], focal: float = 1.0) -> Run:
-    """Run a source that has true poses.  ``focal``: the given focal length is taken times this.
+def run(
+    dataset: Dataset,
+    overrides: Sequence[str] = (),
+    *,
+    frames: int | None = None,
+    calibration: Calibration | None = None,
+) -> Mapped:
+    """Map the first frames of a source; None: all.   calibration: instead of the source's own.
 
-    Raises DatasetError where it has none.
+    Raises DatasetError where it has no true poses.
     """
-    config = load_config(None, overrides)
-    dataset = open_source(source, part=config.ingest)
     if dataset.ground_truth_path is None:
-        raise DatasetError(f"{source}: has no true poses to compare with")
-    truth = read_trajectory(dataset.ground_truth_path)
-    given, history = dataset.calibration, MapHistory()
-    lens = replace(given, fx=focal * given.fx, fy=focal * given.fy)
-    pipeline = Pipeline(lens, config, history)
-    inliers = [pipeline.take(frame).delta.inliers for frame in dataset]
-    pipeline.finish()
-    longest = history.longest_segment()
-    final, causal = (
-        evaluate_trajectory(history.trajectory_in(longest, poses), truth, frames=len(inliers))
-        for poses in (history.final(), history.causal)
+        raise DatasetError(f"{dataset.name}: has no true poses to compare with")
+    truth = read_trajectory(Path(dataset.ground_truth_path))
+    history = MapHistory()
+    pipeline = Pipeline(calibration or dataset.calibration, load_config(None, overrides), history)
+    counts: list[tuple[int, int]] = []
+    deltas = []
+    for source in islice(dataset, frames):
+        frame = pipeline.take(source)
+        counts.append((len(frame.tracks.ids), frame.delta.inliers))
+        deltas = [frame.delta]
+    deltas.append(pipeline.finish())
+    told = [delta for delta in deltas if delta and delta.calibration_correction]
+    tracks, inliers = np.median(counts, axis=0).tolist()
+    longest, final = history.longest_segment(), history.final()
+    return Mapped(
+        final=evaluate_trajectory(history.trajectory_in(longest, final), truth, frames=len(counts)),
+        causal=evaluate_trajectory(history.trajectory_in(longest, history.causal), truth),
+        share=sum(segment == longest for segment, _ in final.values()) / len(counts),
+        tracks=tracks,
+        inliers=inliers,
+        correction=tuple(told[-1].calibration_correction) if told else (),
+        sigmas=tuple(told[-1].calibration_sigmas) if told else (),
     )
-    return Run(final, causal, float(np.median(inliers)))
 
 
 def measure(
     sources: Sequence[str], overrides: Sequence[str], seeds: Sequence[int], focal: float
 ) -> Iterator[str]:
-    """A row for each source and seed."""
+    """A row for each source and seed.   focal: the given focal length is taken times this."""
     yield markdown_header(_HEADER)
     for source in sources:
+        dataset = open_source(source, part=load_config(None, overrides).ingest)
+        given = dataset.calibration
+        lens = replace(given, fx=focal * given.fx, fy=focal * given.fy)
         for seed in seeds:
-            found = run(source, [*overrides, f"seed={seed}"], focal)
-            yield markdown_row(
-                [
-                    Path(source).name,
-                    str(seed),
-                    shown_ate(found.final),
-                    shown_ate(found.causal),
-                    f"{100.0 * (found.final.success_rate or 0.0):.1f} %",
-                ]
-            )
+            found = run(dataset, [*overrides, f"seed={seed}"], calibration=lens)
+            ates = shown_ate(found.final), shown_ate(found.causal)
+            share = f"{100.0 * found.share:.1f} %"
+            yield markdown_row([Path(source).name, str(seed), *ates, share])
 
 
 def shown_ate(evaluation: TrajectoryEvaluation) -> str:

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.mapped import Mapped, run
+from benchmarks.in_process import Mapped, run
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.rectification import distort
 from pliant.datasets import Calibration, open_source
-from pliant.datasets.base import Dataset
 from pliant.datasets.calibration import calibration_from_fov
 
 _SAID = (None, 1.67, 0.87, 0.51)
@@ -25,25 +24,13 @@ _HEADER = (
 )
 
 
-class _Guessed:
-    """A source whose calibration nobody knows."""
-
-    def __init__(self, source: Dataset, calibration: Calibration) -> None:
-        self._source, self.calibration = source, calibration
-        self.name, self.is_live = source.name, source.is_live
-        self.frame_count, self.ground_truth_path = source.frame_count, source.ground_truth_path
-
-    def __iter__(self):
-        return iter(self._source)
-
-
 def measure(sources: Sequence[str], frames: int | None, overrides: Sequence[str]) -> Iterator[str]:
     """A row for each source and what is said of its lens; frames: the first, None: all."""
     yield markdown_header(_HEADER)
     for name in sources:
         source = open_source(name)
         truth = source.calibration
-        calibrated = run(source, overrides, frames)
+        calibrated = run(source, overrides, frames=frames)
         yield markdown_row(
             [Path(name).name, "its calibration", "", "", "", "", calibrated.both, ""]
         )
@@ -55,7 +42,7 @@ def measure(sources: Sequence[str], frames: int | None, overrides: Sequence[str]
                 fov = round(2.0 * math.degrees(math.atan(0.5 * truth.width / (factor * truth.fx))))
                 said = f"{fov} deg"
             guess = calibration_from_fov(*size, fov)
-            found = run(_Guessed(source, guess), overrides, frames)
+            found = run(source, overrides, frames=frames, calibration=guess)
             ratio = f"{found.ate_m / calibrated.ate_m:.2f}"
             lens = _lens_cells(guess, found, truth)
             yield markdown_row([Path(name).name, said, *lens, found.both, ratio])
