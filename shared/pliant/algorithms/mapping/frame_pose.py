@@ -118,9 +118,10 @@ def _by_tracks(
         )  # fmt: skip
 
     together = located(len(rows), _spread(active, rows, directions))
-    if len(directions) and mapped >= limits.min_inliers:
+    still = together.inliers[:mapped].sum()
+    if len(directions) and still < _AGREEING * mapped:
         alone = located(mapped, None)
-        fitting, still = alone.inliers.sum(), together.inliers[:mapped].sum()
+        fitting = alone.inliers.sum()
         if fitting >= limits.min_inliers and still < _AGREEING * fitting:
             active.candidates_agree = False
             return alone
