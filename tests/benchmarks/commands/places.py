@@ -1,0 +1,149 @@
+"""Whether the camera is followed, and places are recognised."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from benchmarks.commands.app import Overrides, Sources, app, show
+
+
+@app.command()
+def tracking(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(help="Frames to measure.")] = 100,
+    overrides: Overrides = None,
+) -> None:
+    """Tracking per stage, beside OpenCV's pyramidal LK for the same points.
+
+    scripts/bench tracking built-in:room
+    """
+    from benchmarks.tracking import measure
+    from pliant.config import load_config
+
+    show(measure(source, load_config(None, overrides or []), frames))
+
+
+@app.command()
+def places(sources: Sources, overrides: Overrides = None) -> None:
+    """How often the place of a frame is recognised, in its own map and in those of the others.
+
+    scripts/bench places built-in:room built-in:tabletop
+    """
+    from benchmarks.places import measure
+    from pliant.config import load_config
+
+    show(measure(sources, load_config(None, overrides or [])))
+
+
+@app.command()
+def deceiving(
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each scene.")] = 5,
+    only: Annotated[str, typer.Option(help="Scenes whose names have this.")] = "",
+    overrides: Overrides = None,
+) -> None:
+    """Rendered scenes that look the same in more than one place: is one ever taken for another?
+
+    scripts/bench deceiving --seeds 5
+    """
+    from benchmarks.deceiving import measure
+    from pliant.config import load_config
+
+    show(measure(load_config(None, overrides or []), seeds, only))
+
+
+@app.command()
+def rough(
+    folder: Annotated[Path, typer.Argument(help="Folder of sequences with a ground truth.")],
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Cases whose names have this.")
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Dark, blurred, covered and few frames, things that move, turns: is the camera followed?
+
+    scripts/bench rough ../shared/data/rigid --only black
+    """
+    from benchmarks.rough import measure
+    from pliant.config import load_config
+
+    show(measure(folder, load_config(None, overrides or []), only or []))
+
+
+@app.command("kept-maps")
+def kept_maps(sources: Sources, overrides: Overrides = None) -> None:
+    """Sources cut in two: the second half localised in the map of the first, and going on in it.
+
+    scripts/bench kept-maps path/to/7scenes_redkitchen400 built-in:room
+    """
+    from benchmarks.kept_maps import measure
+    from pliant.config import load_config
+
+    show(measure(sources, load_config(None, overrides or [])))
+
+
+@app.command("changed-places")
+def changed_places(
+    seeds: Annotated[int, typer.Option(min=1, help="Rooms.")] = 3, overrides: Overrides = None
+) -> None:
+    """How often rendered rooms are recognised: darker, exposed otherwise, rearranged, from afar.
+
+    scripts/bench changed-places --seeds 3
+    """
+    from benchmarks.changed_places import measure
+    from pliant.config import load_config
+
+    show(measure(load_config(None, overrides or []), seeds))
+
+
+@app.command()
+def sessions(sources: Sources, overrides: Overrides = None) -> None:
+    """Sources forth and back, whole and as two sessions with the dark between them.
+
+    scripts/bench sessions path/to/7scenes_redkitchen400 built-in:corridor
+    """
+    from benchmarks.sessions import measure
+    from pliant.config import load_config
+
+    show(measure(sources, load_config(None, overrides or [])))
+
+
+@app.command()
+def kidnappings(sources: Sources, overrides: Overrides = None) -> None:
+    """Sources whose camera is carried off ten times, in the dark and from image to image.
+
+    scripts/bench kidnappings built-in:room path/to/7scenes_redkitchen400
+    """
+    from benchmarks.sessions import kidnappings as measure
+    from pliant.config import load_config
+
+    show(measure(sources, load_config(None, overrides or [])))
+
+
+@app.command("merged-maps")
+def merged_maps(sources: Sources, overrides: Overrides = None) -> None:
+    """Two sessions whose frames overlap by a fifth, and their maps merged into one.
+
+    scripts/bench merged-maps path/to/7scenes_redkitchen400 built-in:room
+    """
+    from benchmarks.merged_maps import measure
+    from pliant.config import load_config
+
+    show(measure(sources, load_config(None, overrides or [])))
+
+
+@app.command("without-places")
+def without_places(
+    sources: Sources,
+    lit: Annotated[bool, typer.Option(help="As they are.")] = True,
+    cut: Annotated[bool, typer.Option(help="And with the dark in the middle.")] = True,
+    overrides: Overrides = None,
+) -> None:
+    """Sources with and without places, as they are and with two seconds in the dark.
+
+    scripts/bench without-places path/to/7scenes_redkitchen400 built-in:court
+    """
+    from benchmarks.without_places import measure
+    from pliant.config import load_config
+
+    show(measure(sources, load_config(None, overrides or []), lit=lit, cut=cut))

@@ -1,0 +1,169 @@
+"""The whole pipeline: accuracy, speed, losses, kills, memory."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from benchmarks.commands.app import Overrides, Sources, app, show
+
+
+@app.command()
+def accuracy(
+    sources: Sources,
+    output: Annotated[Path, typer.Option("--output", "-o")] = Path("results/bench"),
+    seeds: Annotated[int, typer.Option(help="Runs of each source, with seeds 0, 1, ...")] = 1,
+    overrides: Overrides = None,
+) -> None:
+    """The whole pipeline through its processes: accuracy, density and frames per second.
+
+    scripts/bench accuracy built-in:room path/to/sequence --seeds 5
+    """
+    from benchmarks.accuracy import measure
+
+    show(measure(sources, output, seeds=seeds, overrides=overrides or []))
+
+
+@app.command("in-process")
+def in_process(
+    sources: Sources,
+    overrides: Overrides = None,
+    seed: Annotated[int, typer.Option(help="Of the first run.")] = 0,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Runs of each source, with seeds after it.")
+    ] = 1,
+    focal: Annotated[float, typer.Option(help="Times the given focal length: a wrong one.")] = 1.0,
+) -> None:
+    """The rigid pipeline in one process, without services: final and causal ATE.
+
+    scripts/bench in-process path/to/tsukuba150 built-in:room --set tracking.turn_patches=false
+    """
+    from benchmarks.in_process import measure
+
+    show(measure(sources, overrides or [], range(seed, seed + seeds), focal))
+
+
+@app.command()
+def losses(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    runs: Annotated[int, typer.Option(min=1, help="How often.")] = 20,
+) -> None:
+    """Run again and again at full speed: messages lost by sequence number, and equal bytes.
+
+    scripts/bench losses built-in:room --runs 20
+    """
+    from benchmarks.whole_runs import losses
+
+    show(losses(source, runs))
+
+
+@app.command("recording-cost")
+def recording_cost(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    runs: Annotated[int, typer.Option(min=1, help="Runs with and without, in turns.")] = 3,
+) -> None:
+    """Frames a second of the pipeline with and without a recorder.
+
+    scripts/bench recording-cost built-in:room
+    """
+    from benchmarks.whole_runs import recording_cost
+
+    show(recording_cost(source, runs))
+
+
+@app.command("viewer-cost")
+def viewer_cost(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    runs: Annotated[int, typer.Option(min=1, help="Of each kind, in turns.")] = 1,
+) -> None:
+    """Frames a second without a viewer, with one that draws, and with one that is stopped.
+
+    scripts/bench viewer-cost built-in:room
+    """
+    from benchmarks.viewer_cost import measure
+
+    show(measure(source, runs))
+
+
+@app.command()
+def replay(
+    recording: Annotated[Path, typer.Argument(help="Result folder or recording.")],
+    service: Annotated[str, typer.Option(help="Which one.")] = "tracking",
+    runs: Annotated[int, typer.Option(min=1, help="Of each, in turns.")] = 3,
+) -> None:
+    """Frames a second of a replayed service, beside the same service on messages in memory.
+
+    scripts/bench replay results/room --service tracking
+    """
+    from benchmarks.replay_rate import measure
+
+    show(measure(recording, service, runs))
+
+
+@app.command()
+def kills(
+    source: Annotated[str, typer.Argument(help="Of 300 frames.")] = "built-in:room",
+    count: Annotated[int, typer.Option(min=1, help="How often each.")] = 20,
+    seed: Annotated[int, typer.Option(help="Chooses the moments.")] = 0,
+) -> None:
+    """kill -9 of each service, and of all at once, at random moments: are the results the same?
+
+    scripts/bench kills built-in:room --count 20
+    """
+    from benchmarks.whole_runs import kills
+
+    show(kills(source, count, seed))
+
+
+@app.command()
+def latency(images: Annotated[int, typer.Option(min=50, help="To send.")] = 1000) -> None:
+    """What a hop over the bus adds to a 361 kB image: TCP and mutual TLS through a router.
+
+    scripts/bench latency
+    """
+    from benchmarks.latency import measure
+
+    show(measure(images))
+
+
+@app.command()
+def endurance(
+    source: Annotated[str, typer.Argument(help="built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(min=1, help="At most.")] = 108_000,
+    minutes: Annotated[float, typer.Option(min=0.1, help="At most.")] = 60.0,
+) -> None:
+    """An hour's worth of frames at full speed: memory, file handles, threads of each service.
+
+    scripts/bench endurance built-in:room --minutes 10
+    """
+    from benchmarks.endurance import measure
+
+    show(measure(source, frames, minutes))
+
+
+@app.command("slow-mapping")
+def slow_mapping(
+    source: Annotated[str, typer.Argument(help="built-in:NAME.")] = "built-in:room",
+    frames: Annotated[int, typer.Option(min=40, help="Of the source, forth and back.")] = 1200,
+    fps: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 30.0,
+    slowdown: Annotated[float, typer.Option(min=1.0, help="Of bundle adjustment.")] = 10.0,
+    overrides: Overrides = None,
+) -> None:
+    """Live mode before, while and after bundle adjustment is slow: what tracking keeps of its rate.
+
+    scripts/bench slow-mapping built-in:room --fps 10 --frames 400
+    """
+    from benchmarks.slow_mapping import measure
+
+    show(measure(source, frames, fps, slowdown, overrides or []))
+
+
+@app.command()
+def ablation(sources: Sources) -> None:
+    """What each addition to the paper is worth.
+
+    scripts/bench ablation built-in:room path/to/sequence
+    """
+    from benchmarks.ablation import measure
+
+    show(measure(sources))
