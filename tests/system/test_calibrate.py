@@ -1,6 +1,7 @@
 """``pliant calibrate`` without a board: the run that finds its camera."""
 
 import math
+import shutil
 from pathlib import Path
 
 import cv2
@@ -43,9 +44,31 @@ def test_a_camera_is_found_without_a_board(tmp_path: Path) -> None:
     black[:44] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), black)
     anew = tmp_path / "masked.yaml"
+    film = enlarged(builtin_folder(TINY), tmp_path / "film")
     masked = pliant(
-        "calibrate", TINY, "--fov", "50", "--mask", tmp_path / "mask.png", "--output", anew
+        "calibrate", film, "--fov", "50", "--mask", tmp_path / "mask.png", "--output", anew
     )
     assert "8 % of each image are ignored (mask.png)" in masked.stderr
     assert masked.returncode == 0, masked.stderr
     assert read_calibration(anew) != found
+    # It was worked on at half its size: what was seen covers its picture's image all the same, of
+    # which the mask leaves 92 %, as the first one's.
+    assert read_calibration(anew).width == 4 * found.width
+    assert covered(anew.with_suffix(".png")) > 0.8 * covered(picture)
+
+
+def covered(picture: Path) -> float:
+    """Share of a picture of a calibration that is blue: where the image has been seen."""
+    drawn = cv2.imread(str(picture)).astype(int)
+    return float((drawn[..., 0] > drawn[..., 2] + 50).mean())
+
+
+def enlarged(folder: Path, film: Path) -> Path:
+    """A sequence without a calibration, whose images are four times as large as their details."""
+    shutil.copytree(folder, film)
+    (film / "calib.yaml").unlink()
+    for image in (film / "images").iterdir():
+        pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+        assert pixels is not None
+        cv2.imwrite(str(image), cv2.resize(pixels, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC))
+    return film

@@ -36,7 +36,7 @@ from pliant.pictures.calibration import SeenCorners, coverage, draw_calibration
 from pliant.pictures.movie import write_image
 from pliant.recording.reader import Recording
 from pliant.results.folder import CALIBRATION_NAME, RECORDING_NAME, REPORT_NAME, keep_apart
-from pliant.results.run import read_run, seen_by_keyframes
+from pliant.results.run import Run, read_run, seen_by_keyframes
 from pliant_services.calibrate.board import PrintedBoard
 from pliant_services.cli.progress import tell_progress
 from pliant_services.run.command import INTERRUPTED, RunRequest, run_pipeline
@@ -252,31 +252,37 @@ def calibrate_without_board(
         if not report["segments"]:
             raise CalibrationError(f"{source}: no map could start: {report['last_reason']}")
         calibration = read_calibration(Path(folder) / "run" / CALIBRATION_NAME)
-        left, count = left_over(Recording(Path(folder) / "run" / RECORDING_NAME))
-    verdict = str(report["calibration_verdict"]).partition(":")[0]
-    if calibration.focal_sigma > _KNOWN:
-        raise CalibrationError(
-            f"{source}: {verdict}: film sideways and with turns, or film a board "
-            "(pliant calibrate --print-board board.pdf)"
-        )
+        verdict = str(report["calibration_verdict"]).partition(":")[0]
+        if calibration.focal_sigma > _KNOWN:
+            raise CalibrationError(
+                f"{source}: {verdict}: film sideways and with turns, or film a board "
+                "(pliant calibrate --print-board board.pdf)"
+            )
+        recording = Recording(Path(folder) / "run" / RECORDING_NAME)
+        run = read_run(recording.path)
+        left, count = left_over(recording, run)
     lines = [_said(calibration, calibration.focal_sigma), verdict]
-    picture = output.with_suffix(".png")
     make_folder(output.parent)
+    _write(output, calibration, [f"pliant calibrate {source}", verdict])
+    if not len(left.points_px):  # no part of the image has enough of them
+        return [*lines, f"written: {output}"]
+    picture = output.with_suffix(".png")
     of = f"medians of what is left over of {count:,} sights of points, over the image"
     words = [f"{source}: {lines[0]}", verdict, of]
-    size = calibration.width, calibration.height
+    assert run.stream is not None
+    # What was seen are pixels of the size that the run was worked on at.
+    size = run.stream.camera.width, run.stream.camera.height
     write_image(picture, draw_calibration([left], *size, words))
-    _write(output, calibration, [f"pliant calibrate {source}", verdict])
     return [*lines, f"written: {output}, {picture}"]
 
 
-def left_over(recording: Recording) -> tuple[SeenCorners, int]:
+def left_over(recording: Recording, run: Run) -> tuple[SeenCorners, int]:
     """How far from where the final map has them keyframes see its points, over the image: the
-    median in each of its cells that has many.  And how many sights there are in all.
+    median in each of its cells that has many.  And how many sights there are in all.   run: of the
+    recording.
 
     Noise is gone from medians: what is left is a lens that is none of the found one's.
     """
-    run = read_run(recording.path)
     ideal = IdealCamera(run)
     told = seen_by_keyframes(recording, set(ideal.keyframes.values()))
     places, offs = [np.zeros((0, 2))], [np.zeros((0, 2))]
