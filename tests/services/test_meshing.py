@@ -3,14 +3,25 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from meshing_scene import (
+    CAMERA,
+    FRAMES,
+    Inputs,
+    Notes,
+    final,
+    inputs,
+    keyframe,
+    map_update,
+    pose,
+    run,
+    seen,
+)
 
-from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse, matrix_to_pose, move_by_similarity, transform
+from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.image.masks import packed
-from pliant.algorithms.meshing.mesh_blocks import BlockMesh, TriangleMesh
+from pliant.algorithms.meshing.mesh_blocks import BlockMesh
 from pliant.algorithms.meshing.rendering import DrawnTriangles
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import load_config
@@ -18,127 +29,8 @@ from pliant.fusion.keyframe_spool import KeyframeSpool
 from pliant.messages import codec, topics
 from pliant.messages.mesh_pieces import joined, split
 from pliant.messages.topics import Topic
-from pliant.messages.types import (
-    CameraStream,
-    Header,
-    Keyframe,
-    MapUpdate,
-    MeshPiece,
-    MeshUpdate,
-)
+from pliant.messages.types import Header, Keyframe, MapUpdate, MeshPiece, MeshUpdate
 from pliant_services.nodes import meshing
-from pliant_services.runtime.monitor import SilentMonitor
-
-CAMERA = PinholeCamera(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
-POINTS = 1500
-FRAMES = 6
-WINDOW = 2
-VOXEL = 0.2
-"""Of the coarse mesh: the wall is at 4."""
-
-
-def stream(mode: str = "lossless") -> CameraStream:
-    return CameraStream(
-        frame=0, stamp_ns=0, frame_id="camera", source="wall", mode=mode, frames=FRAMES,
-        calibration="", width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5,
-    )  # fmt: skip
-
-
-def world() -> np.ndarray:
-    """Points on a wall at 4 and on a box before it."""
-    generator = np.random.default_rng(0)
-    x, y = generator.uniform((-3.0, -2.0), (3.0, 2.0), (POINTS, 2)).T
-    return np.stack([x, y, np.where(np.abs(x) < 0.7, 3.0, 4.0)], axis=1)
-
-
-def pose(frame: int) -> np.ndarray:
-    T = np.eye(4)
-    T[0, 3] = 0.15 * frame
-    return T
-
-
-def seen(frame: int) -> tuple[np.ndarray, np.ndarray]:
-    local = world() - pose(frame)[:3, 3]
-    pixels = CAMERA.project(local)
-    inside = np.all((pixels > 0) & (pixels < (159, 119)), axis=1)
-    return np.flatnonzero(inside), pixels[inside].astype(np.float32)
-
-
-def map_update(frame: int, *, last: bool = False) -> MapUpdate:
-    none = np.zeros(0, np.int64)
-    first = frame == 0
-    ids = np.arange(POINTS * first, dtype=np.int64)
-    key = np.array([] if last else [frame], np.int64)
-    return MapUpdate(
-        frame=frame, stamp_ns=frame, frame_id="world", state=1, reason="", segment=0, inliers=0,
-        pose_frames=none, pose_segments=none.astype(np.int32), pose_keyframes=none,
-        poses_keyframe_camera=np.zeros((0, 7)), pose_inliers=none.astype(np.int32),
-        keyframe_ids=key, keyframe_frames=key, keyframe_segments=np.zeros(len(key), np.int32),
-        keyframe_poses=matrix_to_pose(pose(frame)[None])[: len(key)],
-        point_ids=ids, point_segments=np.zeros(len(ids), np.int32),
-        points_world=world()[: len(ids)], point_colours=np.zeros((len(ids), 3), np.uint8),
-        point_keyframes=np.full(len(ids), 5, np.int32),
-        point_parallax_rad=np.full(len(ids), 0.1, np.float32),
-        point_sigmas=np.full(len(ids), 0.01, np.float32), removed_point_ids=none,
-        point_hosts=np.zeros(len(ids), np.int64),
-    )  # fmt: skip
-
-
-def keyframe(frame: int, new: int, settled: list[int]) -> Keyframe:
-    told = [*settled, *([new] if new >= 0 else [])]
-    observed = [seen(number) for number in told]
-    image = np.full((120, 160), 40 * max(new, 0), np.uint8)
-    return Keyframe(
-        frame=frame, stamp_ns=frame, frame_id="camera", new=new,
-        keyframe_ids=np.array(told, np.int64),
-        settled=np.array([number in settled for number in told], np.bool_),
-        counts=np.array([len(ids) for ids, _ in observed], np.int32),
-        point_ids=np.concatenate([np.zeros(0, np.int64), *(ids for ids, _ in observed)]),
-        points_px=np.concatenate([np.zeros((0, 2), np.float32), *(px for _, px in observed)]),
-        jpeg=cv2.imencode(".jpg", image)[1].tobytes() if new >= 0 else b"",
-    )  # fmt: skip
-
-
-Inputs = dict[Topic, list[Header]]
-
-
-def inputs(mode: str = "lossless") -> Inputs:
-    leaving = [[frame - WINDOW] if frame >= WINDOW else [] for frame in range(FRAMES)]
-    rest = list(range(FRAMES - WINDOW, FRAMES))
-    return {
-        topics.STREAM: [stream(mode)],
-        topics.MAP_UPDATE: [map_update(frame) for frame in range(FRAMES)],
-        topics.KEYFRAME: [keyframe(frame, frame, leaving[frame]) for frame in range(FRAMES)],
-        topics.MAP_FINAL: [map_update(FRAMES - 1, last=True)],
-        topics.KEYFRAME_FINAL: [keyframe(FRAMES - 1, -1, rest)],
-    }
-
-
-class Notes(SilentMonitor):
-    """Keeps what the service says of itself."""
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
-        self.counters: dict[str, float] = {}
-        self.again: list[float] = []
-
-    def report(self, header: Header, *, note: str = "", **counters: float) -> None:
-        self.notes += [note] if note else []
-        self.counters = counters
-        self.again.append(counters["again"])
-
-
-def run(given: Inputs, monitor: Notes | None = None) -> dict[Topic, list[Header]]:
-    bus = ReplayBus(given)
-    meshing.run(bus, load_config(), monitor or Notes())
-    return bus.outputs
-
-
-def final(outputs: dict[Topic, list[Header]], level: str) -> MeshPiece:
-    (piece,) = [
-        m for m in outputs[topics.MESH_FINAL] if isinstance(m, MeshPiece) and m.level == level
-    ]
-    return piece
 
 
 @pytest.fixture(scope="module")
@@ -387,155 +279,3 @@ def test_a_surface_that_was_kept_gives_the_same_depths() -> None:
     assert np.count_nonzero(one.depths) > 1000
     np.testing.assert_array_equal(other.depths, one.depths)
     np.testing.assert_array_equal(other.weights, one.weights)
-
-
-MET, JOINED = 2, 4
-"""Frames: from MET on the camera is in another segment, until it is known where that lies."""
-
-
-def two_segments() -> Inputs:
-    """The same keyframes; those of a second segment at twice the size, with points of its own."""
-    given = inputs()
-    T = looking_aside()
-    larger = T @ np.diag([2.0, 2.0, 2.0, 1.0])
-    first = map_update(0)
-    own = {
-        "point_ids": first.point_ids + POINTS, "point_segments": np.ones(POINTS, np.int32),
-        "points_world": transform(larger, first.points_world),
-        "point_hosts": np.full(POINTS, MET),
-    }  # fmt: skip
-    for frame in range(MET, FRAMES):
-        update = map_update(frame)
-        if frame < JOINED:
-            there = matrix_to_pose(move_by_similarity(larger, pose(frame))[None])
-            one = np.ones(1, np.int32)
-            update = replace(update, segment=1, keyframe_segments=one, keyframe_poses=there)
-        if frame == MET:
-            points = {name: getattr(first, name) for name in vars(first) if "point" in name}
-            update = replace(update, **points | own)
-        if frame == JOINED:
-            back = inverse(T)
-            back[:3, 3] *= 0.5
-            update = replace(
-                update, joined=np.array([[1, 0]], np.int32), moved_keyframes=np.array([MET]),
-                moves=np.append(matrix_to_pose(back), 0.5)[None],
-            )  # fmt: skip
-        given[topics.MAP_UPDATE][frame] = update
-    for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
-        given[topic] = [seeing_its_own(message) for message in given[topic]]
-    return given
-
-
-def looking_aside() -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], (1.0, 2.0, 3.0)
-    return T
-
-
-def seeing_its_own(message: Header, last: int = FRAMES) -> Keyframe:
-    """Keyframes of the second segment, and later ones before the last, see the points of that."""
-    assert isinstance(message, Keyframe)
-    second = (message.keyframe_ids >= MET) & (message.keyframe_ids < last)
-    own = np.repeat(second, message.counts)
-    return replace(message, point_ids=message.point_ids + POINTS * own)
-
-
-def live(made: dict[Topic, list[Header]], segment: int) -> TriangleMesh:
-    """The last mesh that a viewer has of a segment."""
-    held = BlockMesh()
-    for message in made[topics.MESH_BLOCKS]:
-        assert isinstance(message, MeshUpdate)
-        if message.segment == segment:
-            held.apply(message)
-        else:
-            held = BlockMesh()
-    return held.mesh()
-
-
-def test_segments_that_were_joined_are_one_mesh(outputs: dict[Topic, list[Header]]) -> None:
-    made = run(two_segments())
-    for level in ("fine", "coarse"):
-        one, alone = final(made, level), final(outputs, level)
-        assert (one.segment, one.keyframes) == (0, FRAMES)
-        assert len(one.triangles) == pytest.approx(len(alone.triangles), rel=0.05)
-        assert one.positions[:, 2].max() < 4.1
-    # Its voxels are those of the first keyframe that was fused, which is another one.
-    triangles = len(live(outputs, 0).triangles)
-    assert len(live(made, 0).triangles) == pytest.approx(triangles, rel=0.2)
-
-
-def test_a_segment_that_goes_on_has_its_mesh_again(outputs: dict[Topic, list[Header]]) -> None:
-    """The camera is recognised in the first of two segments: the keyframes from before that only
-    they saw the left of the wall."""
-    given = two_segments()
-    update = given[topics.MAP_UPDATE][JOINED]
-    assert isinstance(update, MapUpdate)
-    nothing = map_update(JOINED)
-    given[topics.MAP_UPDATE][JOINED] = nothing
-    for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
-        given[topic] = [seeing_its_own(message, last=JOINED) for message in inputs()[topic]]
-    found, whole = live(run(given), 0).positions, live(outputs, 0).positions
-    np.testing.assert_allclose(found.min(axis=0), whole.min(axis=0), atol=0.05)
-
-
-DRIFT = 0.6
-"""Three coarse voxels."""
-QUIET = 6
-"""Frames at the end that are no keyframes."""
-
-
-def a_loop() -> Inputs:
-    """The wall lies DRIFT farther away from MET on, cameras and all, until a loop is closed."""
-    given = inputs()
-    first, away = map_update(0), np.array([0.0, 0.0, DRIFT])
-    for frame in range(MET, FRAMES):
-        update = map_update(frame)
-        poses = update.keyframe_poses + np.append(away, np.zeros(4))
-        update = replace(update, keyframe_poses=poses)
-        if frame == MET:
-            points = {name: getattr(first, name) for name in vars(first) if "point" in name}
-            points["point_ids"] = first.point_ids + POINTS
-            points["points_world"] = first.points_world + away
-            points["point_hosts"] = np.full(POINTS, MET)
-            update = replace(update, **points)
-        given[topics.MAP_UPDATE][frame] = update
-    quiet = range(FRAMES, FRAMES + QUIET)
-    given[topics.MAP_UPDATE] += [map_update(frame, last=True) for frame in quiet]
-    given[topics.KEYFRAME] += [keyframe(frame, -1, []) for frame in quiet]
-    closes = given[topics.MAP_UPDATE][FRAMES]
-    assert isinstance(closes, MapUpdate)
-    back = np.eye(4)
-    back[:3, 3] = -away
-    given[topics.MAP_UPDATE][FRAMES] = replace(
-        closes, moved_keyframes=np.array([MET]), moves=np.append(matrix_to_pose(back), 1.0)[None]
-    )
-    for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
-        given[topic] = [seeing_its_own(message) for message in given[topic]]
-    return given
-
-
-def test_a_live_mesh_follows_a_loop(outputs: dict[Topic, list[Header]]) -> None:
-    def followed(way: str) -> tuple[dict[Topic, list[Header]], list[float]]:
-        bus, monitor = ReplayBus(a_loop()), Notes()
-        meshing.run(bus, load_config(None, [f"meshing.corrections={way}"]), monitor)
-        return bus.outputs, monitor.again
-
-    made, again = followed("moved")
-    found, true = live(made, 0), live(outputs, 0)
-    assert found.positions[:, 2].max() < 4.1
-    for one, other in ((found, true), (true, found)):
-        apart = np.linalg.norm(one.positions[:, None] - other.positions[None], axis=2).min(axis=1)
-        # At its rims the surface ends a voxel earlier or later.
-        assert np.percentile(apart, 95) < 0.05 * VOXEL
-        assert apart.max() < 1.1 * VOXEL
-    assert len(found.triangles) == pytest.approx(len(true.triangles), rel=0.1)
-    # One a frame, those that had left the window among them, and each once.
-    assert np.diff(again).max() == 1.0
-    assert again[-1] == FRAMES - MET
-    stayed, none = followed("settled")
-    assert live(stayed, 0).positions[:, 2].max() > 4.0 + DRIFT - 0.1
-    assert none[-1] == 0.0
-    for topic in (topics.MESH_BLOCKS, topics.MESH_FINAL):
-        told = [codec.encode(message) for message in made[topic]]
-        assert [codec.encode(message) for message in followed("moved")[0][topic]] == told
-    assert [codec.encode(message) for message in stayed[topics.MESH_FINAL]] == told
