@@ -11,7 +11,7 @@ _WHOLE = 0.9
 """Share of the frames with a pose in one segment that a good run has."""
 _LITTLE = 0.5
 """With a smaller one a run is bad."""
-_DOUBTS = 0.25
+DOUBTS = 0.25
 """Share of doubtful poses above which a run is.  Good sequences have up to a sixth."""
 
 _FOLLOWED = 0.75
@@ -48,7 +48,7 @@ def judge(
     told = f"{share:.0%} of the {which} have a pose in the largest segment"
     if share < _LITTLE:
         return BAD, told
-    if doubtful > _DOUBTS * posed:
+    if doubtful > DOUBTS * posed:
         return DOUBTFUL, f"{doubtful / posed:.0%} of the poses are doubtful: something large moves?"
     if share < _WHOLE:
         return DOUBTFUL, told
@@ -83,14 +83,14 @@ def judge_surfels(
         return BAD, "no surfels were followed"
     if word == BAD:
         return word, why
-    if slipping > _DOUBTS * posed:
+    if slipping > DOUBTS * posed:
         return DOUBTFUL, (
             f"in {slipping / posed:.0%} of the frames less than {_FOLLOWED:.0%} of the surfels in "
             "view are followed: something covers them, or moves too fast?"
         )
     if word != GOOD:
         return word, why
-    if together > _DOUBTS * posed:
+    if together > DOUBTS * posed:
         return DOUBTFUL, (
             f"in {together / posed:.0%} of the frames all surfels have moved like one rigid thing: "
             "if it is the camera that moves, --camera moving"

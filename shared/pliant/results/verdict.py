@@ -43,7 +43,8 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         for mesh in report["mesh"]
         if mesh["level"] == "fine"
     ]
-    lines += [report["calibration_verdict"]] if report.get("calibration_verdict") else []
+    lens = report.get("calibration_verdict")
+    lines += [lens] if lens and lens != report["verdict_reason"] else []
     lines += _faults(report)
     if not report["segments"]:
         lines.append(f"no map could start: {report['last_reason'] or 'no frames'}")

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pliant.messages.types import DROPPED
+from pliant.results.judgement import DOUBTS
 from pliant.results.report import broken_images
 from pliant.wording import counted
 
@@ -58,12 +59,12 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
             "Few of the tracks became points of the map: the camera turned more than it moved, or "
             "much of what it sees moves by itself. Walk round things instead of turning to them."
         )
-    if report["doubtful_frames"] and report["verdict"] == "doubtful":
+    if len(report["doubtful_frames"]) > DOUBTS * posed:
         told.append(
             f"{len(report['doubtful_frames'])} poses rest on a small part of the image: something "
             "large moves in front of the camera, or most of what it sees is blank."
         )
-    if report["calibration_verdict"]:
+    if report["calibration_verdict"] and report["calibration_verdict"] != report["verdict_reason"]:
         told.append(
             f"{report['calibration_verdict'][:1].upper()}{report['calibration_verdict'][1:]}."
         )
