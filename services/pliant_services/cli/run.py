@@ -156,6 +156,8 @@ def run(
     sets += [f"surfels.camera={camera}"] if camera else []
     sets += [f"surfels.depth_from={depth}"] if depth else []
     sets += [f"ingest.depth={depth_frames}"] if depth_frames else []
+    if resume and poses:
+        raise typer.BadParameter("--poses needs a run from its beginning, and --resume goes on")
     if localise and known is None:
         raise typer.BadParameter("--localise needs --map: a result folder or its map.pliant")
     if known is not None and profile != "rigid":

@@ -64,7 +64,7 @@ def run(
 
     on_frame: called in this thread with each frame's number and its pose (4, 4), as it is known
     then (``result.causal_trajectory``), or None: ``on_frame(12, T_world_camera)``.  The run does
-    not wait for it; ``pliant.follow`` gives each frame with its image and tracks.
+    not wait for it, but its end does; ``pliant.follow`` gives each frame with its image and tracks.
 
     ``result.report["verdict"]`` says whether it went well.  Raises ResultError with what the
     command says, and what ``on_frame`` raises, when the run has been stopped for it.

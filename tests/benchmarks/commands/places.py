@@ -62,7 +62,7 @@ def rough(
 ) -> None:
     """Dark, blurred, covered and few frames, things that move, turns: is the camera followed?
 
-    scripts/bench rough ../shared/data/rigid --only black
+    scripts/bench rough ../shared/data/rigid --only dark
     """
     from benchmarks.rough import measure
     from pliant.config import load_config

@@ -2,7 +2,8 @@
 
 The window corrects what is new; what drifts beyond it only all keyframes together can tell.  Their
 adjustment takes longer than a frame, so it works on a copy of the map and its result is taken over
-a fixed number of frames later.  How long it took decides nothing: who has not got it by then waits.
+a number of frames later that the size of the map decides.  How long it took decides nothing: who
+has not got it by then waits.
 Where the shutter may roll it begins with the first keyframes: they tell the readout.
 
 Meanwhile the map has grown and the window has moved.  So the result is not where the points are,
