@@ -17,6 +17,8 @@ from meshing_scene import (
     map_update,
     pose,
     run,
+    seen,
+    world,
 )
 
 from pliant.algorithms.geometry import inverse, matrix_to_pose, move_by_similarity, transform
@@ -170,3 +172,15 @@ def test_a_live_mesh_follows_a_loop(outputs: dict[Topic, list[Header]]) -> None:
         told = [codec.encode(message) for message in made[topic]]
         assert [codec.encode(message) for message in followed("moved")[0][topic]] == told
     assert [codec.encode(message) for message in stayed[topics.MESH_FINAL]] == told
+
+
+def test_joined_segments_have_their_mesh_without_another_keyframe() -> None:
+    """Each has one keyframe, and the camera stands still from when they are joined on."""
+    given = two_segments()
+    for frame in set(range(FRAMES)) - {0, MET}:
+        given[topics.KEYFRAME][frame] = keyframe(frame, -1, [])
+    mesh = live(run(given), 0)
+    whole = world()[np.concatenate([seen(0)[0], seen(MET)[0]]), 0]
+    assert mesh.positions[:, 0].min() == pytest.approx(whole.min(), abs=VOXEL)
+    assert mesh.positions[:, 0].max() == pytest.approx(whole.max(), abs=VOXEL)
+    assert mesh.positions[:, 2].max() < 4.1

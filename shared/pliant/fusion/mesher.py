@@ -192,9 +192,7 @@ class Mesher:
     def _follow_map(self, timer: StageTimer) -> None:
         """Fuse a keyframe that the live mesh lacks, or has elsewhere than the map has it by now:
         one at a time, so that nobody waits for all."""
-        if self._live is None:
-            return
-        if self._has_moved and self._parameters.corrections == "moved":
+        if self._has_moved and self._live is not None and self._parameters.corrections == "moved":
             lacking = [keyframe for keyframe in self._again if keyframe not in self._live.fused]
             self._again = [*lacking, *self._live.moved(self._map)]
         self._has_moved = False
@@ -235,7 +233,7 @@ class Mesher:
         colour = self._colour(keyframe, correction)
         if self._live is not None:
             with timer("coarse fusion"):
-                self._take_out(keyframe, self._live)
+                self._take_out(keyframe, self._live, colour, correction)
         if surface.depth_map is None or surface.drawn is None or colour is None:
             self._pass_over(keyframe, surface.problem or _NO_IMAGE)
             return
@@ -255,12 +253,18 @@ class Mesher:
             return
         self.counts[count] += 1
 
-    def _take_out(self, keyframe: int, live: LiveMesh) -> None:
-        """By the same depth map and image with which it was put in; nothing where it is not."""
+    def _take_out(
+        self, keyframe: int, live: LiveMesh, colour: U8 | None, correction: tuple[float, ...]
+    ) -> None:
+        """By the same depth map and image with which it was put in; nothing where it is not.
+
+        colour (H, W, 3): of the keyframe, under a correction, which is mostly the same as then.
+        """
         old = live.fused.get(keyframe)
         if old is None:
             return
-        colour = self._colour(keyframe, old.correction)
+        if old.correction != correction:
+            colour = self._colour(keyframe, old.correction)
         assert colour is not None
         depth_map = self._spool.surface(keyframe).depth_map(self._camera)
         live.take_out(keyframe, self._within(keyframe, depth_map, old.correction), colour)
