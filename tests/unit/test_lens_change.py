@@ -13,6 +13,7 @@ from pliant.algorithms.mapping.lens_change import moved, see_by
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.start import WaitingFrame
 from pliant.algorithms.mapping.waiting import Waiting
@@ -64,7 +65,7 @@ def test_what_a_rolling_shutter_moved_goes_along(active):
     keyframe = active.keyframes[3]
     keyframe.rolled_px = keyframe.rolled_px + np.float32(2.0)
     seen, at_once = keyframe.points_px + keyframe.rolled_px, keyframe.points_px
-    active.segment.path.forget()
+    active.segment.path = Path()
     see_by(active.segment, known.view, known.with_lens(FOUND, COVARIANCE))
     # Of a path without frames no motion is known: what was known of it stays.
     whole = OTHER.view.seen(keyframe.points_px + keyframe.rolled_px)

@@ -12,7 +12,7 @@ from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.mapping.final_adjustment import ListedMap
 from pliant.algorithms.mapping.loops import Loop, close_loops
-from pliant.algorithms.mapping.map_store import MAPPED
+from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -102,6 +102,19 @@ def close(mapper):
     answer = mapper.whole_map.settle()
     mapper.follow(mapper.atlas.take_over(answer))
     return answer
+
+
+def test_of_a_loop_that_waits_points_may_go_and_their_rows_be_of_others():
+    points = PointRows()
+    rows = points.allocate(6)
+    points.promote(rows)
+    pairs = rows.reshape(3, 2)
+    loop = Loop(old=0, new=9, S_old_new=np.eye(4), rows=pairs, ids=points.ids[pairs].copy())
+    assert loop.living(points) is loop
+    points.cull(rows[[2]])
+    assert loop.living(points).rows.tolist() == pairs[[0, 2]].tolist()
+    points.promote(points.allocate(1))  # the same row, another point
+    assert loop.living(points).rows.tolist() == pairs[[0, 2]].tolist()
 
 
 def test_a_loop_takes_out_the_drift_and_joins_the_points(drifted):

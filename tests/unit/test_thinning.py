@@ -11,7 +11,7 @@ from test_whole_map import similarity
 
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.mapping import thinning
-from pliant.algorithms.mapping.covisibility import seen_by_none
+from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.given_up import GivenUp
 from pliant.algorithms.mapping.map_store import FREE, MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
@@ -21,6 +21,7 @@ from pliant.algorithms.mapping.parameters import (
     WindowParameters,
 )
 from pliant.algorithms.mapping.segment import Segment
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.thinning import observations_of, thin
 from pliant.state import load_state, save_state
 
@@ -52,18 +53,21 @@ def segment(seen: list[list[int]]) -> Segment:
     return Segment(id=0, points=points, keyframes=keyframes)
 
 
+def seen_by(some: Segment) -> np.ndarray:
+    """How many keyframes see each row."""
+    rows = np.concatenate([keyframe.rows for keyframe in some.keyframes])
+    return np.bincount(rows, minlength=len(some.points.state))
+
+
 def limits(room: int, least: int) -> WindowParameters:
     return WindowParameters(kept_observations=max(room, 1000), kept_per_keyframe=least)
 
 
-def test_points_go_that_no_keyframe_and_no_track_sees() -> None:
+def test_rows_of_points_that_went_are_free() -> None:
     points = PointRows()
     rows = points.allocate(6)
     points.promote(rows[:5])  # the last one is a candidate
-    kept = [keyframe(1, [1, 2])]
-    gone = seen_by_none(rows, kept, np.array([3, -1], np.int32), points)
-    assert gone.tolist() == [0, 4]
-    points.cull(gone)
+    points.cull(rows[[0, 4]])
     assert points.culled == 2
     assert (points.state == MAPPED).sum() == 3
     again = points.allocate(2)
@@ -114,6 +118,40 @@ def test_keyframes_go_where_their_pairs_take_more_room_than_what_they_see(monkey
     monkeypatch.setattr(thinning, "_PAIRS", 10)
     thin(some, room, limits(room, 1), NO_TRACK, whole=1)
     assert len(some.keyframes) == int(0.9 * int(np.sqrt(10 * room)))
+
+
+def test_points_that_one_keyframe_is_left_to_see_go_with_those_that_saw_them_too() -> None:
+    """The final adjustment would take such points out of the results."""
+    some = segment([list(range(10 * k, 10 * k + 25)) for k in range(60)])
+    linked = np.array([some.keyframes[30].rows[3]], np.int32)
+    alone = seen_by(some) == 1
+    thin(some, 400, limits(400, 20), linked, whole=2)
+    assert 0 < len(some.given_up) < 58
+    needed = np.zeros(len(alone), np.bool_)
+    needed[[*linked, *some.keyframes[-2].rows, *some.keyframes[-1].rows]] = True
+    now = (some.points.state == MAPPED) & (seen_by(some) == 1)
+    assert not (now & ~needed & ~alone).any()
+    assert some.points.state[linked] == MAPPED
+
+
+def test_the_newest_keyframes_stay_whole_also_where_there_are_no_others() -> None:
+    """Of a segment that the camera leaves nobody has been told of them yet."""
+    some = segment([list(range(10 * k, 10 * k + 25)) for k in range(5)])
+    before = [keyframe.rows.copy() for keyframe in some.keyframes]
+    thin(some, 30, limits(30, 5), NO_TRACK, whole=8)
+    for keyframe, rows in zip(some.keyframes, before, strict=True):
+        np.testing.assert_array_equal(keyframe.rows, rows)
+
+
+def test_a_segment_that_is_left_keeps_what_is_not_published_yet() -> None:
+    left = segment([list(range(10 * k, 10 * k + 25)) for k in range(30)])
+    window = WindowParameters(keyframes=16, kept_observations=1000, kept_per_keyframe=5)
+    earlier = EarlierSegments()
+    earlier.keep(left, SelfCalibration(CAMERA, np.zeros(6), np.zeros((6, 6))))
+    before = [keyframe.rows.copy() for keyframe in left.keyframes[-16:]]
+    earlier.share_room(left.points, window)
+    for keyframe, rows in zip(left.keyframes[-16:], before, strict=True):
+        np.testing.assert_array_equal(keyframe.rows, rows)
 
 
 def test_what_has_been_given_up_moves_as_what_is_near_it() -> None:

@@ -213,9 +213,7 @@ class ActiveMap:
     def join(self, loop: Loop) -> None:
         """Points that a loop has shown to be the same become one, as far as they still exist."""
         points = self.points
-        alive = points.ids[loop.rows] == loop.ids
-        alive &= points.state[loop.rows] == MAPPED
-        for old, new in loop.rows[alive.all(axis=1), :, None]:
+        for old, new in loop.living(points).rows[:, :, None]:
             if points.state[old] == MAPPED and points.state[new] == MAPPED and old != new:
                 points.merge(new, old)
         linked = self.links.rows != UNLINKED

@@ -168,7 +168,8 @@ class Atlas:
     def remember(self, keyframe: Keyframe, grey: U8 | None, maxima: F32 | None = None) -> None:
         """A new keyframe is a place to come back to, and may be one that was seen before.
 
-        grey (H, W), maxima (M, 3): of its image, the latter where another keyframe has told before.
+        grey (H, W), maxima (M, 3): of its image, the latter None at a start, which nothing has
+        confirmed.
         """
         if grey is None or self.active is None:
             return

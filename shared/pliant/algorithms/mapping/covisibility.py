@@ -6,7 +6,7 @@ work for a frame does not grow with the length of the run.
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, I64, U8, BoolArray
+from pliant.algorithms.arrays import F64, I32, I64, U8
 from pliant.algorithms.mapping.map_store import (
     CANDIDATE,
     MAPPED,
@@ -91,18 +91,6 @@ def missing_rows(rows: I32, linked: I32, state: U8, misses: U8, marks: I64, fram
             wanted[count] = row
             count += 1
     return wanted[:count].copy()
-
-
-def seen_by_none(rows: I32, keyframes: list[Keyframe], linked: I32, points: PointRows) -> I32:
-    """Those of the rows that are points which no keyframe sees and no living track belongs to.
-
-    linked: row of each track, negative where it has none.
-    """
-    kept: BoolArray = np.zeros(len(points.state), np.bool_)
-    for keyframe in keyframes:
-        kept[keyframe.rows] = True
-    kept[linked[linked >= 0]] = True
-    return rows[~kept[rows] & (points.state[rows] == MAPPED)]
 
 
 def collect_garbage(

@@ -81,8 +81,10 @@ class EarlierSegments:
             if some > size:
                 break
             rest -= some
-        for each in own:
-            thin(each.segment, int(size), limits, np.zeros(0, np.int32), whole=1)
+        for whole in (limits.keyframes, 1):  # of the newest nobody may have been told yet
+            if whole > 1 or self._observations(own) > room:
+                for each in own:
+                    thin(each.segment, int(size), limits, np.zeros(0, np.int32), whole=whole)
         while self._observations(own) > room:
             oldest = own.pop(0)
             points.cull(oldest.segment.mapped_rows())

@@ -119,7 +119,7 @@ def _by_tracks(
 
     together = located(len(rows), _spread(active, rows, directions))
     still = together.inliers[:mapped].sum()
-    if len(directions) and still < _AGREEING * mapped:
+    if len(directions) and mapped >= limits.min_inliers and still < _AGREEING * mapped:
         alone = located(mapped, None)
         fitting = alone.inliers.sum()
         if fitting >= limits.min_inliers and still < _AGREEING * fitting:

@@ -15,6 +15,7 @@ from pliant.algorithms.arrays import F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.pose_graph import Edges, optimise_pose_graph
 from pliant.algorithms.geometry import inverse, move_by_similarity, transform_each
 from pliant.algorithms.mapping.final_adjustment import ListedMap
+from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.compiler.kernel import kernel
 
 _COVISIBLE_SHARE = 0.3
@@ -43,6 +44,13 @@ class Loop(NamedTuple):
     S_old_new: F64
     rows: I32
     ids: I64
+
+    def living(self, points: PointRows) -> "Loop":
+        """With those of its points that still exist."""
+        alive = points.ids[self.rows] == self.ids
+        alive &= points.state[self.rows] == MAPPED
+        alive = alive.all(axis=1)
+        return self if alive.all() else self._replace(rows=self.rows[alive], ids=self.ids[alive])
 
 
 def close_loops(
@@ -115,24 +123,21 @@ def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px:
     shared = np.zeros((M, M), np.int32)
     _count_shared(seen.camera[order], starts, shared)
     own = np.diag(shared)
-    enough = shared >= _COVISIBLE_SHARE * np.minimum(own[:, None], own[None])
-    # Of those that see the same without a break, each next pair has told all.
-    since = np.arange(M)[:, None] - np.arange(M)
-    nearest = np.where(enough | (since < 0), np.iinfo(np.int64).max, since).min(axis=1)
-    enough &= since >= nearest[:, None]
+    enough = np.zeros((M, M), np.bool_)
+    _meet_again(shared, _COVISIBLE_SHARE, enough)
     following = np.arange(1, M)
     told = shared[following, following - 1] >= _FOLLOWING_SHARE * np.minimum(own[1:], own[:-1])
     enough[following, following - 1] = told
     jumps = following[~told]
     if len(jumps):
         # A camera that was recognised stands where it was, whatever a loop says.
-        before = np.tril(shared, -1)[jumps]
+        before = np.where(np.arange(M) < jumps[:, None], shared[jumps], 0)
         best = before.argmax(axis=1)
         enough[jumps, best] |= before.max(axis=1) >= _FOLLOWING_SHARE * np.minimum(
             own[jumps], own[best]
         )
-        enough[jumps, jumps - 1] = _apart(np.tril(enough, -1), ends, jumps)
-    j, i = np.nonzero(np.tril(enough, -1))
+        enough[jumps, jumps - 1] = _apart(enough, ends, jumps)
+    j, i = np.nonzero(enough)
     S = seen.T_world_camera
     Z = inverse(S[i]) @ S[j]
     of_loops = [
@@ -164,6 +169,18 @@ def _apart(edges: BoolArray, ends: I32, jumps: I64) -> BoolArray:
     for a, b in [*np.argwhere(edges).tolist(), *ends.tolist()]:
         meet(a, b)
     return np.array([meet(jump - 1, jump) for jump in jumps.tolist()])
+
+
+@kernel
+def _meet_again(shared: I32, share: float, enough: BoolArray) -> None:
+    """Mark pairs that see enough of the same, the newer one first.  Of those that do without a
+    break, each next pair has told all."""
+    for new in range(len(shared)):
+        unbroken = True
+        for old in range(new - 1, -1, -1):
+            sees = shared[new, old] >= share * min(shared[old, old], shared[new, new])
+            unbroken = unbroken and sees
+            enough[new, old] = sees and not unbroken
 
 
 @kernel

@@ -75,10 +75,6 @@ class Path:
         for keyframe, scale in zip(self._known, scales, strict=True):
             self._known[keyframe] = self._known[keyframe] * np.repeat([1.0, scale], 3)
 
-    def forget(self) -> None:
-        """Nobody will ask any more."""
-        self._poses = {}
-
     def motions(self, keyframes: list[Keyframe]) -> F64:
         """(M, 6) (omega, nu) of each keyframe: in its camera, points X become
         ``exp(t omega) X + t nu`` after t frame intervals.  0 where no frame is near.

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, U8
-from pliant.algorithms.geometry import move_by_similarity
+from pliant.algorithms.geometry import move_by_similarity, transform_each
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.covisibility import focus_of
 from pliant.algorithms.mapping.final_adjustment import adjust_keyframes
@@ -128,10 +128,10 @@ class Segment:
         here = (points.state[used] != FREE) & (points.segment[used] == self.id)
         rows = np.flatnonzero(here)
         hosts = points.first_keyframe[rows].astype(np.int64)
-        points.xyz[rows] = moves.points(points.xyz[rows], hosts)
-        points.published_xyz[rows] = moves.points(points.published_xyz[rows], hosts)
-        turned = moves.matrices(hosts)[:, :3, :3] @ points.spread[rows][:, :, None]
-        points.spread[rows] = turned[:, :, 0]
+        S_hosts = moves.matrices(hosts)
+        points.xyz[rows] = transform_each(S_hosts, points.xyz[rows])
+        points.published_xyz[rows] = transform_each(S_hosts, points.published_xyz[rows])
+        points.spread[rows] = (S_hosts[:, :3, :3] @ points.spread[rows][:, :, None])[:, :, 0]
         self.path.scale(moves)
         self.given_up.move(moves)
         return S[-1]

@@ -7,10 +7,11 @@ the adjustment any more how the map lies, and hangs on a keyframe that moves it.
 First go points.  A keyframe sees thousands, and a fraction of them holds it as well; those seen by
 the most keyframes hold the most and stay.  Of each keyframe an equal share is left.  Where that
 becomes less than a place needs, or pairs of keyframes are too many, keyframes go: the one of which
-the least is lost.  Of what a point
-seen by n keyframes tells, one of these is a share of 1 / (n - 1), and all of it where n = 1; the
-mean over the points that it sees is what is lost with a keyframe.  Where a place was visited many
-times, that is one visit of many; on a path, every other keyframe of where the camera was slow.
+the least is lost.  Of what a point seen by n keyframes tells, one of these is a share of
+1 / (n - 1), and all of it where n = 1; the mean over the points that it sees is what is lost with a
+keyframe.  Where a place was visited many times, that is one visit of many; on a path, every other
+keyframe of where the camera was slow.  Points that one keyframe alone is left to see go with them:
+the adjustment would take them for wrong.
 """
 
 import heapq
@@ -18,7 +19,6 @@ import heapq
 import numpy as np
 
 from pliant.algorithms.arrays import I32, I64, BoolArray
-from pliant.algorithms.mapping.covisibility import seen_by_none
 from pliant.algorithms.mapping.given_up import GivenUp
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.parameters import WindowParameters
@@ -68,11 +68,7 @@ def _give_up_points(segment: Segment, room: int, floor: int, linked: I32, whole:
     keyframes, points = segment.keyframes, segment.points
     start, slots = _seen_by(segment)
     counts = np.diff(start)
-    may = (counts > 0) & (points.state == MAPPED)
-    may[linked[linked >= 0]] = False
-    for keyframe in keyframes[len(keyframes) - whole :]:
-        may[keyframe.rows] = False
-    rows = np.flatnonzero(may)
+    rows = np.flatnonzero((counts > 0) & _may_go(segment, linked, whole))
     chance = points.ids[rows] * _SPREAD % (1 << 32)
     order = rows[np.lexsort((chance, counts[rows]))]
     left = np.array([len(keyframe.rows) for keyframe in keyframes], np.int64)
@@ -81,18 +77,30 @@ def _give_up_points(segment: Segment, room: int, floor: int, linked: I32, whole:
     while surplus > 0 and least >= floor:
         surplus = _choose(order, start, slots, int(least), surplus, left, gone)
         least *= _LESS
-    if not gone.any():
-        return
-    for keyframe in keyframes:
+    if gone.any():
+        _let_go(segment, gone)
+
+
+def _may_go(segment: Segment, linked: I32, whole: int) -> BoolArray:
+    """Which rows have points that no track and none of the newest keyframes need."""
+    may = segment.points.state == MAPPED
+    may[linked[linked >= 0]] = False
+    for keyframe in segment.keyframes[max(len(segment.keyframes) - whole, 0) :]:
+        may[keyframe.rows] = False
+    return may
+
+
+def _let_go(segment: Segment, gone: BoolArray) -> None:
+    """Points have been published, and tell the adjustment no more."""
+    for keyframe in segment.keyframes:
         keyframe.keep(~gone[keyframe.rows])
-    points.cull(np.flatnonzero(gone).astype(np.int32))
+    segment.points.cull(np.flatnonzero(gone).astype(np.int32))
     segment.thinned = True
 
 
 def _give_up_keyframes(segment: Segment, surplus: int, count: int, linked: I32, whole: int) -> None:
     """All but the first and the newest may go, until so many observations and so many keyframes
     have."""
-    points = segment.points
     start, slots = _seen_by(segment)
     counts = np.diff(start)
     known = list(segment.keyframes)
@@ -126,9 +134,9 @@ def _give_up_keyframes(segment: Segment, surplus: int, count: int, linked: I32, 
     segment.since -= int(np.count_nonzero(gone < segment.since))
     segment.keyframes = [known[slot] for slot in np.flatnonzero(alive)]
     if len(gone):
-        rows = np.unique(np.concatenate([known[slot].rows for slot in gone]))
-        points.cull(seen_by_none(rows, segment.keyframes, linked, points))
-        segment.thinned = True
+        seen = np.zeros(len(counts), np.bool_)
+        seen[np.concatenate([known[slot].rows for slot in gone])] = True
+        _let_go(segment, seen & (counts < 2) & _may_go(segment, linked, whole))
 
 
 def _loss(counts: I64) -> float:

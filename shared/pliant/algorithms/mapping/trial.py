@@ -113,7 +113,7 @@ class TrialMapper:
     @property
     def given_up(self) -> dict[str, int]:
         """As ``Mapper.given_up``."""
-        return self._mapper.given_up
+        return {} if self._on_trial else self._mapper.given_up
 
     def finish(self) -> MapDelta:
         """As ``Mapper.finish``; a trial that lasts until then ends with it."""

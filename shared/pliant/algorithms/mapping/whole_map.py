@@ -130,7 +130,7 @@ class WholeMap:
         kept = partial(segment.given_up.host_of, kept=keyframe_ids)
         loops = [loop._replace(old=kept(loop.old), new=kept(loop.new)) for loop in loops]
         loops = [loop for loop in loops if np.isin((loop.old, loop.new), keyframe_ids).all()]
-        loops = [loop for loop in loops if loop.old != loop.new]
+        loops = [loop.living(points) for loop in loops if loop.old != loop.new]
         hosts = np.searchsorted(keyframe_ids, points.first_keyframe[seen.rows], side="right") - 1
         self.question = Question(
             frame=frame,

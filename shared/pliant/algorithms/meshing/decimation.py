@@ -3,8 +3,8 @@
 Garland and Heckbert 1997: what a vertex may not leave are the planes of the triangles that it has
 stood for, summed up as a quadric q by their areas; an edge collapses into the point with the least
 sum of both, [x 1] (q_u + q_v) [x 1]^T.  Planes that stand on its rim keep a surface's outline.
-Edges that are the cheapest at both of their ends collapse
-together, so that a few passes over arrays do it.
+Edges that are the cheapest at both of their ends collapse together, so that a few passes over
+arrays do it.
 
 Why not a library: Open3D's needs libraries of the system.  fast-simplification orders edges by
 thresholds, not by cost: of a flat square it loses 6 % at 40 triangles, and it spends as many on
@@ -27,8 +27,8 @@ _FOLD_COSINE = 0.2
 def decimated(positions: F32, colours: U8, triangles: I32, most: int) -> tuple[F32, U8, I32]:
     """A mesh of at most so many triangles, without vertices that none of them has.
 
-    positions, colours: (V, 3).    triangles: (T, 3).  Which way they turn stays.  It has more only
-    where nothing can collapse without a fold.
+    positions, colours: (V, 3).    triangles: (T, 3).  Which way they turn stays.  It has more
+    where the edges that are left folded when they were tried.
     """
     places = positions.astype(np.float64)
     tints = np.column_stack([colours, np.ones(len(colours))]).astype(np.float64)
