@@ -1,12 +1,16 @@
 """The wheel holds the two packages and nothing else, and works where it is installed."""
 
+import ast
 import json
 import os
+import re
 import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
+from collections.abc import Iterable
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -93,6 +97,37 @@ def test_the_archive_of_the_sources_gives_the_same_wheel(wheel: Path, tmp_path: 
     )
     (again,) = tmp_path.glob("*.whl")
     assert again.read_bytes() == wheel.read_bytes()
+
+
+def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:
+    """Not what comes with another package by chance; what some commands need is an extra."""
+    imported: set[str] = set()
+    for folder in (ROOT / "shared", ROOT / "services"):
+        for path in folder.rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Import):
+                    imported.update(alias.name.split(".")[0] for alias in node.names)
+                elif isinstance(node, ast.ImportFrom):
+                    imported.add((node.module or "").split(".")[0])
+    imported -= {*sys.stdlib_module_names, "pliant", "pliant_services"}
+    come_from = packages_distributions()
+    used = distributions(name for module in imported for name in come_from[module])
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = distributions(
+        need for needs in project["optional-dependencies"].values() for need in needs
+    )
+    assert used - extras == distributions(project["dependencies"])
+
+
+def distributions(requirements: Iterable[str]) -> set[str]:
+    """Their names alone, as package indices write them."""
+    names = (re.split(r"[^\w.-]", requirement)[0] for requirement in requirements)
+    return {re.sub(r"[-_.]+", "-", name).lower() for name in names}
+
+
+def test_what_is_installed_here_fits_what_is_declared() -> None:
+    """The other tests install the wheel without what it needs: that is what pip put here."""
+    assert "No broken requirements" in run(sys.executable, "-m", "pip", "check")
 
 
 def test_who_cites_it_finds_how() -> None:
