@@ -9,8 +9,8 @@ from pathlib import Path
 from benchmarks.table import markdown
 from pliant.datasets import open_source
 from pliant.errors import PliantError
-from pliant.evaluation.report import metres, summarise
-from pliant.evaluation.result import evaluate_result
+from pliant.evaluation.presentation import metres, summarise
+from pliant.evaluation.run_evaluation import evaluate_result
 
 _HEADER = (
     "sequence",

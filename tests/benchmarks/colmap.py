@@ -28,8 +28,8 @@ from pliant.datasets import open_source
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import PliantError
-from pliant.evaluation.report import metres
-from pliant.evaluation.result import evaluate_trajectory
+from pliant.evaluation.presentation import metres
+from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.ply import read_ply
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.formats.tum import read_tum

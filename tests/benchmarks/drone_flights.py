@@ -18,8 +18,8 @@ from pliant.config import load_config
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration
 from pliant.errors import PliantError
-from pliant.evaluation.report import metres
-from pliant.evaluation.result import evaluate_trajectory
+from pliant.evaluation.presentation import metres
+from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
 from pliant.offline import process

@@ -12,8 +12,8 @@ from pliant.config import load_config
 from pliant.datasets import Calibration, open_source
 from pliant.datasets.base import Dataset
 from pliant.errors import DatasetError
-from pliant.evaluation.report import metres
-from pliant.evaluation.result import TrajectoryEvaluation, evaluate_trajectory
+from pliant.evaluation.presentation import metres
+from pliant.evaluation.run_evaluation import TrajectoryEvaluation, evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
 from pliant.offline import Pipeline

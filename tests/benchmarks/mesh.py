@@ -18,7 +18,7 @@ from pliant.datasets.builtin import builtin_folder
 from pliant.errors import ResultError
 from pliant.evaluation.mesh_truth import Mesh
 from pliant.evaluation.recorded_mesh import compare_mesh, depth_camera
-from pliant.evaluation.result import evaluate_result
+from pliant.evaluation.run_evaluation import evaluate_result
 from pliant.evaluation.surface_distance import share_within, thin_out
 from pliant.evaluation.truth import true_frames
 from pliant.fusion.keyframe_spool import KeyframeSpool
@@ -29,9 +29,9 @@ from pliant.messages.mesh_pieces import joined
 from pliant.messages.types import Keyframe, MapUpdate
 from pliant.recording.summary import summarise
 from pliant.results.folder import RECORDING_NAME
-from pliant.results.mesh import meshes_of
+from pliant.results.known_scale import MetricRecording
+from pliant.results.mesh_files import meshes_of
 from pliant.results.run import read_run
-from pliant.results.scale import MetricRecording
 from pliant_services.mesh.command import Meshing, mesh_recording
 from pliant_services.nodes.meshing import warm_up
 

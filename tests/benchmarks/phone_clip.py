@@ -23,8 +23,8 @@ from pliant.datasets import open_source
 from pliant.datasets.rectifier import decode
 from pliant.datasets.video import quiet_opencv
 from pliant.errors import PliantError
-from pliant.evaluation.report import metres
-from pliant.evaluation.result import evaluate_trajectory
+from pliant.evaluation.presentation import metres
+from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.formats.tum import read_tum
 from pliant.recording.parts import parts_of

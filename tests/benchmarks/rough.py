@@ -20,8 +20,8 @@ from pliant.datasets import open_source
 from pliant.datasets.base import BUILTIN_PREFIX, Dataset, SourceFrame
 from pliant.datasets.calibration import Calibration, calibration_yaml
 from pliant.datasets.rectifier import Rectifier, decode
-from pliant.evaluation.report import metres
-from pliant.evaluation.result import evaluate_trajectory
+from pliant.evaluation.presentation import metres
+from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.messages.types import CameraStream
 from pliant.offline import Pipeline

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.played import DARK, Reel
 from benchmarks.table import markdown_header, markdown_row
 from pliant.config import Config
-from pliant.evaluation.report import metres
+from pliant.evaluation.presentation import metres
 
 _DARK_S = 2.0
 _HEADER = (

@@ -8,7 +8,7 @@ import pytest
 
 from pliant.algorithms.map_delta import TRACKING, MapDelta
 from pliant.algorithms.tracks import FrameTracks
-from pliant.evaluation.result import evaluate_result
+from pliant.evaluation.run_evaluation import evaluate_result
 from pliant.formats.ply import read_ply
 from pliant.formats.tum import read_tum
 from pliant.messages import codec, topics

@@ -15,14 +15,14 @@ import pliant
 from pliant.algorithms.arrays import F64, U8
 from pliant.datasets.builtin import builtin_folder
 from pliant.errors import PliantError
-from pliant.evaluation.result import evaluate_result
+from pliant.evaluation.run_evaluation import evaluate_result
 from pliant.export.export import export_result
 from pliant.formats.ply import read_ply
 from pliant.formats.tum import read_tum
 from pliant.messages import topics
 from pliant.messages.types import MapUpdate
 from pliant.results.folder import prepare
-from pliant.results.scale import MetricRecording
+from pliant.results.known_scale import MetricRecording
 from pliant.scale.command import Known, scale_result
 
 pytestmark = pytest.mark.system

@@ -154,3 +154,19 @@ def test_no_two_test_files_have_one_name() -> None:
     """Pytest collects only the first of them, beside the other's folder."""
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
     assert sorted({name for name in names if names.count(name) > 1}) == []
+
+
+ONE_MEANING = {
+    *{"__init__", "base", "command", "parameters"},  # of its room
+    *{"colmap", "euroc", "kitti", "textured"},  # formats, read, written and made
+    *{"calibration", "depth", "folder", "images", "masks", "run", "surfels"},
+}
+"""Names of modules that several rooms have: each does its part with the same thing."""
+
+
+def test_no_two_modules_have_one_name_with_two_meanings() -> None:
+    """A command's file is named like what it starts."""
+    command_line = SERVICES / "cli"
+    files = python_files(LIBRARY) + python_files(SERVICES)
+    names = [path.stem for path in files if path.parent != command_line]
+    assert {name for name in names if names.count(name) > 1} <= ONE_MEANING

@@ -23,7 +23,7 @@ from pliant.evaluation.criteria import (
     second_pairs,
 )
 from pliant.evaluation.plots import plot_errors
-from pliant.evaluation.report import (
+from pliant.evaluation.presentation import (
     evaluation_to_json,
     format_evaluation,
     format_summary,
@@ -32,7 +32,7 @@ from pliant.evaluation.report import (
     summary_to_json,
     write_json,
 )
-from pliant.evaluation.result import evaluate_result, evaluate_trajectory
+from pliant.evaluation.run_evaluation import evaluate_result, evaluate_trajectory
 from pliant.formats.tum import read_tum, write_tum
 from pliant.trajectory import Trajectory, associate
 

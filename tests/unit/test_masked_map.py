@@ -13,7 +13,7 @@ from pliant.algorithms.arrays import F64, U8, BoolArray
 from pliant.algorithms.image.masks import clearance_of, packed
 from pliant.config import load_config
 from pliant.datasets import Dataset, SourceFrame, decode, open_source
-from pliant.evaluation.result import evaluate_trajectory
+from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
 from pliant.offline import process

@@ -13,7 +13,7 @@ from pliant.algorithms.map_delta import LOST
 from pliant.config import load_config
 from pliant.datasets import open_source
 from pliant.datasets.base import Dataset
-from pliant.evaluation.result import evaluate_trajectory
+from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.results.judgement import doubtful_frames
 from pliant.results.run import Run

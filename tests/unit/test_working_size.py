@@ -16,7 +16,7 @@ from pliant.datasets import Dataset, SourceFrame, decode, open_source
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.datasets.working_size import SmallerImages, at_working_size
-from pliant.evaluation.result import evaluate_trajectory
+from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
 from pliant.offline import process

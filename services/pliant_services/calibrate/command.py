@@ -38,7 +38,7 @@ from pliant.recording.reader import Recording
 from pliant.results.folder import CALIBRATION_NAME, RECORDING_NAME, REPORT_NAME, keep_apart
 from pliant.results.run import Run, read_run, seen_by_keyframes
 from pliant_services.calibrate.board import PrintedBoard
-from pliant_services.cli.progress import tell_progress
+from pliant_services.cli.counting import tell_progress
 from pliant_services.run.command import INTERRUPTED, RunRequest, run_pipeline
 
 _LOOKED_AT = 200

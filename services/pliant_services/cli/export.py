@@ -47,7 +47,7 @@ def export(
     from functools import partial
 
     from pliant.export.export import export_result
-    from pliant_services.cli.progress import tell_progress
+    from pliant_services.cli.counting import tell_progress
 
     written = export_result(
         result, to, output, force=force, every=every, triangles=triangles,

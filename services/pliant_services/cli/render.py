@@ -24,7 +24,7 @@ def render(
     from pliant.datasets.builtin import builtin_folder
     from pliant.errors import ResultError
     from pliant.results.folder import keep_apart
-    from pliant_services.cli.progress import tell_progress
+    from pliant_services.cli.counting import tell_progress
 
     if output is not None and output.exists() and not force:
         raise ResultError(f"{output} exists: choose another --output, or --force to replace it")

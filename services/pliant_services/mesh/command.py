@@ -19,9 +19,9 @@ from pliant.messages.types import CameraStream, Header, MeshPiece, Status
 from pliant.recording.parts import parts_of
 from pliant.recording.summary import summarise
 from pliant.results.folder import keep_apart, written
-from pliant.results.mesh import mesh_report, meshes_of, write_meshes
+from pliant.results.known_scale import MetricRecording
+from pliant.results.mesh_files import mesh_report, meshes_of, write_meshes
 from pliant.results.run import folded_map
-from pliant.results.scale import MetricRecording
 from pliant_services.processes import BY_NAME
 from pliant_services.replay.services import run_on
 

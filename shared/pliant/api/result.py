@@ -32,7 +32,7 @@ from pliant.recording import parts
 from pliant.recording.reader import Recording
 from pliant.results.calibration import found_calibration
 from pliant.results.folder import RECORDING_NAME
-from pliant.results.mesh import mesh_of
+from pliant.results.mesh_files import mesh_of
 from pliant.results.report import rigid_report
 from pliant.results.run import Run, read_run, seen_by_keyframes
 from pliant.results.surfels import has_surfels, recorded_surfels, surfel_report, surfel_trajectory

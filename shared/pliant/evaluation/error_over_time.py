@@ -2,8 +2,8 @@
 
 from html import escape
 
-from pliant.evaluation.report import metres
-from pliant.evaluation.result import Evaluation
+from pliant.evaluation.presentation import metres
+from pliant.evaluation.run_evaluation import Evaluation
 from pliant.results.page.chart import BLUE, ORANGE, Line, chart
 
 

@@ -9,7 +9,7 @@ from pliant.datasets.base import is_builtin
 from pliant.datasets.builtin import builtin_folder
 from pliant.errors import ResultError
 from pliant.evaluation.error_over_time import error_over_time
-from pliant.evaluation.report import (
+from pliant.evaluation.presentation import (
     evaluation_to_json,
     format_evaluation,
     format_summary,
@@ -17,7 +17,7 @@ from pliant.evaluation.report import (
     summary_to_json,
     write_json,
 )
-from pliant.evaluation.result import Evaluation, evaluate_result
+from pliant.evaluation.run_evaluation import Evaluation, evaluate_result
 from pliant.results.folder import PAGE_NAME, files_read, keep_apart
 from pliant.results.page.page import put_truth_in
 

@@ -12,7 +12,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64, BoolArray
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
-from pliant.evaluation.report import table
+from pliant.evaluation.presentation import table
 from pliant.evaluation.surface_truth import MaterialPoints, SurfaceTruth
 from pliant.evaluation.surfel_truth import rmse, roc
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from pliant.errors import ResultError
-from pliant.evaluation.result import Evaluation
+from pliant.evaluation.run_evaluation import Evaluation
 
 _COLOURS = {"final": "#1668b8", "causal": "#e0751a"}
 

@@ -11,7 +11,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.errors import ResultError
 from pliant.evaluation.mesh_truth import Mesh, MeshEvaluation, MeshTruth, format_mesh
-from pliant.evaluation.result import Evaluation
+from pliant.evaluation.run_evaluation import Evaluation
 from pliant.evaluation.truth import true_frames
 from pliant.formats.ply import read_ply
 from pliant.map_history import MapHistory

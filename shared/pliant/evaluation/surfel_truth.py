@@ -23,7 +23,7 @@ from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
-from pliant.evaluation.report import table
+from pliant.evaluation.presentation import table
 
 MAX_RETURN_PX = 0.5
 MAX_STEP = 0.01

@@ -14,7 +14,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.tracks import FrameTracks
-from pliant.evaluation.report import table
+from pliant.evaluation.presentation import table
 from pliant.evaluation.visible_depth import DepthView
 
 LIMIT_PX = 2.0

@@ -13,7 +13,7 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.errors import ResultError
 from pliant.evaluation.map_truth import evaluate_map, format_map
-from pliant.evaluation.result import Evaluation
+from pliant.evaluation.run_evaluation import Evaluation
 from pliant.evaluation.tracks_truth import TracksTruth, format_tracks
 from pliant.formats.tum import read_tum
 from pliant.messages import topics

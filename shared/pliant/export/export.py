@@ -27,7 +27,7 @@ from pliant.export.overview import (
     overview_pictures,
     still_picture,
 )
-from pliant.export.surface import overlay_pictures, surfaces
+from pliant.export.surface_meshes import overlay_pictures, surfaces
 from pliant.export.textured import glb, obj
 from pliant.formats.euroc import write_euroc
 from pliant.formats.kitti import write_kitti
@@ -42,9 +42,9 @@ from pliant.pictures.overlay import OverlayFrame, write_overlay_video
 from pliant.recording.parts import parts_in
 from pliant.recording.reader import Recorded, Recording
 from pliant.results.folder import RECORDING_NAME, files_read, keep_apart
-from pliant.results.mesh import mesh_of
+from pliant.results.known_scale import MetricRecording
+from pliant.results.mesh_files import mesh_of
 from pliant.results.run import Run, read_run
-from pliant.results.scale import MetricRecording
 from pliant.results.surfels import has_surfels, surfel_trajectory
 from pliant.trajectory import Trajectory
 

@@ -24,7 +24,7 @@ from pliant.formats.textured import TexturedMesh, write_glb, write_obj
 from pliant.messages import topics
 from pliant.messages.types import Keyframe, MeshPiece
 from pliant.recording.reader import Recording
-from pliant.results.mesh import mesh_of
+from pliant.results.mesh_files import mesh_of
 from pliant.results.run import Run, read_run
 
 TRIANGLES = 40_000

@@ -11,7 +11,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I32
 from pliant.compiler.kernel import fast_kernel
-from pliant.rendering.view import NEAR_M, TILE_PX, TILE_RAYS, Reals
+from pliant.rendering.visible_tiles import NEAR_M, TILE_PX, TILE_RAYS, Reals
 
 Scalar: TypeAlias = Any  # a number of any width inside a kernel
 

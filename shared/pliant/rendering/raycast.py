@@ -10,7 +10,7 @@ from pliant.compiler.kernel import fast_kernel, kernel
 from pliant.rendering.colours import LEAST
 from pliant.rendering.intersect import Scalar, face_point, load_tile, meet_tile
 from pliant.rendering.solids import SolidArrays
-from pliant.rendering.view import TILE_PX, TILE_RAYS, Tiles, View
+from pliant.rendering.visible_tiles import TILE_PX, TILE_RAYS, Tiles, View
 
 
 class Atlas(NamedTuple):

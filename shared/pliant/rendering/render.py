@@ -19,7 +19,7 @@ from pliant.rendering.paths import CameraPath
 from pliant.rendering.photometry import exposure_gain, sensor_image
 from pliant.rendering.raycast import Atlas, accumulate, cast, cast_depth
 from pliant.rendering.solids import Scene, SolidArrays, face_sizes, solid_arrays
-from pliant.rendering.view import Tiles, View, tile_bounds, view_of, visible_tiles
+from pliant.rendering.visible_tiles import Tiles, View, tile_bounds, view_of, visible_tiles
 
 # Offsets of the sub-exposures within a pixel, in sixths: no two share a row or a column.
 SUB_PIXELS = ((-2.5, 0.5), (1.5, 2.5), (-0.5, -1.5), (2.5, -0.5), (-1.5, 1.5), (0.5, -2.5))

@@ -12,7 +12,7 @@ from pliant.algorithms.map_density import count_distinct, well_observed
 from pliant.messages.types import DROPPED, MASKED
 from pliant.results.calibration import calibration_doubt, calibration_verdict
 from pliant.results.judgement import doubtful_frames, judge
-from pliant.results.mesh import mesh_report
+from pliant.results.mesh_files import mesh_report
 from pliant.results.run import Run
 
 _ROUGHLY = 0.02

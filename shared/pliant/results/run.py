@@ -25,7 +25,7 @@ from pliant.messages.types import (
 )
 from pliant.recording.reader import Recording
 from pliant.recording.summary import Summary
-from pliant.results.scale import MetricRecording, Scale
+from pliant.results.known_scale import MetricRecording, Scale
 
 _LEFT_ALONE = (
     *(topics.SOURCE, topics.DEPTH, topics.KEYFRAME, topics.KEYFRAME_FINAL, topics.MESH_BLOCKS),

@@ -26,7 +26,7 @@ from pliant.results.folder import (
 )
 from pliant.results.judgement import judge_surfels, slipping_frames
 from pliant.results.moving_together import MovingTogether
-from pliant.results.page.surface import Surface
+from pliant.results.page.moved_surface import Surface
 from pliant.results.page.surfel_page import write_surfel_page
 from pliant.results.report import broken_images, ended_early, process_figures
 from pliant.results.run import Run, read_run

@@ -22,11 +22,11 @@ from pliant.results.folder import (
     SCALE_NAME,
     all_or_none,
 )
-from pliant.results.mesh import write_meshes
+from pliant.results.known_scale import MetricRecording, Scale
+from pliant.results.mesh_files import write_meshes
 from pliant.results.page.rigid_page import write_page
 from pliant.results.report import rigid_report
 from pliant.results.run import Run, read_run
-from pliant.results.scale import MetricRecording, Scale
 from pliant.results.surfels import has_surfels, write_surfel_results
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from pliant.errors import ResultError
 from pliant.recording import parts
 from pliant.results.folder import RECORDING_NAME, written
+from pliant.results.known_scale import MetricRecording, Scale
 from pliant.results.run import Run, read_run
-from pliant.results.scale import MetricRecording, Scale
 from pliant.results.surfels import has_surfels
 from pliant.results.write import write_rigid_results
 from pliant.scale.lengths import from_depth, from_points

@@ -14,8 +14,8 @@ from pliant.datasets.depth import DepthRectifier
 from pliant.errors import ResultError
 from pliant.export.images import camera_of
 from pliant.recording.reader import Recording
+from pliant.results.known_scale import Scale
 from pliant.results.run import Run, seen_by_keyframes
-from pliant.results.scale import Scale
 
 _LEAST_DEPTHS = 100
 _TO_SIGMA = 1.4826

@@ -12,8 +12,8 @@ from pliant.errors import ResultError
 from pliant.export.images import camera_of, rectified_images
 from pliant.export.posed_images import IdealCamera
 from pliant.recording.reader import Recording
+from pliant.results.known_scale import Scale
 from pliant.results.run import Run
-from pliant.results.scale import Scale
 
 _DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36H11")
 _LEAST_VIEWS = 3

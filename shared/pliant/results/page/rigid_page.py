@@ -16,7 +16,7 @@ from pliant.errors import ResultError
 from pliant.pictures.masked import dimmed_by
 from pliant.pictures.movie import encode_animation
 from pliant.recording.reader import Recording
-from pliant.results.mesh import mesh_of
+from pliant.results.mesh_files import mesh_of
 from pliant.results.page.advice import advice
 from pliant.results.page.chart import BLUE, ORANGE, Line, chart
 from pliant.results.page.page import bullets, canvas, fill_page, table_rows

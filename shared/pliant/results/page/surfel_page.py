@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from pliant.results.page.chart import BLUE, ORANGE, Line, chart
+from pliant.results.page.moved_surface import Surface
 from pliant.results.page.page import bullets, canvas, fill_page, table_rows
-from pliant.results.page.surface import Surface
 from pliant.wording import counted
 
 _TINTS = (

@@ -10,7 +10,7 @@ import numpy as np
 
 from pliant.errors import ResultError
 from pliant.evaluation.criteria import ErrorStatistics, RelativeErrors
-from pliant.evaluation.result import Evaluation, TrajectoryEvaluation
+from pliant.evaluation.run_evaluation import Evaluation, TrajectoryEvaluation
 from pliant.formats.text import write_bytes
 
 ALIGNMENT = "Sim(3) aligned (scale is not known to a single camera)"
