@@ -3,6 +3,8 @@
 import os
 import random
 import signal
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -13,8 +15,11 @@ from statistics import median
 
 from benchmarks.table import markdown, markdown_header, markdown_row
 from pliant.config import config_yaml, load_config
+from pliant.messages import topics
+from pliant.messages.topics import Topic
 from pliant.messages.types import Status
-from pliant.results.folder import STATE_FOLDER, prepare
+from pliant.recording.reader import Recording
+from pliant.results.folder import RECORDING_NAME, STATE_FOLDER, prepare
 from pliant.results.write import write_results
 from pliant_services.processes import PROFILES
 from pliant_services.run.command import RunRequest, service_arguments
@@ -59,6 +64,24 @@ def recording_cost(source: str, runs: int) -> Iterator[str]:
     on, off = median(rates["on"]), median(rates["off"])
     rows = [("off", f"{off:.1f}", "1.00"), ("on", f"{on:.1f}", f"{on / off:.2f}")]
     yield markdown(("recording", "frames/s", "of that without"), rows)
+
+
+def first_frame(source: str, runs: int) -> Iterator[str]:
+    """Seconds from the start of ``pliant run`` to the first frame, by the clock of the recorder."""
+    arrived: dict[Topic, list[float]] = {topics.SOURCE: [], topics.MAP_UPDATE: []}
+    for number in range(runs + 1):
+        with tempfile.TemporaryDirectory() as folder:
+            output = Path(folder) / "run"
+            command = ("-m", "pliant_services.cli", "run", source, "--output", str(output))
+            began_ns = time.time_ns()
+            subprocess.run([sys.executable, *command], stdout=subprocess.DEVNULL)
+            if number == 0:
+                continue  # which compiled the kernels, and rendered the source
+            for topic, seconds in arrived.items():
+                first = next(Recording(output / RECORDING_NAME).messages(topic))
+                seconds.append((first.log_time_ns - began_ns) * 1e-9)
+    rows = [(topic.key, f"{median(seconds):.2f}") for topic, seconds in arrived.items()]
+    yield markdown(("first message of", "s after the start"), rows)
 
 
 def kills(source: str, count: int, seed: int) -> Iterator[str]:

@@ -71,6 +71,20 @@ def recording_cost(
     show(recording_cost(source, runs))
 
 
+@app.command("first-frame")
+def first_frame(
+    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    runs: Annotated[int, typer.Option(min=1, help="Of which the median counts.")] = 3,
+) -> None:
+    """From the start of `pliant run` to its first frame, kernels compiled: published, and mapped.
+
+    scripts/bench first-frame built-in:room
+    """
+    from benchmarks.whole_runs import first_frame
+
+    show(first_frame(source, runs))
+
+
 @app.command("viewer-cost")
 def viewer_cost(
     source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
