@@ -17,6 +17,7 @@ from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_formats import UNDERSTOOD
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import CalibrationError, PliantError, ResultError
+from pliant.exit_codes import INTERRUPTED
 from pliant.files import make_folder, write_whole
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.recording import parts
@@ -42,7 +43,6 @@ from pliant_services.run.spectators import Viewer, announced, check_viewer, has_
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
-INTERRUPTED = 130
 _DEFORMABLE = "deformable"
 _KNOWN_MAP = "known_map"
 """In the folder of checkpoints: where the map is in which a run goes on."""
