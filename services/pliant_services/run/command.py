@@ -36,6 +36,7 @@ from pliant.results.folder import (
     prepare,
     written,
 )
+from pliant.wording import counted
 from pliant_services.nodes.ingest import plays_live
 from pliant_services.processes import PROFILES, deformable_fleet, inputs_of, reads_depth
 from pliant_services.run.progress import Progress
@@ -325,8 +326,8 @@ def _recording_in(output: Path) -> str:
     path = output / RECORDING_NAME
     if path.is_file():
         return path.name
-    count = len(parts.parts_of(path))
-    return f"{parts.folder_of_parts(path).name}/ ({count} {'part' if count == 1 else 'parts'})"
+    count = counted(len(parts.parts_of(path)), "part")
+    return f"{parts.folder_of_parts(path).name}/ ({count})"
 
 
 def _say_guess(calibration: Calibration, profile: str, progress: Progress) -> None:
