@@ -38,7 +38,8 @@ from pliant.results.folder import (
 )
 from pliant.wording import counted
 from pliant_services.nodes.ingest import plays_live
-from pliant_services.processes import PROFILES, deformable_fleet, inputs_of, reads_depth
+from pliant_services.processes import deformable_fleet, inputs_of, reads_depth
+from pliant_services.profiles import PROFILES
 from pliant_services.run.progress import Progress
 from pliant_services.run.spectators import Viewer, announced, check_viewer, has_viewer
 from pliant_services.runtime import kernels as warm_up
