@@ -30,6 +30,7 @@ from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.excerpt import Excerpt
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import CalibrationError, DatasetError, ResultError
+from pliant.exit_codes import INTERRUPTED
 from pliant.export.posed_images import INLIER_PX, IdealCamera
 from pliant.files import make_folder, write_whole
 from pliant.pictures.calibration import SeenCorners, coverage, draw_calibration
@@ -39,7 +40,7 @@ from pliant.results.folder import CALIBRATION_NAME, RECORDING_NAME, REPORT_NAME,
 from pliant.results.run import Run, read_run, seen_by_keyframes
 from pliant_services.calibrate.board import PrintedBoard
 from pliant_services.cli.progress import tell_progress
-from pliant_services.run.command import INTERRUPTED, RunRequest, run_pipeline
+from pliant_services.run.command import RunRequest, run_pipeline
 
 _LOOKED_AT = 200
 """Frames in which the board is looked for: the sharpest of so many parts of the source."""
