@@ -21,6 +21,7 @@ from pliant.algorithms.mapping.frame_pose import (
     adjust,
     at_once,
     directions_of,
+    doubt,
     find_again,
     localise,
     stand,
@@ -35,7 +36,6 @@ from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of
 from pliant.algorithms.mapping.start import Start
-from pliant.algorithms.mapping.support import doubt
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses, returned_poses
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages

@@ -1,1 +1,1 @@
-"""Places that were seen before: described, looked up, and verified."""
+"""Places that were seen before: described, looked up, and what of them tells nothing."""
