@@ -25,12 +25,18 @@ from pliant.algorithms.mapping.directions import (
     placed_candidates,
     spread_of,
 )
-from pliant.algorithms.mapping.localisation import Localisation, locate, refine
+from pliant.algorithms.mapping.localisation import (
+    Localisation,
+    Motion,
+    locate,
+    prove,
+    recover,
+    refine,
+)
 from pliant.algorithms.mapping.map_store import MAPPED, UNLINKED, Observations
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import SupportParameters
 from pliant.algorithms.mapping.reacquisition import reacquire
-from pliant.algorithms.mapping.recovery import Motion, prove, recover
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.tracks import FrameExtrema, FrameTracks

@@ -25,11 +25,11 @@ from pliant.algorithms.mapping.frame_pose import (
 )
 from pliant.algorithms.mapping.kept_map import known_camera, take_in
 from pliant.algorithms.mapping.known_places import KnownPlaces
+from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
-from pliant.algorithms.mapping.recovery import Motion
 from pliant.algorithms.mapping.relocalisation import Recognised, is_same_pose
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.whole_map import WholeMap
