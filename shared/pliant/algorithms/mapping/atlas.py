@@ -26,7 +26,7 @@ from pliant.algorithms.mapping.segment import Moved, Segment, see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_guess
 from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held
-from pliant.algorithms.places.features import describe
+from pliant.algorithms.places import describe
 
 
 class Atlas:

@@ -38,8 +38,7 @@ from pliant.algorithms.mapping.same_place import same_place
 from pliant.algorithms.mapping.segment import Moved, Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.whole_map import held
-from pliant.algorithms.places.features import Features, describe
-from pliant.algorithms.places.index import PlaceIndex
+from pliant.algorithms.places import Features, PlaceIndex, describe
 
 _WITHIN = 3
 """Keyframes within which another one must tell the same."""

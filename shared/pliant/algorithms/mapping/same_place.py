@@ -20,7 +20,7 @@ from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
 from pliant.algorithms.mapping.relocalisation import Place, corners_in_map, repeats
-from pliant.algorithms.places.features import match
+from pliant.algorithms.places import match
 
 _ROUNDS = 10
 _MOST = 1.0
