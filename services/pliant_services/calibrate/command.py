@@ -16,11 +16,13 @@ from pliant.algorithms.arrays import U8
 from pliant.algorithms.board_calibration import (
     MIN_VIEWS,
     BoardCalibration,
+    BoardFinder,
     BoardLens,
+    BoardView,
+    boards_seen,
     calibrate,
     choose_views,
 )
-from pliant.algorithms.boards import BoardFinder, BoardView, boards_seen
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.image.sharpness import LONGEST_SIDE_PX, resized, sharpness
