@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pliant.algorithms.boards import Board
+from pliant.algorithms.board_calibration import Board
 from pliant.algorithms.rectification import Lens, undistort
 
 SQUARE_PX = 40

@@ -36,7 +36,7 @@ from pliant.bus.session import free_endpoint, open_session
 from pliant.messages import codec, topics
 from pliant.messages.types import Status
 from pliant.results.folder import MESH_FILES, SESSION_NAME, SURFELS_NAME
-from pliant_services.processes import PROFILES
+from pliant_services.profiles import PROFILES
 
 TIMEOUT_S = 300.0
 LATER_S = 0.1

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from pliant.messages import topics
 from pliant.messages.topics import Topic
-from pliant_services.profiles import PROFILES as PROFILES
 
 if TYPE_CHECKING:
     from pliant.config import Config

@@ -4,8 +4,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from benchmarks.in_process import run
-from benchmarks.table import markdown
+from benchmarks.table import markdown_header, markdown_row
 from pliant.datasets import open_source
+from pliant.errors import PliantError
 
 _OFF = {
     "mutual check": ["tracking.mutual_check=false"],
@@ -33,16 +34,23 @@ VARIANTS: dict[str, list[str]] = {
 }
 
 
-def measure(sources: Sequence[str]) -> Iterator[str]:
-    """ATE (success rate where below 99 %) / median mapped inliers, a column for each source."""
-    header = ["variant", *(Path(source).name for source in sources)]
-    rows = []
-    for name, overrides in VARIANTS.items():
-        rows.append([name, *(_cell(source, overrides) for source in sources)])
-    yield "ATE of the final trajectory / median mapped inliers"
-    yield markdown(header, rows)
+def measure(sources: Sequence[str], *, only: Sequence[str], seeds: int) -> Iterator[str]:
+    """Final / causal ATE (share of the frames below 99 %), a column for each source.
+
+    only: of the switches, everything on beside them; none: all.   seeds: runs of each, numbered
+    from 0.   Raises PliantError for a switch that there is not.
+    """
+    if unknown := sorted(set(only) - set(_OFF)):
+        raise PliantError(f"no switch '{unknown[0]}': there are {', '.join(_OFF)}")
+    chosen = ["everything on", *(f"without {name}" for name in only)] if only else list(VARIANTS)
+    yield markdown_header(["variant", *(Path(source).name for source in sources)])
+    for name in chosen:
+        cells = (
+            ", ".join(_cell(source, [*VARIANTS[name], f"seed={seed}"]) for seed in range(seeds))
+            for source in sources
+        )
+        yield markdown_row([name, *cells])
 
 
 def _cell(source: str, overrides: Sequence[str]) -> str:
-    found = run(open_source(source), overrides)
-    return f"{found.ate} / {found.inliers:.0f}"
+    return run(open_source(source), overrides).both

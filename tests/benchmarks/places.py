@@ -14,7 +14,7 @@ from pliant.algorithms.geometry import inverse, pose_to_matrix, so3_log, transfo
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.relocalisation import Recognised
-from pliant.algorithms.places.features import describe
+from pliant.algorithms.places import describe
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.config import Config
 from pliant.datasets import open_source

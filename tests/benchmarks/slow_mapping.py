@@ -17,7 +17,7 @@ from pliant.config import config_yaml, load_config
 from pliant.datasets.builtin import builtin_folder
 from pliant.messages.types import PASSED_OVER, Status
 from pliant.results.folder import prepare
-from pliant_services.processes import PROFILES
+from pliant_services.profiles import PROFILES
 from pliant_services.run.command import RunRequest, service_arguments
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.launcher import Fleet

@@ -21,7 +21,7 @@ from pliant.messages.types import Status
 from pliant.recording.reader import Recording
 from pliant.results.folder import RECORDING_NAME, STATE_FOLDER, prepare
 from pliant.results.write import write_results
-from pliant_services.processes import PROFILES
+from pliant_services.profiles import PROFILES
 from pliant_services.run.command import RunRequest, service_arguments
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.launcher import Fleet

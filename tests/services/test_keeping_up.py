@@ -24,7 +24,7 @@ from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Extrema, Header, Image
 from pliant.state import load_state, save_state
 from pliant_services.nodes import ingest
-from pliant_services.processes import PROFILES
+from pliant_services.profiles import PROFILES
 from pliant_services.runtime.host import lags
 from pliant_services.runtime.keeping_up import Drops, MappingPace, readers_that_may_lag
 from pliant_services.runtime.link_images import receive_images

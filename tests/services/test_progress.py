@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from pliant_services.processes import PROFILES
+from pliant_services.profiles import PROFILES
 from pliant_services.run.progress import Progress
 
 

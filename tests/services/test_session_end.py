@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from pliant.bus.peers import token_key
+from pliant.bus.peers import OVER_KEY, STOP_KEY, token_key
 from pliant.bus.session import free_endpoint, open_router, open_session
-from pliant.bus.zenoh_bus import OVER_KEY, STOP_KEY
 from pliant.config import load_config
+from pliant.exit_codes import DONE
 from pliant_services.runtime import session_end
 from pliant_services.runtime import status as fleet_status
 from pliant_services.runtime.host import ServiceOptions
@@ -68,7 +68,7 @@ def test_a_router_that_does_not_yet_listen_to_all_hears_that_the_session_is_over
     held.undeclare()
     router.close()
     recorder.join()
-    assert codes == [session_end.DONE]
+    assert codes == [DONE]
 
 
 def test_a_source_that_is_still_coming_up_hears_that_it_is_to_stop(

@@ -15,6 +15,7 @@ from pliant.algorithms.map_delta import LOST, TRACKING, MapDelta
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameTracks
+from pliant.exit_codes import DONE, INCOMPLETE
 from pliant.map_history import Keyframe
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
@@ -30,7 +31,7 @@ from pliant.messages.types import (
 from pliant.recording.writer import RecordingWriter
 from pliant.results.report import rigid_report
 from pliant.results.run import Run
-from pliant.results.verdict import DONE, INCOMPLETE, summary
+from pliant.results.verdict import summary
 from pliant.results.write import write_results
 from pliant_services.run import command as pipeline
 from pliant_services.run.command import RunRequest, run_pipeline

@@ -28,7 +28,7 @@ from pliant.bus.session import free_endpoint, open_router
 from pliant.datasets.builtin import builtin_folder
 from pliant.messages import topics
 from pliant.recording.reader import Recording
-from pliant_services.processes import PROFILES
+from pliant_services.profiles import PROFILES
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
 pytestmark = pytest.mark.system

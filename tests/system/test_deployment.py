@@ -32,7 +32,7 @@ from pliant.config import config_yaml, load_config
 from pliant.messages import codec, topics
 from pliant.messages.types import Status
 from pliant.recording.reader import Recording
-from pliant_services.processes import PROFILES
+from pliant_services.profiles import PROFILES
 
 pytestmark = pytest.mark.system
 

@@ -25,7 +25,7 @@ from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import RECORDING_NAME, STATE_FOLDER, prepare
 from pliant.results.write import write_results
-from pliant_services.processes import PROFILES
+from pliant_services.profiles import PROFILES
 from pliant_services.replay.command import SAME, ReplayRequest, run_replay
 from pliant_services.run.command import (
     RunRequest,

@@ -17,7 +17,7 @@ from pliant.recording.reader import Recording
 from pliant.results.folder import RECORDING_NAME, prepare
 from pliant.results.verdict import summary
 from pliant.results.write import write_results
-from pliant_services.processes import PROFILES
+from pliant_services.profiles import PROFILES
 from pliant_services.run.command import RunRequest, service_arguments
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.launcher import Fleet

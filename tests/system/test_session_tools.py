@@ -14,7 +14,7 @@ from running import AS_FROM_A_SHELL, command, pliant
 
 from pliant import arithmetic
 from pliant.bus.session import free_endpoint
-from pliant_services.processes import PROFILES
+from pliant_services.profiles import PROFILES
 
 pytestmark = pytest.mark.system
 

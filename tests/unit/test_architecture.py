@@ -1,6 +1,7 @@
 """The rules of the house that a machine can check."""
 
 import ast
+import json
 import re
 import subprocess
 import sys
@@ -21,6 +22,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "cache": set(),
     "files": set(),
+    "exit_codes": set(),
     "version": set(),
     "wording": set(),
     "trajectory": {"algorithms"},
@@ -46,7 +48,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "offline": {"datasets", "messages", "algorithms", "config", "map_history"},
     "fusion": {"fusion", "algorithms", "errors", "map_history"},
 }
-ANYWHERE = {"version", "wording"}  # which import nothing; ``pliant`` itself is of the top
+ANYWHERE = {"exit_codes", "version", "wording"}  # they import nothing; ``pliant`` is of the top
 PURE_FORBIDS = {"time", "datetime", "socket", "logging", "os", "pathlib", "random", "threading"}
 
 
@@ -131,6 +133,7 @@ CALLS_NO_KERNEL = (
     "pliant_services.nodes.ingest",
     "pliant_services.nodes.recorder",
     "pliant_services.runtime.host",
+    "pliant_services.runtime.session_end",
     "pliant_services.runtime.status",
     "pliant_services.run.command",
 )
@@ -148,6 +151,42 @@ def test_what_calls_no_kernel_loads_none() -> None:
     command = [sys.executable, "-c", code, *CALLS_NO_KERNEL]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+HEAVY = {
+    *("cv2", "matplotlib", "numba", "scipy"),
+    *("pliant.datasets", "pliant.formats", "pliant.map_history", "pliant.pictures"),
+}
+COMMANDS = {
+    "--help": {*HEAVY, "numpy", "zenoh"},
+    "router --listen nowhere": {*HEAVY, "pliant.config", "pliant.state"},
+    "status --connect nowhere": {*HEAVY, "pliant.config", "pliant.state"},
+    "stop --connect nowhere": {*HEAVY, "pliant.config", "pliant.state"},
+    "service recorder --connect nowhere --output x.mcap": HEAVY,
+}
+"""Commands, and what their processes may not load.  Nowhere is no endpoint: when they say so they
+have imported all that they work with."""
+
+
+def test_processes_that_wait_and_write_load_nothing_heavy(tmp_path: Path) -> None:
+    """All in one process, which names the first that does."""
+    code = (
+        "import json, sys\n"
+        "from pliant_services.cli import main\n"
+        "for command, heavy in json.loads(sys.argv[1]):\n"
+        "    sys.argv = ['pliant', *command.split()]\n"
+        "    try: main()\n"
+        "    except SystemExit as end: code = end.code\n"
+        "    assert code == ('nowhere' in command), f'{command}: {code}'\n"
+        "    loaded = sorted(set(heavy) & set(sys.modules))\n"
+        "    assert not loaded, f'{command} loads {loaded}'\n"
+        "assert 'pliant_services.nodes.recorder' in sys.modules"
+    )
+    cases = json.dumps([(command, sorted(heavy)) for command, heavy in COMMANDS.items()])
+    command = [sys.executable, "-c", code, cases]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("nowhere: not an endpoint") == len(COMMANDS) - 1
 
 
 def test_no_two_test_files_have_one_name() -> None:

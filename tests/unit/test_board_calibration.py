@@ -13,8 +13,13 @@ import pytest
 from board_film import FISHEYE, LENS, film, texture
 from typer.testing import CliRunner
 
-from pliant.algorithms.board_calibration import calibrate, choose_views
-from pliant.algorithms.boards import Board, BoardFinder, BoardView
+from pliant.algorithms.board_calibration import (
+    Board,
+    BoardFinder,
+    BoardView,
+    calibrate,
+    choose_views,
+)
 from pliant.algorithms.rectification import Lens
 from pliant.datasets.calibration_files import read_calibration
 from pliant.errors import CalibrationError, DatasetError, PliantError

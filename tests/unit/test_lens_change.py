@@ -9,11 +9,11 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
-from pliant.algorithms.mapping.lens_change import moved, see_by
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.segment import moved_px, see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.start import WaitingFrame
 from pliant.algorithms.mapping.waiting import Waiting
@@ -86,7 +86,7 @@ def test_earlier_segments_and_waiting_frames_follow(active):
         frame=3, stamp_ns=4, ids=np.arange(2), points_px=px, kappas=np.ones(2, np.float32)
     )
     (waited,) = Waiting([frame], []).seen_by(KNOWN.view, OTHER.view).frames
-    np.testing.assert_array_equal(waited.points_px, moved(px, KNOWN.view, OTHER.view))
+    np.testing.assert_array_equal(waited.points_px, moved_px(px, KNOWN.view, OTHER.view))
     np.testing.assert_allclose(OTHER.view.seen(waited.points_px), px, atol=1e-3)
 
 

@@ -5,8 +5,7 @@ import pytest
 
 from pliant.algorithms.arrays import F32
 from pliant.algorithms.image.pixels import halve, pixels_of, shrink
-from pliant.algorithms.tracking.climbing import climb
-from pliant.algorithms.tracking.curvature import curvature
+from pliant.algorithms.tracking.curvature import climb, curvature
 from pliant.algorithms.tracking.local_flow import CELL_PX, Flow, flow_at, grid_shape, local_flow
 from pliant.algorithms.tracking.maxima import find_maxima
 

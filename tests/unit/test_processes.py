@@ -8,8 +8,8 @@ import pytest
 from pliant.config import Config
 from pliant.messages import topics
 from pliant_services import processes
-from pliant_services.processes import PROCESSES, PROFILES
-from pliant_services.profiles import NAMES
+from pliant_services.processes import PROCESSES
+from pliant_services.profiles import NAMES, PROFILES
 from pliant_services.runtime.host import checkpoint_windows
 
 

@@ -6,7 +6,8 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
 from test_mapper import Published, trajectory_error
 from test_recovery import picture, textures
 
-from pliant.algorithms.mapping import revisits
+from pliant.algorithms.mapping import known_places
+from pliant.algorithms.mapping.known_places import Revisits
 from pliant.algorithms.mapping.map_store import Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
@@ -16,7 +17,6 @@ from pliant.algorithms.mapping.parameters import (
     WindowParameters,
 )
 from pliant.algorithms.mapping.relocalisation import Place
-from pliant.algorithms.mapping.revisits import Revisits
 from pliant.algorithms.mapping.same_place import SamePlace
 from pliant.state import load_state, save_state
 
@@ -64,7 +64,7 @@ def look(own, monkeypatch, segment, newest, proves, alike=None, elsewhere=()):
         rows = np.column_stack([old.keyframe.rows[:40], new.keyframe.rows[:40]])
         return SamePlace(S_old_new=S, rows=rows)
 
-    monkeypatch.setattr(revisits, "same_place", same_place)
+    monkeypatch.setattr(known_places, "same_place", same_place)
     known = keyframes[: newest + 1]
     places = [Place(keyframe=k, features=None, segment=known) for k in known]
     some = [places[k] for k in alike or proves if k < newest]

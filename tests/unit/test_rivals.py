@@ -14,7 +14,7 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import Place, Recognised, relocalise
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.places.features import Features
+from pliant.algorithms.places import Features
 
 PARAMETERS = MappingParameters()
 NOTHING = Features(points_px=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), "u1"))

@@ -9,10 +9,10 @@ from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import align_umeyama, inverse, so3_exp
 from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.recovery import Motion
 from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame, readout_flow
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.map_history import MapHistory

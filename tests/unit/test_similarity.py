@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.geometry import so3_exp
-from pliant.algorithms.places.similarity import (
+from pliant.algorithms.mapping.same_place import (
     Pairs,
     moved,
     refine_similarity,

@@ -8,9 +8,9 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 from test_mapper import run, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING
+from pliant.algorithms.mapping.frame_pose import doubt, support_of
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, SupportParameters
-from pliant.algorithms.mapping.support import doubt, support_of
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.results.judgement import BAD, DOUBTFUL, GOOD, judge, judge_surfels, slipping_frames
 

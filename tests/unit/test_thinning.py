@@ -12,7 +12,6 @@ from test_whole_map import similarity
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.mapping import thinning
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
-from pliant.algorithms.mapping.given_up import GivenUp
 from pliant.algorithms.mapping.map_store import FREE, MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
@@ -20,7 +19,7 @@ from pliant.algorithms.mapping.parameters import (
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.segment import Segment
+from pliant.algorithms.mapping.segment import GivenUp, Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.thinning import observations_of, thin
 from pliant.state import load_state, save_state

@@ -13,13 +13,12 @@ from typing import Any
 
 from pliant.datasets import sources_in
 from pliant.errors import DatasetError, ResultError
+from pliant.exit_codes import DONE, FAILED, INCOMPLETE
 from pliant.files import make_folder, write_whole
 from pliant.results.folder import folder_name, keep_apart, written
-from pliant.results.verdict import DONE, INCOMPLETE
 from pliant_services.batch.one_run import Errand, Outcome, run_clip
 
 SUMMARY_NAME = "batch.json"
-_FAILED = 1
 _OWN = ("--output", "-o", "--force", "--resume", "--view", "--save", "--port")
 """Options of ``pliant run`` that are for one run, and the batch's to say."""
 
@@ -130,7 +129,7 @@ def run_batch(
         finally:
             _tell(batch)
     codes = {clip.exit_code for clip in clips}
-    return _FAILED if codes - {DONE, INCOMPLETE} else max(DONE, *(c or 0 for c in codes))
+    return FAILED if codes - {DONE, INCOMPLETE} else max(DONE, *(c or 0 for c in codes))
 
 
 @contextmanager

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from pliant import __version__
+from pliant.exit_codes import DONE, FAILED, INCOMPLETE
 from pliant.results.folder import REPORT_NAME, STATE_FOLDER, is_being_written
-from pliant.results.verdict import DONE, INCOMPLETE, grade
+from pliant.results.verdict import grade
 
 _LOOK_S = 0.2
-_FAILED = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
 
 
 def _failed(why: str) -> Outcome:
-    return Outcome(exit_code=_FAILED, told={"verdict": "failed", "reason": why})
+    return Outcome(exit_code=FAILED, told={"verdict": "failed", "reason": why})
 
 
 def _report_of(result: Path) -> dict[str, Any] | None:

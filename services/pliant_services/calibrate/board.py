@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pliant.algorithms.boards import DICTIONARIES, Board
+from pliant.algorithms.board_calibration import DICTIONARIES, Board
 from pliant.errors import CalibrationError
 from pliant.formats.pdf import Rectangle, Words, write_page
 

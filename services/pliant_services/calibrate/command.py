@@ -16,11 +16,13 @@ from pliant.algorithms.arrays import U8
 from pliant.algorithms.board_calibration import (
     MIN_VIEWS,
     BoardCalibration,
+    BoardFinder,
     BoardLens,
+    BoardView,
+    boards_seen,
     calibrate,
     choose_views,
 )
-from pliant.algorithms.boards import BoardFinder, BoardView, boards_seen
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.image.sharpness import LONGEST_SIDE_PX, resized, sharpness
@@ -30,6 +32,7 @@ from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.excerpt import Excerpt
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import CalibrationError, DatasetError, ResultError
+from pliant.exit_codes import INTERRUPTED
 from pliant.export.posed_images import INLIER_PX, IdealCamera
 from pliant.files import make_folder, write_whole
 from pliant.pictures.calibration import SeenCorners, coverage, draw_calibration
@@ -39,7 +42,7 @@ from pliant.results.folder import CALIBRATION_NAME, RECORDING_NAME, REPORT_NAME,
 from pliant.results.run import Run, read_run, seen_by_keyframes
 from pliant_services.calibrate.board import PrintedBoard
 from pliant_services.cli.counting import tell_progress
-from pliant_services.run.command import INTERRUPTED, RunRequest, run_pipeline
+from pliant_services.run.command import RunRequest, run_pipeline
 
 _LOOKED_AT = 200
 """Frames in which the board is looked for: the sharpest of so many parts of the source."""

@@ -12,6 +12,7 @@ import typer
 
 from pliant import __version__
 from pliant.errors import PliantError, SourceLostError
+from pliant.exit_codes import FAILED, INCOMPLETE, INTERRUPTED, USAGE
 from pliant_services.cli.groups import GroupedCommands
 from pliant_services.runtime.interruptions import deliver_swallowed_interruptions
 
@@ -49,7 +50,6 @@ def options(
     """Take what comes before a command."""
 
 
-_FAILED, _USAGE, _INCOMPLETE, _INTERRUPTED = 1, 2, 3, 130
 _INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Typer carries its own copy of click, or uses click itself, depending on its version.
 _UsageError: type[typer.BadParameter] = next(
@@ -67,7 +67,7 @@ def main(application: typer.Typer | None = None) -> None:
     try:
         run_and_exit(application or app)
     except KeyboardInterrupt:  # one more, just before it was ignored
-        os._exit(_INTERRUPTED)
+        os._exit(INTERRUPTED)
     finally:
         _take_no_more()
 
@@ -81,7 +81,7 @@ def run_and_exit(application: typer.Typer) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more to flush
         if error.errno != errno.EPIPE and not code:  # `| head` has seen enough
             code = _say(f"cannot write the output: {error.strerror}; free some space")
-    if code >= _INTERRUPTED:
+    if code >= INTERRUPTED:
         # All is closed, but a Zenoh session that was just being opened or closed leaves threads
         # behind for which the interpreter would wait for ever.
         os._exit(code)
@@ -93,26 +93,26 @@ def _run(application: typer.Typer) -> int:
         importlib.import_module("pliant_services.cli.commands")  # registers them
         code = application(standalone_mode=False)
     except PliantError as error:
-        return _say(str(error), _INCOMPLETE if isinstance(error, SourceLostError) else _FAILED)
+        return _say(str(error), INCOMPLETE if isinstance(error, SourceLostError) else FAILED)
     except _UsageError as error:
         if type(error).__name__ == "NoArgsIsHelpError":
             error.show()
-            return _USAGE
+            return USAGE
         command = getattr(getattr(error, "ctx", None), "command_path", "pliant")
         text = error.format_message().replace("Value error, ", "").rstrip(".")
         return _say(f"{text} (see {command} --help)", error.exit_code)
     except (KeyboardInterrupt, typer.Abort):  # not all versions of Typer hand it on
         _take_no_more()
-        code = _INTERRUPTED
+        code = INTERRUPTED
     except SystemExit as end:  # of a signal
-        return end.code if isinstance(end.code, int) else _FAILED
+        return end.code if isinstance(end.code, int) else FAILED
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         where = f"{error.filename}" if error.filename else "the output"
         return _say(f"cannot write {where}: {error.strerror}; free some space")
-    if code == _INTERRUPTED:
-        return _say("interrupted", _INTERRUPTED)
+    if code == INTERRUPTED:
+        return _say("interrupted", INTERRUPTED)
     return code if isinstance(code, int) else 0
 
 
@@ -122,7 +122,7 @@ def _take_no_more() -> None:
         signal.signal(kind, signal.SIG_IGN)
 
 
-def _say(line: str, code: int = _FAILED) -> int:
+def _say(line: str, code: int = FAILED) -> int:
     with suppress(OSError):
         print(f"pliant: {line}", file=sys.stderr)
     return code

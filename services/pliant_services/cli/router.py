@@ -28,8 +28,8 @@ def router(
     import signal
     import threading
 
+    from pliant.bus.peers import OVER_KEY
     from pliant.bus.session import Identity, is_beyond_loopback, open_router
-    from pliant.bus.zenoh_bus import OVER_KEY
     from pliant_services.runtime.relay import Relays
     from pliant_services.security.access import access_control
     from pliant_services.security.certificates import ROUTER

@@ -37,8 +37,7 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.thinning import thin
 from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
 from pliant.algorithms.mapping.whole_map import Answer, Question, WholeMap, find_moves
-from pliant.algorithms.places.features import describe, match
-from pliant.algorithms.places.index import PlaceIndex
+from pliant.algorithms.places import PlaceIndex, describe, match
 from pliant.algorithms.tracking.maxima import maxima_of
 from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.algorithms.tracks import FrameExtrema

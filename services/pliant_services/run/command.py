@@ -17,6 +17,7 @@ from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_formats import UNDERSTOOD
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import CalibrationError, PliantError, ResultError
+from pliant.exit_codes import INTERRUPTED
 from pliant.files import make_folder, write_whole
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.recording import parts
@@ -35,14 +36,15 @@ from pliant.results.folder import (
     prepare,
     written,
 )
+from pliant.wording import counted
 from pliant_services.nodes.ingest import plays_live
-from pliant_services.processes import PROFILES, deformable_fleet, inputs_of, reads_depth
+from pliant_services.processes import deformable_fleet, inputs_of, reads_depth
+from pliant_services.profiles import PROFILES
 from pliant_services.run.progress import Progress
 from pliant_services.run.spectators import Viewer, announced, check_viewer, has_viewer
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
-INTERRUPTED = 130
 _DEFORMABLE = "deformable"
 _KNOWN_MAP = "known_map"
 """In the folder of checkpoints: where the map is in which a run goes on."""
@@ -325,8 +327,8 @@ def _recording_in(output: Path) -> str:
     path = output / RECORDING_NAME
     if path.is_file():
         return path.name
-    count = len(parts.parts_of(path))
-    return f"{parts.folder_of_parts(path).name}/ ({count} {'part' if count == 1 else 'parts'})"
+    count = counted(len(parts.parts_of(path)), "part")
+    return f"{parts.folder_of_parts(path).name}/ ({count})"
 
 
 def _say_guess(calibration: Calibration, profile: str, progress: Progress) -> None:

@@ -14,13 +14,14 @@ from queue import SimpleQueue
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import matrix_to_pose
+from pliant.bus.base import Received
 from pliant.errors import MessageError
 from pliant.formats.text import format_fixed, format_seconds
 from pliant.map_history import MapHistory
 from pliant.messages import codec, topics
 from pliant.messages.types import MapUpdate, Surfels
 from pliant.recording.map_file import MapFile
-from pliant_services.runtime.launcher import Fleet, Heard
+from pliant_services.runtime.launcher import Fleet
 
 _LAST_S = 5.0
 """For what is on the way when the service that said it has left."""
@@ -30,7 +31,7 @@ _LAST_S = 5.0
 def told_poses(fleet: Fleet, known: MapFile | None, *, deformable: bool) -> Generator[None]:
     """Print them until the run is over.  known: the map in which it goes on."""
     topic = topics.SURFELS if deformable else topics.MAP_UPDATE
-    heard: SimpleQueue[Heard | None] = SimpleQueue()
+    heard: SimpleQueue[Received | None] = SimpleQueue()
     history = MapHistory()
     for keyframe in known.keyframes() if known is not None else ():
         history.know(keyframe)

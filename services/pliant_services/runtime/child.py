@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pliant_services.runtime.host import ENDED_EARLY
+from pliant.exit_codes import DONE, INCOMPLETE
 
 _LAST_WORDS = 12  # lines of a service's log that are shown when it dies
 
@@ -30,7 +30,7 @@ class Child:
     @property
     def failed(self) -> bool:
         """Whether it has ended, and not as it should."""
-        return self.process.poll() not in (None, 0, ENDED_EARLY)
+        return self.process.poll() not in (None, DONE, INCOMPLETE)
 
     @property
     def crashed(self) -> bool:

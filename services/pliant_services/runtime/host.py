@@ -24,7 +24,6 @@ from pliant.messages import topics
 from pliant_services import processes
 from pliant_services.runtime.monitor import StatusMonitor
 
-ENDED_EARLY = 3  # exit code of a source that failed after its first frame
 _GRACE_S = 3.0
 _TOLD_MESSAGES = 128  # two seconds at 60 frames/s, and a few
 

@@ -13,12 +13,12 @@ import threading
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import zenoh
 
-from pliant.bus.links import END, ENVELOPE
+from pliant.bus.base import Received
+from pliant.bus.links import received
 from pliant.bus.peers import service_of
 from pliant.bus.session import LocalRouter
 from pliant.errors import BusError, MessageError, PliantError
@@ -44,15 +44,6 @@ class ServiceDiedError(PliantError):
     def __init__(self, text: str, *, crashed: bool) -> None:
         super().__init__(text)
         self.crashed = crashed
-
-
-@dataclass(frozen=True)
-class Heard:
-    """A message of a service, still encoded."""
-
-    sequence: int
-    is_end: bool
-    data: bytes
 
 
 class Fleet:
@@ -92,11 +83,11 @@ class Fleet:
                 self._ready.add(service_of(str(sample.key_expr)))
 
         def on_sample(sample: zenoh.Sample) -> None:
-            envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
-            if envelope[-1:] != b"\x00" or len(sample.payload) > status.max_bytes:
+            heard = received(status, sample)
+            if heard is None or heard.is_end:
                 return
             with suppress(MessageError):  # not from a service of ours
-                message = codec.decode(Status, sample.payload.to_bytes())
+                message = codec.decode(Status, heard.data)
                 if message.service in self._services:
                     self._frames[message.service] = message.frame
                     on_status(message)
@@ -127,14 +118,13 @@ class Fleet:
             time.sleep(_POLL_S)
 
     @contextmanager
-    def listening(self, topic: Topic, on_message: Callable[[Heard], None]) -> Generator[None]:
+    def listening(self, topic: Topic, on_message: Callable[[Received], None]) -> Generator[None]:
         """Hand on what a service says, as it comes, possibly twice; none is asked to wait."""
 
         def on_sample(sample: zenoh.Sample) -> None:
-            attachment = sample.attachment.to_bytes() if sample.attachment is not None else b""
-            if len(attachment) == ENVELOPE.size and len(sample.payload) <= topic.max_bytes:
-                sequence, _, kind = ENVELOPE.unpack(attachment)
-                on_message(Heard(sequence, kind == END, sample.payload.to_bytes()))
+            heard = received(topic, sample)
+            if heard is not None:
+                on_message(heard)
 
         key = f"pliant/{self.session}/{topic.key}"
         declared = self._router.declare_subscriber(key, on_sample)

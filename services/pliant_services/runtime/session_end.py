@@ -10,15 +10,14 @@ import time
 from contextlib import nullcontext
 from pathlib import Path
 
+from pliant.bus.peers import OVER_KEY
 from pliant.bus.session import open_session
-from pliant.bus.zenoh_bus import OVER_KEY
 from pliant.config import Config, config_yaml
 from pliant.errors import ResultError, SessionOverError, SourceLostError
+from pliant.exit_codes import DONE
 from pliant.files import make_folder, put_in_place, write_whole
 from pliant.recording import parts
 from pliant.results.folder import CONFIG_NAME, RECORDING_NAME, written
-from pliant.results.verdict import DONE, grade, summary
-from pliant.results.write import write_results
 from pliant_services.processes import BY_NAME, PROCESSES
 from pliant_services.runtime.host import ServiceOptions, run_service
 
@@ -122,6 +121,10 @@ def _check_recording(output: Path, state: Path | None) -> None:
 
 def _write_results(output: Path, config: Config) -> int:
     """Write the results beside the recording, and say what came of it."""
+    # They load the kernels, which a recorder that records has no use for.
+    from pliant.results.verdict import grade, summary
+    from pliant.results.write import write_results
+
     report = write_results(output.parent)
     write_whole(output.parent / CONFIG_NAME, config_yaml(config))
     for line in summary(report):

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import zenoh
 
 from pliant.bus.health import Health, health_key, read_health
-from pliant.bus.peers import service_of
+from pliant.bus.peers import STOP_KEY, service_of
 from pliant.bus.session import Identity, open_session
-from pliant.bus.zenoh_bus import STOP_KEY
 from pliant.errors import BusError
 
 _HEADINGS = (

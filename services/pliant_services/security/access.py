@@ -4,7 +4,7 @@ processes."""
 from typing import Any
 
 from pliant.bus.health import health_key
-from pliant.bus.zenoh_bus import OVER_KEY, STOP_KEY
+from pliant.bus.peers import OVER_KEY, STOP_KEY
 from pliant_services.processes import BY_NAME, PROCESSES, outputs_of
 from pliant_services.security.certificates import ROUTER
 

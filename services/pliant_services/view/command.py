@@ -12,13 +12,13 @@ from typing import Any, Protocol
 
 import zenoh
 
+from pliant.bus.links import received
 from pliant.bus.session import Identity, open_session
 from pliant.errors import MessageError, PliantError, ResultError
 from pliant.export.images import camera_of
 from pliant.export.models import MESH_NAME, draw
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic, by_key
-from pliant.messages.types import StreamEnd
 from pliant.recording import parts
 from pliant.recording.reader import Recording
 from pliant.results.folder import RECORDING_NAME, files_read, keep_apart, running_session
@@ -26,7 +26,6 @@ from pliant.viewers.canvas import Canvas
 from pliant.viewers.drawn_scene import Scene
 from pliant.viewers.rerun import RerunCanvas, Where
 
-_ENVELOPE_BYTES = 17
 _WAITING = 512  # messages between the network and the drawing; the oldest give way
 _WAITING_BYTES = 256 << 20
 _ASK_S = 0.5
@@ -111,17 +110,10 @@ def follow(
     waiting = Backlog(_WAITING, _WAITING_BYTES)
 
     def on_sample(sample: zenoh.Sample) -> None:
-        envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
         topic = by_key(str(sample.key_expr).removeprefix(prefix))
-        if (
-            topic is None
-            or len(envelope) != _ENVELOPE_BYTES
-            or len(sample.payload) > topic.max_bytes
-        ):
-            return
-        kind = topics.STREAM_END if envelope[-1] else topic
-        sequence = int.from_bytes(envelope[:8], "little")
-        waiting.put(Arrived(kind, sequence, time.monotonic_ns(), sample.payload.to_bytes()))
+        heard = None if topic is None else received(topic, sample)
+        if heard is not None and not heard.is_end:
+            waiting.put(Arrived(heard.topic, heard.sequence, time.monotonic_ns(), heard.data))
 
     with open_session(endpoints, identity) as connection:
         held: list[Any] = [
@@ -203,8 +195,7 @@ def _draw_while(canvas: Canvas, waiting: Backlog, goes_on: Callable[[], bool]) -
             message = codec.decode(topic.message, arrived.data, max_bytes=topic.max_bytes)
         except MessageError:
             continue
-        if not isinstance(message, StreamEnd):
-            scene.take(topic, message, arrived.sequence, arrived.arrived_ns)
+        scene.take(topic, message, arrived.sequence, arrived.arrived_ns)
     scene.close()
     if scene.missed_updates:
         print(

@@ -14,9 +14,9 @@ from pliant.algorithms.geometry import pose_to_matrix
 from pliant.api.result import Result
 from pliant.config import settings_of
 from pliant.errors import ResultError
+from pliant.exit_codes import DONE, INCOMPLETE
 from pliant.recording import parts
 from pliant.results.folder import RECORDING_NAME, folder_name
-from pliant.results.verdict import DONE, INCOMPLETE
 
 OnFrame = Callable[[int, F64 | None], object]
 """Is told the number of a frame and its pose T_world_camera (4, 4); None where it has none."""

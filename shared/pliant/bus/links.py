@@ -185,6 +185,18 @@ class OutLink:
             shared.changed.notify_all()
 
 
+def received(topic: Topic, sample: zenoh.Sample) -> Received | None:
+    """What somebody hears who only listens: possibly twice, and not looked into.
+
+    None where it is no message of a bus.
+    """
+    envelope = sample.attachment.to_bytes() if sample.attachment is not None else b""
+    if len(envelope) != ENVELOPE.size or len(sample.payload) > topic.max_bytes:
+        return None
+    sequence, _, kind = ENVELOPE.unpack(envelope)
+    return Received(topic, sequence, sequence, kind == END, sample.payload.to_bytes())
+
+
 def first_arrived(links: Sequence[InLink]) -> InLink:
     """The link whose first waiting message arrived first."""
     return min((e for e in links if e.box.waiting), key=lambda e: e.box.waiting[0].arrival)

@@ -19,6 +19,9 @@ WIRE_VERSION = 5
 SCHEMA = codec.schema_hash([topic.message for topic in (*TOPICS, status("*"))])
 """Of what messages hold: with other fields a message would be read, and not say the same."""
 
+STOP_KEY, OVER_KEY = "control/stop", "control/over"
+"""What is said to all of a session, without its prefix: end it, and that it is over."""
+
 _MOST_STRANGERS = 16
 
 _TOKEN = re.compile(r"/ready/([^/]+)/(\d{1,20})/(\d{1,9})/([^/]{1,60})$")

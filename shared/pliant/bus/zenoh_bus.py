@@ -31,7 +31,7 @@ from pliant.bus.base import Received, Window
 from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.bus.keeper import Keeper
 from pliant.bus.links import DATA, END, InLink, OutLink, Shared
-from pliant.bus.peers import Peers, token_key
+from pliant.bus.peers import OVER_KEY, STOP_KEY, Peers, token_key
 from pliant.bus.session import Identity, open_session
 from pliant.bus.waits import Waits
 from pliant.errors import MessageError
@@ -39,9 +39,6 @@ from pliant.messages import codec
 from pliant.messages.topics import Topic
 from pliant.messages.types import Header, StreamEnd
 from pliant.state import load_state, save_state
-
-STOP_KEY = "control/stop"
-OVER_KEY = "control/over"
 
 
 class ZenohBus:

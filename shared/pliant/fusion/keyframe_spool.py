@@ -2,7 +2,6 @@
 
 import tempfile
 from dataclasses import dataclass
-from types import TracebackType
 
 import numpy as np
 
@@ -35,12 +34,7 @@ class KeyframeSpool:
     def __enter__(self) -> "KeyframeSpool":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
     @property

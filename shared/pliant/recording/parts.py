@@ -3,7 +3,6 @@
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 
 from pliant.errors import RecordingError
 from pliant.files import make_folder
@@ -129,13 +128,8 @@ class RollingWriter:
     def __enter__(self) -> "RollingWriter":
         return self
 
-    def __exit__(
-        self,
-        error_type: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._writer.__exit__(error_type, error, traceback)
+    def __exit__(self, error_type: type[BaseException] | None, *_: object) -> None:
+        self._writer.__exit__(error_type)
 
     def _part(self) -> RecordingWriter:
         if not self._in_parts:

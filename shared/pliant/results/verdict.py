@@ -4,12 +4,12 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from pliant.exit_codes import DONE, INCOMPLETE
 from pliant.messages.types import BROKEN, DROPPED, MASKED
 from pliant.results.report import broken_images
 from pliant.results.surfels import surfel_summary
 from pliant.wording import counted
 
-DONE, INCOMPLETE = 0, 3
 _NAMED = 10  # broken images beside the first
 _OF_SOURCE = re.compile(r"frame (\d+) of the source: ")
 

@@ -16,6 +16,7 @@ from pliant.export.images import camera_of
 from pliant.recording.reader import Recording
 from pliant.results.known_scale import Scale
 from pliant.results.run import Run, seen_by_keyframes
+from pliant.wording import counted
 
 _LEAST_DEPTHS = 100
 _TO_SIGMA = 1.4826
@@ -74,7 +75,7 @@ def from_depth(recording: Recording, run: Run, source: str) -> Scale:
     logs = np.log(ratios)
     middle = float(np.median(logs))
     sigma = _TO_SIGMA * float(np.median(np.abs(logs - middle)))
-    told = f"depth maps of {len(logs)} {'keyframe' if len(logs) == 1 else 'keyframes'}"
+    told = f"depth maps of {counted(len(logs), 'keyframe')}"
     return Scale(metres_per_unit=float(np.exp(middle)), sigma=sigma, source=told)
 
 

@@ -14,6 +14,7 @@ from pliant.export.posed_images import IdealCamera
 from pliant.recording.reader import Recording
 from pliant.results.known_scale import Scale
 from pliant.results.run import Run
+from pliant.wording import counted
 
 _DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36H11")
 _LEAST_VIEWS = 3
@@ -47,10 +48,8 @@ def from_marker(recording: Recording, run: Run, metres: float) -> Scale:
         )
     factors, spreads = np.array(told).T
     sigma = float(np.median(spreads))
-    count = f"{len(told)} {'marker' if len(told) == 1 else 'markers'}"
-    return Scale(
-        metres_per_unit=float(np.median(factors)), sigma=sigma, source=f"{count} of {metres:g} m"
-    )
+    source = f"{counted(len(told), 'marker')} of {metres:g} m"
+    return Scale(metres_per_unit=float(np.median(factors)), sigma=sigma, source=source)
 
 
 def _markers(recording: Recording, ideal: IdealCamera) -> dict[_Marker, dict[int, F32]]:

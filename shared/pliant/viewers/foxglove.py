@@ -16,7 +16,6 @@ they were known at the time.  Needs its definitions: ``pip install 'pliant[foxgl
 import importlib
 from collections import deque
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -72,12 +71,7 @@ class FoxgloveFile:
     def __enter__(self) -> "FoxgloveFile":
         return self
 
-    def __exit__(
-        self,
-        error_type: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         try:
             self._writer.finish()
             self._file.close()

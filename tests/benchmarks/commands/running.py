@@ -173,11 +173,18 @@ def slow_mapping(
 
 
 @app.command()
-def ablation(sources: Sources) -> None:
-    """What each addition to the paper is worth.
+def ablation(
+    sources: Sources,
+    *,
+    only: Annotated[
+        list[str] | None, typer.Option(help="This switch, beside everything on; can be repeated.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each.")] = 1,
+) -> None:
+    """What each addition to the paper is worth: final / causal ATE.
 
     scripts/bench ablation built-in:room path/to/sequence
     """
     from benchmarks.ablation import measure
 
-    show(measure(sources))
+    show(measure(sources, only=only or [], seeds=seeds))

@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64
-from pliant.algorithms.bundle.block_product import subtract_product3
 from pliant.algorithms.bundle.dense_layout import BLOCK
 from pliant.algorithms.bundle.packed_layout import Places, Slots
 from pliant.algorithms.bundle.projection import (
@@ -43,6 +42,7 @@ from pliant.algorithms.bundle.projection import (
     residual,
     robust_cost,
 )
+from pliant.algorithms.bundle.reduced import subtract_product3
 from pliant.compiler.kernel import fast_kernel
 
 RECORD, FACTOR = 8, 9

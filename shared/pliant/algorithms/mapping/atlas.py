@@ -18,17 +18,15 @@ from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.kept_map import Origin, keep, spans_of, take_in
-from pliant.algorithms.mapping.known_places import KnownPlaces
-from pliant.algorithms.mapping.lens_change import see_by
+from pliant.algorithms.mapping.known_places import KnownPlaces, Meetings, join
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
-from pliant.algorithms.mapping.meetings import Meetings, join
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import Recognised
-from pliant.algorithms.mapping.segment import Moved, Segment
+from pliant.algorithms.mapping.segment import Moved, Segment, see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_guess
 from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held
-from pliant.algorithms.places.features import describe
+from pliant.algorithms.places import describe
 
 
 class Atlas:

@@ -6,10 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.lens_change import see_by
 from pliant.algorithms.mapping.map_store import PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters, WindowParameters
-from pliant.algorithms.mapping.segment import Segment
+from pliant.algorithms.mapping.segment import Segment, see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.thinning import observations_of, thin
 

@@ -1,12 +1,22 @@
-"""The pose of a frame in the map: from the tracks that it shares with it, then from points that are
-found again, then adjusted together with the window (VITAMIN-E section 3.2, Eq. 6)."""
+"""The pose of a frame in the map, and whether what supports it is the world.
+
+The pose comes from the tracks that the frame shares with the map, then from points that are found
+again, then it is adjusted together with the window (VITAMIN-E section 3.2, Eq. 6).
+
+A few dozen inliers always agree with some motion, and those of a large moving object agree well.
+What does not belong to them shows it: parts of the image where tracks live on and no point of the
+map is, or where no depth lets tracks be where the pose has them.  They are counted by area, so that
+the texture of a thing does not decide how large it is.
+"""
 
 import dataclasses
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.directions import (
     Spread,
@@ -15,15 +25,31 @@ from pliant.algorithms.mapping.directions import (
     placed_candidates,
     spread_of,
 )
-from pliant.algorithms.mapping.localisation import Localisation, locate, refine
+from pliant.algorithms.mapping.localisation import (
+    Localisation,
+    Motion,
+    locate,
+    prove,
+    recover,
+    refine,
+)
 from pliant.algorithms.mapping.map_store import MAPPED, UNLINKED, Observations
 from pliant.algorithms.mapping.observation_table import reprojection_errors
+from pliant.algorithms.mapping.parameters import SupportParameters
 from pliant.algorithms.mapping.reacquisition import reacquire
-from pliant.algorithms.mapping.recovery import Motion, prove, recover
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.support import Support, support_of
 from pliant.algorithms.tracks import FrameExtrema, FrameTracks
+from pliant.compiler.kernel import kernel
+
+_COLUMNS, _LINES = 8, 6
+"""Cells of the image: each is for a pose, against it, or shows too little."""
+
+_LEAST_SEEN = 5
+"""Tracks without which a cell says nothing."""
+
+_AGAINST = 0.2
+"""A cell is against a pose with fewer inliers than this share of its tracks."""
 
 _AGREEING = 0.5
 """Share of the points of the map that place a frame alone and still fit once candidates help: with
@@ -38,6 +64,62 @@ _TELLING = 500
 _FEW, _FIRM = 0.05, 0.2
 """Of the points that placed the last frame: where a film is cut, 0.3 to 2 % agree on a pose by
 chance, and 9 % where the views overlap; the fastest turns with blur leave 11 to 20 %."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Support:
+    """What there is for a pose.
+
+    inliers: points where the pose shows them.   share: of the points seen.   contrary: share of the
+    cells with tracks in which hardly any point is where the pose shows it.   spread: standard
+    deviation of the inliers as a share of width or height, whichever is less.
+    """
+
+    inliers: int
+    share: float
+    contrary: float
+    spread: float
+
+
+def support_of(
+    points_px: F32, inliers: BoolArray, telling_px: F32, camera: PinholeCamera
+) -> Support:
+    """points_px: (N, 2) of the points seen, of which ``inliers`` (N,) fit.   telling_px: (M, 2) of
+    the tracks that belong to points if the pose is right, or contradict it.
+    """
+    count = int(np.count_nonzero(inliers))
+    fitting = points_px[inliers]
+    width, height = camera.width, camera.height
+    supported, tracks = _per_cell(fitting, width, height), _per_cell(telling_px, width, height)
+    telling = tracks >= _LEAST_SEEN
+    size = np.array([width, height])
+    return Support(
+        inliers=count,
+        share=count / max(len(points_px), 1),
+        contrary=float((supported < _AGAINST * tracks)[telling].mean()) if telling.any() else 0.0,
+        spread=float(np.min(fitting.std(axis=0) / size)) if count else 0.0,
+    )
+
+
+def doubt(support: Support, parameters: SupportParameters) -> str:
+    """Why the pose may not be that of the camera in the world; "" where nothing speaks for it."""
+    if support.contrary > parameters.max_contrary_share:
+        return f"doubtful: {support.contrary:.0%} of the image moves otherwise"
+    if support.share < parameters.min_share:
+        return f"doubtful: {support.share:.0%} of the points seen are where the pose has them"
+    if support.spread < parameters.min_spread:
+        return "doubtful: all that is seen of the map lies in one place of the image"
+    return ""
+
+
+@kernel
+def _per_cell(points_px: F32, width: int, height: int) -> I64:
+    counts = np.zeros(_COLUMNS * _LINES, np.int64)
+    for i in range(points_px.shape[0]):
+        column = min(max(int(points_px[i, 0] * _COLUMNS / width), 0), _COLUMNS - 1)
+        line = min(max(int(points_px[i, 1] * _LINES / height), 0), _LINES - 1)
+        counts[line * _COLUMNS + column] += 1
+    return counts
 
 
 class Located(NamedTuple):

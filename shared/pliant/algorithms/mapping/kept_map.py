@@ -22,7 +22,7 @@ from pliant.algorithms.mapping.map_store import MAPPED, PATCH_SIDE, Keyframe, Po
 from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.places.features import Features
+from pliant.algorithms.places import Features
 
 
 class Origin(NamedTuple):

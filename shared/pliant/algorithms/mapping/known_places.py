@@ -1,19 +1,32 @@
-"""The keyframes of all segments as places: which of them an image shows, or a keyframe comes to."""
+"""The keyframes of all segments as places: which of them an image shows, or a keyframe comes to.
 
-from collections.abc import Iterable, Iterator
+Within a segment.  Where the map has not drifted by more than a few pixels, points are found again
+by where they are, and the keyframes share them.  A place that looks like a new keyframe without
+sharing points with it has drifted away, or only looks alike.  One that is the same goes on being
+so: keyframes that follow each other must tell of the same drift, so that what is found at one is
+believed when it is told twice.
+
+Between segments.  A segment begins where the camera was lost for long.  Where it comes to a place
+of an earlier one, keyframes tell how the two worlds lie to each other, as they do of loops; one is
+moved into the other, and what is left between them the loops take out that told so.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, U8
+from pliant.algorithms.arrays import F32, F64, U8
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView
-from pliant.algorithms.geometry import move_by_similarity
+from pliant.algorithms.geometry import matrix_to_pose, move_by_similarity, so3_log
 from pliant.algorithms.kept_keyframe import KeptKeyframe
+from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.kept_map import features_for
 from pliant.algorithms.mapping.loops import Loop
-from pliant.algorithms.mapping.map_store import Keyframe, PointRows
-from pliant.algorithms.mapping.meetings import Meetings
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import (
     Place,
@@ -21,17 +34,179 @@ from pliant.algorithms.mapping.relocalisation import (
     relocalise,
     rest_is_elsewhere,
 )
-from pliant.algorithms.mapping.revisits import Revisits
-from pliant.algorithms.mapping.segment import Segment
+from pliant.algorithms.mapping.same_place import same_place
+from pliant.algorithms.mapping.segment import Moved, Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.places.features import Features, describe
-from pliant.algorithms.places.index import PlaceIndex
+from pliant.algorithms.mapping.whole_map import held
+from pliant.algorithms.places import Features, PlaceIndex, describe
+
+_WITHIN = 3
+"""Keyframes within which another one must tell the same."""
+
+_SAME_TURN_RAD = np.radians(2.0)
+_SAME_SHIFT = 0.05
+"""Drifts are the same within this turn, and this share of the depth: of scale, too."""
+
+_TRIES = 3
+"""Places of a segment that are compared with a keyframe: none of them may contradict."""
 
 _PLACES = 5
 """That look most like a frame are looked at more closely."""
 
 _ELSEWHERE = 2
 """Places more where one of these is proved: what looks the same is often seen by many keyframes."""
+
+
+@dataclass(kw_only=True)
+class Revisits:
+    """waiting: what one keyframe has told, until another one tells the same."""
+
+    waiting: list[Loop] = field(default_factory=list[Loop])
+
+    def look(
+        self,
+        new: Place,
+        places: Iterable[Place],
+        points: PointRows,
+        camera: PinholeCamera,
+        parameters: MappingParameters,
+        tries: int = 1,
+        elsewhere: Iterable[Place] = (),
+    ) -> list[Loop]:
+        """The loops that a new keyframe proves: with a place that looks like it, if any.
+
+        places: of one segment that look like it, the most alike first.   tries: how many of them
+        are asked; if they contradict each other, what is alike in both proves neither.
+        elsewhere: others, which are asked as well where one of these is proved.
+        """
+        keyframe = new.keyframe
+        mine = np.zeros(len(points.state), np.bool_)
+        mine[keyframe.rows] = True
+        mine &= points.state == MAPPED
+        self.waiting = [loop for loop in self.waiting if keyframe.id - loop.new <= _WITHIN]
+        window = {k.id for k in new.segment[-parameters.window.keyframes :]}
+        # Its own, so that no frame is located otherwise because something was looked at here.
+        generator = np.random.default_rng(keyframe.id)
+        least, told = parameters.localisation.min_inliers, list[Loop]()
+
+        def ask(some: Iterable[Place]) -> None:
+            for old in some:
+                found = same_place(old, new, points, camera, parameters, generator)
+                if isinstance(found, str):
+                    continue
+                rows, S_old_new = found.rows[found.rows[:, 0] != found.rows[:, 1]], found.S_old_new
+                ids = points.ids[rows]
+                told.append(Loop(old.keyframe.id, keyframe.id, S_old_new, rows, ids))
+
+        ask(
+            islice(
+                (
+                    old
+                    for old in places
+                    if old.keyframe.id not in window and mine[old.keyframe.rows].sum() < least
+                ),
+                tries,
+            )
+        )
+        if told:
+            ask(elsewhere)
+        loop = max(told, key=lambda each: len(each.rows), default=None)
+        if loop is None or not all(_agree(each, loop, new, points) for each in told):
+            return []
+        others = [each for each in self.waiting if each.new != keyframe.id]
+        agreeing = [each for each in others if _agree(each, loop, new, points)]
+        self.waiting = [] if agreeing else [*self.waiting, loop]
+        return [*agreeing, loop] if agreeing else []
+
+
+def _agree(one: Loop, other: Loop, new: Place, points: PointRows) -> bool:
+    """Whether two loops take what the new keyframe sees to the same place."""
+    keyframe = new.keyframe
+    between: F64 = np.linalg.inv(other.S_old_new) @ one.S_old_new
+    scale = float(np.cbrt(np.linalg.det(between[:3, :3])))
+    turn = float(np.linalg.norm(so3_log(between[:3, :3] / scale)))
+    centre = keyframe.T_world_camera[:3, 3]
+    rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
+    if len(rows) == 0:
+        return False
+    depth = float(np.median((points.xyz[rows] - centre) @ keyframe.T_world_camera[:3, 2]))
+    shift = float(np.linalg.norm(between[:3, :3] @ centre + between[:3, 3] - centre))
+    close = shift < _SAME_SHIFT * depth and abs(np.log(scale)) < _SAME_SHIFT
+    return close and turn < _SAME_TURN_RAD
+
+
+@dataclass(kw_only=True)
+class Meetings:
+    """Of the segment that the camera is in with earlier ones.
+
+    told: by each of those, what awaits a second keyframe.   proved: loops that have been confirmed,
+    from places of earlier segments to keyframes of this one, until the segments are joined.
+    """
+
+    told: dict[int, Revisits] = field(default_factory=dict[int, Revisits])
+    proved: list[Loop] = field(default_factory=list[Loop])
+
+    def look(
+        self,
+        new: Place,
+        places: Iterable[Place],
+        elsewhere: Callable[[int], Iterable[Place]],
+        points: PointRows,
+        camera: PinholeCamera,
+        parameters: MappingParameters,
+        contradicts: Callable[[Loop], bool],
+    ) -> None:
+        """Compare a new keyframe with places of earlier segments, the most alike first.
+
+        elsewhere: others of a segment, which must not tell otherwise.   contradicts: whether the
+        keyframe's image does, to what is proved.
+        """
+        by_segment: dict[int, list[Place]] = {}
+        for place in places:
+            by_segment.setdefault(place.keyframe.segment, []).append(place)
+        for segment, some in by_segment.items():
+            told = self.told.setdefault(segment, Revisits())
+            proved = told.look(
+                new, some, points, camera, parameters, tries=_TRIES, elsewhere=elsewhere(segment)
+            )
+            if not any(contradicts(loop) for loop in proved if loop.new == new.keyframe.id):
+                self.proved += proved
+
+
+def join(
+    active: ActiveMap,
+    earlier: Segment,
+    loops: list[Loop],
+    spans: list[tuple[int, int]],
+    calibration: SelfCalibration,
+) -> Moved:
+    """Make two segments one, in the world of the older one: its first keyframe goes on holding it.
+
+    loops: from the earlier one to the one that goes on.   spans: as of ``held``.   calibration: of
+    the segment that goes on.
+    """
+    goes_on = active.segment
+    to_earlier = max(loops, key=lambda loop: len(loop.rows)).S_old_new
+    active_moves = goes_on.id > earlier.id
+    moving, staying = (goes_on, earlier) if active_moves else (earlier, goes_on)
+    gone, id = moving.id, staying.id
+    S = to_earlier if active_moves else np.asarray(np.linalg.inv(to_earlier), np.float64)
+    scale = float(np.cbrt(np.linalg.det(S[:3, :3])))
+    turned = S.copy()
+    turned[:3, :3] /= scale
+    first = min(number for number, of in spans if of == gone)
+    move = MapMoves(
+        keyframe_ids=np.array([first], np.int64),
+        moves=np.concatenate([matrix_to_pose(turned), [scale]])[None],
+    )
+    moves = held(move, spans, gone)
+    (active if active_moves else earlier).move(moves)
+    moving.inverse_distance /= scale
+    goes_on.take_in(earlier, id)
+    if calibration.readout:
+        goes_on.unroll(earlier.keyframes, calibration)
+    told = tuple((loop.old, loop.new) for loop in loops)
+    return Moved(S if active_moves else np.eye(4), moves, gone, told)
 
 
 @dataclass(kw_only=True)

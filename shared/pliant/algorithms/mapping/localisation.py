@@ -1,22 +1,43 @@
-"""The pose of a frame from the points of the map that it sees."""
+"""The pose of a frame from the points of the map that it sees, and where no track leads to them.
 
-from dataclasses import dataclass
+A camera that is covered, blurred or dark for a moment goes on moving.  Where it is afterwards lies
+the farther from any prediction the longer that took, so that points are looked for in a radius that
+grows with the time since the last pose.  Of the many maxima in it a point takes the one whose patch
+fits best; P3P and RANSAC find the pose that the good ones among these agree on, and all points that
+are found where it shows them must prove it.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from pliant.algorithms.absolute_pose import pose_by_ransac, truncated_cost
-from pliant.algorithms.arrays import F32, F64, BoolArray
+from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
 from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.subspace import refine_pose
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse
+from pliant.algorithms.geometry import inverse, move_by_similarity, so3_exp, so3_log
 from pliant.algorithms.mapping.directions import Spread, refine_pose_spread
-from pliant.algorithms.mapping.parameters import LocalisationParameters
+from pliant.algorithms.mapping.map_store import PointRows
+from pliant.algorithms.mapping.parameters import (
+    LocalisationParameters,
+    MappingParameters,
+    RecoveryParameters,
+)
+from pliant.algorithms.mapping.reacquisition import MaximaGrid, match_widely, reacquire
+from pliant.algorithms.mapping.rolling_shutter import motion_between
 
 _COARSE_SIGMAS = 4.0
 """The kernel is first this many times wider, so that a poor prediction still converges."""
 
 _PREDICTION_GATE_PX = 20.0
+
+_SPEEDING_UP = 0.5
+"""Share of its last acceleration that a camera is taken to keep: all of it lets noise grow."""
+
+_NEAR = 0.3
+"""Share of the radius that is searched first: mostly enough, and far less to confuse."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,3 +124,179 @@ def _cost(T_world_camera: F64, points_world: F64, points_n: F64, gate: float) ->
         np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), points_world, points_n,
         gate,
     )  # fmt: skip
+
+
+@dataclass(kw_only=True)
+class Motion:
+    """How the camera moved last: T_world_camera (4, 4) of two frames, the newer one last.
+
+    inliers: points that support the newer one, as far as that is known.
+    """
+
+    frames: tuple[int, int]
+    stamps_ns: tuple[int, int]
+    poses: tuple[F64, F64]
+    inliers: int = 0
+
+    @staticmethod
+    def at(frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
+        """Of a camera of which one pose is known."""
+        twice = (T_world_camera, T_world_camera)
+        return Motion(frames=(frame, frame), stamps_ns=(stamp_ns, stamp_ns), poses=twice)
+
+    def then(self, frame: int, stamp_ns: int, T_world_camera: F64, inliers: int = 0) -> "Motion":
+        """The motion after one more pose."""
+        return Motion(
+            frames=(self.frames[1], frame),
+            stamps_ns=(self.stamps_ns[1], stamp_ns),
+            poses=(self.poses[1], T_world_camera),
+            inliers=inliers,
+        )
+
+    def moved(self, S: F64) -> "Motion":
+        """The motion after the world has moved by a similarity (4, 4)."""
+        before, last = (move_by_similarity(S, pose) for pose in self.poses)
+        return replace(self, poses=(before, last))
+
+    def velocity(self) -> F64:
+        """(6,) between the two, as of ``Path.motions``."""
+        frames = max(1, self.frames[1] - self.frames[0])
+        return motion_between(*self.poses, self.poses[1]) / frames
+
+    def velocity_at(self, frame: int, T_world_camera: F64) -> F64:
+        """(6,) at a frame that follows with this pose."""
+        between = self.then(frame, 0, T_world_camera).velocity()
+        if self.frames[0] == self.frames[1]:
+            return between
+        # The velocity that was between the frames has changed since.
+        share = (frame - self.frames[1]) / (frame - self.frames[0])
+        return between + _SPEEDING_UP * share * (between - self.velocity())
+
+    def interval_s(self) -> float:
+        """Seconds between the two."""
+        return 1e-9 * (self.stamps_ns[1] - self.stamps_ns[0])
+
+    def lost_s(self, stamp_ns: int) -> float:
+        """Seconds since the last pose."""
+        return 1e-9 * (stamp_ns - self.stamps_ns[1])
+
+    def predictions(self, stamp_ns: int) -> list[F64]:
+        """T_world_camera by constant velocity, and that of a camera that has stopped since."""
+        before, last = self.poses
+        elapsed = self.stamps_ns[1] - self.stamps_ns[0]
+        if elapsed <= 0:
+            return [last]
+        share = (stamp_ns - self.stamps_ns[1]) / elapsed
+        step = inverse(before) @ last
+        moved = np.eye(4)
+        moved[:3, :3] = so3_exp(share * so3_log(step[:3, :3]))
+        moved[:3, 3] = share * step[:3, 3]
+        return [last @ moved, last]
+
+
+def search_radius_px(lost_s: float, camera: PinholeCamera, parameters: RecoveryParameters) -> float:
+    """How far from its prediction a point may be, px, this long after the last pose."""
+    grown = parameters.radius_share + parameters.growth_share_per_s * lost_s
+    return camera.width * min(grown, parameters.max_radius_share)
+
+
+def recover(
+    motion: Motion,
+    stamp_ns: int,
+    rows: I32,
+    points: PointRows,
+    maxima: F32,
+    grey: U8,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    generator: np.random.Generator,
+) -> F64 | None:
+    """T_world_camera of a frame that no track leads to, None where the image does not prove one.
+
+    motion: before.   stamp_ns: of the frame.   rows: of points that it may show.   maxima: (M, 3)
+    of the frame.   grey: (H, W).
+    """
+    predictions = motion.predictions(stamp_ns)
+    radius_px = search_radius_px(motion.lost_s(stamp_ns), camera, parameters.recovery)
+    for radius in (_NEAR * radius_px, radius_px):
+        grid = MaximaGrid.build(maxima, camera.width, camera.height, radius)
+        for prediction in predictions:
+            T_world_camera = look_about(
+                prediction, rows, points, grid, grey, radius, camera, parameters, generator
+            )
+            if T_world_camera is None:
+                continue
+            proved = prove(
+                T_world_camera, rows, points, maxima, grey, camera, parameters,
+                parameters.recovery.min_agreement,
+            )  # fmt: skip
+            if proved is not None:
+                return proved.T_world_camera
+    return None
+
+
+def look_about(
+    T_world_camera: F64,
+    rows: I32,
+    points: PointRows,
+    grid: MaximaGrid,
+    grey: U8,
+    radius_px: float,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    generator: np.random.Generator,
+) -> F64 | None:
+    """The pose that points agree on which are looked for about where a pose shows them.
+
+    rows: of the points.   grid: the maxima of the image, for this radius.
+    """
+    own = parameters.recovery
+    limits = parameters.localisation.model_copy(update={"ransac_samples": own.ransac_samples})
+    found, points_px = match_widely(
+        T_world_camera, rows, points, grid, grey, camera, radius_px, own.points,
+        parameters.reacquisition.min_zncc,
+    )  # fmt: skip
+    if len(found) < own.min_agreeing:
+        return None
+    located = locate([T_world_camera], points.xyz[found], points_px, camera, limits, generator)
+    return located.T_world_camera if located.inliers.sum() >= own.min_agreeing else None
+
+
+class Proved(NamedTuple):
+    """A pose, and the rows of the points that prove it."""
+
+    T_world_camera: F64
+    rows: I32
+
+
+def prove(
+    T_world_camera: F64,
+    rows: I32,
+    points: PointRows,
+    maxima: F32,
+    grey: U8,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    min_agreement: float,
+) -> Proved | None:
+    """The pose refined by all points found where it shows them, None if these are too few of them.
+
+    min_agreement: least share of the points found that support it, see ``RecoveryParameters``.
+    Wrong poses find points as well: wherever a maximum is near and its patch looks alike.
+    """
+    found = reacquire(T_world_camera, rows, points, maxima, grey, camera, parameters.reacquisition)
+    if len(found.rows) < parameters.localisation.min_inliers:
+        return None
+    located = refine(
+        T_world_camera, points.xyz[found.rows], found.points_px, camera, parameters.localisation,
+        near=True,
+    )  # fmt: skip
+    inliers = int(located.inliers.sum())
+    enough = max(
+        parameters.localisation.min_inliers,
+        parameters.recovery.min_support_share * len(found.visible),
+        min_agreement * len(found.rows),
+    )
+    if inliers < enough:
+        return None
+    return Proved(located.T_world_camera, found.rows[located.inliers])

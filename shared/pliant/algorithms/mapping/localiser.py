@@ -15,17 +15,23 @@ from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
-from pliant.algorithms.mapping.frame_pose import at_once, find_again, localise
+from pliant.algorithms.mapping.frame_pose import (
+    Support,
+    at_once,
+    doubt,
+    find_again,
+    localise,
+    support_of,
+)
 from pliant.algorithms.mapping.kept_map import known_camera, take_in
 from pliant.algorithms.mapping.known_places import KnownPlaces
+from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
-from pliant.algorithms.mapping.recovery import Motion
 from pliant.algorithms.mapping.relocalisation import Recognised, is_same_pose
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.support import Support, doubt, support_of
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracks import FrameExtrema

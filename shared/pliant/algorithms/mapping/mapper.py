@@ -21,21 +21,21 @@ from pliant.algorithms.mapping.frame_pose import (
     adjust,
     at_once,
     directions_of,
+    doubt,
     find_again,
     localise,
     stand,
 )
 from pliant.algorithms.mapping.kept_map import known_camera
+from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import EarlierPose, placed_again
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
-from pliant.algorithms.mapping.recovery import Motion
 from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of
 from pliant.algorithms.mapping.start import Start
-from pliant.algorithms.mapping.support import doubt
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses, returned_poses
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages

@@ -1,9 +1,9 @@
 """Two kept maps that show the same places become one.
 
 The second one is taken as a session whose segments all lie before us: its keyframes are compared
-with the places of the first map as those of a new segment are (``meetings``), what is proved moves
-it into the world of the first one, and what is left between the two its loops take out, with the
-adjustment of the whole map (``loops``, ``whole_map``).
+with the places of the first map as those of a new segment are (``known_places``), what is proved
+moves it into the world of the first one, and what is left between the two its loops take out, with
+the adjustment of the whole map (``loops``, ``whole_map``).
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,10 +20,9 @@ from pliant.algorithms.mapping.kept_map import (
     spans_of,
     take_in,
 )
-from pliant.algorithms.mapping.known_places import KnownPlaces
+from pliant.algorithms.mapping.known_places import KnownPlaces, join
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.map_store import Keyframe, PointRows
-from pliant.algorithms.mapping.meetings import join
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration

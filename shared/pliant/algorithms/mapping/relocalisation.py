@@ -17,13 +17,11 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.mapping.covisibility import most_shared, rows_of
-from pliant.algorithms.mapping.localisation import refine
+from pliant.algorithms.mapping.localisation import look_about, prove, refine
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
-from pliant.algorithms.mapping.recovery import look_about, prove
-from pliant.algorithms.places.features import Features, match
-from pliant.algorithms.places.repetition import repeated_share
+from pliant.algorithms.places import Features, match, repeated_share
 
 _NEAR_SHARE = 0.0125
 """Of the image's width: a corner is as far as the nearest point of the map within."""

@@ -1,21 +1,163 @@
 """Two keyframes that look alike: whether they show one place, and how their maps lie to each other.
 
 For loops and for segments that meet.  Corners propose a similarity; the map's own points count.
+
+Of pairs of points most may be wrong.  Three pairs give a similarity in closed form (Umeyama, PAMI
+1991); RANSAC (Fischler and Bolles 1981) takes the one under which most points are seen where both
+cameras saw them, as ORB-SLAM does for loops (Mur-Artal et al., T-RO 2015, section VII.B).  Depths
+of a map are far less certain than directions, so errors are counted, and then minimised, in the
+images and not in space.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32
+from pliant.algorithms.arrays import F32, F64, I32, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.geometry import hat, inverse, so3_exp, transform
 from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
 from pliant.algorithms.mapping.relocalisation import Place, corners_in_map, repeats
-from pliant.algorithms.places.features import match
-from pliant.algorithms.places.similarity import Pairs, refine_similarity, similarity_by_ransac
+from pliant.algorithms.places import match
+
+_ROUNDS = 10
+_MOST = 1.0
+"""Turn and change of the log scale within one round."""
+
+_MIN_DEPTH = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pairs:
+    """Points that may be the same, as each of two cameras has them.
+
+    xyz_a, xyz_b: (N, 3) in the frame of the camera, whose maps differ in scale.   seen_a, seen_b:
+    (N, 2) where it saw them, on the plane z = 1.
+    """
+
+    xyz_a: F64
+    xyz_b: F64
+    seen_a: F64
+    seen_b: F64
+
+    def of(self, rows: BoolArray) -> "Pairs":
+        """Some of them."""
+        return Pairs(
+            xyz_a=self.xyz_a[rows], xyz_b=self.xyz_b[rows], seen_a=self.seen_a[rows],
+            seen_b=self.seen_b[rows],
+        )  # fmt: skip
+
+
+def similarity_by_ransac(
+    pairs: Pairs, generator: np.random.Generator, *, gate: float, samples: int
+) -> tuple[F64, BoolArray] | None:
+    """S_a_b (4, 4), ``xyz_a ~ S_a_b xyz_b``, and which pairs agree with it; None for fewer than
+    four pairs, or where fewer than four agree.
+
+    gate: largest error of a pair in either image, on the plane z = 1.
+    """
+    count = len(pairs.xyz_a)
+    if count < 4:
+        return None
+    triples = generator.integers(0, count, (samples, 3))
+    S = _closed_form(pairs.xyz_b[triples], pairs.xyz_a[triples])
+    if not len(S):
+        return None
+    costs = np.minimum(_squared(S, pairs), gate * gate).sum(axis=1)
+    best = S[int(np.argmin(costs))]
+    for _ in range(2):  # with those that agree after the first round
+        agreeing = _squared(best, pairs) < gate * gate
+        if agreeing.sum() < 4:
+            return None
+        best = refine_similarity(best, pairs.of(agreeing), scale=gate)
+    agreeing = _squared(best, pairs) < gate * gate
+    return (best, agreeing) if agreeing.sum() >= 4 else None
+
+
+def refine_similarity(S_a_b: F64, pairs: Pairs, *, scale: float) -> F64:
+    """Gauss-Newton on the errors in both images, with Geman-McClure weights of that scale."""
+    for _ in range(_ROUNDS):
+        residuals, J = residuals_of(S_a_b, pairs)
+        weights = (1.0 / (1.0 + (residuals**2).sum(axis=1) / scale**2)) ** 2
+        H = np.einsum("nri,n,nrj->ij", J, weights, J)
+        g = np.einsum("nri,n,nr->i", J, weights, residuals)
+        step = -np.linalg.solve(H + 1e-12 * np.trace(H) * np.eye(7), g)
+        if not np.abs(step[[0, 1, 2, 6]]).max() < _MOST:
+            break  # nothing holds it
+        S_a_b = moved(S_a_b, step)
+        if np.abs(step).max() < 1e-10:
+            break
+    return S_a_b
+
+
+def moved(S: F64, step: F64) -> F64:
+    """S (4, 4) after a step (omega, tau, sigma): ``X -> e^sigma exp(omega) X + tau``."""
+    after = np.eye(4)
+    after[:3, :3] = np.exp(step[6]) * so3_exp(step[:3])
+    after[:3, 3] = step[3:6]
+    return after @ S
+
+
+def residuals_of(S_a_b: F64, pairs: Pairs) -> tuple[F64, F64]:
+    """(N, 4) errors in the image of a and in that of b, and (N, 4, 7) derivatives by ``moved``.
+
+    With Y = S X_b: ``dY = -[Y] domega + dtau + Y dsigma``; S^-1 X_a turns with the opposite step.
+    """
+    Y = pairs.xyz_b @ S_a_b[:3, :3].T + S_a_b[:3, 3]
+    back = np.linalg.inv(S_a_b)
+    Z = pairs.xyz_a @ back[:3, :3].T + back[:3, 3]
+    residuals = np.concatenate([_project(Y) - pairs.seen_a, _project(Z) - pairs.seen_b], axis=1)
+    one = np.broadcast_to(np.eye(3), (len(Y), 3, 3))
+    dY = np.concatenate([-hat(Y), one, Y[:, :, None]], axis=2)
+    X = pairs.xyz_a
+    dZ = -back[:3, :3] @ np.concatenate([-hat(X), one, X[:, :, None]], axis=2)
+    return residuals, np.concatenate([_slope(Y) @ dY, _slope(Z) @ dZ], axis=1)
+
+
+def _project(X: F64) -> F64:
+    z = np.where(np.abs(X[..., 2:]) < _MIN_DEPTH, _MIN_DEPTH, X[..., 2:])
+    return X[..., :2] / z
+
+
+def _slope(X: F64) -> F64:
+    """(N, 2, 3) of the projection."""
+    z = np.where(np.abs(X[:, 2]) < _MIN_DEPTH, _MIN_DEPTH, X[:, 2])
+    J = np.zeros((len(X), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0 / z
+    J[:, 0, 2], J[:, 1, 2] = -X[:, 0] / z**2, -X[:, 1] / z**2
+    return J
+
+
+def _squared(S_a_b: F64, pairs: Pairs) -> F64:
+    """(..., N) the larger squared error of each pair in the two images under similarities
+    (..., 4, 4); infinite behind a camera."""
+    A, t = np.swapaxes(S_a_b[..., :3, :3], -1, -2), S_a_b[..., None, :3, 3]
+    Y = pairs.xyz_b @ A + t
+    Z = (pairs.xyz_a - t) @ np.linalg.inv(A)
+    a = ((_project(Y) - pairs.seen_a) ** 2).sum(axis=-1)
+    b = ((_project(Z) - pairs.seen_b) ** 2).sum(axis=-1)
+    front = (Y[..., 2] > 0.0) & (Z[..., 2] > 0.0)
+    return np.where(front, np.maximum(a, b), np.inf)
+
+
+def _closed_form(source: F64, target: F64) -> F64:
+    """(S, 4, 4) similarities that take source (S, 3, 3) rows to target; those of triples without
+    extent, among them triples that have a point twice, are left out."""
+    mean_source, mean_target = source.mean(axis=1), target.mean(axis=1)
+    s, t = source - mean_source[:, None], target - mean_target[:, None]
+    U, D, Vt = np.linalg.svd(np.swapaxes(t, 1, 2) @ s)
+    signs = np.ones((len(source), 3))
+    signs[:, 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    extent = (s**2).sum(axis=(1, 2))
+    good = D[:, 1] > 1e-9 * np.maximum(D[:, 0], 1e-300)
+    R = (U * signs[:, None]) @ Vt
+    scale = (D * signs).sum(axis=1) / np.where(extent > 0.0, extent, 1.0)
+    S = np.broadcast_to(np.eye(4), (len(source), 4, 4)).copy()
+    S[:, :3, :3] = scale[:, None, None] * R
+    S[:, :3, 3] = mean_target - (S[:, :3, :3] @ mean_source[:, :, None])[:, :, 0]
+    return S[good & (scale > 0.0)]
 
 
 @dataclass(frozen=True, kw_only=True)

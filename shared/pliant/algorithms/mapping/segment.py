@@ -2,6 +2,18 @@
 
 A segment begins where a map starts, and rests where the camera is lost.  The camera may come back
 to it, other segments may become a part of it, and at the end all of it is adjusted.
+
+Keyframes that it has given up have been published, with frames and points that hang on them: they
+move when those that it has kept do.  One on a path moves as the map between the keyframes before
+and after it: in between, by what share of the way lies behind it.  Where others of another time see
+more of what it saw, it moves as the one that sees most.
+
+It goes on under another lens where the adjustment of the whole map has found that the one in use is
+wrong.  Tracks come as pixels of the rectified image, and the mapper works on those of an ideal
+camera, see ``self_calibration``.  So what keyframes have seen is moved to where the new ideal
+camera sees it, and a point to where the keyframe on which it hangs sees it, as far away as it was:
+how distances change, the moves of ``whole_map`` say.  What is left, the adjustment of the window
+takes out.
 """
 
 from dataclasses import dataclass, field
@@ -9,12 +21,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, U8
-from pliant.algorithms.geometry import move_by_similarity, transform_each
+from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
+from pliant.algorithms.corrected_view import CorrectedView
+from pliant.algorithms.geometry import (
+    inverse,
+    matrix_to_pose,
+    move_by_similarity,
+    so3_exp,
+    so3_log,
+    transform_each,
+)
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.covisibility import focus_of
 from pliant.algorithms.mapping.final_adjustment import adjust_keyframes
-from pliant.algorithms.mapping.given_up import GivenUp
 from pliant.algorithms.mapping.map_store import FREE, MAPPED, UNLINKED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import PassedFrames
@@ -23,6 +42,82 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.compiler.kernel import kernel
 
 _MIN_DEPTH = 1e-6
+
+
+@dataclass(kw_only=True)
+class GivenUp:
+    """ids: (G,) of the keyframes, ascending.   hosts: (G,) the keyframe that each moves as, by id,
+    itself where it lies between others.   centres: (G, 3) where they stood.
+    """
+
+    ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    hosts: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    centres: F64 = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def take_in(self, other: "GivenUp") -> None:
+        """Those of another segment, or others of this one, are given up as well."""
+        ids = np.concatenate([self.ids, other.ids])
+        order = np.argsort(ids)
+        self.ids = ids[order]
+        self.centres = np.concatenate([self.centres, other.centres])[order]
+        hosts, before = np.concatenate([self.hosts, other.hosts])[order], None
+        while before is None or (hosts != before).any():  # a host may have been given up since
+            before = hosts
+            gone = np.isin(hosts, self.ids)
+            hosts = hosts.copy()
+            hosts[gone] = before[np.searchsorted(self.ids, before[gone])]
+        self.hosts = hosts
+
+    def host_of(self, keyframe: int, kept: I64) -> int:
+        """A keyframe, or where it has been given up one that has been kept and is near it, by id.
+
+        kept: (M,) all of these, ascending.
+        """
+        if keyframe in self.ids:
+            keyframe = int(self.hosts[np.searchsorted(self.ids, keyframe)])
+        if keyframe in self.ids:
+            keyframe = int(kept[max(np.searchsorted(kept, keyframe) - 1, 0)])
+        return keyframe
+
+    def told_with(self, moves: MapMoves) -> MapMoves:
+        """The moves of all keyframes of the segment from those of the ones that had been kept."""
+        new = ~np.isin(self.ids, moves.keyframe_ids)
+        if not new.any():
+            return moves
+        ids = np.concatenate([moves.keyframe_ids, self.ids[new]])
+        rows = np.concatenate([moves.moves, self._between(moves, new)])
+        order = np.argsort(ids)
+        ids, rows = ids[order], rows[order]
+        hosted = new & (self.hosts != self.ids)
+        # A host that is newer than all that are told of moves as the last of them.
+        host = np.searchsorted(ids, self.hosts[hosted], side="right") - 1
+        rows[np.searchsorted(ids, self.ids[hosted])] = rows[host]
+        return MapMoves(keyframe_ids=ids, moves=rows)
+
+    def _between(self, moves: MapMoves, some: BoolArray) -> F64:
+        """(S, 8) of some of them, as of ``MapMoves``, in between those of what is told of."""
+        ids, told = self.ids[some], moves.keyframe_ids
+        b = np.clip(np.searchsorted(told, ids), 1, len(told) - 1) if len(told) > 1 else 0 * ids
+        a = np.maximum(b - 1, 0)
+        share = np.clip((ids - told[a]) / np.maximum(told[b] - told[a], 1), 0.0, 1.0)[:, None]
+        first, last = moves.matrices(told[a]), moves.matrices(told[b])
+        scale_a, scale_b = moves.moves[a, 7:], moves.moves[b, 7:]
+        R_a, R_b = first[:, :3, :3] / scale_a[:, None], last[:, :3, :3] / scale_b[:, None]
+        T = np.tile(np.eye(4), (len(ids), 1, 1))
+        T[:, :3, :3] = R_a @ so3_exp(share * so3_log(np.swapaxes(R_a, 1, 2) @ R_b))
+        scales = scale_a ** (1.0 - share) * scale_b**share
+        # What happens where it stood lies in between; elsewhere R and scale say.
+        at = self.centres[some]
+        moved = (1.0 - share) * transform_each(first, at) + share * transform_each(last, at)
+        T[:, :3, 3] = moved - scales * (T[:, :3, :3] @ at[:, :, None])[:, :, 0]
+        return np.column_stack([matrix_to_pose(T), scales])
+
+    def move(self, moves: MapMoves) -> None:
+        """The map moves."""
+        self.centres = moves.points(self.centres, self.ids)
 
 
 class Moved(NamedTuple):
@@ -191,3 +286,47 @@ def _inverse_depths(rows: I32, state: U8, xyz: F64, T_world_camera: F64, depths:
             depth = x * T[0, 2] + y * T[1, 2] + z * T[2, 2]
             if depth > _MIN_DEPTH:
                 depths[i] = 1.0 / depth
+
+
+def see_by(segment: Segment, before: CorrectedView, known: SelfCalibration) -> None:
+    """Let a segment that was made in one view be as another camera sees it.
+
+    before: whose pixels its keyframes have.   known: of the camera by now.
+    """
+    _bend(segment, before, known.view)
+    for keyframe in segment.keyframes:
+        seen = moved_px(keyframe.points_px + keyframe.rolled_px, before, known.view)
+        keyframe.points_px = moved_px(keyframe.points_px, before, known.view)
+        keyframe.rolled_px = seen - keyframe.points_px
+    segment.passed.seen_by(before, known.view)
+    if known.readout:
+        segment.unroll(segment.keyframes, known)
+
+
+def moved_px(points_px: F32, before: CorrectedView, after: CorrectedView) -> F32:
+    """(N, 2) pixels of one ideal camera in another one."""
+    return after.pixels(before.seen(points_px))
+
+
+def _bend(segment: Segment, before: CorrectedView, after: CorrectedView) -> None:
+    """Move the points, candidates with their provisional places among them."""
+    points, keyframes = segment.points, segment.keyframes
+    used = slice(0, points.count)
+    here = (points.state[used] != FREE) & (points.segment[used] == segment.id)
+    rows = np.flatnonzero(here)
+    ids = np.array([keyframe.id for keyframe in keyframes], np.int64)
+    # What hung on a keyframe that the map has forgotten hangs on the one before it.
+    slots = np.maximum(np.searchsorted(ids, points.first_keyframe[rows], side="right") - 1, 0)
+    T_world_keyframe = np.array([keyframe.T_world_camera for keyframe in keyframes])
+    T_world_host, T_host_world = T_world_keyframe[slots], inverse(T_world_keyframe)[slots]
+    in_host = _each(T_host_world, points.xyz[rows])
+    ahead = in_host[:, 2] > _MIN_DEPTH
+    rows, in_host = rows[ahead], in_host[ahead]
+    px = moved_px(before.camera.project(in_host).astype(np.float32), before, after)
+    in_host[:, :2] = after.camera.normalise(px) * in_host[:, 2:]
+    points.xyz[rows] = _each(T_world_host[ahead], in_host)
+
+
+def _each(T: F64, points: F64) -> F64:
+    """Transform points (N, 3), each by its own of (N, 4, 4)."""
+    return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]

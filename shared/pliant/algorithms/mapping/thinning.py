@@ -19,10 +19,9 @@ import heapq
 import numpy as np
 
 from pliant.algorithms.arrays import I32, I64, BoolArray
-from pliant.algorithms.mapping.given_up import GivenUp
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.parameters import WindowParameters
-from pliant.algorithms.mapping.segment import Segment
+from pliant.algorithms.mapping.segment import GivenUp, Segment
 from pliant.compiler.kernel import kernel
 
 _SPARE = 0.1

@@ -14,11 +14,11 @@ from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.epipolar import rotation_between
-from pliant.algorithms.mapping.lens_change import moved
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.parameters import LocalisationParameters, MappingParameters
 from pliant.algorithms.mapping.passing import EarlierPose
+from pliant.algorithms.mapping.segment import moved_px
 from pliant.algorithms.mapping.start import Start, WaitingFrame, keep_waiting
 from pliant.algorithms.tracks import FrameTracks
 
@@ -91,7 +91,7 @@ class Waiting:
 
     def seen_by(self, before: CorrectedView, after: CorrectedView) -> "Waiting":
         """With the pixels of another ideal camera."""
-        frames = [replace(f, points_px=moved(f.points_px, before, after)) for f in self.frames]
+        frames = [replace(f, points_px=moved_px(f.points_px, before, after)) for f in self.frames]
         return Waiting(frames, self.turns)
 
 

@@ -18,9 +18,7 @@ from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.subspace import refine_pose
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.places.features import Features, match
-from pliant.algorithms.places.index import PlaceIndex
-from pliant.algorithms.places.repetition import repeated_share
+from pliant.algorithms.places import Features, PlaceIndex, match, repeated_share
 from pliant.algorithms.surfels.deformation_models import move_poses
 from pliant.algorithms.surfels.patch_sampling import A, B, F, X
 from pliant.algorithms.surfels.surfel_table import SurfelTable

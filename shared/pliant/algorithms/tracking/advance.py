@@ -24,8 +24,7 @@ from pliant.algorithms.image.patch_sums import (
 )
 from pliant.algorithms.image.pixels import Pixels
 from pliant.algorithms.image.vector_code import prefetch
-from pliant.algorithms.tracking.climbing import climb
-from pliant.algorithms.tracking.curvature import CURVATURE_BORDER
+from pliant.algorithms.tracking.curvature import CURVATURE_BORDER, climb
 from pliant.algorithms.tracking.local_flow import Flow, flow_at
 from pliant.algorithms.tracking.maxima import subpixel_offset
 from pliant.algorithms.tracking.track_table import Track, Tracks

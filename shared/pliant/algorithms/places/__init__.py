@@ -1,1 +1,0 @@
-"""Places that were seen before: described, looked up, and verified."""
