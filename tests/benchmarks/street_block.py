@@ -1,4 +1,4 @@
-"""A street about a block of houses, rendered: a loop of 202 m out of doors, under a bare sky.
+"""A street about a block of houses, rendered: a loop of 203 m out of doors, under a bare sky.
 
 Facades with windows and doors, asphalt, kerbs, parked cars, trees and lamp posts; the camera rides
 once around at the speed of a bicycle and comes 15 m over where it began.

@@ -153,14 +153,15 @@ def without_places(
 def street_block(
     folder: Annotated[Path, typer.Argument(help="Folder to make.")],
     frames: Annotated[int | None, typer.Option(min=2, help="First frames only.")] = None,
+    fps: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 30.0,
 ) -> None:
-    """Render a ride of 202 m about a block of houses, out of doors: two minutes of CPU.
+    """Render a ride of 203 m about a block of houses, out of doors: 150 s of CPU.
 
     scripts/bench street-block results/street-block
     """
-    from benchmarks.street_block import render
+    from benchmarks.street_block import CAMERA, render
 
-    render(folder, frames=frames)
+    render(folder, frames=frames, camera=CAMERA.model_copy(update={"fps": fps}))
 
 
 @app.command()
