@@ -45,7 +45,8 @@ class Played:
 
     final: (7,) poses of the segment that has most of them in the end.   causal: likewise, as they
     were known when the image had come.   truth: (3,) positions.   lit: images that were not dark.
-    joined: when segments became one.   cpu_ms: an image.
+    joined: when segments became one.   same_places: pairs of keyframes that were found to show one
+    place.   cpu_ms: an image.
     """
 
     final: dict[int, F64]
@@ -54,6 +55,7 @@ class Played:
     lit: int
     segments: int
     joined: list[int]
+    same_places: int
     cpu_ms: float
 
     @property
@@ -137,6 +139,7 @@ class Reel:
             lit=sum(source != DARK for source in order),
             segments=len({segment for segment, _ in final.values()}),
             joined=joined,
+            same_places=len(history.same_places),
             cpu_ms=1e3 * spent / len(order),
         )
 

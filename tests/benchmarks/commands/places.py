@@ -147,3 +147,30 @@ def without_places(
     from pliant.config import load_config
 
     show(measure(sources, load_config(None, overrides or []), lit=lit, cut=cut))
+
+
+@app.command("street-block")
+def street_block(
+    folder: Annotated[Path, typer.Argument(help="Folder to make.")],
+    frames: Annotated[int | None, typer.Option(min=2, help="First frames only.")] = None,
+    fps: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 30.0,
+) -> None:
+    """Render a ride of 203 m about a block of houses, out of doors: 150 s of CPU.
+
+    scripts/bench street-block results/street-block
+    """
+    from benchmarks.street_block import CAMERA, render
+
+    render(folder, frames=frames, camera=CAMERA.model_copy(update={"fps": fps}))
+
+
+@app.command()
+def loops(sources: Sources, overrides: Overrides = None) -> None:
+    """Sources that end where they began: what drift is left there, with and without places.
+
+    scripts/bench loops results/street-block built-in:court
+    """
+    from benchmarks.loops import measure
+    from pliant.config import load_config
+
+    show(measure(sources, load_config(None, overrides or [])))
