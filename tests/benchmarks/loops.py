@@ -13,7 +13,7 @@ from benchmarks.played import Played, Reel
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.geometry import align_umeyama
 from pliant.config import Config
-from pliant.evaluation.report import metres
+from pliant.evaluation.presentation import metres
 
 _FIRST, _LAST = 100, 10
 """Poses that are aligned, and that are measured."""
