@@ -141,7 +141,7 @@ def test_an_earlier_result_survives_a_mistake_with_force(here: Path) -> None:
     endpoint = free_endpoint()
     with open_router(endpoint):
         port = endpoint.rsplit(":", 1)[1]
-        done = pliant("run", here / "nan", "--output", "result", "--force", cwd=here)
+        done = in_this_process("run", here / "nan", "--output", "result", "--force", cwd=here)
         assert_one_line(done, "calib.yaml")
         write_sequence(here / "good", IMAGES)
         done = pliant("run", here / "good", "--output", "result", "--force", "--port", port)

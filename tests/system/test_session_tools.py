@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from running import AS_FROM_A_SHELL, command, pliant
+from running import AS_FROM_A_SHELL, command, in_this_process, pliant
 
 from pliant import arithmetic
 from pliant.bus.session import free_endpoint
@@ -95,7 +95,7 @@ def test_a_run_is_found_by_its_result_folder(tmp_path: Path) -> None:
     """Its router is at a socket that only its user reaches."""
     (idle := tmp_path / "idle").mkdir()
     for name in ("status", "stop"):
-        refused = pliant(name, str(idle))
+        refused = in_this_process(name, str(idle))
         assert (refused.returncode, "no run goes on there" in refused.stderr) == (1, True)
     result = tmp_path / "room"
     with start("run", "built-in:room", "--output", str(result)) as run:
