@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from running import pliant
+from running import in_this_process
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.map_delta import TRACKING
@@ -131,7 +131,7 @@ def test_images_that_were_not_recorded_are_one_line(
     told = {t: list(Recording(corrected_run / "recording.mcap").decoded(t)) for t in topics.TOPICS}
     told.pop(topics.SOURCE)
     recorder.run(ReplayBus(told), Config(), tmp_path / "recording.mcap", {})
-    done = pliant("export", tmp_path, "--to", kind)
+    done = in_this_process("export", tmp_path, "--to", kind)
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "has no images (--no-images)" in done.stderr

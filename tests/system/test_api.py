@@ -133,7 +133,8 @@ def test_a_run_tells_each_pose_as_it_is_known(tmp_path: Path) -> None:
     assert 0 < len(poses) < len(told)  # a map begins once the camera has moved
     found = list[object]()
     within = pliant.run(
-        TINY, output=tmp_path / "within", end=0.3, map=part.path, localise=True, quiet=True,
+        TINY, output=tmp_path / "within", end=0.3, map=part.path, localise=True,
+        settings={"meshing.enabled": False}, quiet=True,
         on_frame=lambda frame, T_world_camera: found.append(T_world_camera),
     )  # fmt: skip
     located = np.array([T for T in found if T is not None])
@@ -146,7 +147,10 @@ def test_a_callback_that_raises_ends_the_run(tmp_path: Path) -> None:
         raise ValueError(f"frame {frame}")
 
     with pytest.raises(ValueError, match="frame 0"):
-        pliant.run(TINY, output=tmp_path / "part", quiet=True, on_frame=refuse)
+        pliant.run(
+            TINY, output=tmp_path / "part", settings={"meshing.enabled": False}, quiet=True,
+            on_frame=refuse,
+        )  # fmt: skip
 
 
 def test_images_one_by_one_give_the_same(followed: list[pliant.Tracked]) -> None:

@@ -129,7 +129,7 @@ def test_a_mistake_is_one_line(
 
 def test_a_source_that_fails_before_its_first_frame_leaves_no_result(here: Path) -> None:
     part = ("--start", "1.01", "--end", "1.02")
-    done = pliant("run", TINY, *part, "--output", "part", cwd=here)
+    done = pliant("run", TINY, *part, *NO_MESH, "--output", "part", cwd=here)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("pliant: ingest: built-in:tiny: no frame lies")
     assert done.stdout == ""
@@ -141,7 +141,7 @@ def test_an_earlier_result_survives_a_mistake_with_force(here: Path) -> None:
     endpoint = free_endpoint()
     with open_router(endpoint):
         port = endpoint.rsplit(":", 1)[1]
-        done = pliant("run", here / "nan", "--output", "result", "--force", cwd=here)
+        done = in_this_process("run", here / "nan", "--output", "result", "--force", cwd=here)
         assert_one_line(done, "calib.yaml")
         write_sequence(here / "good", IMAGES)
         done = pliant("run", here / "good", "--output", "result", "--force", "--port", port)
@@ -295,7 +295,7 @@ def small_disk(tmp_path: Path) -> Generator[Path]:
 
 def test_a_full_disk_is_named_and_what_was_written_is_read(small_disk: Path) -> None:
     folder = small_disk / "result"
-    done = pliant("run", TINY, "--output", folder)
+    done = pliant("run", TINY, "--output", folder, *NO_MESH)
     assert done.returncode == 1
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("pliant: ")]
     assert str(folder) in line

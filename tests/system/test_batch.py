@@ -24,6 +24,7 @@ from running import (
 )
 
 from pliant.datasets.builtin import builtin_folder
+from pliant_services.batch import on_cluster
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 OPTIONS = NO_MESH
@@ -150,8 +151,9 @@ def test_the_clip_of_a_worker_that_is_killed_goes_to_another_one(
 
 
 def test_no_scheduler_no_dask_and_workers_without_the_clips_are_one_line(
-    tmp_path: Path, scheduler: str
+    tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(on_cluster, "_ANSWERS_S", 1.0)  # nobody listens: longer says no more
     (tmp_path / "clips").mkdir()
     (tmp_path / "clips" / "a.mp4").touch()
     (tmp_path / "none" / "distributed").mkdir(parents=True)

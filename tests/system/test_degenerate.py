@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from running import pliant, write_sequence
+from running import NO_MESH, in_this_process, pliant, write_sequence
 
 from pliant.config import load_config
 from pliant.datasets import open_source
@@ -112,7 +112,7 @@ def run(source: Path, history: MapHistory) -> str:
 def test_a_run_without_a_map_ends_with_code_3_and_the_reason(tmp_path: Path) -> None:
     """Of one frame, so that the stream ends where it begins."""
     source = write_sequence(tmp_path / "video", VIDEOS["one frame"]())
-    done = pliant("run", source, "--output", tmp_path / "result")
+    done = pliant("run", source, *NO_MESH, "--output", tmp_path / "result")
     assert done.returncode == 3, done.stderr
     assert "Traceback" not in done.stderr
     (line,) = [line for line in done.stdout.splitlines() if "no map could start" in line]
@@ -126,6 +126,6 @@ def test_a_run_without_a_map_ends_with_code_3_and_the_reason(tmp_path: Path) -> 
 
 def test_an_image_too_small_for_a_camera_is_one_line(tmp_path: Path) -> None:
     source = write_sequence(tmp_path / "video", [np.zeros((1, 1), np.uint8)], fx=1.0, fy=1.0)
-    done = pliant("run", source, cwd=tmp_path)
+    done = in_this_process("run", source, cwd=tmp_path)
     assert done.returncode == 1
     assert "width is 1: expected 2 to" in done.stderr

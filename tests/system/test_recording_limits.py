@@ -73,7 +73,7 @@ def test_a_full_disk_is_one_line_and_what_was_written_is_readable(tmp_path: Path
         "sys.argv = ['pliant', *sys.argv[1:]];"
         "runpy.run_module('pliant_services.cli', run_name='__main__')"
     )
-    run = ["run", f"{TINY}?frames=30", "--output", str(tmp_path / "r")]
+    run = ["run", f"{TINY}?frames=30", "--output", str(tmp_path / "r"), *NO_MESH]
     done = subprocess.run(
         [*AS_FROM_A_SHELL, sys.executable, "-c", code, *run],
         capture_output=True,

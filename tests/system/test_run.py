@@ -10,7 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from running import NO_MESH, TINY, UP, assert_one_line, children, has_ended, pliant, running
+from running import (
+    NO_MESH,
+    TINY,
+    UP,
+    assert_one_line,
+    children,
+    has_ended,
+    in_this_process,
+    pliant,
+    running,
+)
 
 from pliant.bus.session import CONNECT_TIMEOUT_S, free_endpoint, open_router
 from pliant.messages import topics
@@ -53,7 +63,7 @@ def test_nothing_is_missing_in_the_recording(result: Path) -> None:
 
 
 def test_an_existing_result_is_not_overwritten(result: Path) -> None:
-    done = pliant("run", TINY, "--output", result)
+    done = in_this_process("run", TINY, "--output", result)
     assert_one_line(done, "--force")
 
 

@@ -172,5 +172,5 @@ def test_a_scale_that_is_none_is_one_line(doubled: Path, tmp_path: Path) -> None
     folder = Path(shutil.copytree(doubled, tmp_path / "tiny"))
     (folder / "scale.yaml").write_text("metres_per_unit: -1\nsigma: 0\nsource: nobody\n")
     assert_one_line(in_this_process("export", folder, "--to", "tum"), "scale.yaml: no scale")
-    told = command("scale", folder, "--points", "1,2", "1,2,4", 1)
+    told = in_this_process("scale", folder, "--points", "1,2", "1,2,4", 1)
     assert_one_line(told, "expected X,Y,Z", code=2)

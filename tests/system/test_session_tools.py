@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from running import AS_FROM_A_SHELL, command, pliant
+from benchmarks.endurance import forth_and_back
+from running import AS_FROM_A_SHELL, NO_MESH, command, in_this_process, pliant
 
 from pliant import arithmetic
 from pliant.bus.session import free_endpoint
+from pliant.datasets.builtin import builtin_folder
 from pliant_services.profiles import PROFILES
 
 pytestmark = pytest.mark.system
@@ -46,9 +48,14 @@ def endpoint() -> Iterator[str]:
     router.stdout.close()
 
 
+def long_source(folder: Path) -> str:
+    """One that goes on until it is stopped, and needs no rendering."""
+    return str(forth_and_back(builtin_folder("built-in:tiny"), folder / "source", 1000, 30.0))
+
+
 def test_status_and_stop_of_a_session_in_parts(endpoint: str, tmp_path) -> None:
     extra = {
-        "ingest": ["--source", "built-in:room"],
+        "ingest": ["--source", long_source(tmp_path)],
         "recorder": ["--output", str(tmp_path / "recording.mcap")],
     }
     with ExitStack() as running:
@@ -95,10 +102,10 @@ def test_a_run_is_found_by_its_result_folder(tmp_path: Path) -> None:
     """Its router is at a socket that only its user reaches."""
     (idle := tmp_path / "idle").mkdir()
     for name in ("status", "stop"):
-        refused = pliant(name, str(idle))
+        refused = in_this_process(name, str(idle))
         assert (refused.returncode, "no run goes on there" in refused.stderr) == (1, True)
-    result = tmp_path / "room"
-    with start("run", "built-in:room", "--output", str(result)) as run:
+    result = tmp_path / "long"
+    with start("run", long_source(tmp_path), *NO_MESH, "--output", str(result)) as run:
         rows: set[str] = set()
         while not {"ingest", "recorder"} <= rows:
             shown = pliant("status", str(result), "--seconds", "1.5")

@@ -160,7 +160,7 @@ def test_what_is_no_calibration_is_one_line(
         "blank": lambda: [np.full((480, 640), 90, np.uint8)] * 16,
         "few": lambda: filmed("charuco", LENS)[:4] * 5,
         "straight": lambda: filmed("charuco", LENS, 12, 0.3),
-    }.get(shows, lambda: filmed(shows, LENS)[:8])()
+    }.get(shows, lambda: filmed(shows, LENS)[:4])()
     source, output = folder(tmp_path / "board", images), tmp_path / "calib.yaml"
     with pytest.raises(CalibrationError) as caught:
         calibrate_with_board(source, parse_board(board), output, lens="pinhole-radtan", topic="")
