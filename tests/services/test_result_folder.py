@@ -10,13 +10,13 @@ import pytest
 
 from pliant.algorithms.tracks import FrameTracks
 from pliant.config import config_yaml, load_config
-from pliant.errors import PliantError, ResultError
+from pliant.errors import PliantError, RecordingError, ResultError
 from pliant.evaluation.evaluate import EvaluationRequest, run_evaluation
 from pliant.export.export import export_result
 from pliant.messages import codec, topics
 from pliant.messages.types import CameraStream, Extrema, Header, StreamEnd
 from pliant.recording.writer import RecordingWriter
-from pliant.results.folder import commit_of, keep_apart, prepare, run_metadata, written
+from pliant.results.folder import commit_of, keep_apart, prepare, run_metadata, settle, written
 from pliant_services.cli.commands import app
 from pliant_services.mesh.command import run_mesh
 from pliant_services.replay.command import ReplayRequest, run_replay
@@ -88,6 +88,58 @@ def test_a_run_does_not_destroy_what_it_reads(
         refused(lambda request=request: run_pipeline(request), room)
     monkeypatch.chdir(room)
     refused(lambda: run_pipeline(RunRequest(source=".", output=Path("."), force=True)), room)
+
+
+def test_a_run_does_not_destroy_the_calibration_that_it_is_given(room: Path) -> None:
+    """What a run has found is for the next one: not into the same folder."""
+    found = room / "calibration.yaml"
+    found.write_text("found by an earlier run")
+    run = RunRequest(source="built-in:tiny", output=room, calibration=found, force=True)
+    refused(lambda: run_pipeline(run), room, f"{READ}: choose another --output")
+
+
+def test_earlier_results_are_there_until_those_that_replace_them_have_begun(room: Path) -> None:
+    (room / "recording").mkdir()
+    for name in ("recording/part_00000.mcap", "recording/mine", "points_segment_1.ply", "notes"):
+        (room / name).write_text(name)
+    (room / "state" / "tracking").mkdir(parents=True)
+    (room / "state" / "tracking" / "1.state").touch()
+    before = contents(room)
+    for _ in range(2):
+        with written(room, force=True):
+            prepare(room, "seed: 1\n")
+            assert not (room / "recording.mcap").exists()
+            (room / "recording.mcap").write_text("no frame")
+            (room / "recording" / "part_00001.mcap").write_text("no frame")
+        assert {**contents(room), "metadata.json": b""} == {**before, "metadata.json": b""}
+    prepare(room, "seed: 1\n")  # killed at this point
+    with written(room, force=True):
+        prepare(room, "seed: 2\n")
+    assert {**contents(room), "metadata.json": b""} == {**before, "metadata.json": b""}
+    with written(room, force=True):
+        prepare(room, "seed: 2\n")
+        settle(room)
+    assert set(contents(room)) == {"config.yaml", "metadata.json", "mine", "notes"}
+
+
+def test_a_replay_that_fails_leaves_what_was_there(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other.mcap"
+    os.link(room / "recording.mcap", other)
+    (room / "recording.mcap").unlink()
+    (room / "recording.mcap").write_text("another run's")
+    before = contents(room)
+
+    def fails(*_: object) -> None:
+        raise RecordingError("it ends here")
+
+    monkeypatch.setattr("pliant_services.replay.command.require_inputs", lambda *_: None)
+    monkeypatch.setattr("pliant_services.replay.command.Replay.run", fails)
+    replay = ReplayRequest(recording=other, services=["bundle_adjustment"], output=room, force=True)
+    with pytest.raises(PliantError, match="ends here"):
+        run_replay(replay)
+    assert {**contents(room), "metadata.json": b""} == {**before, "metadata.json": b""}
 
 
 def test_parts_are_read_wherever_they_are(room: Path, tmp_path: Path) -> None:
