@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,6 +18,7 @@ from pliant.messages import codec, topics
 from pliant.messages.types import CameraStream, Extrema, Header, StreamEnd
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import commit_of, keep_apart, prepare, run_metadata, settle, written
+from pliant_services.calibrate.command import check_file
 from pliant_services.cli.commands import app
 from pliant_services.mesh.command import run_mesh
 from pliant_services.replay.command import ReplayRequest, run_replay
@@ -174,10 +176,89 @@ def test_no_command_destroys_what_it_reads(room: Path, tmp_path: Path) -> None:
         for option in ("json", "plot"):
             request = EvaluationRequest(
                 results=[link], groundtruth=str(room / "trajectory.txt"), times=None, frames=None,
-                tracks=False, points=False, mesh=False, surfels=False,
+                tracks=False, points=False, mesh=False, surfels=False, force=True,
                 **{"json": None, "plot": None, option: room / file},
             )  # fmt: skip
             refused(lambda request=request: list(run_evaluation(request)), room)
+
+
+def evaluation(truth: Path, **outputs: object) -> Callable[[], object]:
+    request: dict[str, Any] = {
+        "results": [truth / "result.txt"], "groundtruth": str(truth), "times": None, "frames": None,
+        "tracks": False, "points": False, "mesh": False, "surfels": False, "json": None,
+        "plot": None, **outputs,
+    }  # fmt: skip
+    return lambda: list(run_evaluation(EvaluationRequest(**request)))
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> Path:
+    """A sequence with true poses, and a trajectory to evaluate."""
+    folder = tmp_path / "sequence"
+    folder.mkdir()
+    poses = "".join(f"{i} {i} {i * i} 0 0 0 0 1\n" for i in range(5))
+    for name in ("groundtruth.txt", "result.txt", "times.txt", "0000.png"):
+        (folder / name).write_text(poses)
+    return folder
+
+
+@pytest.mark.parametrize("file", ["groundtruth.txt", "times.txt", "0000.png", "result.txt"])
+@pytest.mark.parametrize("option", ["json", "plot"])
+def test_an_evaluation_replaces_no_truth(truth: Path, file: str, option: str) -> None:
+    for groundtruth in (truth, truth / "groundtruth.txt"):
+        if groundtruth == truth or file != "0000.png":  # nothing of that is read with a file
+            command = evaluation(
+                truth, groundtruth=str(groundtruth), force=True, **{option: truth / file}
+            )
+            refused(command, truth, f"choose another --{option}")
+    times = truth.with_name("times")
+    times.touch()
+    refused(
+        evaluation(truth, times=times, force=True, **{option: times}), truth, "choose another --"
+    )
+
+
+def test_an_evaluation_replaces_what_is_there_with_force_alone(truth: Path) -> None:
+    figures = truth.with_name("figures.json")
+    figures.write_text("precious")
+    refused(evaluation(truth, json=figures), truth, "exists: choose another --json, or --force")
+    assert figures.read_text() == "precious"
+    evaluation(truth, json=figures, force=True)()
+    evaluation(truth, json=truth / "figures.json")()
+    assert figures.read_text() == (truth / "figures.json").read_text()
+    both = evaluation(truth, json=figures, plot=figures, force=True)
+    refused(both, truth, "choose another --plot")
+
+
+@pytest.mark.parametrize(
+    ("output", "says"),
+    [
+        ("cal/000005.yaml", "lies in"),
+        ("cal/calib.yaml", "lies in"),
+        ("clip.yaml", READ),  # its picture would be what is filmed
+        ("mask.yaml", READ),
+        ("found.png", "is no picture"),
+    ],
+)
+def test_a_calibration_and_its_picture_replace_nothing(
+    output: str, says: str, tmp_path: Path
+) -> None:
+    (tmp_path / "cal").mkdir()
+    for name in ("cal/000005.png", "clip.png", "mask.png", "there.png"):
+        (tmp_path / name).write_text("precious")
+    source = str(tmp_path / ("clip.png" if output == "clip.yaml" else "cal"))
+    mask = tmp_path / "mask.png"
+
+    def check(output: str, *, force: bool) -> None:
+        check_file(tmp_path / output, source=source, mask=mask, force=force)
+
+    for force in (True, False):
+        with pytest.raises(ResultError, match=says):
+            check(output, force=force)
+    with pytest.raises(ResultError, match=r"there\.png exists: .*--force"):
+        check("there.yaml", force=False)
+    check("there.yaml", force=True)
+    check("results/calib.yaml", force=False)
 
 
 @pytest.mark.parametrize(
