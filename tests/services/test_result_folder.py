@@ -1,23 +1,19 @@
-"""Who may write a result folder: nobody what he reads, and one at a time."""
+"""Who may write a result folder: nobody what he reads."""
 
 import os
 import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
+from result_room import evaluation, made_room, refused
 
-from pliant.algorithms.tracks import FrameTracks
-from pliant.config import config_yaml, load_config
-from pliant.errors import PliantError, RecordingError, ResultError
+from pliant.errors import ResultError
 from pliant.evaluation.evaluate import EvaluationRequest, run_evaluation
 from pliant.export.export import export_result
-from pliant.messages import codec, topics
-from pliant.messages.types import CameraStream, Extrema, Header, StreamEnd
-from pliant.recording.writer import RecordingWriter
-from pliant.results.folder import commit_of, keep_apart, prepare, run_metadata, settle, written
+from pliant.results.folder import (
+    commit_of,
+    keep_apart,
+)
 from pliant_services.calibrate.command import check_file
 from pliant_services.cli.commands import app
 from pliant_services.mesh.command import run_mesh
@@ -29,41 +25,7 @@ READ = "is read from there"
 
 @pytest.fixture
 def room(tmp_path: Path) -> Path:
-    """A result folder with a recording of one frame."""
-    folder = tmp_path / "room"
-    prepare(folder, config_yaml(load_config()))
-    header = Header(frame=0, stamp_ns=0, frame_id="camera")
-    stream = CameraStream(
-        frame=0, stamp_ns=0, frame_id="camera", source="fake", mode="lossless", frames=1,
-        calibration="", width=24, height=16, fx=20.0, fy=20.0, cx=12.0, cy=8.0,
-    )  # fmt: skip
-    messages = (
-        (topics.STREAM, stream),
-        (topics.EXTREMA, Extrema.of(header, FrameTracks.empty())),
-    )
-    metadata = run_metadata(config_yaml(load_config()))
-    with RecordingWriter(folder / "recording.mcap", metadata) as writer:
-        for topic, message in messages:
-            end = StreamEnd(
-                frame=1, stamp_ns=0, frame_id="", topic=topic.key, messages=1, complete=True
-            )
-            for sequence, (to, what) in enumerate([(topic, message), (topics.STREAM_END, end)]):
-                data = codec.encode(what)
-                writer.write(to, data, sequence=sequence, log_time_ns=1, publish_time_ns=0)
-    for name in ("trajectory.txt", "report.json", "points.ply"):
-        (folder / name).write_text(f"{name} of an earlier run")
-    return folder
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {p.name: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-def refused(command: Callable[[], object], folder: Path, says: str = READ) -> None:
-    before = contents(folder)
-    with pytest.raises(PliantError, match=says):
-        command()
-    assert contents(folder) == before
+    return made_room(tmp_path)
 
 
 def test_a_run_does_not_destroy_what_it_reads(
@@ -98,50 +60,6 @@ def test_a_run_does_not_destroy_the_calibration_that_it_is_given(room: Path) -> 
     found.write_text("found by an earlier run")
     run = RunRequest(source="built-in:tiny", output=room, calibration=found, force=True)
     refused(lambda: run_pipeline(run), room, f"{READ}: choose another --output")
-
-
-def test_earlier_results_are_there_until_those_that_replace_them_have_begun(room: Path) -> None:
-    (room / "recording").mkdir()
-    for name in ("recording/part_00000.mcap", "recording/mine", "points_segment_1.ply", "notes"):
-        (room / name).write_text(name)
-    (room / "state" / "tracking").mkdir(parents=True)
-    (room / "state" / "tracking" / "1.state").touch()
-    before = contents(room)
-    for _ in range(2):
-        with written(room, force=True):
-            prepare(room, "seed: 1\n")
-            assert not (room / "recording.mcap").exists()
-            (room / "recording.mcap").write_text("no frame")
-            (room / "recording" / "part_00001.mcap").write_text("no frame")
-        assert {**contents(room), "metadata.json": b""} == {**before, "metadata.json": b""}
-    prepare(room, "seed: 1\n")  # killed at this point
-    with written(room, force=True):
-        prepare(room, "seed: 2\n")
-    assert {**contents(room), "metadata.json": b""} == {**before, "metadata.json": b""}
-    with written(room, force=True):
-        prepare(room, "seed: 2\n")
-        settle(room)
-    assert set(contents(room)) == {"config.yaml", "metadata.json", "mine", "notes"}
-
-
-def test_a_replay_that_fails_leaves_what_was_there(
-    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    other = tmp_path / "other.mcap"
-    os.link(room / "recording.mcap", other)
-    (room / "recording.mcap").unlink()
-    (room / "recording.mcap").write_text("another run's")
-    before = contents(room)
-
-    def fails(*_: object) -> None:
-        raise RecordingError("it ends here")
-
-    monkeypatch.setattr("pliant_services.replay.command.require_inputs", lambda *_: None)
-    monkeypatch.setattr("pliant_services.replay.command.Replay.run", fails)
-    replay = ReplayRequest(recording=other, services=["bundle_adjustment"], output=room, force=True)
-    with pytest.raises(PliantError, match="ends here"):
-        run_replay(replay)
-    assert {**contents(room), "metadata.json": b""} == {**before, "metadata.json": b""}
 
 
 def test_parts_are_read_wherever_they_are(room: Path, tmp_path: Path) -> None:
@@ -180,15 +98,6 @@ def test_no_command_destroys_what_it_reads(room: Path, tmp_path: Path) -> None:
                 **{"json": None, "plot": None, option: room / file},
             )  # fmt: skip
             refused(lambda request=request: list(run_evaluation(request)), room)
-
-
-def evaluation(truth: Path, **outputs: object) -> Callable[[], object]:
-    request: dict[str, Any] = {
-        "results": [truth / "result.txt"], "groundtruth": str(truth), "times": None, "frames": None,
-        "tracks": False, "points": False, "mesh": False, "surfels": False, "json": None,
-        "plot": None, **outputs,
-    }  # fmt: skip
-    return lambda: list(run_evaluation(EvaluationRequest(**request)))
 
 
 @pytest.fixture
@@ -284,53 +193,6 @@ def test_what_lies_apart_is_written(tmp_path: Path) -> None:
     source.write_bytes(b"")
     for output in ("clip", "clip.mp4.out", "results/clip.mp4", "../clip.mp4"):
         keep_apart(tmp_path / output, [source, tmp_path / "none"])
-
-
-HOLD = """
-import sys
-from pathlib import Path
-from pliant.results.folder import written
-with written(Path(sys.argv[1]), force=True):
-    print("held", flush=True)
-    sys.stdin.read()
-"""
-
-
-def test_one_process_writes_a_result_folder_and_a_dead_one_holds_nobody_up(room: Path) -> None:
-    command = [sys.executable, "-c", HOLD, str(room)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
-        assert holder.stdout is not None
-        holder.stdout.readline()
-        says = f"is being written by process {holder.pid}: wait"
-        run = RunRequest(source="built-in:tiny", output=room, force=True)
-        refused(lambda: run_pipeline(run), room, says)
-        resumed = RunRequest(source="built-in:tiny", output=room, resume=True)
-        refused(lambda: run_pipeline(resumed), room, says)
-        other = room.with_name("other.mcap")
-        os.link(room / "recording.mcap", other)
-        replay = ReplayRequest(recording=other, services=["tracking"], output=room, force=True)
-        refused(lambda: run_replay(replay), room, says)
-        holder.kill()
-    with written(room, force=True):
-        assert (room / ".lock").read_text() == f"{os.getpid()}\n"
-    assert not (room / ".lock").exists()
-
-
-def test_a_folder_that_nothing_came_of_goes(tmp_path: Path) -> None:
-    output = tmp_path / "results" / "none"
-    with pytest.raises(PliantError, match="no such"):
-        run_pipeline(RunRequest(source=str(tmp_path / "none.mp4"), output=output))
-    assert not output.parent.exists()
-    with (
-        written(output, force=False),
-        pytest.raises(ResultError, match="being written"),
-        written(output, force=False),
-    ):
-        pass
-    with written(output, force=False):
-        (output / "mine").touch()
-    with pytest.raises(ResultError, match="--force"), written(output, force=False):
-        pass
 
 
 def git(folder: Path, *arguments: str) -> str:

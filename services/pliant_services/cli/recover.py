@@ -23,7 +23,7 @@ def recover(
     from pliant.recording.parts import parts_of
     from pliant.recording.recover import recover as make_whole
     from pliant.recording.summary import describe, summarise
-    from pliant.results.folder import keep_apart
+    from pliant.results.folder import check_free, keep_apart
     from pliant_services.cli.info import recording_file
 
     damaged = recording_file(recording)
@@ -32,6 +32,7 @@ def recover(
     keep_apart(whole, parts_of(damaged))
     if whole.exists() and not force:
         raise RecordingError(f"{whole} exists: choose another --output, or --force to replace it")
+    check_free(whole.parent)
     recovery = make_whole(damaged, whole)
     typer.echo(f"{recovery.messages} messages kept in {whole}")
     if recovery.unchecked:

@@ -18,7 +18,7 @@ from pliant.evaluation.report import (
     write_json,
 )
 from pliant.evaluation.result import Evaluation, evaluate_result
-from pliant.results.folder import PAGE_NAME, files_read, keep_apart
+from pliant.results.folder import PAGE_NAME, check_free, files_read, keep_apart
 from pliant.results.page.page import put_truth_in
 
 
@@ -44,6 +44,7 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
     missing = [str(result) for result in request.results if not result.exists()]
     if missing:
         raise ResultError(f"{missing[0]}: no such result")
+    check_free(*request.results)
     _check_outputs(request)
     if request.surfels:
         yield from _evaluate_surfels(request)

@@ -132,13 +132,33 @@ def written(output: Path, *, force: bool) -> Generator[None]:
                 folder.rmdir()
 
 
-def _locked(output: Path) -> int:
+@contextmanager
+def recorded_into(folder: Path) -> Generator[None]:
+    """Hold the folder of a recording against those who would replace what is there.
+
+    Others may record into it beside us.  Raises ResultError where results are written to it.
+    """
+    try:
+        make_folder(folder)
+        lock = _locked(folder, fcntl.LOCK_SH)
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # another one still records
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            (folder / _LOCK_NAME).unlink(missing_ok=True)
+        os.close(lock)
+
+
+def _locked(output: Path, kind: int = fcntl.LOCK_EX) -> int:
     """The descriptor of a lock file with our number in it."""
     path = output / _LOCK_NAME
     while True:
         lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, kind | fcntl.LOCK_NB)
             if os.path.exists(path) and os.path.samestat(os.fstat(lock), os.stat(path)):
                 os.truncate(lock, 0)
                 os.write(lock, f"{os.getpid()}\n".encode())
@@ -150,26 +170,44 @@ def _locked(output: Path) -> int:
                 raise
             holder = os.read(lock, 20).decode().strip()
             os.close(lock)
-            raise ResultError(
-                f"{output} is being written by process {holder or '?'}: "
-                "wait for its end, or choose another --output"
-            ) from None
+            raise _held(output, holder) from None
         os.close(lock)  # its holder left between our two looks, and took the file away
 
 
 def is_being_written(output: Path) -> bool:
     """Whether another process holds a result folder, perhaps on another machine."""
+    return _holder(output) is not None
+
+
+def check_free(*folders: Path) -> None:
+    """Raise ResultError where another process writes to one of these folders."""
+    for folder in folders:
+        holder = _holder(folder)
+        if holder is not None:
+            raise _held(folder, holder)
+
+
+def _holder(output: Path) -> str | None:
+    """The number of the process that holds a folder, "" where nobody knows; None: nobody does."""
     try:
         lock = os.open(output / _LOCK_NAME, os.O_RDWR)
     except OSError:
-        return False
+        return None
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        return error.errno in (errno.EACCES, errno.EAGAIN)
+        if error.errno in (errno.EACCES, errno.EAGAIN):
+            return os.read(lock, 20).decode().strip()
     finally:
         os.close(lock)
-    return False
+    return None
+
+
+def _held(output: Path, holder: str) -> ResultError:
+    return ResultError(
+        f"{output} is being written by process {holder or '?'}: "
+        "wait for its end, or choose another --output"
+    )
 
 
 def running_session(result: Path) -> tuple[list[str], str]:
