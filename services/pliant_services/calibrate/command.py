@@ -39,6 +39,7 @@ from pliant.recording.parts import parts_of
 from pliant.recording.reader import Recording
 from pliant.results.folder import CALIBRATION_NAME, RECORDING_NAME, REPORT_NAME, keep_apart
 from pliant.results.run import Run, read_run, seen_by_keyframes
+from pliant.wording import counted
 from pliant_services.calibrate.board import PrintedBoard
 from pliant_services.cli.progress import tell_progress
 from pliant_services.run.command import INTERRUPTED, RunRequest, run_pipeline
@@ -120,15 +121,16 @@ def calibrate_with_board(
     found, others, looked = _look_for(dataset, printed, source)
     if not found:
         raise CalibrationError(
-            f"{source}: {printed.spelled} is in none of {looked} frames: {_hint(others, printed)}"
+            f"{source}: {printed.spelled} is in none of {counted(looked, 'frame')}: "
+            + _hint(others, printed)
         )
     views = [each.view for each in found]
     chosen = choose_views(views, [each.sharpness for each in found], printed.board, width)
     if len(chosen) < MIN_VIEWS:
         raise CalibrationError(
-            f"{source}: {printed.spelled} is in {len(found)} of {looked} frames, of which "
-            f"{len(chosen)} differ, and {MIN_VIEWS} are needed: move it through the whole image "
-            f"and tilt it; of the other frames: {_hint(others, printed)}"
+            f"{source}: {printed.spelled} is in {len(found)} of {counted(looked, 'frame')}, "
+            f"of which {len(chosen)} differ, and {MIN_VIEWS} are needed: move it through the whole "
+            f"image and tilt it; of the other frames: {_hint(others, printed)}"
         )
     chosen_views = [views[i] for i in chosen]
     result = calibrate(chosen_views, width, height, lens)
@@ -139,8 +141,9 @@ def calibrate_with_board(
     covered = coverage(seen, width, height)
     lines = [
         _said(calibration, result.focal_sigma),
-        f"reprojection error {result.rms_px:.2f} px in {len(used)} views, of {len(found)} frames "
-        f"with {printed.spelled}; they cover {100.0 * covered:.0f} % of the image",
+        f"reprojection error {result.rms_px:.2f} px in {counted(len(used), 'view')}, of "
+        f"{counted(len(found), 'frame')} with {printed.spelled}; they cover "
+        f"{100.0 * covered:.0f} % of the image",
     ]
     picture = picture_of(output)
     make_folder(output.parent)

@@ -23,6 +23,7 @@ from pliant.results.folder import (
 )
 from pliant.results.verdict import summary
 from pliant.results.write import write_results
+from pliant.wording import counted
 from pliant_services.replay.services import (
     Replay,
     gaps,
@@ -98,7 +99,7 @@ def _replay_into(output: Path, request: ReplayRequest) -> int:
     )
     for difference in differences:
         print(
-            f"{difference.topic} differs in {difference.messages} messages, "
+            f"{difference.topic} differs in {counted(difference.messages, 'message')}, "
             f"first {difference.first}"
         )
     if not differences:
