@@ -135,7 +135,7 @@ def test_what_a_mask_covers_is_no_board(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output + str(done.exception)
     assert abs(read_calibration(output, (640, 480)).fx - LENS.fx) < 3.0
     output.unlink()
-    done = CliRunner().invoke(app, command)
+    done = CliRunner().invoke(app, [*command, "--force"])
     assert done.exit_code != 0 or abs(read_calibration(output).fx - LENS.fx) > 10.0
     done = CliRunner().invoke(app, [*command, "--force", "--mask", str(tmp_path / "none.png")])
     assert "none.png: cannot be read" in str(done.exception)

@@ -15,6 +15,7 @@ from pliant.bus.peers import Peers, token_key
 from pliant.bus.waits import Waiting
 from pliant.errors import BusError, SessionOverError
 from pliant.messages import topics
+from pliant_services.view.command import check_versions
 
 WINDOW = 4
 
@@ -209,6 +210,15 @@ def test_versions_that_do_not_fit_are_both_named() -> None:
             BusError, match=f"ingest is pliant .* tracking is {__version__}"
         ) as said:
             peers.raise_if_refused()
+        assert "\n" not in str(said.value)
+
+
+def test_a_viewer_of_another_version_is_told_both() -> None:
+    own = [f"pliant/s/{token_key('ingest', 3)}", "pliant/s/ready/nonsense"]
+    check_versions(own)
+    for token in ("ready/ingest/3/99/9.9.9", token_key("ingest", 3)[:-8] + "01234567"):
+        with pytest.raises(BusError, match=f"ingest is pliant .* viewer is {__version__}") as said:
+            check_versions([*own, f"pliant/s/{token}"])
         assert "\n" not in str(said.value)
 
 

@@ -3,15 +3,31 @@
 import struct
 import threading
 from dataclasses import replace
+from typing import Any, cast
 
 import pytest
 from zenoh_buses import PATIENCE_S, WINDOW, image, in_thread, reader, write, writer
 
 from pliant.bus.links import ENVELOPE
+from pliant.bus.session import open_session
 from pliant.bus.zenoh_bus import ZenohBus
-from pliant.errors import MessageError
+from pliant.errors import BusError, MessageError, ResultError
 from pliant.messages import codec, topics
 from pliant.messages.types import StreamEnd
+from pliant_services.runtime.status import listen, table
+from pliant_services.view.command import follow
+
+
+def test_who_looks_on_at_another_version_is_told(endpoint: str) -> None:
+    with open_session([endpoint]) as connection:
+        token = connection.liveliness().declare_token("pliant/s/ready/ingest/3/99/9.9.9")
+        with pytest.raises(BusError, match=r"ingest is pliant 9\.9\.9 .*this viewer is"):
+            follow([endpoint], "s", cast(Any, None))
+        _, silent = listen([endpoint], "s", 0.5)
+        assert "pliant 9.9.9" in "\n".join(table([], silent))
+        token.undeclare()
+        with pytest.raises(ResultError, match="no such session"):
+            follow([endpoint], "s", cast(Any, None))
 
 
 def test_a_sender_that_ignores_credit_fills_no_memory(endpoint: str) -> None:

@@ -63,6 +63,7 @@ def test_counts_come_before_order_before_fields(tmp_path: Path) -> None:
     found = differences(tmp_path, was, now)
     assert [d.kind for d in found] == ["count", "field"]
     assert found[0].first == "3 messages, was 5"
+    assert differences(tmp_path, was, was[:1])[0].first == "1 message, was 5"
     found = differences(tmp_path, was, [was[0], was[2], was[1], *was[3:]])
     assert [(d.kind, d.messages) for d in found] == [("order", 2)]
     assert found[0].first == "message 1 is of frame 2, was of 1"

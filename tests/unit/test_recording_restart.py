@@ -143,6 +143,19 @@ def test_a_part_of_which_nothing_reached_the_disk_is_set_aside(path: Path, conte
     assert record(path, range(2, 4)) == part
 
 
+@pytest.mark.parametrize("content", [b"", bytes(5000)])
+def test_an_earlier_part_of_which_nothing_is_left_is_set_aside(path: Path, content: bytes) -> None:
+    """The recorder goes on: what its senders still have is behind the last part."""
+    part = record(path, range(2))
+    part.write_bytes(content)
+    record(path, range(2, 4))
+    assert mend(path) == ({KEY: 4}, set())
+    assert part.with_name(f"{part.name}.unreadable").read_bytes() == content
+    assert on_disk(path) == [2, 3]
+    assert record(path, range(4, 6)).name == "part_00002.mcap"
+    assert mend(path) == ({KEY: 6}, set())
+
+
 def test_what_earlier_recorders_closed_is_not_read_again(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

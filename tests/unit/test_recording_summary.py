@@ -64,6 +64,18 @@ def test_gaps_and_what_the_end_says_are_counted(tmp_path: Path) -> None:
     assert "5 messages missing" in text
 
 
+def test_one_of_a_thing_is_said_in_the_singular(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, [0], end=2)
+    text = "\n".join(describe(summarise(path)))
+    assert " 1 message, " in text
+    assert "1 message missing" in text
+    write(path, [*range(0, 14, 2)], end=13)
+    assert "1 more gap)" in "\n".join(describe(summarise(path)))
+    write(path, [0], end=None)
+    assert "1 topic" in "\n".join(describe(summarise(path)))
+
+
 def test_an_interrupted_run_is_closed_and_not_complete(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, list(range(5)), end=5, complete=False)

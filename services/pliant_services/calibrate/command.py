@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import math
+import os
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,9 +38,11 @@ from pliant.export.posed_images import INLIER_PX, IdealCamera
 from pliant.files import make_folder, write_whole
 from pliant.pictures.calibration import SeenCorners, coverage, draw_calibration
 from pliant.pictures.movie import write_image
+from pliant.recording.parts import parts_of
 from pliant.recording.reader import Recording
 from pliant.results.folder import CALIBRATION_NAME, RECORDING_NAME, REPORT_NAME, keep_apart
 from pliant.results.run import Run, read_run, seen_by_keyframes
+from pliant.wording import counted
 from pliant_services.calibrate.board import PrintedBoard
 from pliant_services.cli.counting import tell_progress
 from pliant_services.run.command import RunRequest, run_pipeline
@@ -79,10 +82,25 @@ def check_file(output: Path, *, source: str, mask: Path | None, force: bool) -> 
     """Raise ResultError where the calibration cannot go there.  Changes nothing."""
     if output.is_dir():
         raise ResultError(f"{output} is a folder: name a file, such as {output / 'calib.yaml'}")
-    if output.exists() and not force:
-        raise ResultError(f"{output} exists: choose another --output, or --force to replace it")
-    read = [Path(source)] if Path(source).exists() else []
-    keep_apart(output, read if mask is None else [*read, mask])
+    picture = picture_of(output)
+    if picture == output:
+        raise ResultError(f"{output}: a calibration is no picture: name it {output.stem}.yaml")
+    read = [Path(source), *parts_of(Path(source))] if os.path.exists(source) else []
+    read += [] if mask is None else [mask]
+    for path in (output, picture):
+        keep_apart(path, read)
+        for folder in (each.resolve() for each in read if each.is_dir()):
+            if folder in path.resolve().parents:
+                raise ResultError(
+                    f"{path} lies in {folder}, which is read: choose another --output"
+                )
+        if path.exists() and not force:
+            raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
+
+
+def picture_of(output: Path) -> Path:
+    """Where the picture of a calibration goes: beside it."""
+    return output.with_suffix(".png")
 
 
 def calibrate_with_board(
@@ -106,15 +124,16 @@ def calibrate_with_board(
     found, others, looked = _look_for(dataset, printed, source)
     if not found:
         raise CalibrationError(
-            f"{source}: {printed.spelled} is in none of {looked} frames: {_hint(others, printed)}"
+            f"{source}: {printed.spelled} is in none of {counted(looked, 'frame')}: "
+            + _hint(others, printed)
         )
     views = [each.view for each in found]
     chosen = choose_views(views, [each.sharpness for each in found], printed.board, width)
     if len(chosen) < MIN_VIEWS:
         raise CalibrationError(
-            f"{source}: {printed.spelled} is in {len(found)} of {looked} frames, of which "
-            f"{len(chosen)} differ, and {MIN_VIEWS} are needed: move it through the whole image "
-            f"and tilt it; of the other frames: {_hint(others, printed)}"
+            f"{source}: {printed.spelled} is in {len(found)} of {counted(looked, 'frame')}, "
+            f"of which {len(chosen)} differ, and {MIN_VIEWS} are needed: move it through the whole "
+            f"image and tilt it; of the other frames: {_hint(others, printed)}"
         )
     chosen_views = [views[i] for i in chosen]
     result = calibrate(chosen_views, width, height, lens)
@@ -125,10 +144,11 @@ def calibrate_with_board(
     covered = coverage(seen, width, height)
     lines = [
         _said(calibration, result.focal_sigma),
-        f"reprojection error {result.rms_px:.2f} px in {len(used)} views, of {len(found)} frames "
-        f"with {printed.spelled}; they cover {100.0 * covered:.0f} % of the image",
+        f"reprojection error {result.rms_px:.2f} px in {counted(len(used), 'view')}, of "
+        f"{counted(len(found), 'frame')} with {printed.spelled}; they cover "
+        f"{100.0 * covered:.0f} % of the image",
     ]
-    picture = output.with_suffix(".png")
+    picture = picture_of(output)
     make_folder(output.parent)
     write_image(picture, draw_calibration(seen, width, height, [f"{source}: {lines[0]}", lines[1]]))
     _write(output, calibration, [f"pliant calibrate {source} --board {printed.spelled}", *lines])
@@ -269,7 +289,7 @@ def calibrate_without_board(
     _write(output, calibration, [f"pliant calibrate {source}", verdict])
     if not len(left.points_px):  # no part of the image has enough of them
         return [*lines, f"written: {output}"]
-    picture = output.with_suffix(".png")
+    picture = picture_of(output)
     of = f"medians of what is left over of {count:,} sights of points, over the image"
     words = [f"{source}: {lines[0]}", verdict, of]
     assert run.stream is not None

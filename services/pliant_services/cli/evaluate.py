@@ -37,6 +37,9 @@ def evaluate(
         Path | None, typer.Option(help="PNG of the error over time (needs matplotlib).")
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every figure as JSON.")] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace an existing --json or --plot.")
+    ] = False,
 ) -> None:
     """Compare a result with the truth: ATE under Sim(3), RPE, success rate, final and causal.
 
@@ -61,6 +64,7 @@ def evaluate(
         surfels=surfels,
         plot=plot,
         json=json,
+        force=force,
     )
     for line in run_evaluation(request):
         typer.echo(line)

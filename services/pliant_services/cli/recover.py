@@ -23,7 +23,8 @@ def recover(
     from pliant.recording.parts import parts_of
     from pliant.recording.recover import recover as make_whole
     from pliant.recording.summary import describe, summarise
-    from pliant.results.folder import keep_apart
+    from pliant.results.folder import check_free, keep_apart
+    from pliant.wording import counted
     from pliant_services.cli.info import recording_file
 
     damaged = recording_file(recording)
@@ -32,11 +33,12 @@ def recover(
     keep_apart(whole, parts_of(damaged))
     if whole.exists() and not force:
         raise RecordingError(f"{whole} exists: choose another --output, or --force to replace it")
+    check_free(whole.parent)
     recovery = make_whole(damaged, whole)
-    typer.echo(f"{recovery.messages} messages kept in {whole}")
+    typer.echo(f"{counted(recovery.messages, 'message')} kept in {whole}")
     if recovery.unchecked:
         typer.echo(f"{recovery.unchecked} of them from a chunk that was cut off, unchecked")
     for damage in recovery.damage:
-        typer.echo(f"lost at byte {damage.offset}, {damage.size} bytes: {damage.what}")
+        typer.echo(f"lost at byte {damage.offset}, {counted(damage.size, 'byte')}: {damage.what}")
     for line in describe(summarise(whole)):
         typer.echo(line)

@@ -22,6 +22,7 @@ from pliant.results.folder import keep_apart, written
 from pliant.results.known_scale import MetricRecording
 from pliant.results.mesh_files import mesh_report, meshes_of, write_meshes
 from pliant.results.run import folded_map
+from pliant.wording import counted
 from pliant_services.processes import BY_NAME
 from pliant_services.replay.services import run_on
 
@@ -90,8 +91,9 @@ def run_mesh(
         write_whole(output / REPORT_NAME, json.dumps(report, indent=1) + "\n")
     for mesh in mesh_report(found.pieces):
         yield (
-            f"segment {mesh['segment']}, {mesh['level']}: {mesh['triangles']} triangles, "
-            f"{mesh['vertices']} vertices, voxel {mesh['voxel_size']:.4g}"
+            f"segment {mesh['segment']}, {mesh['level']}: "
+            f"{counted(mesh['triangles'], 'triangle')}, {mesh['vertices']} vertices, "
+            f"voxel {mesh['voxel_size']:.4g}"
         )
     if not found.pieces:
         why = found.notes[-1] if found.notes else "it has no keyframes"

@@ -13,9 +13,17 @@ from pliant.recording.compare import check_tolerances, compare
 from pliant.recording.parts import parts_of
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
-from pliant.results.folder import RECORDING_NAME, keep_apart, prepare, run_metadata, written
+from pliant.results.folder import (
+    RECORDING_NAME,
+    keep_apart,
+    prepare,
+    run_metadata,
+    settle,
+    written,
+)
 from pliant.results.verdict import summary
 from pliant.results.write import write_results
+from pliant.wording import counted
 from pliant_services.replay.services import (
     Replay,
     gaps,
@@ -75,6 +83,7 @@ def _replay_into(output: Path, request: ReplayRequest) -> int:
         print(line, file=sys.stderr)
     replay.run(output / RECORDING_NAME, metadata)
     report = write_results(output)
+    settle(output)
     has_map = topics.MAP_UPDATE in replay.made or topics.MAP_UPDATE.key not in replay.affected
     for line in summary(report, has_map=has_map):
         print(line)
@@ -90,7 +99,7 @@ def _replay_into(output: Path, request: ReplayRequest) -> int:
     )
     for difference in differences:
         print(
-            f"{difference.topic} differs in {difference.messages} messages, "
+            f"{difference.topic} differs in {counted(difference.messages, 'message')}, "
             f"first {difference.first}"
         )
     if not differences:

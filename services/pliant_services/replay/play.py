@@ -17,6 +17,7 @@ from pliant.errors import RecordingError
 from pliant.messages.topics import Topic
 from pliant.recording.playback import Playback
 from pliant.recording.reader import Recording
+from pliant.wording import counted
 from pliant_services.processes import BY_NAME, inputs_of, outputs_of
 from pliant_services.replay.player import Played, chosen_topics, play, senders
 from pliant_services.runtime.host import observer_windows
@@ -80,7 +81,7 @@ def run_play(request: PlayRequest) -> int:
                 windows=observer_windows(config, fleet),
                 wait_until=pace.wait_until,
             )
-            _say(f"{count} messages played")
+            _say(f"{counted(count, 'message')} played")
             if pace.stopped or not request.loop:
                 return 0
 

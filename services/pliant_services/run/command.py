@@ -20,6 +20,7 @@ from pliant.errors import CalibrationError, PliantError, ResultError
 from pliant.exit_codes import INTERRUPTED
 from pliant.files import make_folder, write_whole
 from pliant.fusion.memory import check_voxel_sizes
+from pliant.messages.types import Status
 from pliant.recording import parts
 from pliant.recording.map_file import MapFile
 from pliant.recording.recover import mend
@@ -32,8 +33,10 @@ from pliant.results.folder import (
     files_of,
     files_read,
     folder_name,
+    has_earlier,
     keep_apart,
     prepare,
+    settle,
     written,
 )
 from pliant.wording import counted
@@ -87,7 +90,8 @@ def run_pipeline(request: RunRequest) -> int:
     known = None if request.known is None else MapFile(request.known)
     if known is not None:
         read.append(known.path)
-    read += [request.mask] if request.mask is not None else []
+    # What the configuration says is taken over before anything goes: it may be of this folder.
+    read += [path for path in (request.mask, request.calibration) if path is not None]
     keep_apart(output, read)
     if request.save is not None:
         keep_apart(request.save, [*read, *files_read(output)], option="--save")
@@ -152,7 +156,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
         fleet = Fleet(
             services,
             log_folder=output / "logs",
-            on_status=progress.on_status,
+            on_status=lambda status: _on_status(status, output, progress),
             port=request.port,
             state=state,
         )
@@ -209,6 +213,13 @@ def _go_through(
             return False, error
     finally:
         fleet.close()
+
+
+def _on_status(status: Status, output: Path, progress: Progress) -> None:
+    """Take in a status; the first that tells of a mapped frame ends the time of earlier results."""
+    if status.service in ("bundle_adjustment", "surfels"):
+        settle(output)
+    progress.on_status(status)
 
 
 def _told_poses(request: RunRequest, fleet: Fleet) -> AbstractContextManager[None]:
@@ -299,7 +310,12 @@ def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> 
         if failure is not None:  # it came first, and says why this one followed
             raise failure from None
         raise
-    if isinstance(failure, ServiceDiedError) and not (failure.crashed or report["frames"]):
+    if report["frames"]:
+        settle(output)
+    elif has_earlier(output):  # which come back
+        none = ResultError(f"{output}: the run had no frame, earlier results are kept")
+        raise failure or (KeyboardInterrupt() if interrupted else none)
+    elif isinstance(failure, ServiceDiedError) and not failure.crashed:
         discard(output)  # its line says it all
         raise failure
     with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them

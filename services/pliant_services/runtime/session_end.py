@@ -7,7 +7,7 @@ then tells everybody that the session is over.
 
 import sys
 import time
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from pliant.bus.peers import OVER_KEY
@@ -17,7 +17,7 @@ from pliant.errors import ResultError, SessionOverError, SourceLostError
 from pliant.exit_codes import DONE
 from pliant.files import make_folder, put_in_place, write_whole
 from pliant.recording import parts
-from pliant.results.folder import CONFIG_NAME, RECORDING_NAME, written
+from pliant.results.folder import CONFIG_NAME, RECORDING_NAME, recorded_into, written
 from pliant_services.processes import BY_NAME, PROCESSES
 from pliant_services.runtime.host import ServiceOptions, run_service
 
@@ -38,7 +38,7 @@ def run_alone(name: str, config: Config, options: ServiceOptions, *, results: bo
     if not _is_done(name, options.state, recorded):
         if recorded is not None:
             _check_recording(recorded, options.state)
-        with nullcontext() if recorded is None else written(recorded.parent, force=True):
+        with _held(output, results=recorded is not None):
             try:
                 run_service(name, config, options)
             except SessionOverError as over:
@@ -55,6 +55,13 @@ def run_alone(name: str, config: Config, options: ServiceOptions, *, results: bo
     if recorded is not None:
         _say_over(options)
     return code
+
+
+def _held(output: Path | None, *, results: bool) -> AbstractContextManager[None]:
+    """The folder that a recorder writes to, so that nobody replaces what is there."""
+    if output is None:
+        return nullcontext()
+    return written(output.parent, force=True) if results else recorded_into(output.parent)
 
 
 def _say_over(options: ServiceOptions) -> None:

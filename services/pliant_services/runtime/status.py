@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import zenoh
 
 from pliant.bus.health import Health, health_key, read_health
-from pliant.bus.peers import STOP_KEY, service_of
+from pliant.bus.peers import STOP_KEY, misfit, service_of
 from pliant.bus.session import Identity, open_session
 from pliant.errors import BusError
 
@@ -20,6 +20,7 @@ _HEADINGS = (
 
 _SAY_AGAIN_S = 0.5
 _SILENT = "told nothing: stopped, or its host cut off"
+_READER = "this command"
 
 
 @dataclass
@@ -41,9 +42,9 @@ class Seen:
 
 def listen(
     endpoints: Sequence[str], session: str, seconds: float, identity: Identity | None = None
-) -> tuple[list[Seen], list[tuple[str, str]]]:
+) -> tuple[list[Seen], list[tuple[str, str, str]]]:
     """Every service that told its health in so many seconds, by session and name; and the session
-    and name of those that are announced and told nothing.
+    and name of those that are announced and told nothing that we read, and why that is.
 
     Raises BusError where no router answers.
     """
@@ -81,18 +82,22 @@ def listen(
         time.sleep(seconds)
         for subscriber in subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
-    silent = set(announced.values()) - set(seen)
+    silent = {
+        (*name, misfit(key, _READER) or _SILENT)
+        for key, name in announced.items()
+        if name not in seen
+    }
     return [seen[key] for key in sorted(seen)], sorted(silent)
 
 
-def table(services: Sequence[Seen], silent: Sequence[tuple[str, str]] = ()) -> Iterator[str]:
-    """The services as lines of text.  silent: session and name of those that told nothing."""
+def table(services: Sequence[Seen], silent: Sequence[tuple[str, str, str]] = ()) -> Iterator[str]:
+    """The services as lines of text.  silent: session, name, and why nothing is told of it."""
     newest: dict[str, int] = {}
     for each in services:
         newest[each.session] = max(newest.get(each.session, 0), each.last.frame)
     rows = [_HEADINGS, *(_row(each, newest[each.session]) for each in services)]
     unknown = ("-",) * (len(_HEADINGS) - 3)
-    rows += [(*which, *unknown, _SILENT) for which in silent]
+    rows += [(session, name, *unknown, why) for session, name, why in silent]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADINGS))]
     for row in rows:
         yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip()

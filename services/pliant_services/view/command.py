@@ -5,7 +5,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,8 +13,9 @@ from typing import Any, Protocol
 import zenoh
 
 from pliant.bus.links import received
+from pliant.bus.peers import misfit
 from pliant.bus.session import Identity, open_session
-from pliant.errors import MessageError, PliantError, ResultError
+from pliant.errors import BusError, MessageError, PliantError, ResultError
 from pliant.export.images import camera_of
 from pliant.export.models import MESH_NAME, draw
 from pliant.messages import codec, topics
@@ -104,7 +105,8 @@ def follow(
 
     patience_s: for a session that is about to start.     identity: for tls/ endpoints.
 
-    Raises BusError where nothing listens, ResultError where the session does not run.
+    Raises BusError where nothing listens or what runs is of another version, ResultError where the
+    session does not run.
     """
     prefix = f"pliant/{session}/view/"
     waiting = Backlog(_WAITING, _WAITING_BYTES)
@@ -123,6 +125,7 @@ def follow(
         deadline = time.monotonic() + patience_s
         while not _runs(connection, session):
             if time.monotonic() > deadline:
+                check_versions(_tokens(connection, session))
                 raise ResultError("no such session runs there: `pliant status` lists what does")
             time.sleep(0.1)
         _draw_while(canvas, waiting, lambda: canvas.is_watched and _runs(connection, session))
@@ -203,8 +206,21 @@ def _draw_while(canvas: Canvas, waiting: Backlog, goes_on: Callable[[], bool]) -
         )
 
 
+def _tokens(connection: zenoh.Session, session: str) -> list[str]:
+    """Of the services that are there, those of other versions included."""
+    replies = connection.liveliness().get(f"pliant/{session}/ready/**")
+    return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+
 def _runs(connection: zenoh.Session, session: str) -> bool:
-    return any(True for _ in connection.liveliness().get(f"pliant/{session}/ready/**"))
+    """Whether a service is there that speaks as we do."""
+    return any(not misfit(token, "") for token in _tokens(connection, session))
+
+
+def check_versions(tokens: Iterable[str]) -> None:
+    """Raise BusError where a service is of another version: its messages would not be read."""
+    for words in filter(None, (misfit(token, "this viewer") for token in tokens)):
+        raise BusError(f"{words}: look on with the release that runs there")
 
 
 def _recording(source: Path | None) -> Recording | None:

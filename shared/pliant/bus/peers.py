@@ -37,6 +37,22 @@ def service_of(key: str) -> str:
     return key.split("/ready/", 1)[1].split("/")[0]
 
 
+def misfit(key: str, reader: str) -> str:
+    """What is said of the token of another version than this reader's; "" of one that fits, and of
+    none of ours."""
+    match = _TOKEN.search(key)
+    if match is None:
+        return ""
+    name, _, wire, version = match.groups()
+    release, _, schema = version.partition("+")
+    if (int(wire), schema) == (WIRE_VERSION, SCHEMA):
+        return ""
+    return (
+        f"{name} is pliant {release} (wire version {wire}, messages {schema or '-'}), "
+        f"{reader} is {__version__} (wire version {WIRE_VERSION}, messages {SCHEMA})"
+    )
+
+
 @dataclass
 class Peers:
     """The services that are here, and since when those that went away are gone."""
@@ -68,13 +84,9 @@ class Peers:
         match = _TOKEN.search(key)
         if match is None:
             return ""
-        name, number, wire, version = match.groups()
-        release, _, schema = version.partition("+")
-        if (int(wire), schema) != (WIRE_VERSION, SCHEMA):
-            words = (
-                f"{name} is pliant {release} (wire version {wire}, messages {schema or '-'}), "
-                f"{self.service} is {__version__} (wire version {WIRE_VERSION}, messages {SCHEMA})"
-            )
+        name, number = match.groups()[:2]
+        words = misfit(key, self.service)
+        if words:
             if alive and name in self.needed and not self.here.get(name):
                 self.refusal = f"{words}: run one version everywhere"
             elif alive and len(self.strangers) < _MOST_STRANGERS:

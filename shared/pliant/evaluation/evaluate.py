@@ -18,7 +18,7 @@ from pliant.evaluation.presentation import (
     write_json,
 )
 from pliant.evaluation.run_evaluation import Evaluation, evaluate_result
-from pliant.results.folder import PAGE_NAME, files_read, keep_apart
+from pliant.results.folder import PAGE_NAME, check_free, files_read, keep_apart
 from pliant.results.page.page import put_truth_in
 
 
@@ -36,6 +36,7 @@ class EvaluationRequest:
     surfels: bool
     plot: Path | None
     json: Path | None
+    force: bool = False
 
 
 def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
@@ -43,10 +44,8 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
     missing = [str(result) for result in request.results if not result.exists()]
     if missing:
         raise ResultError(f"{missing[0]}: no such result")
-    read = [file for result in request.results for file in [result, *files_read(result)]]
-    for option, path in (("--json", request.json), ("--plot", request.plot)):
-        if path is not None:
-            keep_apart(path, [*read, Path(request.groundtruth)], option=option)
+    check_free(*request.results)
+    _check_outputs(request)
     if request.surfels:
         yield from _evaluate_surfels(request)
         return
@@ -87,6 +86,25 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         yield from mesh_against_truth(request.results[0], truth, evaluations[0], figures)
     if request.json is not None:
         write_json(request.json, figures)
+
+
+def _check_outputs(request: EvaluationRequest) -> None:
+    """Raise ResultError where a file would replace what is read, or what is there.
+
+    It may be a new one beside what is read.
+    """
+    truth = Path(request.groundtruth)
+    read = [truth, *(file for each in request.results for file in [each, *files_read(each)])]
+    read += [truth.with_name("times.txt") if request.times is None else request.times]
+    for option, path in (("--json", request.json), ("--plot", request.plot)):
+        if path is None:
+            continue
+        keep_apart(path, read, option=option)
+        if path.exists() and truth.is_dir() and truth.resolve() in path.resolve().parents:
+            raise ResultError(f"{path} is of what is read, {truth}: choose another {option}")
+        if path.is_file() and not request.force:
+            raise ResultError(f"{path} exists: choose another {option}, or --force to replace it")
+        read.append(path)
 
 
 def _tell_pages(results: Sequence[Path], evaluations: Sequence[Evaluation]) -> Iterator[str]:

@@ -41,7 +41,7 @@ from pliant.pictures.movie import animation_suffix, write_animation, write_image
 from pliant.pictures.overlay import OverlayFrame, write_overlay_video
 from pliant.recording.parts import parts_in
 from pliant.recording.reader import Recorded, Recording
-from pliant.results.folder import RECORDING_NAME, files_read, keep_apart
+from pliant.results.folder import RECORDING_NAME, check_free, files_read, keep_apart
 from pliant.results.known_scale import MetricRecording
 from pliant.results.mesh_files import mesh_of
 from pliant.results.run import Run, read_run
@@ -100,6 +100,7 @@ def export_result(
     _check_ending(path, to, name)
     if path.exists() and not force:
         raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
+    check_free(path, path.parent)
     fresh = not path.exists()
     try:
         write(recording, path, folder, **given)

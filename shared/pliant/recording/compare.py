@@ -11,6 +11,7 @@ from pliant.errors import RecordingError
 from pliant.messages.topics import Topic
 from pliant.messages.types import Header
 from pliant.recording.reader import Recording
+from pliant.wording import counted
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ def _compare_topic(
         else:
             content.append(f"frame {was.frame}: {told}")
     if counts[0] != counts[1]:
-        what = f"{counts[1]} messages, was {counts[0]}"
+        what = f"{counted(counts[1], 'message')}, was {counts[0]}"
         yield Difference(topic.key, "count", what, abs(counts[0] - counts[1]))
     for kind, first in (("order", order), ("field", content)):
         if first:

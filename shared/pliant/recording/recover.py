@@ -119,26 +119,29 @@ def mend(path: Path) -> tuple[dict[str, int], set[str]]:
     For a recorder that is started again.  What is counted is on the disk, without a gap, under a
     checksum: what else a power cut left of the last part is dropped, for its senders, who were not
     told that it is safe, have it still.  Earlier parts were put on the disk when they were closed,
-    and are not read again.  A last part of which nothing is readable is set aside.  An end counts
+    and are not read again.  A part of which nothing is readable is set aside.  An end counts
     as a message of its topic.  ``path``: of the recording, whose parts lie beside it.
 
     Raises RecordingError where a part cannot be read or written.
     """
     books = _Books()
     files = parts_in(folder_of_parts(path))
-    for file in files[:-1]:
-        books.take_up(file)
+    whole = [file for file in files[:-1] if _read_or_set_aside(books.take_up, file)]
     for last in files[-1:]:
-        books.from_the_beginning = [*map(number_of, files)] == [*range(len(files))]
-        try:
-            summary = summarise(last)
-            if not summary.has_index or summary.damage:
-                books.mend(last)
-            else:
-                books.take_up(last)
-        except NothingReadableError:
-            put_in_place(last, last.with_name(last.name + ".unreadable"))
+        numbers = [*map(number_of, [*whole, last])]
+        books.from_the_beginning = numbers == [*range(len(files))]
+        _read_or_set_aside(books.take_up_last, last)
     return books.counts, books.ended
+
+
+def _read_or_set_aside(read: Callable[[Path], None], file: Path) -> bool:
+    """Whether something of a part can be read; it gets another name where nothing can."""
+    try:
+        read(file)
+    except NothingReadableError:
+        put_in_place(file, file.with_name(file.name + ".unreadable"))
+        return False
+    return True
 
 
 @dataclass
@@ -195,6 +198,14 @@ class _Books:
         except RecordingError:
             recover(file, file)
             self._count_last(Index(file))
+
+    def take_up_last(self, file: Path) -> None:
+        """Count what a part says that was perhaps cut off."""
+        summary = summarise(file)
+        if not summary.has_index or summary.damage:
+            self.mend(file)
+        else:
+            self.take_up(file)
 
     def _count_last(self, index: Index) -> None:
         for topic in index.topics:

@@ -12,6 +12,7 @@ from pliant.messages import topics
 from pliant.messages.types import ClipPiece, StreamEnd
 from pliant.recording.reader import Recorded, Recording
 from pliant.recording.scan import Closed, Damage
+from pliant.wording import counted
 
 _SEQUENCES = 1 << 32  # MCAP counts with 32 bits
 
@@ -145,7 +146,7 @@ def describe(summary: Summary) -> Iterator[str]:
     pliant = summary.metadata.get("pliant", {})
     yield (
         f"{in_words(summary.size)}, {summary.duration_s:.1f} s, "
-        f"{sum(t.messages for t in summary.topics.values())} messages, {state(summary)}"
+        f"{counted(sum(t.messages for t in summary.topics.values()), 'message')}, {state(summary)}"
     )
     if pliant:
         written = f"pliant {pliant.get('version', '?')} {pliant.get('commit', '')[:12]}".strip()
@@ -174,13 +175,13 @@ def state(summary: Summary) -> str:
     if not summary.has_index:
         words.append("not closed (pliant recover makes it whole again)")
     elif summary.open_topics:
-        words.append(f"indexed, without the end of {len(summary.open_topics)} topics")
+        words.append(f"indexed, without the end of {counted(len(summary.open_topics), 'topic')}")
     else:
         interrupted = any(t.end and not t.end.complete for t in summary.topics.values())
         words.append("closed after an interruption" if interrupted else "closed")
-    words.append(f"{summary.missing} messages missing" if summary.missing else "no gaps")
+    words.append(f"{counted(summary.missing, 'message')} missing" if summary.missing else "no gaps")
     if summary.repeated:
-        words.append(f"{summary.repeated} messages twice")
+        words.append(f"{counted(summary.repeated, 'message')} twice")
     if summary.damage and summary.has_index:
         words.append("damaged")
     return ", ".join(words)
@@ -188,7 +189,7 @@ def state(summary: Summary) -> str:
 
 def _missing(topic: TopicSummary) -> str:
     shown = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in topic.gaps[:5])
-    more = f" and {len(topic.gaps) - 5} more gaps" if len(topic.gaps) > 5 else ""
+    more = f" and {counted(len(topic.gaps) - 5, 'more gap')}" if len(topic.gaps) > 5 else ""
     count = f"{topic.missing}{f' ({shown}{more})' if shown else ''}"
     return count if topic.end is not None else f"{count}, no end"
 

@@ -49,6 +49,11 @@ SOMETIMES = (MAP_NAME, SCALE_NAME)
 """Of a map that came to its end, and of one whose scale is known."""
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
 _LOCK_NAME = ".lock"
+_EARLIER = ".earlier"
+"""Results that are about to be replaced, until those of the new run have begun."""
+_MOVING = ".earlier.partial"
+"""While they are moved there or back: what lies in it is not in its place, and the rest is."""
+_GOING = ".earlier.going"
 _VERSIONS = ("eclipse-zenoh", "mcap", "msgpack", "numba", "numpy", "opencv-python-headless")
 
 
@@ -101,8 +106,9 @@ def all_or_none(output: Path) -> Generator[Path]:
 def written(output: Path, *, force: bool) -> Generator[None]:
     """Hold a result folder while results are written to it; made here, it goes if it stays empty.
 
-    The lock is the system's, so that of a process that died holds nobody up.  Raises ResultError
-    where the results cannot go there, or another process is writing them.
+    Earlier results that ``prepare`` has set aside come back, unless ``settle`` was called.  The
+    lock is the system's, so that of a process that died holds nobody up.  Raises ResultError where
+    the results cannot go there, or another process is writing them.
     """
     check_output(output, force=force)
     missing = [folder for folder in (output, *output.parents) if not folder.exists()]
@@ -116,6 +122,8 @@ def written(output: Path, *, force: bool) -> Generator[None]:
             check_output(output, force=force)  # another one may have been here meanwhile
             yield
         finally:
+            with suppress(OSError):  # they are there, and the next run finds them
+                _put_back(output)
             (output / _LOCK_NAME).unlink(missing_ok=True)
             os.close(lock)
     finally:
@@ -124,13 +132,33 @@ def written(output: Path, *, force: bool) -> Generator[None]:
                 folder.rmdir()
 
 
-def _locked(output: Path) -> int:
+@contextmanager
+def recorded_into(folder: Path) -> Generator[None]:
+    """Hold the folder of a recording against those who would replace what is there.
+
+    Others may record into it beside us.  Raises ResultError where results are written to it.
+    """
+    try:
+        make_folder(folder)
+        lock = _locked(folder, fcntl.LOCK_SH)
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # another one still records
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            (folder / _LOCK_NAME).unlink(missing_ok=True)
+        os.close(lock)
+
+
+def _locked(output: Path, kind: int = fcntl.LOCK_EX) -> int:
     """The descriptor of a lock file with our number in it."""
     path = output / _LOCK_NAME
     while True:
         lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, kind | fcntl.LOCK_NB)
             if os.path.exists(path) and os.path.samestat(os.fstat(lock), os.stat(path)):
                 os.truncate(lock, 0)
                 os.write(lock, f"{os.getpid()}\n".encode())
@@ -142,26 +170,44 @@ def _locked(output: Path) -> int:
                 raise
             holder = os.read(lock, 20).decode().strip()
             os.close(lock)
-            raise ResultError(
-                f"{output} is being written by process {holder or '?'}: "
-                "wait for its end, or choose another --output"
-            ) from None
+            raise _held(output, holder) from None
         os.close(lock)  # its holder left between our two looks, and took the file away
 
 
 def is_being_written(output: Path) -> bool:
     """Whether another process holds a result folder, perhaps on another machine."""
+    return _holder(output) is not None
+
+
+def check_free(*folders: Path) -> None:
+    """Raise ResultError where another process writes to one of these folders."""
+    for folder in folders:
+        holder = _holder(folder)
+        if holder is not None:
+            raise _held(folder, holder)
+
+
+def _holder(output: Path) -> str | None:
+    """The number of the process that holds a folder, "" where nobody knows; None: nobody does."""
     try:
         lock = os.open(output / _LOCK_NAME, os.O_RDWR)
     except OSError:
-        return False
+        return None
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        return error.errno in (errno.EACCES, errno.EAGAIN)
+        if error.errno in (errno.EACCES, errno.EAGAIN):
+            return os.read(lock, 20).decode().strip()
     finally:
         os.close(lock)
-    return False
+    return None
+
+
+def _held(output: Path, holder: str) -> ResultError:
+    return ResultError(
+        f"{output} is being written by process {holder or '?'}: "
+        "wait for its end, or choose another --output"
+    )
 
 
 def running_session(result: Path) -> tuple[list[str], str]:
@@ -193,31 +239,79 @@ def check_output(output: Path, *, force: bool) -> None:
 
 
 def prepare(output: Path, config: str) -> None:
-    """Make the folder, free of earlier results, with what the services read."""
+    """Make the folder, free of earlier results, with what the services read.
+
+    Earlier results are set aside, until ``settle`` says that the new ones have begun.
+    """
     try:
         make_folder(output / "logs")
-        _clear(output)
+        _put_back(output)  # where a run was killed before it had begun
+        shutil.rmtree(output / _GOING, ignore_errors=True)
+        _set_aside(output)
         write_whole(output / CONFIG_NAME, config)
         write_whole(output / "logs" / "metadata.json", json.dumps(run_metadata(config)))
     except OSError as error:
         raise _unwritable(output, error) from None
 
 
-def _clear(output: Path) -> None:
-    parts.remove(output / RECORDING_NAME)
-    shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
-    for name in (*_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME):
-        (output / name).unlink(missing_ok=True)
-    for path in output.glob("*_segment_*"):
-        path.unlink()
+def settle(output: Path) -> None:
+    """The new results have begun: earlier ones, where some were set aside, go."""
+    with suppress(OSError):
+        (output / _EARLIER).rename(output / _GOING)  # a kill half through brings none of them back
+    shutil.rmtree(output / _GOING, ignore_errors=True)
+
+
+def has_earlier(output: Path) -> bool:
+    """Whether earlier results are set aside, and come back if the new ones do not begin."""
+    return (output / _EARLIER).is_dir()
 
 
 def discard(output: Path) -> None:
     """Take away all that a run has left, of one that came to nothing."""
     with suppress(OSError):
         _clear(output)
-        (output / CONFIG_NAME).unlink(missing_ok=True)
         shutil.rmtree(output / "logs", ignore_errors=True)
+
+
+def _results_in(output: Path) -> list[Path]:
+    """All that a run replaces, but for its logs: files, and the folder of checkpoints."""
+    recording = output / RECORDING_NAME
+    names = (CONFIG_NAME, *_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME, STATE_FOLDER)
+    named = [recording, *(output / name for name in dict.fromkeys(names))]
+    found = [*named, *parts.parts_in(parts.folder_of_parts(recording))]
+    return [path for path in (*found, *output.glob("*_segment_*")) if os.path.lexists(path)]
+
+
+def _clear(output: Path) -> None:
+    for path in _results_in(output):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink()
+
+
+def _set_aside(output: Path) -> None:
+    earlier = _results_in(output)
+    if earlier:
+        _move(earlier, output, output / _MOVING)
+        (output / _MOVING).rename(output / _EARLIER)
+
+
+def _put_back(output: Path) -> None:
+    """Earlier results take their places again; what the new run has left of them goes."""
+    if has_earlier(output):
+        _clear(output)
+        (output / _EARLIER).rename(output / _MOVING)
+    if (output / _MOVING).is_dir():
+        _move(_results_in(output / _MOVING), output / _MOVING, output)
+        shutil.rmtree(output / _MOVING)
+
+
+def _move(paths: Iterable[Path], here: Path, there: Path) -> None:
+    for path in paths:
+        place = there / path.relative_to(here)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(path, place)  # a folder of parts may be a link to another disk
 
 
 def _unwritable(output: Path, error: OSError) -> ResultError:

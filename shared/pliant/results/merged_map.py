@@ -10,6 +10,7 @@ from pliant.files import make_folder
 from pliant.messages.types import WORLD_FRAME_ID, Header, MapKeyframe
 from pliant.recording.map_file import MapFile, MapHeader, write_map
 from pliant.results.folder import keep_apart
+from pliant.wording import counted
 
 
 def merge_maps(first: Path, second: Path, output: Path, *, force: bool) -> Iterator[str]:
@@ -35,8 +36,8 @@ def merge_maps(first: Path, second: Path, output: Path, *, force: bool) -> Itera
         raise MapError(f"{first} and {second}: damaged: {error}") from None
     if merged is None:
         raise MapError(
-            f"{second}: none of its {len(other)} keyframes shows a place of {first}: nothing is "
-            "written; a run through both with --map joins them"
+            f"{second}: none of its {counted(len(other), 'keyframe')} shows a place of {first}: "
+            "nothing is written; a run through both with --map joins them"
         )
     first_header = files[0].header
     header = MapHeader(
@@ -60,9 +61,10 @@ def _messages(merged: Merged) -> Iterator[MapKeyframe]:
 
 def _told(merged: Merged, second: Path, output: Path) -> Iterator[str]:
     points = sum(len(each.point_ids) for each in merged.keyframes)
-    yield f"{output}: {len(merged.keyframes)} keyframes, {points} points"
+    yield f"{output}: {counted(len(merged.keyframes), 'keyframe')}, {counted(points, 'point')}"
     for old, segment in merged.joined:
         yield f"segment {old} of {second} lies in segment {segment} now"
     for old, segment in merged.apart:
         yield f"segment {old} of {second} shows no place of the other map: it is segment {segment}"
-    yield f"{merged.proofs} pairs of keyframes show the same place"
+    shows = "pair of keyframes shows" if merged.proofs == 1 else "pairs of keyframes show"
+    yield f"{merged.proofs} {shows} the same place"

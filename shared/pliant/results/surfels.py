@@ -132,19 +132,19 @@ def surfel_summary(report: dict[str, Any]) -> list[str]:
     lines = [
         f"{counted(frames, 'frame')} at {report['frames_per_second']:.1f} frames/s, "
         f"{report['frames_with_pose']} followed ({100.0 * report['success_rate']:.1f} %), "
-        f"{report['births']} surfels born",
+        f"{counted(report['births'], 'surfel')} born",
         f"alive: {report['median_alive']:.0f} in the median frame, "
         f"{alive[-1] if alive else 0} in the last one "
         f"({', '.join(f'{n} {state}' for state, n in report['last_states'].items()) or 'none'})",
     ]
     notes = list(report["notes"].values())
     if notes:
-        lines.append(f"{len(notes)} unusable depth maps: {notes[0]}")
+        lines.append(f"{counted(len(notes), 'unusable depth map')}: {notes[0]}")
     if not report["segments"]:
         lines.append(f"no surfels could start: {report['last_reason']}")
     elif report["frames_lost"]:
         lines.append(
-            f"tracking was lost in {len(report['frames_lost'])} frames, "
+            f"tracking was lost in {counted(len(report['frames_lost']), 'frame')}, "
             f"first {report['frames_lost'][0]}; it starts again where there is depth"
         )
     return lines

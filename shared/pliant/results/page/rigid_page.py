@@ -22,6 +22,7 @@ from pliant.results.page.chart import BLUE, ORANGE, Line, chart
 from pliant.results.page.page import bullets, canvas, fill_page, table_rows
 from pliant.results.page.scene import make_scene
 from pliant.results.run import Run, SeenKeyframe, seen_by_keyframes
+from pliant.wording import counted
 
 _PICTURES = 24
 _WIDTH_PX = 480
@@ -120,7 +121,7 @@ def _figures(run: Run, report: dict[str, Any]) -> list[tuple[str, str]]:
     waited = "every frame waited for the map to begin"
     rows = [
         ("frames", f"{report['frames']}, {report['frames_with_pose']} with a pose"),
-        ("map", f"{report['keyframes']} keyframes, {report['points']:,} points"),
+        ("map", f"{counted(report['keyframes'], 'keyframe')}, {report['points']:,} points"),
         (
             "median per frame",
             f"{report['median_tracks_per_frame']:,.0f} tracks, "
