@@ -1,7 +1,7 @@
-"""The pinhole camera, the distortion models, and the maps that rectify an image.
+"""The pinhole camera: everything behind the ingest works on rectified images.
 
 Pixels are (u, v) with (0, 0) at the centre of the top-left pixel; the camera frame is x right,
-y down, z forward.  Everything behind the ingest works on rectified images and ``PinholeCamera``.
+y down, z forward.
 """
 
 import math
