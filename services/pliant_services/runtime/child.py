@@ -3,7 +3,9 @@
 import signal
 import subprocess
 import threading
+import time
 from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +13,8 @@ from pathlib import Path
 from pliant.exit_codes import DONE, INCOMPLETE
 
 _LAST_WORDS = 12  # lines of a service's log that are shown when it dies
+_POLL_S = 0.05
+_PATIENCE_S = 5.0  # for a process that has left its session, and takes long to end
 
 
 @dataclass
@@ -78,3 +82,21 @@ class Child:
             how += " (is the memory full?)" if -code == signal.SIGKILL else ""
         text = "\n".join(words)
         return f"{self.name} {how}; its log is {self.log}" + (f":\n{text}" if text else "")
+
+
+def first_to_fail(children: Sequence[Child]) -> Child | None:
+    """Which of the services has failed by itself; None where none has failed.
+
+    One death makes others complain that it went away.  It left the session before they heard of
+    it, but its process may end after theirs: then that is waited for.
+    """
+    deadline = time.monotonic() + _PATIENCE_S
+    while failed := [child for child in children if child.failed]:
+        running = any(child.process.poll() is None for child in children)
+        for child in failed:
+            if "went away" not in " ".join(child.last_words()):
+                return child
+        if not running or time.monotonic() > deadline:
+            return failed[0]
+        time.sleep(_POLL_S)
+    return None

@@ -26,7 +26,7 @@ from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import Status
 from pliant_services.processes import BY_NAME
-from pliant_services.runtime.child import Child
+from pliant_services.runtime.child import Child, first_to_fail
 from pliant_services.runtime.relay import Relay
 
 READY_TIMEOUT_S = 120.0
@@ -245,13 +245,9 @@ class Fleet:
 
     def raise_if_died(self) -> None:
         """Raise ServiceDiedError where a service has failed."""
-        if not any(child.failed for child in self._children):
-            return
-        # One death makes others complain that it went away: name the one that did not say so.
-        time.sleep(4 * _POLL_S)
-        failed = [child for child in self._children if child.failed]
-        first = next((c for c in failed if "went away" not in " ".join(c.last_words())), failed[0])
-        raise ServiceDiedError(first.obituary(), crashed=first.crashed)
+        first = first_to_fail(self._children)
+        if first is not None:
+            raise ServiceDiedError(first.obituary(), crashed=first.crashed)
 
 
 @contextmanager
