@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 import pliant  # noqa: F401  (fixes the arithmetic before any test loads numpy)
+from pliant.bus.session import free_endpoint, open_router
 
 ROOT = Path(__file__).parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
@@ -125,3 +126,12 @@ def rigid_data() -> Path:
     if not folder.is_dir():
         pytest.skip("the real sequences are not here (../shared/data/rigid)")
     return folder
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    """Where a router of this process listens."""
+    found = free_endpoint()
+    router = open_router(found)
+    yield found
+    router.close()

@@ -72,13 +72,13 @@ def run(
     history = MapHistory()
     pipeline = Pipeline(calibration or dataset.calibration, load_config(None, overrides), history)
     counts: list[tuple[int, int]] = []
-    deltas = []
+    delta = None
     for source in islice(dataset, frames):
         frame = pipeline.take(source)
         counts.append((len(frame.tracks.ids), frame.delta.inliers))
-        deltas = [frame.delta]
-    deltas.append(pipeline.finish())
-    told = [delta for delta in deltas if delta and delta.calibration_correction]
+        delta = frame.delta
+    ends = (delta, pipeline.finish())
+    told = [each for each in ends if each and each.calibration_correction]
     tracks, inliers = np.median(counts, axis=0).tolist()
     longest, final = history.longest_segment(), history.final()
     return Mapped(

@@ -11,7 +11,6 @@ import numpy as np
 
 from benchmarks.played import Played, Reel
 from benchmarks.table import markdown_header, markdown_row
-from pliant.algorithms.geometry import align_umeyama
 from pliant.config import Config
 from pliant.evaluation.presentation import metres
 
@@ -48,9 +47,4 @@ def path_m(came: Played) -> float:
 
 def end_error_m(came: Played) -> float:
     """Mean error of the last final poses after the Sim(3) that aligns the first ones."""
-    chosen = sorted(came.final.keys() & came.truth.keys())
-    mine = np.array([came.final[n][:3] for n in chosen])
-    true = np.array([came.truth[n] for n in chosen])
-    scale, R, t = align_umeyama(mine[:_FIRST], true[:_FIRST], with_scale=True)
-    last = scale * mine[-_LAST:] @ R.T + t
-    return float(np.linalg.norm(last - true[-_LAST:], axis=1).mean())
+    return float(came.errors_m(came.final, by=_FIRST)[-_LAST:].mean())

@@ -63,12 +63,14 @@ class Played:
         """Of the lit images, those that have a pose in the longest segment."""
         return f"{100.0 * len(self.final) / self.lit:.1f} %"
 
-    def errors_m(self, poses: dict[int, F64], of: Set[int] | None = None) -> F64:
-        """Of poses, after the Sim(3) that aligns them.   of: these alone."""
+    def errors_m(
+        self, poses: dict[int, F64], of: Set[int] | None = None, *, by: int | None = None
+    ) -> F64:
+        """Of poses, after the Sim(3) that aligns them, or the first ``by``.   of: these alone."""
         chosen = sorted(poses.keys() & self.truth.keys() & (poses.keys() if of is None else of))
         mine = np.array([poses[n][:3] for n in chosen])
         true = np.array([self.truth[n] for n in chosen])
-        scale, R, t = align_umeyama(mine, true, with_scale=True)
+        scale, R, t = align_umeyama(mine[:by], true[:by], with_scale=True)
         return np.linalg.norm(scale * mine @ R.T + t - true, axis=1)
 
     def ate_m(self, poses: dict[int, F64], of: Set[int] | None = None) -> float:

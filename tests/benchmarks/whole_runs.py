@@ -15,6 +15,8 @@ from statistics import median
 
 from benchmarks.table import markdown, markdown_header, markdown_row
 from pliant.config import config_yaml, load_config
+from pliant.errors import PliantError
+from pliant.exit_codes import DONE, INCOMPLETE
 from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import Status
@@ -72,9 +74,12 @@ def first_frame(source: str, runs: int) -> Iterator[str]:
     for number in range(runs + 1):
         with tempfile.TemporaryDirectory() as folder:
             output = Path(folder) / "run"
-            command = ("-m", "pliant_services.cli", "run", source, "--output", str(output))
+            options = ("--end", "2", "--output", str(output))
+            command = ("-m", "pliant_services.cli", "run", source, *options)
             began_ns = time.time_ns()
-            subprocess.run([sys.executable, *command], stdout=subprocess.DEVNULL)
+            done = subprocess.run([sys.executable, *command], stdout=subprocess.DEVNULL)
+            if done.returncode not in (DONE, INCOMPLETE):
+                raise PliantError(f"{source}: does not run")
             if number == 0:
                 continue  # which compiled the kernels, and rendered the source
             for topic, seconds in arrived.items():

@@ -20,8 +20,6 @@ from recorded_clips import (
     record,
     references,
     rewritten,
-    write_clip,
-    write_large_clip,
 )
 
 from pliant.datasets.clip import clip_of
@@ -32,16 +30,6 @@ from pliant.messages import topics
 from pliant.recording.layout import CHUNK_BYTES
 from pliant.recording.reader import Recording
 from pliant.recording.recover import recover
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_clip(tmp_path_factory.mktemp("clip") / "clip.mp4")
-
-
-@pytest.fixture(scope="module")
-def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_large_clip(tmp_path_factory.mktemp("large") / "large.avi")
 
 
 def test_a_damaged_clip_is_recorded_and_decoded_as_the_run_did(clip: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""One at a time writes a result folder, and earlier results stay until new ones have begun."""
+"""One at a time writes a result folder."""
 
 import os
 import subprocess
@@ -6,16 +6,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from result_room import contents, evaluation, made_room, refused
+from result_room import evaluation, refused
 
 from pliant.config import load_config
-from pliant.errors import PliantError, RecordingError, ResultError, SourceLostError
+from pliant.errors import PliantError, ResultError, SourceLostError
 from pliant.export.export import export_result
 from pliant.results.folder import (
     is_being_written,
-    prepare,
     recorded_into,
-    settle,
     written,
 )
 from pliant_services.cli.commands import app
@@ -23,56 +21,6 @@ from pliant_services.replay.command import ReplayRequest, run_replay
 from pliant_services.run.command import RunRequest, run_pipeline
 from pliant_services.runtime.host import ServiceOptions
 from pliant_services.runtime.session_end import run_alone
-
-
-@pytest.fixture
-def room(tmp_path: Path) -> Path:
-    return made_room(tmp_path)
-
-
-def test_earlier_results_are_there_until_those_that_replace_them_have_begun(room: Path) -> None:
-    (room / "recording").mkdir()
-    for name in ("recording/part_00000.mcap", "recording/mine", "points_segment_1.ply", "notes"):
-        (room / name).write_text(name)
-    (room / "state" / "tracking").mkdir(parents=True)
-    (room / "state" / "tracking" / "1.state").touch()
-    before = contents(room)
-    for _ in range(2):
-        with written(room, force=True):
-            prepare(room, "seed: 1\n")
-            assert not (room / "recording.mcap").exists()
-            (room / "recording.mcap").write_text("no frame")
-            (room / "recording" / "part_00001.mcap").write_text("no frame")
-        assert {**contents(room), "metadata.json": b""} == {**before, "metadata.json": b""}
-    prepare(room, "seed: 1\n")  # killed at this point
-    with written(room, force=True):
-        prepare(room, "seed: 2\n")
-    assert {**contents(room), "metadata.json": b""} == {**before, "metadata.json": b""}
-    with written(room, force=True):
-        prepare(room, "seed: 2\n")
-        settle(room)
-    assert set(contents(room)) == {"config.yaml", "metadata.json", "mine", "notes"}
-
-
-def test_a_replay_that_fails_leaves_what_was_there(
-    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    other = tmp_path / "other.mcap"
-    os.link(room / "recording.mcap", other)
-    (room / "recording.mcap").unlink()
-    (room / "recording.mcap").write_text("another run's")
-    before = contents(room)
-
-    def fails(*_: object) -> None:
-        raise RecordingError("it ends here")
-
-    monkeypatch.setattr("pliant_services.replay.command.require_inputs", lambda *_: None)
-    monkeypatch.setattr("pliant_services.replay.command.Replay.run", fails)
-    replay = ReplayRequest(recording=other, services=["bundle_adjustment"], output=room, force=True)
-    with pytest.raises(PliantError, match="ends here"):
-        run_replay(replay)
-    assert {**contents(room), "metadata.json": b""} == {**before, "metadata.json": b""}
-
 
 HOLD = """
 import sys

@@ -4,14 +4,12 @@ import os
 import pty
 import termios
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pliant.bus.replay_bus import ReplayBus
-from pliant.bus.session import free_endpoint, open_router
 from pliant.bus.zenoh_bus import ZenohBus
 from pliant.config import Config
 from pliant.datasets import open_source
@@ -43,14 +41,6 @@ def path(ingested: ReplayBus, tmp_path_factory: pytest.TempPathFactory) -> Path:
     logged = {t: m for t, m in ingested.outputs.items() if t.logged}
     recorder.run(ReplayBus(logged), Config(), file, {"config": {"yaml": ""}})
     return file
-
-
-@pytest.fixture
-def endpoint() -> Iterator[str]:
-    found = free_endpoint()
-    router = open_router(found)
-    yield found
-    router.close()
 
 
 def tracking_bus(endpoint: str) -> ZenohBus:

@@ -2,7 +2,7 @@
 
 import random
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from pathlib import Path
 
 import cv2
@@ -18,14 +18,11 @@ from recorded_clips import (
     published_on,
     record,
     references,
-    write_clip,
-    write_large_clip,
 )
 
 import pliant
 from pliant.algorithms.image.masks import unpacked
 from pliant.bus.replay_bus import ReplayBus
-from pliant.bus.session import free_endpoint, open_router
 from pliant.bus.zenoh_bus import ZenohBus
 from pliant.config import Config, IngestParameters
 from pliant.datasets import open_source
@@ -43,16 +40,6 @@ from pliant_services.replay.play import PlayRequest, run_play
 from pliant_services.runtime.monitor import SilentMonitor
 
 PATIENCE_S = 60.0
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_clip(tmp_path_factory.mktemp("clip") / "clip.mp4")
-
-
-@pytest.fixture(scope="module")
-def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_large_clip(tmp_path_factory.mktemp("large") / "large.avi")
 
 
 def test_the_recording_of_a_video_is_as_large_as_the_video(clip: Path, tmp_path: Path) -> None:
@@ -242,14 +229,6 @@ def test_it_is_a_source_with_the_frames_of_the_run(clip: Path, tmp_path: Path) -
     assert [(f.stamp_ns, f.data) for f in open_source(str(path))] == [
         (m.stamp_ns, m.data) for m in published
     ]
-
-
-@pytest.fixture
-def endpoint() -> Iterator[str]:
-    found = free_endpoint()
-    router = open_router(found)
-    yield found
-    router.close()
 
 
 def test_a_replay_plays_pixels(endpoint: str, clip: Path, tmp_path: Path) -> None:

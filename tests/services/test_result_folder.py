@@ -5,10 +5,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from result_room import evaluation, made_room, refused
+from result_room import evaluation, refused
 
 from pliant.errors import ResultError
-from pliant.evaluation.evaluate import EvaluationRequest, run_evaluation
 from pliant.export.export import export_result
 from pliant.results.folder import (
     commit_of,
@@ -21,11 +20,6 @@ from pliant_services.replay.command import ReplayRequest, run_replay
 from pliant_services.run.command import RunRequest, run_pipeline
 
 READ = "is read from there"
-
-
-@pytest.fixture
-def room(tmp_path: Path) -> Path:
-    return made_room(tmp_path)
 
 
 def test_a_run_does_not_destroy_what_it_reads(
@@ -92,12 +86,8 @@ def test_no_command_destroys_what_it_reads(room: Path, tmp_path: Path) -> None:
             )
     for file in ("recording.mcap", "report.json", "trajectory.txt"):
         for option in ("json", "plot"):
-            request = EvaluationRequest(
-                results=[link], groundtruth=str(room / "trajectory.txt"), times=None, frames=None,
-                tracks=False, points=False, mesh=False, surfels=False, force=True,
-                **{"json": None, "plot": None, option: room / file},
-            )  # fmt: skip
-            refused(lambda request=request: list(run_evaluation(request)), room)
+            written = {"results": [link], "force": True, option: room / file}
+            refused(evaluation(room / "trajectory.txt", **written), room)
 
 
 @pytest.fixture

@@ -50,11 +50,10 @@ def test_a_camera_is_found_without_a_board(tmp_path: Path) -> None:
     )
     assert "8 % of each image are ignored (mask.png)" in masked.stderr
     assert masked.returncode == 0, masked.stderr
-    assert read_calibration(anew) != found
     # It was worked on at half its size: what was seen covers its picture's image all the same, of
     # which the mask leaves 92 %, as the first one's.
     assert read_calibration(anew).width == 4 * found.width
-    assert covered(anew.with_suffix(".png")) > 0.8 * covered(picture)
+    assert 0.8 < covered(anew.with_suffix(".png")) / covered(picture) < 0.97
 
 
 def covered(picture: Path) -> float:

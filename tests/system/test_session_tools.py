@@ -50,7 +50,7 @@ def endpoint() -> Iterator[str]:
 
 def long_source(folder: Path) -> str:
     """One that goes on until it is stopped, and needs no rendering."""
-    return str(forth_and_back(builtin_folder("built-in:tiny"), folder / "source", 1000, 30.0))
+    return str(forth_and_back(builtin_folder("built-in:tiny"), folder / "source", 20_000, 30.0))
 
 
 def test_status_and_stop_of_a_session_in_parts(endpoint: str, tmp_path) -> None:

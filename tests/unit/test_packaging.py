@@ -111,7 +111,7 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None
                     imported.add((node.module or "").split(".")[0])
     imported -= {*sys.stdlib_module_names, "pliant", "pliant_services"}
     come_from = packages_distributions()
-    used = distributions(name for module in imported for name in come_from[module])
+    used = distributions(name for module in imported for name in come_from.get(module, [module]))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = distributions(
         need for needs in project["optional-dependencies"].values() for need in needs

@@ -287,9 +287,10 @@ def calibrate_without_board(
     lines = [_said(calibration, calibration.focal_sigma), verdict]
     make_folder(output.parent)
     _write(output, calibration, [f"pliant calibrate {source}", verdict])
-    if not len(left.points_px):  # no part of the image has enough of them
-        return [*lines, f"written: {output}"]
     picture = picture_of(output)
+    if not len(left.points_px):  # no part of the image has enough of them
+        picture.unlink(missing_ok=True)  # that of another calibration
+        return [*lines, f"written: {output}"]
     of = f"medians of what is left over of {count:,} sights of points, over the image"
     words = [f"{source}: {lines[0]}", verdict, of]
     assert run.stream is not None

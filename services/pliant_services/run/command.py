@@ -20,7 +20,6 @@ from pliant.errors import CalibrationError, PliantError, ResultError
 from pliant.exit_codes import INTERRUPTED
 from pliant.files import make_folder, write_whole
 from pliant.fusion.memory import check_voxel_sizes
-from pliant.messages.types import Status
 from pliant.recording import parts
 from pliant.recording.map_file import MapFile
 from pliant.recording.recover import mend
@@ -33,10 +32,8 @@ from pliant.results.folder import (
     files_of,
     files_read,
     folder_name,
-    has_earlier,
     keep_apart,
     prepare,
-    settle,
     written,
 )
 from pliant.wording import counted
@@ -131,6 +128,8 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
         mask=request.mask,
     )
     check_start(dataset)
+    if request.force and not dataset.is_live:
+        next(iter(dataset), None)  # what has no first frame costs no earlier result
     progress = Progress(dataset.frame_count)
     for note in notes_on(dataset):
         progress.say(note)
@@ -156,7 +155,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
         fleet = Fleet(
             services,
             log_folder=output / "logs",
-            on_status=lambda status: _on_status(status, output, progress),
+            on_status=progress.on_status,
             port=request.port,
             state=state,
         )
@@ -213,13 +212,6 @@ def _go_through(
             return False, error
     finally:
         fleet.close()
-
-
-def _on_status(status: Status, output: Path, progress: Progress) -> None:
-    """Take in a status; the first that tells of a mapped frame ends the time of earlier results."""
-    if status.service in ("bundle_adjustment", "surfels"):
-        settle(output)
-    progress.on_status(status)
 
 
 def _told_poses(request: RunRequest, fleet: Fleet) -> AbstractContextManager[None]:
@@ -310,12 +302,7 @@ def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> 
         if failure is not None:  # it came first, and says why this one followed
             raise failure from None
         raise
-    if report["frames"]:
-        settle(output)
-    elif has_earlier(output):  # which come back
-        none = ResultError(f"{output}: the run had no frame, earlier results are kept")
-        raise failure or (KeyboardInterrupt() if interrupted else none)
-    elif isinstance(failure, ServiceDiedError) and not failure.crashed:
+    if isinstance(failure, ServiceDiedError) and not (failure.crashed or report["frames"]):
         discard(output)  # its line says it all
         raise failure
     with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them

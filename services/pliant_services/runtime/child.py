@@ -91,12 +91,12 @@ def first_to_fail(children: Sequence[Child]) -> Child | None:
     it, but its process may end after theirs: then that is waited for.
     """
     deadline = time.monotonic() + _PATIENCE_S
-    while failed := [child for child in children if child.failed]:
+    while True:
         running = any(child.process.poll() is None for child in children)
+        failed = [child for child in children if child.failed]  # who ends in between is in it
         for child in failed:
             if "went away" not in " ".join(child.last_words()):
                 return child
-        if not running or time.monotonic() > deadline:
-            return failed[0]
+        if not failed or not running or time.monotonic() > deadline:
+            return failed[0] if failed else None
         time.sleep(_POLL_S)
-    return None

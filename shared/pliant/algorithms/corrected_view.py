@@ -79,6 +79,11 @@ class CorrectedView:
         return u, camera.cy + np.exp(s) * camera.fy * (y * factor + b)
 
 
+def moved_px(points_px: F32, before: CorrectedView, after: CorrectedView) -> F32:
+    """(N, 2) pixels of one ideal camera in another one."""
+    return after.pixels(before.seen(points_px))
+
+
 def parts_of(correction: tuple[float, ...]) -> tuple[float, float, float, float, float]:
     """(s, k1, k2, a, b) of a correction, also of a recording from before the last two."""
     known = (*correction, *np.zeros(6))[:6] if len(correction) >= 3 else np.zeros(6)

@@ -49,11 +49,6 @@ SOMETIMES = (MAP_NAME, SCALE_NAME)
 """Of a map that came to its end, and of one whose scale is known."""
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
 _LOCK_NAME = ".lock"
-_EARLIER = ".earlier"
-"""Results that are about to be replaced, until those of the new run have begun."""
-_MOVING = ".earlier.partial"
-"""While they are moved there or back: what lies in it is not in its place, and the rest is."""
-_GOING = ".earlier.going"
 _VERSIONS = ("eclipse-zenoh", "mcap", "msgpack", "numba", "numpy", "opencv-python-headless")
 
 
@@ -106,9 +101,8 @@ def all_or_none(output: Path) -> Generator[Path]:
 def written(output: Path, *, force: bool) -> Generator[None]:
     """Hold a result folder while results are written to it; made here, it goes if it stays empty.
 
-    Earlier results that ``prepare`` has set aside come back, unless ``settle`` was called.  The
-    lock is the system's, so that of a process that died holds nobody up.  Raises ResultError where
-    the results cannot go there, or another process is writing them.
+    The lock is the system's, so that of a process that died holds nobody up.  Raises ResultError
+    where the results cannot go there, or another process is writing them.
     """
     check_output(output, force=force)
     missing = [folder for folder in (output, *output.parents) if not folder.exists()]
@@ -122,8 +116,6 @@ def written(output: Path, *, force: bool) -> Generator[None]:
             check_output(output, force=force)  # another one may have been here meanwhile
             yield
         finally:
-            with suppress(OSError):  # they are there, and the next run finds them
-                _put_back(output)
             (output / _LOCK_NAME).unlink(missing_ok=True)
             os.close(lock)
     finally:
@@ -239,79 +231,31 @@ def check_output(output: Path, *, force: bool) -> None:
 
 
 def prepare(output: Path, config: str) -> None:
-    """Make the folder, free of earlier results, with what the services read.
-
-    Earlier results are set aside, until ``settle`` says that the new ones have begun.
-    """
+    """Make the folder, free of earlier results, with what the services read."""
     try:
         make_folder(output / "logs")
-        _put_back(output)  # where a run was killed before it had begun
-        shutil.rmtree(output / _GOING, ignore_errors=True)
-        _set_aside(output)
+        _clear(output)
         write_whole(output / CONFIG_NAME, config)
         write_whole(output / "logs" / "metadata.json", json.dumps(run_metadata(config)))
     except OSError as error:
         raise _unwritable(output, error) from None
 
 
-def settle(output: Path) -> None:
-    """The new results have begun: earlier ones, where some were set aside, go."""
-    with suppress(OSError):
-        (output / _EARLIER).rename(output / _GOING)  # a kill half through brings none of them back
-    shutil.rmtree(output / _GOING, ignore_errors=True)
-
-
-def has_earlier(output: Path) -> bool:
-    """Whether earlier results are set aside, and come back if the new ones do not begin."""
-    return (output / _EARLIER).is_dir()
+def _clear(output: Path) -> None:
+    parts.remove(output / RECORDING_NAME)
+    shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
+    for name in (*_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME):
+        (output / name).unlink(missing_ok=True)
+    for path in output.glob("*_segment_*"):
+        path.unlink()
 
 
 def discard(output: Path) -> None:
     """Take away all that a run has left, of one that came to nothing."""
     with suppress(OSError):
         _clear(output)
+        (output / CONFIG_NAME).unlink(missing_ok=True)
         shutil.rmtree(output / "logs", ignore_errors=True)
-
-
-def _results_in(output: Path) -> list[Path]:
-    """All that a run replaces, but for its logs: files, and the folder of checkpoints."""
-    recording = output / RECORDING_NAME
-    names = (CONFIG_NAME, *_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME, STATE_FOLDER)
-    named = [recording, *(output / name for name in dict.fromkeys(names))]
-    found = [*named, *parts.parts_in(parts.folder_of_parts(recording))]
-    return [path for path in (*found, *output.glob("*_segment_*")) if os.path.lexists(path)]
-
-
-def _clear(output: Path) -> None:
-    for path in _results_in(output):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink()
-
-
-def _set_aside(output: Path) -> None:
-    earlier = _results_in(output)
-    if earlier:
-        _move(earlier, output, output / _MOVING)
-        (output / _MOVING).rename(output / _EARLIER)
-
-
-def _put_back(output: Path) -> None:
-    """Earlier results take their places again; what the new run has left of them goes."""
-    if has_earlier(output):
-        _clear(output)
-        (output / _EARLIER).rename(output / _MOVING)
-    if (output / _MOVING).is_dir():
-        _move(_results_in(output / _MOVING), output / _MOVING, output)
-        shutil.rmtree(output / _MOVING)
-
-
-def _move(paths: Iterable[Path], here: Path, there: Path) -> None:
-    for path in paths:
-        place = there / path.relative_to(here)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.move(path, place)  # a folder of parts may be a link to another disk
 
 
 def _unwritable(output: Path, error: OSError) -> ResultError:

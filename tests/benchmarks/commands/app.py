@@ -14,6 +14,7 @@ app = typer.Typer(
 )
 
 Sources = Annotated[list[str], typer.Argument(help="Folders or built-in:NAME.")]
+Source = Annotated[str, typer.Argument(help="Folder or built-in:NAME.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE; may be repeated.")]
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.commands.app import app, show
+from benchmarks.commands.app import Source, app, show
 
 
 @app.command()
@@ -56,7 +56,7 @@ def mesh_parts(
 
 @app.command()
 def images(
-    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    source: Source = "built-in:room",
     frames: Annotated[int, typer.Option(min=1, help="Frames to measure.")] = 12,
 ) -> None:
     """Images for a link between machines: how small, and what that costs on either side.

@@ -5,12 +5,12 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.commands.app import Overrides, Sources, app, show
+from benchmarks.commands.app import Overrides, Source, Sources, app, show
 
 
 @app.command()
 def tracking(
-    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    source: Source = "built-in:room",
     frames: Annotated[int, typer.Option(help="Frames to measure.")] = 100,
     overrides: Overrides = None,
 ) -> None:

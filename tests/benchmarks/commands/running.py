@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.commands.app import Overrides, Sources, app, show
+from benchmarks.commands.app import Overrides, Source, Sources, app, show
 
 
 @app.command()
@@ -45,7 +45,7 @@ def in_process(
 
 @app.command()
 def losses(
-    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    source: Source = "built-in:room",
     runs: Annotated[int, typer.Option(min=1, help="How often.")] = 20,
 ) -> None:
     """Run again and again at full speed: messages lost by sequence number, and equal bytes.
@@ -59,7 +59,7 @@ def losses(
 
 @app.command("recording-cost")
 def recording_cost(
-    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    source: Source = "built-in:room",
     runs: Annotated[int, typer.Option(min=1, help="Runs with and without, in turns.")] = 3,
 ) -> None:
     """Frames a second of the pipeline with and without a recorder.
@@ -73,7 +73,7 @@ def recording_cost(
 
 @app.command("first-frame")
 def first_frame(
-    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    source: Source = "built-in:room",
     runs: Annotated[int, typer.Option(min=1, help="Of which the median counts.")] = 3,
 ) -> None:
     """From the start of `pliant run` to its first frame, kernels compiled: published, and mapped.
@@ -87,7 +87,7 @@ def first_frame(
 
 @app.command("viewer-cost")
 def viewer_cost(
-    source: Annotated[str, typer.Argument(help="Folder or built-in:NAME.")] = "built-in:room",
+    source: Source = "built-in:room",
     runs: Annotated[int, typer.Option(min=1, help="Of each kind, in turns.")] = 1,
 ) -> None:
     """Frames a second without a viewer, with one that draws, and with one that is stopped.

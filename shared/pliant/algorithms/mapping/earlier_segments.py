@@ -80,10 +80,14 @@ class EarlierSegments:
             if some > size:
                 break
             rest -= some
-        for whole in (limits.keyframes, 1):  # of the newest nobody may have been told yet
-            if whole > 1 or self._observations(own) > room:
-                for each in own:
-                    thin(each.segment, int(size), limits, np.zeros(0, np.int32), whole=whole)
+
+        def thinned(whole: int) -> None:
+            for each in own:
+                thin(each.segment, int(size), limits, np.zeros(0, np.int32), whole=whole)
+
+        thinned(limits.keyframes)  # of the newest nobody may have been told yet
+        if self._observations(own) > room:
+            thinned(1)
         while self._observations(own) > room:
             oldest = own.pop(0)
             points.cull(oldest.segment.mapped_rows())

@@ -11,6 +11,7 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.problem import BundleProblem, BundleResult, shared_intrinsics
 from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import moved_px
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
@@ -134,7 +135,7 @@ def adjust_keyframes(
     count = np.bincount(seen.point[good], minlength=len(seen.rows))
     _update_statistics(seen, good, count, points, view.camera)
     for keyframe in keyframes:
-        keyframe.points_px = view.pixels(before.seen(keyframe.points_px + keyframe.rolled_px))
+        keyframe.points_px = moved_px(keyframe.points_px + keyframe.rolled_px, before, view)
         keyframe.rolled_px = np.zeros_like(keyframe.points_px)
     return known, seen.rows[count < 2], moves
 

@@ -9,8 +9,7 @@ map is, or where no depth lets tracks be where the pose has them.  They are coun
 the texture of a thing does not decide how large it is.
 """
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -42,15 +41,6 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 from pliant.compiler.kernel import kernel
 
-_COLUMNS, _LINES = 8, 6
-"""Cells of the image: each is for a pose, against it, or shows too little."""
-
-_LEAST_SEEN = 5
-"""Tracks without which a cell says nothing."""
-
-_AGAINST = 0.2
-"""A cell is against a pose with fewer inliers than this share of its tracks."""
-
 _AGREEING = 0.5
 """Share of the points of the map that place a frame alone and still fit once candidates help: with
 fewer, what these are on moves by itself."""
@@ -64,6 +54,22 @@ _TELLING = 500
 _FEW, _FIRM = 0.05, 0.2
 """Of the points that placed the last frame: where a film is cut, 0.3 to 2 % agree on a pose by
 chance, and 9 % where the views overlap; the fastest turns with blur leave 11 to 20 %."""
+
+_COLUMNS, _LINES = 8, 6
+"""Cells of the image: each is for a pose, against it, or shows too little."""
+
+_LEAST_SEEN = 5
+"""Tracks without which a cell says nothing."""
+
+_AGAINST = 0.2
+"""A cell is against a pose with fewer inliers than this share of its tracks."""
+
+
+class Located(NamedTuple):
+    """T_world_camera of a frame.   is_firm: so much leads there that the view has not been cut."""
+
+    T_world_camera: F64
+    is_firm: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,54 +85,6 @@ class Support:
     share: float
     contrary: float
     spread: float
-
-
-def support_of(
-    points_px: F32, inliers: BoolArray, telling_px: F32, camera: PinholeCamera
-) -> Support:
-    """points_px: (N, 2) of the points seen, of which ``inliers`` (N,) fit.   telling_px: (M, 2) of
-    the tracks that belong to points if the pose is right, or contradict it.
-    """
-    count = int(np.count_nonzero(inliers))
-    fitting = points_px[inliers]
-    width, height = camera.width, camera.height
-    supported, tracks = _per_cell(fitting, width, height), _per_cell(telling_px, width, height)
-    telling = tracks >= _LEAST_SEEN
-    size = np.array([width, height])
-    return Support(
-        inliers=count,
-        share=count / max(len(points_px), 1),
-        contrary=float((supported < _AGAINST * tracks)[telling].mean()) if telling.any() else 0.0,
-        spread=float(np.min(fitting.std(axis=0) / size)) if count else 0.0,
-    )
-
-
-def doubt(support: Support, parameters: SupportParameters) -> str:
-    """Why the pose may not be that of the camera in the world; "" where nothing speaks for it."""
-    if support.contrary > parameters.max_contrary_share:
-        return f"doubtful: {support.contrary:.0%} of the image moves otherwise"
-    if support.share < parameters.min_share:
-        return f"doubtful: {support.share:.0%} of the points seen are where the pose has them"
-    if support.spread < parameters.min_spread:
-        return "doubtful: all that is seen of the map lies in one place of the image"
-    return ""
-
-
-@kernel
-def _per_cell(points_px: F32, width: int, height: int) -> I64:
-    counts = np.zeros(_COLUMNS * _LINES, np.int64)
-    for i in range(points_px.shape[0]):
-        column = min(max(int(points_px[i, 0] * _COLUMNS / width), 0), _COLUMNS - 1)
-        line = min(max(int(points_px[i, 1] * _LINES / height), 0), _LINES - 1)
-        counts[line * _COLUMNS + column] += 1
-    return counts
-
-
-class Located(NamedTuple):
-    """T_world_camera of a frame.   is_firm: so much leads there that the view has not been cut."""
-
-    T_world_camera: F64
-    is_firm: bool
 
 
 def directions_of(active: ActiveMap) -> I64:
@@ -223,7 +181,7 @@ def at_once(
     maxima = seen.maxima.copy()
     maxima[:, :2] -= rolled.shifts(np.ascontiguousarray(maxima[:, :2]))
     points_px = seen.points_px - rolled.shifts(seen.points_px, depths)
-    return dataclasses.replace(seen, points_px=points_px, maxima=maxima), rolled
+    return replace(seen, points_px=points_px, maxima=maxima), rolled
 
 
 def find_again(
@@ -331,3 +289,44 @@ def stand(
 
 def _spread(active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
     return spread_of(active.points, rows, active.keyframes[-1]) if len(directions) else None
+
+
+def support_of(
+    points_px: F32, inliers: BoolArray, telling_px: F32, camera: PinholeCamera
+) -> Support:
+    """points_px: (N, 2) of the points seen, of which ``inliers`` (N,) fit.   telling_px: (M, 2) of
+    the tracks that belong to points if the pose is right, or contradict it.
+    """
+    count = int(np.count_nonzero(inliers))
+    fitting = points_px[inliers]
+    width, height = camera.width, camera.height
+    supported, tracks = _per_cell(fitting, width, height), _per_cell(telling_px, width, height)
+    telling = tracks >= _LEAST_SEEN
+    size = np.array([width, height])
+    return Support(
+        inliers=count,
+        share=count / max(len(points_px), 1),
+        contrary=float((supported < _AGAINST * tracks)[telling].mean()) if telling.any() else 0.0,
+        spread=float(np.min(fitting.std(axis=0) / size)) if count else 0.0,
+    )
+
+
+def doubt(support: Support, parameters: SupportParameters) -> str:
+    """Why the pose may not be that of the camera in the world; "" where nothing speaks for it."""
+    if support.contrary > parameters.max_contrary_share:
+        return f"doubtful: {support.contrary:.0%} of the image moves otherwise"
+    if support.share < parameters.min_share:
+        return f"doubtful: {support.share:.0%} of the points seen are where the pose has them"
+    if support.spread < parameters.min_spread:
+        return "doubtful: all that is seen of the map lies in one place of the image"
+    return ""
+
+
+@kernel
+def _per_cell(points_px: F32, width: int, height: int) -> I64:
+    counts = np.zeros(_COLUMNS * _LINES, np.int64)
+    for i in range(points_px.shape[0]):
+        column = min(max(int(points_px[i, 0] * _COLUMNS / width), 0), _COLUMNS - 1)
+        line = min(max(int(points_px[i, 1] * _LINES / height), 0), _LINES - 1)
+        counts[line * _COLUMNS + column] += 1
+    return counts

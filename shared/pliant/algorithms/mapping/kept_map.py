@@ -8,6 +8,7 @@ keyframe stands for itself: no part grows with the map.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -15,7 +16,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, I32, I64, U8, check_arrays
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import CorrectedView, corrected_view
+from pliant.algorithms.corrected_view import CorrectedView, corrected_view, moved_px
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.mapping.covisibility import focus_of
 from pliant.algorithms.mapping.map_store import MAPPED, PATCH_SIDE, Keyframe, PointRows
@@ -183,11 +184,7 @@ def corrected_as(kept: KeptKeyframe, calibration: SelfCalibration) -> KeptKeyfra
     """
     if kept.given_camera != calibration.given:
         return kept
-    before, after = view_of(kept), calibration.view
-
-    def moved(points_px: F32) -> F32:
-        return after.pixels(before.seen(points_px))
-
+    moved = partial(moved_px, before=view_of(kept), after=calibration.view)
     seen_px = moved(kept.seen_px)
     return replace(
         kept, correction=calibration.correction.copy(), sigmas=calibration.sigmas,

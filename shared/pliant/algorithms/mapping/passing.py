@@ -14,7 +14,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.bundle.subspace import refine_pose
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import CorrectedView
+from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.mapping.directions import MAPPED_SHARE
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
@@ -77,7 +77,7 @@ class PassedFrames:
     def seen_by(self, before: CorrectedView, after: CorrectedView) -> None:
         """The pixels become those of another ideal camera."""
         self._frames = [
-            replace(each, points_px=after.pixels(before.seen(each.points_px)))
+            replace(each, points_px=moved_px(each.points_px, before, after))
             for each in self._frames
         ]
 

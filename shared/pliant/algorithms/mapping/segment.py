@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
-from pliant.algorithms.corrected_view import CorrectedView
+from pliant.algorithms.arrays import F64, I32, I64, U8, BoolArray
+from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.geometry import (
     inverse,
     matrix_to_pose,
@@ -301,11 +301,6 @@ def see_by(segment: Segment, before: CorrectedView, known: SelfCalibration) -> N
     segment.passed.seen_by(before, known.view)
     if known.readout:
         segment.unroll(segment.keyframes, known)
-
-
-def moved_px(points_px: F32, before: CorrectedView, after: CorrectedView) -> F32:
-    """(N, 2) pixels of one ideal camera in another one."""
-    return after.pixels(before.seen(points_px))
 
 
 def _bend(segment: Segment, before: CorrectedView, after: CorrectedView) -> None:
