@@ -78,6 +78,52 @@ def test_a_step_is_that_of_dense_normal_equations():
     assert np.linalg.norm(r) < np.linalg.norm(residuals(true, edges))
 
 
+def by_gtsam(S, edges, fixed):
+    """The least squares of the same graph by GTSAM's Levenberg-Marquardt: (M, 4, 4).
+
+    Its similarities are ``p -> s (R p + t)``, with 1/s in the last element of their matrices.
+    """
+    gtsam = pytest.importorskip("gtsam", reason="GTSAM has no wheel here")
+
+    def as_gtsam(S):
+        scale = np.cbrt(np.linalg.det(S[:3, :3]))
+        return gtsam.Similarity3(gtsam.Rot3(S[:3, :3] / scale), S[:3, 3] / scale, scale)
+
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k, each in enumerate(S):
+        start.insert(k, as_gtsam(each))
+        if fixed[k]:
+            graph.add(gtsam.NonlinearEqualitySimilarity3(k, as_gtsam(each)))
+    for i, j, Z, sigmas in zip(edges.i, edges.j, edges.Z, edges.sigmas, strict=True):
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        graph.add(gtsam.BetweenFactorSimilarity3(int(i), int(j), as_gtsam(Z), noise))
+    limits = gtsam.LevenbergMarquardtParams()
+    limits.setRelativeErrorTol(1e-12)
+    limits.setAbsoluteErrorTol(1e-15)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, start, limits).optimize()
+    homogeneous = np.array([found.atSimilarity3(k).matrix() for k in range(len(S))])
+    return homogeneous / homogeneous[:, 3:, 3:]
+
+
+def test_what_is_found_is_what_gtsam_finds():
+    """Its residual is the logarithm of the whole similarity, which is ours to first order."""
+    true = some_similarities(30, 11)
+    generator = np.random.default_rng(12)
+    pairs = [(k, k + n) for n in (1, 3) for k in range(30 - n)] + [(29, 0), (4, 21), (17, 2)]
+    edges = edges_of(true, pairs)
+    sigmas = 1e-3 * generator.uniform(0.3, 3.0, (len(pairs), 7))
+    noisy = step_by(edges.Z, sigmas * generator.normal(size=sigmas.shape))
+    edges = Edges(**{**vars(edges), "Z": noisy, "sigmas": sigmas})
+    start = step_by(true, 0.05 * generator.normal(size=(30, 7)))
+    fixed = np.arange(30) % 20 == 3
+    start[fixed] = true[fixed]
+    found, _ = optimise_pose_graph(start, edges, fixed)
+    theirs = by_gtsam(start, edges, fixed)
+    away = np.abs(found - theirs).max()
+    assert away < 0.01 * np.abs(found - true).max()
+    assert np.square(residuals(found, edges) / sigmas).sum() < 7 * len(pairs)
+
+
 def circle(count):
     """Keyframes on a circle of 1 m that look outward, and what odometry with drift makes of it."""
     angles = np.linspace(0.0, 2.0 * np.pi, count)
