@@ -16,6 +16,7 @@ from pliant.results.folder import (
     recorded_into,
     written,
 )
+from pliant.scale.command import Known, scale_result
 from pliant_services.cli.commands import app
 from pliant_services.replay.command import ReplayRequest, run_replay
 from pliant_services.run.command import RunRequest, run_pipeline
@@ -37,7 +38,8 @@ def test_one_process_writes_a_result_folder_and_a_dead_one_holds_nobody_up(room:
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None
         holder.stdout.readline()
-        says = f"is being written by process {holder.pid}: wait"
+        waits = f"is being written by process {holder.pid}: wait for its end$"
+        says = f"{waits[:-1]}, or choose another --output$"
         run = RunRequest(source="built-in:tiny", output=room, force=True)
         refused(lambda: run_pipeline(run), room, says)
         resumed = RunRequest(source="built-in:tiny", output=room, resume=True)
@@ -48,7 +50,8 @@ def test_one_process_writes_a_result_folder_and_a_dead_one_holds_nobody_up(room:
         refused(lambda: run_replay(replay), room, says)
         for output in (None, room / "new"):
             refused(lambda output=output: export_result(room, "tum", output), room, says)
-        refused(evaluation(room, results=[room], groundtruth=str(other)), room, says)
+        refused(evaluation(room, results=[room], groundtruth=str(other)), room, waits)
+        refused(lambda: list(scale_result(room, Known(marker=0.1))), room, waits)
         recover = ["recover", str(room), "--output", str(room / "whole.mcap")]
         refused(lambda: app(recover, standalone_mode=False), room, says)
         holder.kill()

@@ -44,7 +44,7 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
     missing = [str(result) for result in request.results if not result.exists()]
     if missing:
         raise ResultError(f"{missing[0]}: no such result")
-    check_free(*request.results)
+    check_free(*request.results, elsewhere=False)
     _check_outputs(request)
     if request.surfels:
         yield from _evaluate_surfels(request)

@@ -171,12 +171,15 @@ def is_being_written(output: Path) -> bool:
     return _holder(output) is not None
 
 
-def check_free(*folders: Path) -> None:
-    """Raise ResultError where another process writes to one of these folders."""
+def check_free(*folders: Path, elsewhere: bool = True) -> None:
+    """Raise ResultError where another process writes to one of these folders.
+
+    elsewhere: whether the command has an --output that can name another one.
+    """
     for folder in folders:
         holder = _holder(folder)
         if holder is not None:
-            raise _held(folder, holder)
+            raise _held(folder, holder, elsewhere=elsewhere)
 
 
 def _holder(output: Path) -> str | None:
@@ -195,10 +198,10 @@ def _holder(output: Path) -> str | None:
     return None
 
 
-def _held(output: Path, holder: str) -> ResultError:
+def _held(output: Path, holder: str, *, elsewhere: bool = True) -> ResultError:
     return ResultError(
-        f"{output} is being written by process {holder or '?'}: "
-        "wait for its end, or choose another --output"
+        f"{output} is being written by process {holder or '?'}: wait for its end"
+        + ", or choose another --output" * elsewhere
     )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pliant.errors import ResultError
 from pliant.recording import parts
-from pliant.results.folder import RECORDING_NAME, written
+from pliant.results.folder import RECORDING_NAME, check_free, written
 from pliant.results.known_scale import MetricRecording, Scale
 from pliant.results.run import Run, read_run
 from pliant.results.surfels import has_surfels
@@ -40,6 +40,7 @@ def scale_result(result: Path, known: Known) -> Iterator[str]:
         raise ResultError(f"{result}: no result folder with a recording")
     if has_surfels(result / RECORDING_NAME):
         raise ResultError(f"{result}: a scene that deforms: only results of rigid ones are scaled")
+    check_free(result, elsewhere=False)
     with written(result, force=True):
         recording = MetricRecording(result / RECORDING_NAME)
         run = read_run(recording.path)
