@@ -1,8 +1,11 @@
 """Who may write a result folder: nobody what he reads."""
 
+import json
 import os
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from result_room import evaluation, refused
@@ -215,3 +218,19 @@ def test_the_commit_is_that_of_our_own_sources(
     assert commit_of(tmp_path / package) == (head if told else "")
     monkeypatch.setenv("GIT_DIR", str(tmp_path / "none"))  # as in a hook of another checkout
     assert commit_of(tmp_path / package) == (head if told else "")
+
+
+def test_the_figures_of_all_surfel_results_are_kept(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def judged(result: Path, _: str, figures: dict[str, Any]) -> Iterator[str]:
+        figures["surfels"] = result.name
+        yield result.name
+
+    monkeypatch.setattr("pliant.evaluation.recorded_surfels.surfels_against_truth", judged)
+    other, kept = tmp_path / "other", tmp_path / "kept.json"
+    other.mkdir()
+    for results in ([room], [room, other]):
+        evaluation(room, results=results, surfels=True, json=kept, force=True)()
+        each = [{"result": str(result), "surfels": result.name} for result in results]
+        assert json.loads(kept.read_text()) == (each[0] if len(each) == 1 else {"results": each})

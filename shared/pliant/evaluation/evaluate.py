@@ -124,8 +124,10 @@ def _tell_pages(results: Sequence[Path], evaluations: Sequence[Evaluation]) -> I
 def _evaluate_surfels(request: EvaluationRequest) -> Iterator[str]:
     from pliant.evaluation.recorded_surfels import surfels_against_truth
 
+    every: list[dict[str, Any]] = []
     for result in request.results:
         figures: dict[str, Any] = {}
         yield from surfels_against_truth(result, request.groundtruth, figures)
-        if request.json is not None:
-            write_json(request.json, figures)
+        every.append({"result": str(result), **figures})
+    if request.json is not None:
+        write_json(request.json, every[0] if len(every) == 1 else {"results": every})
