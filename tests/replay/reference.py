@@ -43,7 +43,7 @@ _PACKAGES = ("llvmlite", "numba", "numpy", "opencv-python-headless")
 
 def fingerprint() -> dict[str, str]:
     """What the bytes depend on beside the input: arithmetic, and whose."""
-    versions = {name: version(name) for name in _PACKAGES}
+    versions = {f"{name} version": version(name) for name in _PACKAGES}
     return {**arithmetic.in_force(), **versions, "libc": " ".join(platform.libc_ver())}
 
 

@@ -4,9 +4,11 @@ import copy
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import reference
 
+from pliant import arithmetic
 from pliant.messages import codec, topics
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
@@ -20,6 +22,12 @@ def test_the_services_make_of_the_reference_what_they_made() -> None:
     assert not found, (
         "; ".join(found) + "\nif this is meant: scripts/bench reference --refresh, and say why"
     )
+
+
+def test_the_fingerprint_has_whose_code_and_what_it_computes_for() -> None:
+    found = reference.fingerprint()
+    assert found.items() >= arithmetic.in_force().items()
+    assert found["numpy version"] == np.__version__
 
 
 def test_the_docs_have_the_fingerprints() -> None:
