@@ -153,6 +153,15 @@ def test_a_segment_that_is_left_keeps_what_is_not_published_yet() -> None:
         np.testing.assert_array_equal(keyframe.rows, rows)
 
 
+def test_two_segments_that_become_one_have_not_been_adjusted_as_one() -> None:
+    """Nothing of it is settled, so that nothing goes before its adjustment."""
+    points = PointRows()
+    goes_on, rests = (Segment(id=i, points=points, keyframes=[keyframe(i, [])]) for i in (1, 0))
+    goes_on.adjusted = 1
+    goes_on.take_in(rests, 0)
+    assert goes_on.adjusted == -1
+
+
 def test_what_has_been_given_up_moves_as_what_is_near_it() -> None:
     """In time, or in what it saw; also where that was given up later."""
     here = GivenUp()

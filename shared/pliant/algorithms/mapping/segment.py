@@ -245,6 +245,7 @@ class Segment:
         for keyframe in self.keyframes:
             keyframe.segment = id
         self.since = len(older)
+        self.adjusted = -1  # not as one
         self.thinned |= earlier.thinned
         self.given_up.take_in(earlier.given_up)
         self.path.take_in(earlier.path)
