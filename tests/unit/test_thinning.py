@@ -11,6 +11,7 @@ from test_whole_map import similarity
 
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.mapping import thinning
+from pliant.algorithms.mapping.atlas import Atlas
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.map_store import FREE, MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
@@ -160,6 +161,20 @@ def test_two_segments_that_become_one_have_not_been_adjusted_as_one() -> None:
     goes_on.adjusted = 1
     goes_on.take_in(rests, 0)
     assert goes_on.adjusted == -1
+
+
+def test_what_a_segment_without_room_had_is_given_up_with_it() -> None:
+    left = segment([list(range(10 * k, 10 * k + 25)) for k in range(30)])
+    atlas = Atlas(SelfCalibration(CAMERA, np.zeros(6), np.zeros((6, 6))), MappingParameters())
+    atlas.points = left.points
+    left.given_up.take_in(
+        GivenUp(ids=np.array([30]), hosts=np.array([30]), centres=np.zeros((1, 3)))
+    )
+    atlas._earlier.keep(left, atlas.calibration)
+    no_room = WindowParameters(kept_observations=1000).model_copy(update={"kept_observations": 20})
+    atlas._earlier.share_room(left.points, no_room)
+    assert atlas.everything() == []
+    assert atlas.given_up == {"given_up_keyframes": 31, "given_up_points": 315}
 
 
 def test_what_has_been_given_up_moves_as_what_is_near_it() -> None:

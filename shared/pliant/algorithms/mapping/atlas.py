@@ -85,7 +85,8 @@ class Atlas:
     @property
     def given_up(self) -> dict[str, int]:
         """How many keyframes and points the map had no more room for, where it had not."""
-        keyframes = sum(len(segment.given_up) for segment, _ in self.everything())
+        keyframes = self._earlier.dropped_keyframes
+        keyframes += sum(len(segment.given_up) for segment, _ in self.everything())
         counts = {"given_up_keyframes": keyframes, "given_up_points": self.points.culled}
         return counts if self.points.culled or keyframes else {}
 

@@ -25,10 +25,12 @@ class _Earlier(NamedTuple):
 
 
 class EarlierSegments:
-    """adjusted: those that have been adjusted, oldest first."""
+    """adjusted: those that have been adjusted, oldest first.   dropped_keyframes: of those for
+    which there was no room."""
 
     def __init__(self) -> None:
         self.adjusted: list[Segment] = []
+        self.dropped_keyframes = 0
         self._kept: list[_Earlier] = []
 
     def keep(self, segment: Segment, calibration: SelfCalibration, *, known: bool = False) -> None:
@@ -90,6 +92,7 @@ class EarlierSegments:
             thinned(1)
         while self._observations(own) > room:
             oldest = own.pop(0)
+            self.dropped_keyframes += len(oldest.segment.keyframes) + len(oldest.segment.given_up)
             points.cull(oldest.segment.mapped_rows())
             self._kept = [each for each in self._kept if each is not oldest]
         return limits.kept_observations - self._observations(own)
