@@ -9,10 +9,12 @@ from itertools import islice
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from hostile import attack, samples
 from running import TINY, assert_one_line, digests, in_this_process, pliant
 
+from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.config import config_yaml, load_config
 from pliant.datasets import open_source
 from pliant.datasets.calibration import calibration_yaml
@@ -20,7 +22,7 @@ from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.rectifier import decode
 from pliant.datasets.video import quiet_opencv
 from pliant.messages import topics
-from pliant.messages.types import ClipPiece, SourceImage, Status
+from pliant.messages.types import ClipPiece, MapUpdate, SourceImage, Status
 from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import RECORDING_NAME, STATE_FOLDER, prepare
@@ -142,9 +144,9 @@ def test_all_with_the_launcher_and_resume(tmp_path: Path, undisturbed: dict[str,
     assert run(tmp_path, resume=True) == undisturbed
 
 
-def replayed(recorded: Path, output: Path) -> dict[str, str]:
+def replayed(recorded: Path, output: Path, frames: int = FRAMES) -> dict[str, str]:
     """What the services make, undisturbed, of all frames of the source."""
-    assert json.loads((recorded / "report.json").read_text())["frames"] == FRAMES
+    assert json.loads((recorded / "report.json").read_text())["frames"] == frames
     request = ReplayRequest(
         recording=recorded / RECORDING_NAME,
         services=("tracking", "bundle_adjustment"),
@@ -238,6 +240,47 @@ def test_the_recording_of_a_video_has_all_images_whoever_is_killed(
     assert made == [frame.data for frame in open_source(clip.source)]
     pieces = [m for m in recording.decoded(topics.CLIP) if isinstance(m, ClipPiece)]
     assert b"".join(piece.data for piece in pieces) == Path(clip.source).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def torn(tmp_path_factory: pytest.TempPathFactory) -> RunRequest:
+    """The left half of a scene, the dark, its right half, and then the whole of it: a map that is
+    lost, another one, and what shows that they are one."""
+    folder = tmp_path_factory.mktemp("torn")
+    source = open_source(TINY)
+    images = [decode(frame) for frame in source]
+    middle = images[0].shape[1] // 2
+    left, right = (np.zeros_like(images[0]) for _ in range(2))
+    left[:, :middle], right[:, middle:] = 1, 1
+    shown = [image * left for image in images[:14]] + [0 * left] * 6
+    shown += [image * right for image in images[18:32]] + images[31::-1]
+    for number, image in enumerate(shown):
+        cv2.imwrite(str(folder / f"{number:03}.png"), image)
+    (folder / "calib.yaml").write_text(calibration_yaml(source.calibration))
+    return RunRequest(source=str(folder))
+
+
+def test_bundle_adjustment_is_killed_after_a_loss_and_while_maps_become_one(
+    tmp_path: Path, torn: RunRequest
+) -> None:
+    """While it waits for another map, and while the loop between the two is being closed."""
+    at, killed = (22, 58), list[int]()
+    kills = once_at(*((frame, ("bundle_adjustment",)) for frame in at))
+
+    def victims(status: Status, fleet: Fleet) -> Sequence[str]:
+        chosen = kills(status, fleet)
+        killed.extend(status.frame for _ in chosen)
+        return chosen
+
+    settings = ["bundle_adjustment.localisation.max_lost_s=0.1"]
+    found = run(tmp_path / "run", victims, request=torn, settings=settings)
+    assert len(killed) == len(at)
+    updates = Recording(tmp_path / "run").decoded(topics.MAP_UPDATE)
+    said = {m.frame: m for m in updates if isinstance(m, MapUpdate)}
+    assert [said[frame].state for frame in (14, *at)] == [LOST, WAITING, TRACKING]
+    (joined,) = (m.frame for m in said.values() if len(m.joined))
+    assert 34 < joined < at[-1]  # the loop's answer is taken over later
+    assert found == replayed(tmp_path / "run", tmp_path / "whole", frames=66)
 
 
 def test_a_live_run_is_not_resumed_but_its_recording_is_a_source(
