@@ -14,7 +14,7 @@ from pliant.bus.links import ENVELOPE
 from pliant.bus.session import open_session
 from pliant.errors import MessageError
 from pliant.messages import codec
-from pliant.messages.topics import TOPICS, by_key, status
+from pliant.messages.topics import MAP_KEPT, MAP_KNOWN, TOPICS, by_key, status
 from pliant.recording.reader import Recording
 from pliant_services.processes import inputs_of, readers_of
 
@@ -33,12 +33,12 @@ def keys_of(fleet: tuple[str, ...]) -> list[str]:
 
 
 def samples(recording: Path) -> dict[str, bytes]:
-    """A true message of each topic that has one for every frame."""
+    """A true message of each topic that has one for every frame, and of maps as they are kept."""
     found: dict[str, bytes] = {}
     for recorded in Recording(recording).messages():
-        if recorded.topic.per_frame:
+        if recorded.topic.per_frame or recorded.topic == MAP_KEPT:
             found.setdefault(recorded.topic.key, recorded.data)
-    return found
+    return found | {MAP_KNOWN.key: found[MAP_KEPT.key]}
 
 
 def messages(
