@@ -9,7 +9,7 @@ from pliant.algorithms.mapping import passing
 from pliant.algorithms.mapping.map_store import CANDIDATE, Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.passing import PassedFrames, placed_again
+from pliant.algorithms.mapping.passing import PassedFrames, refined_poses
 from pliant.map_history import MapHistory
 
 PARAMETERS = MappingParameters()
@@ -42,7 +42,7 @@ def passed(points, id=3):
 
 def test_a_frame_is_placed_where_it_sees_the_points_as_they_are_now(points):
     frames = passed(points)
-    (placed,) = placed_again(frames.take_all(), points, CAMERA, PARAMETERS)
+    (placed,) = refined_poses(frames.take_all(), points, CAMERA, PARAMETERS)
     assert (placed.frame, placed.keyframe.id, placed.inliers) == (23, 3, 200)
     np.testing.assert_allclose(placed.T_world_camera, TRUE, atol=1e-5)
     assert frames.take_all() == []
@@ -52,7 +52,7 @@ def test_rows_that_became_other_points_tell_nothing(points):
     frames = passed(points).take_all()
     points.xyz[:120] += 0.03  # all in one direction: robustness alone would not do
     points.first_keyframe[:120] = 4
-    (placed,) = placed_again(frames, points, CAMERA, PARAMETERS)
+    (placed,) = refined_poses(frames, points, CAMERA, PARAMETERS)
     assert placed.inliers == 80
     np.testing.assert_allclose(placed.T_world_camera, TRUE, atol=1e-5)
 
@@ -60,7 +60,7 @@ def test_rows_that_became_other_points_tell_nothing(points):
 def test_a_frame_that_sees_little_of_the_map_stays(points):
     frames = passed(points).take_all()
     points.state[:160] = CANDIDATE
-    assert placed_again(frames, points, CAMERA, PARAMETERS) == []
+    assert refined_poses(frames, points, CAMERA, PARAMETERS) == []
 
 
 def test_what_finds_no_room_goes_first(points, monkeypatch):

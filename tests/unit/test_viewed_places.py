@@ -78,7 +78,7 @@ def test_a_viewer_shows_a_loop_as_it_closes_and_moves_it_with_the_map() -> None:
     keyframes = [keyframe(k, 0, float(k)) for k in range(4)]
     viewed.take(update(changes, 0, keyframes), 30)
     assert not viewed.drawn.lines
-    changes.see_again([(0, 2), (1, 3)])
+    changes.add_same_places([(0, 2), (1, 3)])
     viewed.take(update(changes, 0, keyframes), 60)
     (lines,) = viewed.drawn.lines.values()
     np.testing.assert_array_equal(lines[:, :, 0], [(0, 2), (1, 3)])
@@ -101,11 +101,11 @@ def test_a_viewer_shows_a_loop_as_it_closes_and_moves_it_with_the_map() -> None:
 def test_a_viewer_says_where_a_lost_camera_is_recognised() -> None:
     viewed, changes = Viewed(), MapChanges()
     viewed.take(update(changes, 0, [keyframe(k, 0, float(k)) for k in range(3)]), 20)
-    changes.see_again([(1, 5)])
+    changes.add_same_places([(1, 5)])
     viewed.take(update(changes, 0, [keyframe(5, 0, 1.5)]), 50)
     assert viewed.drawn.said == ["recognised: frame 50 shows the place of frame 10"]
     assert viewed.drawn.lines[0].shape == (1, 2, 3)
-    changes.see_again([(2, -1)])  # a frame of a run that only localises
+    changes.add_same_places([(2, -1)])  # a frame of a run that only localises
     viewed.take(update(changes, 0, []), 67)
     assert viewed.drawn.said[1:] == ["recognised: frame 67 shows the place of frame 20"]
     assert viewed.drawn.lines[0].shape == (1, 2, 3)
@@ -116,11 +116,11 @@ def test_a_viewer_shows_what_joins_two_segments_once() -> None:
     viewed.take(update(changes, 0, [keyframe(0, 0, 0.0)]), 0)
     viewed.take(update(changes, 1, [keyframe(7, 1, 7.0)]), 70)
     changes.join(1, 0)
-    changes.see_again([(0, 7)])
+    changes.add_same_places([(0, 7)])
     viewed.take(update(changes, 0, [keyframe(7, 0, 7.0)]), 90)
     assert viewed.drawn.said == ["segment 1 joined to 0: frame 70 shows the place of frame 0"]
     np.testing.assert_array_equal(viewed.drawn.lines[0][:, :, 0], [(0, 7)])
-    changes.see_again([(0, 7)])  # what was left between the two has been spread
+    changes.add_same_places([(0, 7)])  # what was left between the two has been spread
     viewed.take(update(changes, 0, []), 120)
     assert len(viewed.drawn.said) == 1
 
@@ -128,9 +128,9 @@ def test_a_viewer_shows_what_joins_two_segments_once() -> None:
 def test_results_have_the_places_and_the_page_draws_them() -> None:
     history, changes = MapHistory(), MapChanges()
     history.apply(update(changes, 0, [keyframe(0, 0, 0.0)]), frame=0, stamp_ns=0)
-    changes.see_again([(0, 4), (0, -1)])
+    changes.add_same_places([(0, 4), (0, -1)])
     history.apply(update(changes, 0, [keyframe(4, 0, 4.0)]), frame=40, stamp_ns=40)
-    changes.see_again([(0, 4)])
+    changes.add_same_places([(0, 4)])
     history.apply(update(changes, 0, []), frame=50, stamp_ns=50, final=True)
     assert history.same_places == [(0, 4)]
     poses = np.array([np.eye(4)] * 3)

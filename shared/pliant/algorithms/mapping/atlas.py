@@ -54,7 +54,7 @@ class Atlas:
         self._spans = spans_of(known)
         self._next_segment = 1 + max((each.segment for each in known), default=-1)
         self._next_keyframe = known[-1].id + 1 if known else 0
-        self._adjusted = False  # all of the active segment, and nobody has been told
+        self._adjusted = False  # all of the active segment, and it is not published yet
         self._adjusts = parameters.window.final_adjustment
         for segment in take_in(known, self.points, calibration):
             self._earlier.keep(segment, calibration, known=True)
@@ -277,8 +277,8 @@ class Atlas:
         before = newest.T_world_camera
         self.calibration, moves = active.adjust_all(self.calibration)
         self._adjusted = True
-        told = None if moves is None else held(moves, self._spans, self.segment)
-        return Moved(newest.T_world_camera @ inverse(before), told)
+        published = None if moves is None else held(moves, self._spans, self.segment)
+        return Moved(newest.T_world_camera @ inverse(before), published)
 
     def stay(self) -> None:
         """Forget what is about to move the map: nobody has it yet."""
@@ -303,7 +303,7 @@ class Atlas:
         return moved
 
     def take_changed(self, *, everything: bool) -> tuple[list[Keyframe], I32]:
-        """The keyframes, and rows of the points, of which readers may have to be told.
+        """The keyframes, and rows of the points, that may have to be published.
 
         everything: not only points that are new, of those that the last frame sees.
         """
@@ -315,12 +315,12 @@ class Atlas:
         elif self.active is not None:
             window = self.active.window
             keyframes = window.keyframes
-            rows = window.rows if everything else self._untold(window.current_rows())
+            rows = window.rows if everything else self._unpublished(window.current_rows())
         for earlier in self._earlier.adjusted:
             keyframes = [*keyframes, *earlier.keyframes]
             rows = np.concatenate([rows, earlier.mapped_rows()])
         return keyframes, rows
 
-    def _untold(self, rows: I32) -> I32:
+    def _unpublished(self, rows: I32) -> I32:
         """Those of which nothing has been published."""
         return rows[np.isnan(self.points.published_sigmas[rows])]

@@ -184,7 +184,7 @@ def at_once(
     return replace(seen, points_px=points_px, maxima=maxima), rolled
 
 
-def find_again(
+def reacquire_points(
     active: ActiveMap,
     frame: int,
     T_world_camera: F64,

@@ -116,7 +116,7 @@ def take_in(
     """The segments of a kept map, their points in rows that are new; those without a point are
     left out.
 
-    calibration: of the camera that goes on in it.   Raises ValueError where a point is told twice.
+    calibration: of the camera that goes on in it.   Raises ValueError where a point comes twice.
     """
     rows = points.allocate(sum(len(each.point_ids) for each in kept))
     first = 0
@@ -127,7 +127,7 @@ def take_in(
     order = np.argsort(points.ids[rows], kind="stable").astype(np.int32)
     ids, rows = points.ids[rows][order], rows[order]
     if (np.diff(ids) == 0).any():
-        raise ValueError("a point that is told twice")
+        raise ValueError("a point that comes twice")
     points.go_on_after(int(ids[-1]) if len(ids) else -1)
     segments: list[Segment] = []
     for number in sorted({each.segment for each in kept}):

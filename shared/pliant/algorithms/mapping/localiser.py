@@ -19,8 +19,8 @@ from pliant.algorithms.mapping.frame_pose import (
     Support,
     at_once,
     doubt,
-    find_again,
     localise,
+    reacquire_points,
     support_of,
 )
 from pliant.algorithms.mapping.kept_map import known_camera, take_in
@@ -95,7 +95,7 @@ class Localiser:
             return self._publish(LOST, f"lost: {support.inliers} points of the map are seen", 0)
         if self._motion is None:
             self._motion = Motion.at(frame, stamp_ns, located)
-            self._changes.see_again([(self._hanging.id, -1)])
+            self._changes.add_same_places([(self._hanging.id, -1)])
         else:
             self._motion = self._motion.then(frame, stamp_ns, located, support.inliers)
         self._changes.add_pose(frame, self._hanging, located, support.inliers)
@@ -203,7 +203,9 @@ class Localiser:
             velocity = self._motion.velocity_at(frame, T_world_camera)
             tracks, rolled = at_once(active, self.calibration, T_world_camera, velocity, tracks)
             grey = grey if grey is None else rolled.image(grey)
-        T_world_camera, found = find_again(active, frame, T_world_camera, tracks, grey, rolled)
+        T_world_camera, found = reacquire_points(
+            active, frame, T_world_camera, tracks, grey, rolled
+        )
         linked = active.linked(MAPPED)
         rows, points_px = active.observed(tracks.points_px, found, np.zeros(0, np.int64))
         errors = reprojection_errors(T_world_camera, self._points.xyz[rows], points_px, camera)
@@ -231,4 +233,4 @@ class Localiser:
             centre=self._looked_from[:3, 3].copy(),
             snapshot=False,
         )
-        return self.calibration.told_with(delta)
+        return self.calibration.published_with(delta)

@@ -22,15 +22,15 @@ from pliant.algorithms.mapping.frame_pose import (
     at_once,
     directions_of,
     doubt,
-    find_again,
     localise,
+    reacquire_points,
     stand,
 )
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.passing import EarlierPose, placed_again
+from pliant.algorithms.mapping.passing import EarlierPose, refined_poses
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved
@@ -147,7 +147,7 @@ class Mapper:
                 velocity = self._motion.velocity_at(frame, located)
                 tracks, rolled = at_once(active, self.calibration, located, velocity, seen)
                 grey = grey if grey is None else rolled.image(grey)
-            T_world_camera, found = find_again(active, frame, located, tracks, grey, rolled)
+            T_world_camera, found = reacquire_points(active, frame, located, tracks, grey, rolled)
         with self._timer("subspace adjustment"):
             T_world_camera, support = adjust(active, self._motion, T_world_camera, found, tracks)
         with self._timer("triangulation"):
@@ -169,13 +169,13 @@ class Mapper:
             T_world_camera = hanging.T_world_camera
             self._keyframe_ns = stamp_ns
             if self._recognised is not None:
-                self._changes.see_again([(self._recognised, hanging.id)])
+                self._changes.add_same_places([(self._recognised, hanging.id)])
                 self._recognised = None
             with self._timer("places"):
                 atlas.remember(hanging, grey, tracks.maxima)
             with self._timer("passed frames"):
                 surplus = active.segment.passed.take_surplus(self._parameters)
-                self._correct(placed_again(surplus, active.points, self._camera, self._parameters))
+                self._correct(refined_poses(surplus, active.points, self._camera, self._parameters))
         else:
             active.pass_by(frame, T_world_camera, tracks.points_px, found)
         self._place_waiting(active, hanging, T_world_camera)
@@ -194,7 +194,7 @@ class Mapper:
                 self._changes.move(each.moves)
             if each.gone is not None:
                 self._changes.join(each.gone, self.atlas.segment)
-            self._changes.see_again(each.same_places)
+            self._changes.add_same_places(each.same_places)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
         """Pass over a frame, without pixels (dropped or broken) or without time: it gets no pose.
@@ -210,7 +210,7 @@ class Mapper:
         self.follow(self.atlas.finish())
         for segment, seen_by in self.atlas.everything():
             frames, camera = segment.passed.take_all(), seen_by.view.camera
-            self._correct(placed_again(frames, segment.points, camera, self._parameters))
+            self._correct(refined_poses(frames, segment.points, camera, self._parameters))
         if self.atlas.active is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         self._keyframe_changes.settle(self.atlas.active.keyframes)
@@ -396,4 +396,4 @@ class Mapper:
             centre=centre,
             snapshot=snapshot,
         )
-        return self.calibration.told_with(delta)
+        return self.calibration.published_with(delta)

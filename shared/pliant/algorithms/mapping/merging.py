@@ -49,7 +49,7 @@ def merge(
     proved to be in the second.
 
     Worlds, scales and the camera are those of the first map, numbers of the second follow on it.
-    Raises ValueError where a map tells a point twice.
+    Raises ValueError where a map has a point twice.
     """
     camera = known_camera(first, first[-1].given_camera)
     assert camera is not None, "of its own last session"
@@ -58,7 +58,7 @@ def merge(
 
 class _Merging:
     """worlds: segments of the first map and what has been joined to them.   rest: segments of the
-    second one that have not been recognised yet.   told: pairs of keyframes that show one place."""
+    second one that have not been recognised yet.   proved: keyframes that show one place."""
 
     def __init__(
         self,
@@ -78,7 +78,7 @@ class _Merging:
         segments = take_in(both, PointRows(), calibration)
         self._worlds = [each for each in segments if each.id in known]
         self._rest = [each for each in segments if each.id not in known]
-        self._told = WholeMap()
+        self._proved = WholeMap()
 
     def result(self) -> Merged | None:
         """What has become of both."""
@@ -87,7 +87,7 @@ class _Merging:
             joined |= found
         if not joined:
             return None
-        proofs = len(self._told.loops)
+        proofs = len(self._proved.loops)
         kept = sorted(self._kept(), key=lambda keyframe: keyframe.id)
         return Merged(
             joined=[(number - self._shift, joined[number].segment) for number in sorted(joined)],
@@ -122,16 +122,16 @@ class _Merging:
 
     def _join(self, segment: Segment, proved: list[Loop]) -> None:
         """Become one with all worlds of which a place was seen."""
-        self._told.loops += proved
+        self._proved.loops += proved
         seen = {loop.old for loop in proved}
         for world in [w for w in self._worlds if any(k.id in seen for k in w.keyframes)]:
             there = {keyframe.id for keyframe in world.keyframes}
             here = {keyframe.id for keyframe in segment.keyframes}
-            met = [e for e in self._told.loops if e.old in there and e.new in here]
+            met = [e for e in self._proved.loops if e.old in there and e.new in here]
             moved = join(self._active(segment), world, met, self._spans, self._calibration)
             self._spans = [(k, segment.id if of == moved.gone else of) for k, of in self._spans]
             assert moved.moves is not None
-            self._told.move(moved.moves)
+            self._proved.move(moved.moves)
             self._worlds.remove(world)
         self._worlds.append(segment)
 
@@ -144,7 +144,7 @@ class _Merging:
         origins = {each.id: Origin(each.session, each.source_frame) for each in self._given}
         for each in self._worlds:
             ids = {keyframe.id for keyframe in each.keyframes}
-            loops = [loop for loop in self._told.loops if loop.new in ids]
+            loops = [loop for loop in self._proved.loops if loop.new in ids]
             if loops:
                 yield from keep(each, self._close(each, loops), features, origins)
                 changed |= ids

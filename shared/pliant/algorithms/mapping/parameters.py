@@ -114,7 +114,7 @@ class RecoveryParameters(Parameters):
 
 
 class SupportParameters(Parameters):
-    """When a pose is told as doubtful."""
+    """When a pose is published as doubtful."""
 
     settled_s: float = Field(
         default=0.5,

@@ -109,7 +109,7 @@ class PassedFrames:
         return taken
 
 
-def placed_again(
+def refined_poses(
     frames: Iterable[_Passed],
     points: PointRows,
     camera: PinholeCamera,

@@ -46,7 +46,7 @@ class MapChanges:
         """What belongs to a segment that is gone belongs to another one, after all moves."""
         self._joined.append((gone, segment))
 
-    def see_again(self, pairs: Iterable[tuple[int, int]]) -> None:
+    def add_same_places(self, pairs: Iterable[tuple[int, int]]) -> None:
         """Keyframes show one place, the older one first; -1: this frame, which is none."""
         self._same_places += pairs
 

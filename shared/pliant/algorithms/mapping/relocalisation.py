@@ -92,7 +92,7 @@ def relocalise(
     own = parameters.recovery
     best: Recognised | None = None
     rivals: list[Recognised] = []
-    told: _Proposed | None = None
+    proof: _Proposed | None = None
     for number, place in enumerate(chain(places, elsewhere)):
         if number >= len(places) and best is None:
             break
@@ -111,23 +111,23 @@ def relocalise(
                 corners=len(proposed.corners),
             )
             if best is None:
-                best, told = found, proposed
+                best, proof = found, proposed
                 continue
             same = _is_same(best, found, place, points)
             if found.inliers > best.inliers:
-                best, told, found = found, proposed, best
+                best, proof, found = found, proposed, best
             if not same:
                 rivals.append(found)
-    if best is None or told is None:
+    if best is None or proof is None:
         return None
     if any(_is_as_good(rival, best, points, parameters) for rival in rivals):
         return None
-    here = transform(inverse(told.T_world_camera), told.xyz)
-    if repeats(seen, told.corners, here, camera, parameters):
+    here = transform(inverse(proof.T_world_camera), proof.xyz)
+    if repeats(seen, proof.corners, here, camera, parameters):
         return None
     moved = rest_is_elsewhere(
-        best.T_world_camera, told.place.keyframe, told.place.segment, points, maxima, grey, camera,
-        parameters, generator,
+        best.T_world_camera, proof.place.keyframe, proof.place.segment, points, maxima, grey,
+        camera, parameters, generator,
     )  # fmt: skip
     return None if moved else best
 

@@ -92,18 +92,18 @@ class GivenUp:
         order = np.argsort(ids)
         ids, rows = ids[order], rows[order]
         hosted = new & (self.hosts != self.ids)
-        # A host that is newer than all that are told of moves as the last of them.
+        # A host that is newer than all of these moves as the last of them.
         host = np.searchsorted(ids, self.hosts[hosted], side="right") - 1
         rows[np.searchsorted(ids, self.ids[hosted])] = rows[host]
         return MapMoves(keyframe_ids=ids, moves=rows)
 
     def _between(self, moves: MapMoves, some: BoolArray) -> F64:
-        """(S, 8) of some of them, as of ``MapMoves``, in between those of what is told of."""
-        ids, told = self.ids[some], moves.keyframe_ids
-        b = np.clip(np.searchsorted(told, ids), 1, len(told) - 1) if len(told) > 1 else 0 * ids
+        """(S, 8) of some of them, as of ``MapMoves``, in between those of what was kept."""
+        ids, kept = self.ids[some], moves.keyframe_ids
+        b = np.clip(np.searchsorted(kept, ids), 1, len(kept) - 1) if len(kept) > 1 else 0 * ids
         a = np.maximum(b - 1, 0)
-        share = np.clip((ids - told[a]) / np.maximum(told[b] - told[a], 1), 0.0, 1.0)[:, None]
-        first, last = moves.matrices(told[a]), moves.matrices(told[b])
+        share = np.clip((ids - kept[a]) / np.maximum(kept[b] - kept[a], 1), 0.0, 1.0)[:, None]
+        first, last = moves.matrices(kept[a]), moves.matrices(kept[b])
         scale_a, scale_b = moves.moves[a, 7:], moves.moves[b, 7:]
         R_a, R_b = first[:, :3, :3] / scale_a[:, None], last[:, :3, :3] / scale_b[:, None]
         T = np.tile(np.eye(4), (len(ids), 1, 1))

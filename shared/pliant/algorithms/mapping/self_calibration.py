@@ -163,7 +163,7 @@ class SelfCalibration:
         """(H, W) or (H, W, 3) an image of the camera found so far."""
         return None if pixels is None else self.view.image(pixels)
 
-    def told_with(self, delta: MapDelta) -> MapDelta:
+    def published_with(self, delta: MapDelta) -> MapDelta:
         """What is published, with what the map was made with."""
         if not self.correction.any():
             return delta

@@ -85,8 +85,8 @@ class TrialMapper:
                 self._taken.append(taken)
                 return self._begin(timer)
         self._taken = kept
-        told = delta.reason or f"the focal length is known to {100.0 * uncertain:.1f} %"
-        return _nothing(delta, told)
+        reason = delta.reason or f"the focal length is known to {100.0 * uncertain:.1f} %"
+        return _nothing(delta, reason)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
         """As ``Mapper.skip``."""

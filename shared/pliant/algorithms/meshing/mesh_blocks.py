@@ -130,12 +130,12 @@ class BlockMesh:
                 triangles=blocks.triangles[face].copy(),
             )
 
-    def clear_span(self, told: I32, first: int, last: int) -> I32:
-        """Let go of blocks whose packed keys lie in [first, last] and that were not ``told``.
+    def clear_span(self, published: I32, first: int, last: int) -> I32:
+        """Let go of blocks whose packed keys lie in [first, last] and that were not published.
 
-        told: (T, 3) keys.  Returns the (N, 3) keys of those that are gone, ascending.
+        published: (T, 3) keys.  Returns the (N, 3) keys of those that are gone, ascending.
         """
-        kept = set(pack(told).tolist())
+        kept = set(pack(published).tolist())
         gone = sorted(key for key in self._blocks if first <= key <= last and key not in kept)
         for key in gone:
             del self._blocks[key]

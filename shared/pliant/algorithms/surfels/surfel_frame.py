@@ -19,7 +19,7 @@ class SurfelState(IntEnum):
     LOST = 4  # none of the above was mended for long; is still looked for
 
 
-def _not_told() -> F64:
+def _none_tried() -> F64:
     return np.zeros((0, 3))
 
 
@@ -45,8 +45,8 @@ class SurfelFrame:
     age: Annotated[I32, Shape("N")]  # frames since birth
     born: Annotated[I32, Shape("N")]  # frame of birth
     # (N, 3) metres, world: of the pose that zncc and visible speak of, kept or not; or (0, 3)
-    # in recordings that were made before it was told.
-    tried: Annotated[F64, Shape("T", 3)] = field(default_factory=_not_told)
+    # in recordings that were made before it was published.
+    tried: Annotated[F64, Shape("T", 3)] = field(default_factory=_none_tried)
 
     def __post_init__(self) -> None:
         check_arrays(self)

@@ -111,10 +111,10 @@ class SurfelTable:
         return self.state == SurfelState.TRACKED
 
 
-def told(
+def frame_of(
     table: SurfelTable, *, frame: int, segment: int, lost: bool, T_world_camera: F64
 ) -> SurfelFrame:
-    """What is said of the surfels in a frame."""
+    """What is published of the surfels in a frame."""
     poses, validations = table.poses, table.validations
     f11, f12, f22 = (poses[:, F + k, None] for k in range(3))
     a, b = poses[:, A : A + 3], poses[:, B : B + 3]

@@ -27,7 +27,7 @@ from pliant.algorithms.surfels.surfel_alignment import (
     no_equilibrium,
 )
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
-from pliant.algorithms.surfels.surfel_table import SurfelTable, told
+from pliant.algorithms.surfels.surfel_table import SurfelTable, frame_of
 
 _RELOCATED_ZNCC = 0.9
 """A surfel that was missing must fit better than one that was followed: chance has had tries."""
@@ -382,7 +382,7 @@ class SurfelTracker:
         )
 
     def _result(self) -> SurfelFrame:
-        return told(
+        return frame_of(
             self._table, frame=self._frame, segment=self._segment, lost=self._lost,
             T_world_camera=self._T_world_camera,
         )  # fmt: skip
