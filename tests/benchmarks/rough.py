@@ -214,6 +214,7 @@ def _turned() -> dict[str, Case]:
     cases = {f"{xyz}, 300 frames": Case(source=xyz, frames=300)}
     cases[f"{xyz}, 300 frames, upright"] = Case(source=xyz, frames=300, upright=True)
     turns = {axis: f"built-in:room?turn={axis}" for axis in ("yaw", "pitch", "roll")}
+    turns["pitch, 320 columns"] = f"{turns['pitch']}&width=320"
     return cases | {f"room, a full turn ({axis})": Case(source=s) for axis, s in turns.items()}
 
 

@@ -2,12 +2,13 @@
 
 from collections.abc import Collection
 from functools import partial
+from pathlib import Path
 from typing import cast
 
 import cv2
 import numpy as np
 import pytest
-from benchmarks.rough import Case, RoughFrames, Spoil, follow, thing
+from benchmarks.rough import CASES, Case, RoughFrames, Spoil, follow, thing
 
 from pliant.algorithms.map_delta import LOST
 from pliant.config import load_config
@@ -64,3 +65,13 @@ def test_half_of_the_image_that_moves_by_itself_is_told_and_does_not_carry_the_c
     told = [frame for frame in doubtful_frames(run.history) if frame >= first]
     assert len(told) > 0.6 * (len(run.tracks) - first)
     assert error < 2e-3
+
+
+def test_every_row_of_the_docs_is_a_case() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8")
+    _, _, section = page.partition("scripts/bench rough path/to/sequences\n")
+    table = section.partition("\n\n")[2].partition("\n\n")[0]
+    rows = [line.split("|")[1].strip() for line in table.splitlines()[2:]]
+    assert len(rows) > 30
+    cases = {name.removeprefix("built-in:").replace(" %", "%") for name in CASES}
+    assert {row.replace(" %", "%") for row in rows} <= cases
