@@ -2,17 +2,22 @@
 
 import numpy as np
 import pytest
-from mapping_scene import CAMERA, Scene, looking
+from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 from test_mapper import run, trajectory_error
+from test_whole_map import similarity
 
 from pliant.algorithms.bundle.projection import move_camera
 from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
+from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.directions import (
     linearise,
     off_epipolar_line,
     place,
+    placed_candidates,
     refine_pose_spread,
 )
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import MappingParameters
 
 K = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
 
@@ -192,3 +197,39 @@ def test_frames_that_turned_before_the_map_started_get_poses():
     for k in (0, 75, 149):
         turn = poses[k][:3, :3].T @ R @ published.pose(k)[:3, :3]
         assert np.degrees(np.linalg.norm(so3_log(turn))) < 0.5
+
+
+def test_directions_move_with_the_map_and_are_where_an_adjustment_leaves_it():
+    mapper = Mapper(CAMERA, MappingParameters(), 0)
+    for frame, tracks in enumerate(Scene.box(death=0.1).frames(sideways(45))):
+        mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+    active = mapper.atlas.active
+    last, points = active.keyframes[-1], active.points
+    rows = active.window.rows[placed_candidates(points, active.window.rows)]
+    assert len(rows) > 50
+
+    mapped = active.segment.mapped_rows()
+
+    def seen(rows):
+        """(N, 3) of the newest keyframe."""
+        return transform(inverse(last.T_world_camera), points.xyz[rows])
+
+    def grown(rows, before):
+        return np.linalg.norm(seen(rows), axis=1) / np.linalg.norm(before, axis=1)
+
+    before, map_before, spread = (
+        seen(rows),
+        seen(mapped),
+        np.linalg.norm(points.spread[rows], axis=1),
+    )
+    # The second half of the map, as it drifts.
+    half = active.keyframes[len(active.keyframes) // 2].id
+    drift = [similarity(1.0, (0, 0, 0), (0, 0, 0)), similarity(1.05, (0, 0.02, 0), (0.1, 0, 0.05))]
+    ids = np.array([active.keyframes[0].id, half])
+    active.move(MapMoves(keyframe_ids=ids, moves=np.array(drift)))
+    np.testing.assert_allclose(seen(rows), 1.05 * before, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(points.spread[rows], axis=1), 1.05 * spread)
+    active.adjust_all(mapper.calibration)
+    np.testing.assert_allclose(CAMERA.project(seen(rows)), CAMERA.project(before), atol=0.5)
+    scale = np.median(grown(mapped, map_before))
+    np.testing.assert_allclose(grown(rows, before), scale, rtol=0.02)

@@ -260,8 +260,7 @@ class ActiveMap:
         self.rebuild_window()
         self.window.triangulate(self.parameters.point)
         self._adjust_window()
-        segment = self.segment
-        segment.inverse_distance = self.window.place_directions(segment.inverse_distance)
+        self._place_directions()
         if grey is not None:
             mapped = self.points.state[newest.rows] == MAPPED
             rows, points_px = newest.rows[mapped], newest.points_px[mapped]
@@ -271,6 +270,10 @@ class ActiveMap:
         self.window.adjust(self.parameters)
         self.window.remove_outliers(self.parameters.window.outlier_px)
         self.window.update_statistics()
+
+    def _place_directions(self) -> None:
+        segment = self.segment
+        segment.inverse_distance = self.window.place_directions(segment.inverse_distance)
 
     def _link_new_tracks(self, points_px: F32) -> I64:
         """Give candidate rows to tracks that have none.  Returns the indices of those tracks."""
@@ -319,8 +322,7 @@ class ActiveMap:
         self.window.T_world_camera[-1] = before.T_world_camera[-1]
         if before.keyframes:
             self._adjust_window()
-            distance = self.segment.inverse_distance
-            self.segment.inverse_distance = self.window.place_directions(distance)
+            self._place_directions()
 
     def collect_garbage(self) -> None:
         """Give back the rows of dead candidates and of merged points."""
@@ -365,10 +367,8 @@ class ActiveMap:
         self._nearby = rows_of(older, self.window.rows, len(self.points.state))
 
     def look_with(self, seen: Keyframe) -> None:
-        """The camera has been recognised, and sees what a keyframe saw.
-
-        What has been mapped stays where it is; the next frame is a keyframe.
-        """
+        """The camera has been recognised, and sees what a keyframe saw: the next frame is one, and
+        what has been mapped stays where it is."""
         older = most_shared(self.keyframes, [seen], self.points)[:_NEAR_KEYFRAMES]
         self._look_at(older, older[: self.parameters.window.keyframes], [])
 
@@ -387,6 +387,7 @@ class ActiveMap:
         known, moves = self.segment.adjust(known, self.parameters)
         self.camera = known.view.camera
         self.rebuild_window()
+        self._place_directions()  # they were placed in the map that it was
         return known, moves
 
     def close(self) -> None:
