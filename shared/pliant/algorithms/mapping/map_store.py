@@ -286,15 +286,3 @@ def _carry_over(ids: I64, rows: I32, new_ids: I64, new_rows: I32) -> None:
             i += 1
         if i < ids.size and ids[i] == new_ids[j]:
             new_rows[j] = rows[i]
-
-
-@kernel
-def sample_colours(image: U8, points_px: F32) -> U8:
-    """(N, 3) RGB of the pixel nearest to each point; image (H, W, 3), or grey (H, W, 1)."""
-    colours = np.empty((points_px.shape[0], 3), np.uint8)
-    for i in range(points_px.shape[0]):
-        column = min(max(int(points_px[i, 0] + 0.5), 0), image.shape[1] - 1)
-        line = min(max(int(points_px[i, 1] + 0.5), 0), image.shape[0] - 1)
-        for k in range(3):
-            colours[i, k] = image[line, column, min(k, image.shape[2] - 1)]
-    return colours
