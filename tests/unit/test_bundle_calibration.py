@@ -221,3 +221,12 @@ def test_ideal_pixels_undo_the_correction(correction):
     px = (seen * focal + centre).astype(np.float32)
     ideal = ideal_pixels(px, camera, np.array([s, k1, k2, 0.0, a, b]))
     np.testing.assert_allclose(ideal, xy * focal + centre, atol=2e-3)
+
+
+@pytest.mark.parametrize("lens", [(0.05, -0.02), (-0.3, 0.9)])
+def test_an_ideal_pixel_is_the_same_alone_and_among_many(lens):
+    camera = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
+    px = np.random.default_rng(0).uniform((-600, -450), (1240, 930), (300, 2)).astype(np.float32)
+    correction = np.array([0.01, *lens, 0.0, 0.01, -0.02])
+    alone = [ideal_pixels(each, camera, correction) for each in px[:, None]]
+    np.testing.assert_array_equal(ideal_pixels(px, camera, correction), np.concatenate(alone))

@@ -23,7 +23,6 @@ from pliant.algorithms.mapping.map_store import (
     Keyframe,
     PointRows,
     TrackLinks,
-    sample_colours,
 )
 from pliant.algorithms.mapping.observation_table import reprojection_errors, window_errors
 from pliant.algorithms.mapping.parameters import (
@@ -209,15 +208,6 @@ def test_patches_at_the_border_stay_empty():
     px = np.array([[2.0, 100.0], [637.5, 100.0]], np.float32)
     cut_patches(texture(), px, np.arange(2, dtype=np.int32), patches)
     assert not patches.any()
-
-
-def test_colours_are_those_of_the_nearest_pixel():
-    image = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
-    px = np.array([[0.4, 0.4], [3.6, 2.2], [99.0, -7.0]], np.float32)
-    expected = [image[0, 0], image[2, 4], image[0, 4]]
-    np.testing.assert_array_equal(sample_colours(image, px), expected)
-    grey = np.ascontiguousarray(image[..., 1:2])
-    np.testing.assert_array_equal(sample_colours(grey, px)[:, 0], [e[1] for e in expected])
 
 
 def test_errors_are_distances_to_projections():

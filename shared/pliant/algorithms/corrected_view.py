@@ -3,12 +3,12 @@
 from dataclasses import replace
 from functools import cached_property, lru_cache
 
-import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.bundle.calibration import ideal_pixels
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.image.moved_image import Move, moved_image
 
 
 class CorrectedView:
@@ -49,8 +49,12 @@ class CorrectedView:
         """(H, W) or (H, W, 3) the ideal image of a rectified one."""
         if not self._correction.any():
             return pixels
-        moved = cv2.remap(pixels, *self._places, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
-        return np.asarray(moved, np.uint8)
+        return moved_image(pixels, self._places)
+
+    @property
+    def moves(self) -> tuple[Move, ...]:
+        """What ``image`` does to an image, as of ``MovedImage``."""
+        return (self._places,) if self._correction.any() else ()
 
     @property
     def shows(self) -> BoolArray:
@@ -61,7 +65,7 @@ class CorrectedView:
         return (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
 
     @cached_property
-    def _places(self) -> tuple[F32, F32]:
+    def _places(self) -> Move:
         """(H, W) pixel of the rectified image that each of the ideal one shows: u, v."""
         camera = self.camera
         x: F64 = (np.arange(camera.width, dtype=np.float64) - camera.cx) / camera.fx

@@ -95,8 +95,8 @@ def matrix_to_pose(T: F64) -> F64:
 
 def inverse(T: F64) -> F64:
     """Invert (..., 4, 4) rigid motions."""
-    out = np.zeros_like(T)
-    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
+    out = np.zeros(T.shape)
+    R_t = T[..., :3, :3].swapaxes(-1, -2)
     out[..., :3, :3] = R_t
     out[..., :3, 3] = -(R_t @ T[..., :3, 3:4])[..., 0]
     out[..., 3, 3] = 1.0

@@ -279,19 +279,36 @@ def ideal_pixels(points_px: F32, camera: PinholeCamera, correction: F64) -> F32:
 
 @kernel
 def _ideal_pixels(points_px: F32, K: F64, correction: F64, shrunk: float, ideal: F32) -> None:
+    """In blocks: a step is SIMD code.  Each of their points stops where it has settled."""
     k1, k2, a, b = correction[1], correction[2], correction[4], correction[5]
-    for n in range(points_px.shape[0]):
-        x = shrunk / K[0] * (points_px[n, 0] - np.float32(K[2])) - a
-        y = shrunk / K[1] * (points_px[n, 1] - np.float32(K[3])) - b
-        wanted = np.sqrt(x * x + y * y)
-        r = wanted
+    fx, fy, cx, cy = K
+    x, y, wanted, r = np.empty((4, BLOCK))
+    settled = np.empty(BLOCK, np.bool_)
+    for first in range(0, points_px.shape[0], BLOCK):
+        size = min(BLOCK, points_px.shape[0] - first)
+        for i in range(size):
+            x[i] = shrunk / fx * (points_px[first + i, 0] - np.float32(cx)) - a
+            y[i] = shrunk / fy * (points_px[first + i, 1] - np.float32(cy)) - b
+            wanted[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
+        r[:], settled[:size], settled[size:] = wanted, False, True
         for _ in range(_NEWTON_STEPS):
-            r2, before = r * r, r
-            slope = max(1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2), _LEAST_SLOPE)
-            r -= (r * (1.0 + r2 * (k1 + k2 * r2)) - wanted) / slope
-            r = min(max(r, 0.0), _FARTHEST * wanted)
-            if abs(r - before) <= _SQUARES_TO_ROUNDING * wanted:
+            _newton_step(wanted, k1, k2, r, settled)
+            if settled.all():
                 break
-        share = r / wanted if wanted > 0.0 else 1.0
-        ideal[n, 0] = K[2] + K[0] * x * share
-        ideal[n, 1] = K[3] + K[1] * y * share
+        for i in range(size):
+            share = r[i] / wanted[i] if wanted[i] > 0.0 else 1.0
+            ideal[first + i, 0] = cx + fx * x[i] * share
+            ideal[first + i, 1] = cy + fy * y[i] * share
+
+
+@kernel
+def _newton_step(wanted: F64, k1: float, k2: float, r: F64, settled: BoolArray) -> None:
+    """Move the radii r (BLOCK,) that have not settled yet."""
+    for i in range(BLOCK):
+        before = r[i]
+        r2 = before * before
+        slope = max(1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2), _LEAST_SLOPE)
+        after = before - (before * (1.0 + r2 * (k1 + k2 * r2)) - wanted[i]) / slope
+        after = min(max(after, 0.0), _FARTHEST * wanted[i])
+        r[i] = before if settled[i] else after
+        settled[i] |= abs(after - before) <= _SQUARES_TO_ROUNDING * wanted[i]

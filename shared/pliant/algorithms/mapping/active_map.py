@@ -6,6 +6,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.covisibility import (
     MAX_MISSES,
@@ -23,7 +24,6 @@ from pliant.algorithms.mapping.map_store import (
     Keyframe,
     Observations,
     TrackLinks,
-    sample_colours,
 )
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, Reacquired, cut_patches
@@ -105,7 +105,8 @@ class ActiveMap:
         self.links.ids, self.links.rows = start.ids, rows
         self.links.follow(newest.ids)
         self._link_new_tracks(newest.points_px)
-        self._paint(self.links.rows, newest.points_px, colour if colour is not None else grey)
+        image = colour if colour is not None else grey
+        self._paint(self.links.rows, newest.points_px, None if image is None else MovedImage(image))
         self.points.kappas[self.links.rows] = newest.kappas
         frames = {frame.frame: frame for frame in waiting}
         for k, number in enumerate(start.frames.tolist()):
@@ -232,16 +233,16 @@ class ActiveMap:
         rolled_px: F32,
         found: Observations,
         grey: U8 | None,
-        colour: U8 | None,
+        colours: MovedImage | None,
         turned: bool,
     ) -> Keyframe:
         """Make the frame a keyframe and adjust the window.
 
         points_px, rolled_px: of all living tracks.   found: points that it sees without a track.
-        turned: whether it stands where the last one does.
+        grey: (H, W).   colours: None: as grey.   turned: whether it stands where the last one does.
         """
         new = self._link_new_tracks(points_px)
-        image = colour if colour is not None else grey
+        image = MovedImage(grey) if colours is None and grey is not None else colours
         self._paint(self.links.rows[new], points_px[new], image)
         keyframe = self._append_keyframe(
             frame,
@@ -284,10 +285,9 @@ class ActiveMap:
         self.points.first_keyframe[rows] = self.next_keyframe_id
         return new
 
-    def _paint(self, rows: I32, points_px: F32, image: U8 | None) -> None:
-        if image is not None and image.size:
-            image = image if image.ndim == 3 else image[:, :, None]
-            self.points.colours[rows] = sample_colours(image, points_px)
+    def _paint(self, rows: I32, points_px: F32, image: MovedImage | None) -> None:
+        if image is not None and image.pixels.size:
+            self.points.colours[rows] = image.colours(points_px)
 
     def _append_keyframe(
         self, frame: int, T_world_camera: F64, rows: I32, points_px: F32, rolled_px: F32 | None

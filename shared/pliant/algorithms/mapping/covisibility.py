@@ -58,7 +58,7 @@ def most_shared(older: list[Keyframe], moving: list[Keyframe], points: PointRows
     for keyframe in moving:
         marked[keyframe.rows] = True
     marked &= points.state == MAPPED
-    shared = [int(marked[keyframe.rows].sum()) for keyframe in older]
+    shared = [int(np.count_nonzero(marked[keyframe.rows])) for keyframe in older]
     order = np.argsort(-np.array(shared), kind="stable").tolist()
     return [older[i] for i in order if shared[i] > 0]
 

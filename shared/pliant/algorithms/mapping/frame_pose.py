@@ -16,6 +16,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.directions import (
     Spread,
@@ -262,6 +263,16 @@ def _contradicting(active: ActiveMap, T_world_camera: F64, points_px: F32) -> I6
         T_world_camera, points.xyz[rows], points.spread[rows], points_px[candidates], active.camera
     )
     return candidates[off > _OFF * active.parameters.localisation.inlier_px]
+
+
+def coloured(
+    calibration: SelfCalibration, rolled: RolledFrame | None, colour: U8 | None
+) -> MovedImage | None:
+    """The colours (H, W, 3) of a frame where its tracks are."""
+    if colour is None:
+        return None
+    at_once = () if rolled is None else (rolled.places,)
+    return MovedImage(colour, (*calibration.view.moves, *at_once))
 
 
 def stand(

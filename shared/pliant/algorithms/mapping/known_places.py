@@ -103,7 +103,8 @@ class Revisits:
                 (
                     old
                     for old in places
-                    if old.keyframe.id not in window and mine[old.keyframe.rows].sum() < least
+                    if old.keyframe.id not in window
+                    and np.count_nonzero(mine[old.keyframe.rows]) < least
                 ),
                 tries,
             )

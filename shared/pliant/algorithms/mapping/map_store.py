@@ -167,33 +167,42 @@ class Keyframe:
 
     def keep(self, mask: BoolArray) -> None:
         """Forget the observations that are not in the mask."""
-        rows = self.rows
-        _, self.rolled_px = _kept(rows, self.rolled_px, mask)
-        self.rows, self.points_px = _kept(rows, self.points_px, mask)
+        self.rows, self.points_px, self.rolled_px = _kept(
+            self.rows, self.points_px, self.rolled_px, mask
+        )
 
     def follow_aliases(self, points: PointRows) -> None:
         """Let observations of merged rows stand for the rows that took them in."""
-        rows, alias = self.rows, points.alias
-        _, self.rolled_px = _follow_aliases(rows, self.rolled_px, alias)
-        self.rows, self.points_px = _follow_aliases(rows, self.points_px, alias)
+        self.rows, self.points_px, self.rolled_px = _follow_aliases(
+            self.rows, self.points_px, self.rolled_px, points.alias
+        )
 
 
 @kernel
-def _kept(rows: I32, points_px: F32, mask: BoolArray) -> tuple[I32, F32]:
+def _kept(rows: I32, points_px: F32, rolled_px: F32, mask: BoolArray) -> tuple[I32, F32, F32]:
     count = mask.sum()
     if count == rows.size:
-        return rows, points_px
-    out, out_px = np.empty(count, np.int32), np.empty((count, 2), np.float32)
+        return rows, points_px, rolled_px
+    out, out_px, out_rolled = _room_for(count)
     at = 0
     for i in range(rows.size):
         if mask[i]:
-            out[at], out_px[at, 0], out_px[at, 1] = rows[i], points_px[i, 0], points_px[i, 1]
+            out[at] = rows[i]
+            for k in range(2):
+                out_px[at, k], out_rolled[at, k] = points_px[i, k], rolled_px[i, k]
             at += 1
-    return out, out_px
+    return out, out_px, out_rolled
 
 
 @kernel
-def _follow_aliases(rows: I32, points_px: F32, alias: I32) -> tuple[I32, F32]:
+def _room_for(count: int) -> tuple[I32, F32, F32]:
+    """Rows, points_px and rolled_px of so many observations, to be filled."""
+    shape = (count, 2)
+    return np.empty(count, np.int32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+
+
+@kernel
+def _follow_aliases(rows: I32, points_px: F32, rolled_px: F32, alias: I32) -> tuple[I32, F32, F32]:
     """Ascending rows stay so, each once: of two observations that of the lower row is kept."""
     merged = np.empty(rows.size, np.int32)
     count = 0
@@ -207,8 +216,8 @@ def _follow_aliases(rows: I32, points_px: F32, alias: I32) -> tuple[I32, F32]:
             merged[at] = i
             count += 1
     if count == 0:
-        return rows, points_px
-    out, out_px = np.empty(rows.size, np.int32), np.empty((rows.size, 2), np.float32)
+        return rows, points_px, rolled_px
+    out, out_px, out_rolled = _room_for(rows.size)
     size, own, other = 0, 0, 0
     while own < rows.size or other < count:
         if own < rows.size and alias[rows[own]] != rows[own]:
@@ -221,9 +230,11 @@ def _follow_aliases(rows: I32, points_px: F32, alias: I32) -> tuple[I32, F32]:
             other += 1
         row = alias[rows[i]]
         if size == 0 or out[size - 1] != row:
-            out[size], out_px[size, 0], out_px[size, 1] = row, points_px[i, 0], points_px[i, 1]
+            out[size] = row
+            for k in range(2):
+                out_px[size, k], out_rolled[size, k] = points_px[i, k], rolled_px[i, k]
             size += 1
-    return out[:size].copy(), out_px[:size].copy()
+    return out[:size].copy(), out_px[:size].copy(), out_rolled[:size].copy()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,15 +286,3 @@ def _carry_over(ids: I64, rows: I32, new_ids: I64, new_rows: I32) -> None:
             i += 1
         if i < ids.size and ids[i] == new_ids[j]:
             new_rows[j] = rows[i]
-
-
-@kernel
-def sample_colours(image: U8, points_px: F32) -> U8:
-    """(N, 3) RGB of the pixel nearest to each point; image (H, W, 3), or grey (H, W, 1)."""
-    colours = np.empty((points_px.shape[0], 3), np.uint8)
-    for i in range(points_px.shape[0]):
-        column = min(max(int(points_px[i, 0] + 0.5), 0), image.shape[1] - 1)
-        line = min(max(int(points_px[i, 1] + 0.5), 0), image.shape[0] - 1)
-        for k in range(3):
-            colours[i, k] = image[line, column, min(k, image.shape[2] - 1)]
-    return colours

@@ -20,6 +20,7 @@ from pliant.algorithms.mapping.frame_pose import (
     Located,
     adjust,
     at_once,
+    coloured,
     directions_of,
     doubt,
     localise,
@@ -157,13 +158,11 @@ class Mapper:
         if self._keyframe_is_new:
             with self._timer("keyframe"):
                 T_world_camera, turned = stand(active, T_world_camera, found, tracks)
-                colour = self.calibration.ideal_image(colour)
                 if rolled is not None:
-                    colour = colour if colour is None else rolled.image(colour)
                     active.segment.unroll(active.window.keyframes, self.calibration)
                 hanging = active.insert_keyframe(
                     frame, T_world_camera, tracks.points_px, seen.points_px - tracks.points_px,
-                    found, grey, colour, turned,
+                    found, grey, coloured(self.calibration, rolled, colour), turned,
                 )  # fmt: skip
             self.follow(atlas.calibrate())
             T_world_camera = hanging.T_world_camera

@@ -1,5 +1,6 @@
 """What has been published of the map, and so what the next MapDelta and KeyframeDelta say."""
 
+import bisect
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -173,9 +174,8 @@ def _unpublished(
 
 
 def _differs(keyframe: Keyframe) -> bool:
-    return keyframe.published_pose is None or not np.array_equal(
-        keyframe.published_pose, keyframe.T_world_camera
-    )
+    published = keyframe.published_pose
+    return published is None or bool((published != keyframe.T_world_camera).any())
 
 
 class KeyframeChanges:
@@ -190,8 +190,9 @@ class KeyframeChanges:
 
     def settle(self, keyframes: Sequence[Keyframe]) -> None:
         """These keyframes, in the order of their ids, will not change any more."""
-        self._final += [k for k in keyframes if k.id > self._settled]
-        self._settled = max([self._settled, *(keyframe.id for keyframe in self._final)])
+        first = bisect.bisect_right(keyframes, self._settled, key=lambda keyframe: keyframe.id)
+        self._final += keyframes[first:]
+        self._settled = max([self._settled, *(keyframe.id for keyframe in keyframes[first:])])
 
     def publish(self, newest: Keyframe | None) -> KeyframeDelta:
         """What has not been published yet.  newest: the last keyframe that was made, if any."""

@@ -18,12 +18,12 @@ Keyframes remember p - q, so that a better readout, motion or depth can take its
 from dataclasses import dataclass
 from functools import cached_property
 
-import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log
+from pliant.algorithms.image.moved_image import Move, moved_image
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.compiler.kernel import fast_kernel, kernel
@@ -139,12 +139,10 @@ class RolledFrame:
 
     def image(self, pixels: U8) -> U8:
         """The image (H, W) or (H, W, 3), had it been taken at once: all of it at one depth."""
-        return np.asarray(
-            cv2.remap(pixels, *self._places, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE), np.uint8
-        )
+        return moved_image(pixels, self.places)
 
     @cached_property
-    def _places(self) -> tuple[F32, F32]:
+    def places(self) -> Move:
         """(H, W) columns and rows in which the pixels of the image taken at once are seen."""
         width, height = self.camera.width, self.camera.height
         columns, rows = -(-width // _GRID_PX) + 1, -(-height // _GRID_PX) + 1
