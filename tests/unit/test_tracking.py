@@ -43,10 +43,17 @@ def render(frame: int, *, gain: float = 1.0, noise: float = 2.0) -> U8:
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
-def follow(images: list[U8], parameters: TrackingParameters, seed: int = 0) -> list[FrameExtrema]:
+def stamp_ns(frame: int, fps: int = 30) -> int:
+    """When a frame was taken."""
+    return round(frame * 1e9 / fps)
+
+
+def follow(
+    images: list[U8], parameters: TrackingParameters, seed: int = 0, fps: int = 30
+) -> list[FrameExtrema]:
     """Track a list of images."""
     tracker = ExtremaTracker(images[0].shape[1], images[0].shape[0], parameters, seed)
-    return [tracker.track(image) for image in images]
+    return [tracker.track(image, stamp_ns(k, fps)) for k, image in enumerate(images)]
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +145,7 @@ def test_any_size_of_image_will_do(shape: tuple[int, int]) -> None:
 def test_an_image_of_another_size_is_refused() -> None:
     tracker = ExtremaTracker(WIDTH, HEIGHT, TrackingParameters())
     with pytest.raises(ValueError, match="uint8 image of shape"):
-        tracker.track(np.zeros((HEIGHT, WIDTH + 1), np.uint8))
+        tracker.track(np.zeros((HEIGHT, WIDTH + 1), np.uint8), 0)
 
 
 @pytest.mark.parametrize("both_signs", [True, False])
@@ -161,3 +168,15 @@ def test_kappas_are_told_to_eight_bits(sequence: list[U8]) -> None:
     there = np.isfinite(exact)
     assert there.sum() > 0.9 * len(at)
     np.testing.assert_allclose(tracks.kappas[there], exact[there], rtol=2.0**-8)
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(5, 3), (30, 20), (60, 40)])
+def test_tracks_coast_for_seconds_of_the_stream(fps: int, frames: int) -> None:
+    bright, dim = (render(0, gain=gain, noise=0.0) for gain in (1.0, 0.4))
+    # Curvature goes with the cube of the contrast: the patches stay, the extrema do not.
+    strongest = float(np.abs(maxima_of(bright, TrackingParameters())[:, 2]).max())
+    parameters = TrackingParameters(min_curvature=0.1 * strongest)
+    first, *coasting, last = follow([bright, *[dim] * (frames + 1)], parameters, fps=fps)
+    assert len(coasting) == frames
+    assert all(len(tracks.ids) > 0.8 * len(first.ids) > 500 for tracks in coasting)
+    assert len(last.ids) == 0

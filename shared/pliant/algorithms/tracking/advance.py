@@ -50,7 +50,10 @@ class FrameImages(NamedTuple):
 
 
 class StepLimits(NamedTuple):
-    """Limits and switches of a step: see the fields of TrackingParameters."""
+    """Limits and switches of a step: see the fields of TrackingParameters.
+
+    interval_s: from the frame before to this one.
+    """
 
     prediction_weight: np.float32
     prediction_sigma: np.float32
@@ -66,7 +69,8 @@ class StepLimits(NamedTuple):
     subpixel: bool
     patch_refinement: bool
     patch_iterations: int
-    coast_frames: int
+    coast_s: np.float32
+    interval_s: np.float32
 
 
 class _Place(NamedTuple):
@@ -233,7 +237,7 @@ def _settle(kappa: Pixels, pixel: int, subpixel: bool, track: Track) -> None:
     track.kappa = kappa.values[pixel]
     track.pixel = pixel
     track.state = EXTREMUM
-    track.coasted = 0
+    track.coasted = np.float32(0.0)
 
 
 @fast_kernel
@@ -300,7 +304,8 @@ def _follow_patch(
         gate = limits.extremum_gate
         on_extremum = place.accepted and off_u * off_u + off_v * off_v < gate * gate
     if not on_extremum:
-        if track.coasted >= limits.coast_frames:
+        track.coasted += limits.interval_s
+        if track.coasted > limits.coast_s:
             return False
         place = _align_track(image, u + du, v + dv, limits.coast_gate, limits, track, templates)
         if not place.accepted or not _leads_back(
@@ -313,7 +318,6 @@ def _follow_patch(
     else:
         track.pixel = -1
         track.state = COASTING
-        track.coasted += 1
     border = np.float32(CURVATURE_BORDER)
     if place.u < border or place.v < border:
         return False

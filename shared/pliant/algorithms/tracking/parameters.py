@@ -111,8 +111,8 @@ class TrackingParameters(Parameters):
         gt=0.0,
         description="A patch that ends farther from its extremum coasts instead, px.",
     )
-    coast_frames: int = Field(
-        default=20, ge=0, le=1000, description="Most frames in a row without an extremum."
+    coast_s: float = Field(
+        default=0.68, ge=0.0, description="Most seconds in a row without an extremum."
     )
     coast_gate_px: float = Field(
         default=3.0,
