@@ -9,7 +9,6 @@ from pliant.datasets import open_source
 from pliant.errors import PliantError
 
 _OFF = {
-    "mutual check": ["tracking.mutual_check=false"],
     "local flow": ["tracking.local_flow=false"],
     "de-duplication": ["tracking.deduplicate=false"],
     "sub-pixel extrema": ["tracking.subpixel=false"],
@@ -22,7 +21,7 @@ _OFF = {
     "final adjustment": ["bundle_adjustment.window.final_adjustment=false"],
     "readout of a rolling shutter": ["bundle_adjustment.calibration.readout=0"],
 }
-_TRACKER = ("mutual check", "local flow", "de-duplication", "sub-pixel extrema")
+_TRACKER = ("local flow", "de-duplication", "sub-pixel extrema")
 _LITERAL = [s for name in (*_TRACKER, "patch refinement and coasting") for s in _OFF[name]]
 _LITERAL += _OFF["minima beside maxima"]
 

@@ -44,6 +44,7 @@ class ExtremaTracker:
         self._brief = BriefExtractor(np.random.default_rng(seed), parameters.flow_points)
         self._table = TrackTable.with_capacity(parameters.max_tracks)
         self._next_id = 0
+        self._kappa = np.zeros(self._shape, np.float32)
         self._owners = np.zeros(self._shape, np.int32)
         self._motions = np.zeros((parameters.max_tracks, 2), np.float32)
         self._scratch = np.zeros(TEMPLATE_FLOATS, np.float32)
@@ -53,9 +54,7 @@ class ExtremaTracker:
         self._has_previous = False
         self._stamp_ns = 0
         self._smooth = np.zeros(self._shape, np.float32)
-        self._kappa = np.zeros(self._shape, np.float32)
         self._spare_smooth = np.zeros(self._shape, np.float32)
-        self._spare_kappa = np.zeros(self._shape, np.float32)
         self._pyramid: list[F32] = []
         self._maxima: F32 = np.zeros((0, 3), np.float32)
         self._features: BriefFeatures | None = None
@@ -81,13 +80,13 @@ class ExtremaTracker:
             )
         p, grey = self._parameters, filled(grey, clearance)
         with timer("curvature and maxima"):
-            smooth, kappa, pixels, maxima = curvature_and_maxima(
+            smooth, _, pixels, maxima = curvature_and_maxima(
                 grey,
                 p.blur_sigma_px,
                 p.min_curvature,
                 both_signs=p.both_signs,
                 smooth=self._spare_smooth,
-                kappa=self._spare_kappa,
+                kappa=self._kappa,
             )
             pixels, maxima = uncovered(pixels, maxima, clearance)
         with timer("dominant flow"):
@@ -96,14 +95,13 @@ class ExtremaTracker:
         with timer("local flow"):
             pyramid = _pyramid(smooth)
             flow = self._local_flow(pyramid, dominant.astype(np.float32).ravel())
-        now = FrameImages(pixels_of(smooth), pixels_of(pyramid[0]), pixels_of(kappa))
+        now = FrameImages(pixels_of(smooth), pixels_of(pyramid[0]))
         if self._has_previous:
             with timer("tracks"):
                 self._advance(now, flow, 1e-9 * (stamp_ns - self._stamp_ns), clearance)
         with timer("upkeep"):
             self._start_tracks(now, pixels, maxima, clearance)
         self._spare_smooth, self._smooth = self._smooth, smooth
-        self._spare_kappa, self._kappa = self._kappa, kappa
         self._pyramid, self._maxima, self._features = pyramid, maxima, features
         self._local = flow.grid
         self._has_previous, self._stamp_ns = True, stamp_ns
@@ -129,12 +127,11 @@ class ExtremaTracker:
         self, now: FrameImages, flow: Flow, interval_s: float, clearance: F32 | None
     ) -> None:
         table, p = self._table, self._parameters
-        before = FrameImages(
-            pixels_of(self._smooth), pixels_of(self._pyramid[0]), pixels_of(self._kappa)
-        )
+        before = FrameImages(pixels_of(self._smooth), pixels_of(self._pyramid[0]))
         advance_tracks(
             before,
             now,
+            pixels_of(self._kappa),
             flow,
             _step_limits(p, interval_s),
             scan_order(table.tracks, self._shape[0]),
@@ -215,14 +212,12 @@ def _step_limits(p: TrackingParameters, interval_s: float) -> StepLimits:
         prediction_weight=np.float32(p.prediction_weight),
         prediction_sigma=np.float32(p.prediction_sigma_px),
         max_correction=np.float32(p.max_correction_px),
-        mutual_gate=np.float32(p.mutual_gate_px),
         min_curvature=np.float32(p.min_curvature),
         min_zncc=np.float32(p.min_zncc),
         min_residual=np.float32(p.min_residual),
         extremum_gate=np.float32(p.extremum_gate_px),
         coast_gate=np.float32(p.coast_gate_px),
         backward_gate=np.float32(p.backward_gate_px),
-        mutual_check=p.mutual_check,
         subpixel=p.subpixel,
         patch_refinement=p.patch_refinement,
         patch_iterations=p.patch_iterations,
