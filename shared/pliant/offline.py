@@ -65,7 +65,9 @@ class Pipeline:
             delta = self._mapper.skip(image.frame)
         else:
             clearance = clearance_in(image.mask)
-            tracks = self._tracker.track(image.grey, self._timers.tracking, clearance)
+            tracks = self._tracker.track(
+                image.grey, image.stamp_ns, self._timers.tracking, clearance
+            )
             colour = image.colour if image.colour.size else None
             delta = self._mapper.process(
                 image.frame, image.stamp_ns, tracks, filled(image.grey, clearance), colour,

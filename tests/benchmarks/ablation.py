@@ -9,20 +9,19 @@ from pliant.datasets import open_source
 from pliant.errors import PliantError
 
 _OFF = {
-    "mutual check": ["tracking.mutual_check=false"],
     "local flow": ["tracking.local_flow=false"],
     "de-duplication": ["tracking.deduplicate=false"],
     "sub-pixel extrema": ["tracking.subpixel=false"],
     "patch refinement and coasting": ["tracking.patch_refinement=false"],
     "turned patches": ["tracking.turn_patches=false"],
-    "coasting": ["tracking.coast_frames=0"],
+    "coasting": ["tracking.coast_s=0"],
     "minima beside maxima": ["tracking.both_signs=false"],
     "re-acquisition": ["bundle_adjustment.reacquisition.enabled=false"],
     "sweeps on every frame": ["bundle_adjustment.window.sweeps=0"],
     "final adjustment": ["bundle_adjustment.window.final_adjustment=false"],
     "readout of a rolling shutter": ["bundle_adjustment.calibration.readout=0"],
 }
-_TRACKER = ("mutual check", "local flow", "de-duplication", "sub-pixel extrema")
+_TRACKER = ("local flow", "de-duplication", "sub-pixel extrema")
 _LITERAL = [s for name in (*_TRACKER, "patch refinement and coasting") for s in _OFF[name]]
 _LITERAL += _OFF["minima beside maxima"]
 

@@ -38,7 +38,7 @@ class Mapped:
         mapper = Mapper(self._camera, config.bundle_adjustment, config.seed)
         for k, (grey, _) in enumerate(views):
             stamp_ns = round(k * 1e9 / CAMERA.fps)
-            mapper.process(k, stamp_ns, tracker.track(grey), grey, None)
+            mapper.process(k, stamp_ns, tracker.track(grey, stamp_ns), grey, None)
             mapper.publish_keyframes()
         mapper.finish()
         self._atlas = mapper.atlas

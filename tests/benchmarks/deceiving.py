@@ -92,7 +92,8 @@ class _Session:
     def _take(self, grey: U8) -> None:
         frame, self._next = self._next, self._next + 1
         stamp_ns = round(frame * 1e9 / CAMERA.fps)
-        delta = self.mapper.process(frame, stamp_ns, self.tracker.track(grey), grey, None)
+        tracks = self.tracker.track(grey, stamp_ns)
+        delta = self.mapper.process(frame, stamp_ns, tracks, grey, None)
         self.mapper.publish_keyframes()
         self.history.apply(delta, frame=frame, stamp_ns=stamp_ns)
         self.joined += len(delta.joined)

@@ -82,8 +82,8 @@ def _extrema(grey: U8) -> U8:
 def _flow(before: U8, after: U8) -> U8:
     """How a frame lies on a later one as it is, and the motion of every fifth track."""
     tracker = ExtremaTracker(before.shape[1], before.shape[0], load_config().tracking)
-    first = tracker.track(before)
-    second = tracker.track(after)
+    first = tracker.track(before, 0)
+    second = tracker.track(after, 1)
     _, one, two = np.intersect1d(first.ids, second.ids, return_indices=True)
     dominant = second.dominant_flow
     A, b = dominant[:, :2], dominant[:, 2]

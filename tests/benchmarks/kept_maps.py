@@ -71,7 +71,7 @@ class Source:
                 continue
             image = rectified(source, self._rectifier)
             begin = time.process_time()
-            tracks = tracker.track(image.grey)
+            tracks = tracker.track(image.grey, image.stamp_ns)
             tracked = time.process_time()
             last, colour = image.frame, image.colour if image.colour.size else None
             delta = mapper.process(last, image.stamp_ns, tracks, image.grey, colour)

@@ -44,7 +44,7 @@ class _Run:
         last = 0
         for frame in dataset:
             image = rectified(frame, rectifier)
-            tracks = tracker.track(image.grey)
+            tracks = tracker.track(image.grey, image.stamp_ns)
             last = image.frame
             delta = self.mapper.process(last, image.stamp_ns, tracks, image.grey, None)
             self.mapper.publish_keyframes()

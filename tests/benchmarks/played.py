@@ -125,7 +125,7 @@ class Reel:
             colour = image.colour if image.colour.size else None
             stamp_ns = int(self.stamps_ns[number]) if on_and_on else number * self.step_ns
             begin = time.process_time()
-            tracks = tracker.track(image.grey)
+            tracks = tracker.track(image.grey, stamp_ns)
             delta = mapper.process(number, stamp_ns, tracks, image.grey, colour)
             mapper.publish_keyframes()
             spent += time.process_time() - begin

@@ -47,7 +47,7 @@ def _pairs(sequence: Sequence, parameters: SurfelParameters) -> tuple[int, int, 
     for first in range(0, 2 * _PAIRS, 2):
         tracker = SurfelTracker(parameters)
         born = tracker.start(sequence.images[first], sequence.depths[first], sequence.camera)
-        found = tracker.track(sequence.images[first + 1])
+        found = tracker.track(sequence.images[first + 1], sequence.interval_s(first + 1))
         points = truth.at_pixels(first, np.rint(born.points_px).astype(np.float64))
         exact = truth.positions(points, first + 1)
         kept = truth.visible(points, first + 1, 0.5 * parameters.patch_px + 1.0)

@@ -80,7 +80,7 @@ def _after(
             image = np.clip(generator.normal(4.0, 2.0, image.shape), 0, 255).astype(np.uint8)
         elif number >= again and turned:
             image = _warped(image, T[:3, :3], sequence.camera)
-        frame = tracker.track(image, depth=depth)
+        frame = tracker.track(image, sequence.interval_s(number), depth=depth)
         if number - again in _AFTER:
             exact.add(number, frame)
     return exact.rows[1:]

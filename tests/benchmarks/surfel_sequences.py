@@ -26,6 +26,7 @@ class Sequence:
 
     camera: PinholeCamera
     images: list[U8]
+    stamps_ns: list[int]
     depths: list[F64]
     truth: SurfaceTruth | None
 
@@ -33,7 +34,14 @@ class Sequence:
     def tracks(self) -> list[FrameTracks]:
         """What the tracking service would make of the images."""
         tracker = ExtremaTracker(self.camera.width, self.camera.height, TrackingParameters(), 0)
-        return [tracker.track(image) for image in self.images]
+        return [
+            tracker.track(image, stamp_ns)
+            for image, stamp_ns in zip(self.images, self.stamps_ns, strict=True)
+        ]
+
+    def interval_s(self, number: int) -> float:
+        """From the frame before to this one."""
+        return 1e-9 * (self.stamps_ns[number] - self.stamps_ns[number - 1])
 
 
 def load(source: str, frames: int, *, all_depths: bool = False) -> Sequence:
@@ -46,6 +54,7 @@ def load(source: str, frames: int, *, all_depths: bool = False) -> Sequence:
     rectifier, depths = Rectifier(dataset.calibration), DepthRectifier(dataset.calibration)
     exact = is_deforming(source)
     images: list[U8] = []
+    stamps_ns: list[int] = []
     maps: list[F64] = []
     for frame in dataset:
         if len(images) == frames:
@@ -58,8 +67,9 @@ def load(source: str, frames: int, *, all_depths: bool = False) -> Sequence:
         except BrokenFrame as error:
             raise DatasetError(f"{source}: {error}") from None
         images.append(grey)
+        stamps_ns.append(frame.stamp_ns)
         maps.append(depth)
     if not images or not maps[0].size:
         raise DatasetError(f"{source}: its first frame has no depth map to start from")
     truth = SurfaceTruth(Path(folder), rectifier.camera) if exact else None
-    return Sequence(rectifier.camera, images, maps, truth)
+    return Sequence(rectifier.camera, images, stamps_ns, maps, truth)

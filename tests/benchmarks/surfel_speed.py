@@ -33,6 +33,7 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 _LK: dict[str, Any] = {"winSize": (23, 23), "maxLevel": 2}
 _STEPS_OF_A_ROUND = 18
+_STEP_S = 1.0 / 30.0
 
 
 def measure(source: str | None, frames: int, surfels: int) -> Iterator[str]:
@@ -64,7 +65,7 @@ def _run(
 ) -> tuple[Stopwatch, list[float], list[float], float]:
     warm = SurfelTracker(parameters)
     warm.start(images[0], depth, camera)
-    warm.track(images[0])
+    warm.track(images[0], _STEP_S)
     tracker, watch = SurfelTracker(parameters), Stopwatch(time.process_time)
     last = tracker.start(images[0], depth, camera)
     spent: list[float] = []
@@ -73,7 +74,7 @@ def _run(
     for before, image in pairwise(images):
         reference.append(_lucas_kanade_s(before, image, last.points_px))
         start = time.process_time()
-        last = tracker.track(image, timer=watch)
+        last = tracker.track(image, _STEP_S, timer=watch)
         spent.append(time.process_time() - start)
         watch.lap()
         counts.append(int(np.count_nonzero(last.state == SurfelState.TRACKED)))

@@ -192,7 +192,8 @@ def _measure(sequence: Sequence, parameters: SurfelParameters) -> list[str]:
         if number == 0:
             surfels = tracker.start(image, sequence.depths[0], sequence.camera)
         else:
-            surfels = tracker.track(image, predict(seen, before, now) if before and now else None)
+            prediction = predict(seen, before, now) if before and now else None
+            surfels = tracker.track(image, sequence.interval_s(number), prediction)
         spent.append(time.perf_counter() - start)
         seen = surfels.points_px
         if exact is not None:

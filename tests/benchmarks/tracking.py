@@ -36,7 +36,7 @@ def measure(source: str, config: Config, frames: int) -> Iterator[str]:
             continue
         warm = number >= _WARM_FRAMES
         start = time.perf_counter()
-        tracks = tracker.track(image.grey, watch)
+        tracks = tracker.track(image.grey, image.stamp_ns, watch)
         spent = time.perf_counter() - start
         if warm:
             totals.append(spent)

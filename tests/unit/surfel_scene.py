@@ -16,6 +16,9 @@ from pliant.rendering.solids import Material, Scene, Solid
 
 WIDTH, HEIGHT = 320, 240
 
+STEP_S = 1.0 / 30.0
+"""From a frame to the next."""
+
 EVERYWHERE = np.ones((120, 160))
 """Depth for the templates of ``waves``, with a bound that is infinite."""
 

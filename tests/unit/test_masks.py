@@ -5,8 +5,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
-from surfel_scene import board_renderer, film, motion
-from test_tracking import HEIGHT, WIDTH, follow, render
+from surfel_scene import STEP_S, board_renderer, film, motion
+from test_tracking import HEIGHT, WIDTH, follow, render, stamp_ns
 from test_tracking import motion as motion_of_texture
 
 from pliant.algorithms.arrays import U8, BoolArray
@@ -118,7 +118,7 @@ def test_no_track_and_no_maximum_touches_what_is_covered(
         for frame in range(8):
             used = mask(frame)
             image = np.where(used, render(frame), noise(seed))
-            made.append(tracker.track(image, clearance=clearance_of(used)))
+            made.append(tracker.track(image, stamp_ns(frame), clearance=clearance_of(used)))
         outcome.append(made)
     for frame, (tracks, other) in enumerate(zip(*outcome, strict=True)):
         clearance = clearance_of(mask(frame))
@@ -142,7 +142,10 @@ def test_without_a_mask_a_pattern_that_stays_misleads_the_flow_and_with_it_does_
     images = [np.where(used, render(frame), noise(1)) for frame in range(4)]
     flows = [follow(images, PARAMETERS)[-1].dominant_flow]
     tracker = ExtremaTracker(WIDTH, HEIGHT, PARAMETERS)
-    flows += [tracker.track(each, clearance=clearance_of(used)).dominant_flow for each in images]
+    flows += [
+        tracker.track(image, stamp_ns(frame), clearance=clearance_of(used)).dominant_flow
+        for frame, image in enumerate(images)
+    ]
     before, after = motion_of_texture(2), motion_of_texture(3)
     middle = np.array([WIDTH / 2.0, HEIGHT / 2.0])
     to = after[:, :2] @ np.linalg.solve(before[:, :2], middle - before[:, 2]) + after[:, 2]
@@ -168,7 +171,7 @@ def test_no_surfel_is_born_or_seen_where_it_is_covered() -> None:
     assert len(born.ids) > 20
     tracker = SurfelTracker(parameters)
     born = tracker.start(first.image, first.depth_m, camera)
-    covered = tracker.track(glaring(second.image, clearance_of(used)))
+    covered = tracker.track(glaring(second.image, clearance_of(used)), STEP_S)
     here = right(born.points_px)
     assert (covered.state[~here] != SurfelState.TRACKED).all()
     assert np.count_nonzero(~here) > 10

@@ -154,7 +154,7 @@ def test_tracker_and_mapper_go_on_as_if_nothing_had_been() -> None:
 
         def step(tracker: ExtremaTracker, mapper: Mapper, image=image) -> tuple[bytes, bytes]:
             header = Header(frame=image.frame, stamp_ns=image.stamp_ns, frame_id="world")
-            tracks = tracker.track(image.grey)
+            tracks = tracker.track(image.grey, image.stamp_ns)
             delta = mapper.process(image.frame, image.stamp_ns, tracks, image.grey, image.colour)
             return (
                 codec.encode(Extrema.of(header, tracks)),

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from surfel_scene import board_renderer, film, motion
+from surfel_scene import STEP_S, board_renderer, film, motion
 
 from pliant.algorithms.arrays import I64
 from pliant.algorithms.camera import PinholeCamera
@@ -65,7 +65,7 @@ def test_surfels_behind_the_camera_are_outside(
     passed = first.points_px[:, 0] < np.quantile(first.points_px[:, 0], 0.3)
     put(tracker, np.flatnonzero(passed), (0.0, 0.0, depth))
     for number in (1, 2, 3):
-        frame = tracker.track(board[0][number].image)
+        frame = tracker.track(board[0][number].image, STEP_S)
         assert_finite(frame)
         assert not frame.lost
         assert (frame.state[~passed] == SurfelState.TRACKED).mean() > 0.9
@@ -85,12 +85,12 @@ def test_all_behind_is_a_loss(
     """Where the view is no known one; a depth map starts another segment."""
     tracker, first = start(board, mode, neighbours)
     put(tracker, np.arange(len(first.ids)), (0.0, 0.0, -2.0))
-    frame = tracker.track(mirrored(board[0][1].image))
+    frame = tracker.track(mirrored(board[0][1].image), STEP_S)
     assert_finite(frame)
     assert frame.lost
     assert (frame.state == SurfelState.OUTSIDE).all()
     after = board[0][2]
-    again = tracker.track(mirrored(after.image), None, mirrored(after.depth_m))
+    again = tracker.track(mirrored(after.image), STEP_S, None, mirrored(after.depth_m))
     assert_finite(again)
     assert not again.lost
     assert again.segment == 1
@@ -104,11 +104,11 @@ def test_a_camera_that_is_beyond_them(
     until the view is a known one."""
     tracker, _ = start(board, mode, neighbours)
     tracker._T_world_camera = motion((0.0, 0.0, 0.0), (0.0, 0.0, 1.5))
-    frame = tracker.track(mirrored(board[0][1].image))
+    frame = tracker.track(mirrored(board[0][1].image), STEP_S)
     assert_finite(frame)
     assert frame.lost
     assert (frame.state == SurfelState.OUTSIDE).all()
-    found = tracker.track(board[0][2].image)
+    found = tracker.track(board[0][2].image, STEP_S)
     assert (found.state == SurfelState.TRACKED).mean() > 0.9
 
 
@@ -121,7 +121,7 @@ def test_a_camera_that_flies_past_a_surfel() -> None:
     tracker.start(frames[0].image, frames[0].depth_m, camera)
     passed = False
     for frame in frames[1:]:
-        result = tracker.track(frame.image)
+        result = tracker.track(frame.image, STEP_S)
         assert_finite(result)
         depth = result.positions[:, 2] - result.T_world_camera[2, 3]
         behind = depth < 0.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from surfel_scene import EVERYWHERE, board_renderer, film, level_of, slanted_surfels, waves
+from surfel_scene import EVERYWHERE, STEP_S, board_renderer, film, level_of, slanted_surfels, waves
 from surfel_scene import motion as rigid_motion
 
 from pliant.algorithms.arrays import F64
@@ -49,7 +49,7 @@ def test_camera_before_a_rigid_scene(
     tracker = SurfelTracker(SMALL.model_copy(update={"neighbours": neighbours}))
     first = tracker.start(frames[0].image, frames[0].depth_m, camera)
     for frame, T in zip(frames[1:], motions[1:], strict=True):
-        result = tracker.track(frame.image)
+        result = tracker.track(frame.image, STEP_S)
         off = inverse(T) @ result.T_world_camera
         assert np.linalg.norm(off[:3, 3]) < 0.002
         assert np.linalg.norm(so3_log(off[None, :3, :3])[0]) < 0.002
@@ -66,7 +66,7 @@ def test_static_camera_mode_keeps_the_camera(
     frames, camera, _ = board
     tracker = SurfelTracker(SMALL.model_copy(update={"camera": "static"}))
     tracker.start(frames[0].image, frames[0].depth_m, camera)
-    np.testing.assert_array_equal(tracker.track(frames[1].image).T_world_camera, np.eye(4))
+    np.testing.assert_array_equal(tracker.track(frames[1].image, STEP_S).T_world_camera, np.eye(4))
 
 
 def problem(seed: int = 0, count: int = 12) -> dict[str, object]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from surfel_scene import HEIGHT, WIDTH, board_renderer, film, motion
+from surfel_scene import HEIGHT, STEP_S, WIDTH, board_renderer, film, motion
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
@@ -56,7 +56,7 @@ def test_recovery_without_noise(
     first = tracker.start(frames[0].image, frames[0].depth_m, camera)
     assert len(first.ids) == 60
     for frame, T in zip(frames[1:], motions[1:], strict=True):
-        result = tracker.track(frame.image)
+        result = tracker.track(frame.image, STEP_S)
         truth = transform(inverse(T), first.positions)
         good = result.state == SurfelState.TRACKED
         assert good.mean() >= 0.95
@@ -77,7 +77,7 @@ def test_the_same_frame_changes_nothing(
     frames, camera, _ = board
     tracker = SurfelTracker(SMALL)
     first = tracker.start(frames[0].image, frames[0].depth_m, camera)
-    again = tracker.track(frames[0].image)
+    again = tracker.track(frames[0].image, STEP_S)
     np.testing.assert_allclose(again.positions, first.positions, atol=1e-5)
     assert (again.zncc > 0.9999).all()
 
@@ -90,7 +90,7 @@ def test_same_bytes_in_every_run(
     for _ in range(2):
         tracker = SurfelTracker(SMALL)
         results = [tracker.start(frames[0].image, frames[0].depth_m, camera)]
-        results += [tracker.track(frame.image) for frame in frames[1:]]
+        results += [tracker.track(frame.image, STEP_S) for frame in frames[1:]]
         runs.append([arrays(result) for result in results])
     assert runs[0] == runs[1]
 
@@ -145,12 +145,12 @@ def test_what_was_tried_is_told(
     tracker = SurfelTracker(SMALL)
     first = tracker.start(frames[0].image, frames[0].depth_m, camera)
     np.testing.assert_array_equal(first.tried, first.positions)
-    second = tracker.track(frames[1].image)
+    second = tracker.track(frames[1].image, STEP_S)
     good = second.state == SurfelState.TRACKED
     np.testing.assert_array_equal(second.tried[good], second.positions[good])
     covered = frames[2].image.copy()
     covered[:, 160:] = 60
-    third = tracker.track(covered)
+    third = tracker.track(covered, STEP_S)
     bad = third.state != SurfelState.TRACKED
     assert bad.any()
     assert (third.tried[bad] != third.positions[bad]).any(axis=1).mean() > 0.9
@@ -164,7 +164,7 @@ def test_gain_and_bias_take_up_the_light(
     tracker = SurfelTracker(SMALL)
     tracker.start(frames[0].image, frames[0].depth_m, camera)
     darker = np.rint(0.7 * frames[1].image + 10.0).astype(np.uint8)
-    result = tracker.track(darker)
+    result = tracker.track(darker, STEP_S)
     good = result.state == SurfelState.TRACKED
     assert good.mean() > 0.95
     assert np.median(result.gains[good]) == pytest.approx(1 / 0.7, rel=0.03)
@@ -177,18 +177,18 @@ def test_black_frame_jump_and_cover_are_stated(
     frames, camera, _ = board
     tracker = SurfelTracker(SMALL)
     first = tracker.start(frames[0].image, frames[0].depth_m, camera)
-    black = tracker.track(np.zeros_like(frames[0].image))
+    black = tracker.track(np.zeros_like(frames[0].image), STEP_S)
     assert black.lost
     assert not (black.state == SurfelState.TRACKED).any()
     np.testing.assert_array_equal(black.positions, first.positions)
     noise = np.random.default_rng(0).integers(0, 255, frames[0].image.shape).astype(np.uint8)
-    assert_finite(tracker.track(noise))
+    assert_finite(tracker.track(noise, STEP_S))
     # Found again where the frame shows them again.
-    again = tracker.track(frames[0].image)
+    again = tracker.track(frames[0].image, STEP_S)
     assert (again.state == SurfelState.TRACKED).mean() > 0.95
     covered = frames[0].image.copy()
     covered[:, : WIDTH // 2] = 128
-    result = tracker.track(covered)
+    result = tracker.track(covered, STEP_S)
     under = first.points_px[:, 0] < WIDTH // 2 - 15
     assert not (result.state[under] == SurfelState.TRACKED).any()
     beside = first.points_px[:, 0] > WIDTH // 2 + 15
@@ -200,19 +200,42 @@ def test_lost_surfels_make_room_for_new_ones(
     board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
 ) -> None:
     frames, camera, _ = board
-    tracker = SurfelTracker(SMALL.model_copy(update={"lost_after": 2}))
+    tracker = SurfelTracker(SMALL.model_copy(update={"lost_after_s": 2.5 * STEP_S}))
     first = tracker.start(frames[0].image, frames[0].depth_m, camera)
     for _ in range(4):
-        lost = tracker.track(np.zeros_like(frames[0].image))
+        lost = tracker.track(np.zeros_like(frames[0].image), STEP_S)
     assert (lost.state == SurfelState.LOST).all()
     assert lost.segment == 0
     restarted = tracker.track(
-        np.flip(frames[0].image, 1).copy(), depth=np.flip(frames[0].depth_m, 1)
+        np.flip(frames[0].image, 1).copy(), STEP_S, depth=np.flip(frames[0].depth_m, 1)
     )
     assert restarted.segment == 1
     assert not restarted.lost
     assert restarted.ids.min() > first.ids.max()
     assert (restarted.age == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("fps", "lost_in", "given_up_in"), [(5, 3, 28), (30, 16, 166), (60, 32, 331)]
+)
+def test_surfels_are_lost_and_given_up_after_seconds_of_the_stream(
+    board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
+    fps: int,
+    lost_in: int,
+    given_up_in: int,
+) -> None:
+    frames, camera, _ = board
+    tracker = SurfelTracker(SMALL.model_copy(update={"max_surfels": 30, "levels": 1}))
+    first = tracker.start(frames[0].image, frames[0].depth_m, camera)
+    covered = frames[0].image.copy()
+    covered[:, : WIDTH // 2] = 128
+    under = first.ids[first.points_px[:, 0] < WIDTH // 2 - 15]
+    assert len(under) > 5
+    for number in range(1, given_up_in + 1):
+        result = tracker.track(covered, 1.0 / fps, depth=frames[0].depth_m)
+        there = np.isin(result.ids, under)
+        assert there.sum() == (0 if number == given_up_in else len(under))
+        assert (result.state[there] == SurfelState.LOST).all() == (number >= lost_in)
 
 
 def test_births_fill_what_is_free(
@@ -224,7 +247,7 @@ def test_births_fill_what_is_free(
     half[:, 100:] = 0.0
     first = tracker.start(frames[0].image, half, camera)
     assert 0 < len(first.ids) < 60
-    result = tracker.track(frames[1].image, depth=frames[1].depth_m)
+    result = tracker.track(frames[1].image, STEP_S, depth=frames[1].depth_m)
     assert len(result.ids) == 60
     np.testing.assert_array_equal(result.ids[: len(first.ids)], first.ids)
     assert (result.born[len(first.ids) :] == 1).all()
@@ -249,7 +272,7 @@ def test_a_background_without_depth_is_no_part_of_the_texture(
     assert len(near)
     background = tracker._table.templates[0].images[near, 0] > 1e6
     assert (background.sum(axis=1) > 0).all()
-    result = tracker.track(shown)
+    result = tracker.track(shown, STEP_S)
     truth = transform(inverse(motions[1]), first.positions)
     error = np.linalg.norm(result.positions - truth, axis=1)[near]
     assert np.median(error) < 0.004
@@ -271,10 +294,10 @@ def test_no_texture_and_no_depth_give_no_surfels() -> None:
     frame = tracker.start(flat, np.ones((HEIGHT, WIDTH)), camera)
     assert frame.lost
     assert len(frame.ids) == 0
-    assert tracker.track(flat).lost
+    assert tracker.track(flat, STEP_S).lost
     textured = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH)).astype(np.uint8)
     assert tracker.start(textured, np.zeros((HEIGHT, WIDTH)), camera).lost
-    assert tracker.track(textured, depth=np.full((HEIGHT, WIDTH), np.nan)).lost
+    assert tracker.track(textured, STEP_S, depth=np.full((HEIGHT, WIDTH), np.nan)).lost
 
 
 def test_wrong_input_is_refused() -> None:
@@ -282,7 +305,7 @@ def test_wrong_input_is_refused() -> None:
     image, depth = np.zeros((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH))
     tracker = SurfelTracker(SMALL)
     with pytest.raises(ValueError, match="before start"):
-        tracker.track(image)
+        tracker.track(image, STEP_S)
     with pytest.raises(ValueError, match="expected depth of shape"):
         tracker.start(image, depth[1:], camera)
     with pytest.raises(ValueError, match="expected a uint8 image"):
@@ -303,7 +326,7 @@ def test_prediction_bridges_a_jump(mode: str) -> None:
         prediction = shown - first.points_px + 2.0
         prediction[::10] = np.nan
         tracker._views = RememberedViews()  # else it is found back
-        result = tracker.track(frames[1].image, prediction if predicted else None)
+        result = tracker.track(frames[1].image, STEP_S, prediction if predicted else None)
         staying = (shown[:, 0] > 15) & (shown[:, 0] < WIDTH - 15) & np.isfinite(prediction[:, 0])
         px = result.points_px - shown
         right = (np.abs(px).max(axis=1) < 0.5) & (result.state == SurfelState.TRACKED)
@@ -313,4 +336,4 @@ def test_prediction_bridges_a_jump(mode: str) -> None:
     # With a moving camera the equilibrium first holds against a jump of the whole scene.
     assert found[True] > (0.9 if mode == "static" else 0.75)
     with pytest.raises(ValueError, match="expected a prediction of shape"):
-        tracker.track(frames[1].image, prediction[1:])
+        tracker.track(frames[1].image, STEP_S, prediction[1:])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from surfel_scene import board_renderer, film, motion
+from surfel_scene import STEP_S, board_renderer, film, motion
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
@@ -52,8 +52,8 @@ def test_what_was_carried_off_is_found_back(board: Film, mode: str, covered: boo
     frames, camera = board
     tracker, first = started(board, mode)
     for _ in range(3 if covered else 0):
-        assert tracker.track(np.full_like(frames[HERE].image, 5)).lost
-    found = tracker.track(frames[TURNED].image)
+        assert tracker.track(np.full_like(frames[HERE].image, 5), STEP_S).lost
+    found = tracker.track(frames[TURNED].image, STEP_S)
     T = MOTIONS[TURNED]
     np.testing.assert_array_equal(found.ids, first.ids)
     tracked, seen = found.state == SurfelState.TRACKED, in_view(first, T, camera)
@@ -72,7 +72,7 @@ def test_nothing_is_found_where_nothing_was_seen(board: Film, mode: str) -> None
     frames, _ = board
     tracker, first = started(board, mode)
     for _ in range(3):
-        elsewhere = tracker.track(frames[ELSEWHERE].image)
+        elsewhere = tracker.track(frames[ELSEWHERE].image, STEP_S)
         assert elsewhere.lost
         assert elsewhere.segment == 0
         np.testing.assert_array_equal(elsewhere.positions, first.positions)
@@ -83,9 +83,11 @@ def test_in_the_dark_no_depth_starts_anew(board: Film) -> None:
     frames, _ = board
     tracker, first = started(board, "static")
     for _ in range(20):
-        dark = tracker.track(np.full_like(frames[HERE].image, 5), depth=frames[HERE].depth_m)
+        dark = tracker.track(
+            np.full_like(frames[HERE].image, 5), STEP_S, depth=frames[HERE].depth_m
+        )
         assert dark.lost
-    after = tracker.track(frames[NEARBY].image, depth=frames[NEARBY].depth_m)
+    after = tracker.track(frames[NEARBY].image, STEP_S, depth=frames[NEARBY].depth_m)
     assert after.segment == 0
     still = after.state[np.isin(after.ids, first.ids)] == SurfelState.TRACKED
     assert still.sum() > 0.9 * len(first.ids)
@@ -94,17 +96,17 @@ def test_in_the_dark_no_depth_starts_anew(board: Film) -> None:
 def test_the_camera_comes_back_from_another_segment(board: Film) -> None:
     frames, camera = board
     tracker, first = started(board, "moving")
-    there = tracker.track(frames[ELSEWHERE].image, depth=frames[ELSEWHERE].depth_m)
+    there = tracker.track(frames[ELSEWHERE].image, STEP_S, depth=frames[ELSEWHERE].depth_m)
     assert there.segment == 1
     assert not np.isin(there.ids, first.ids).any()
-    back = tracker.track(frames[AGAIN].image)
+    back = tracker.track(frames[AGAIN].image, STEP_S)
     assert back.segment == 0
     np.testing.assert_array_equal(back.ids, first.ids)
     seen = in_view(first, MOTIONS[AGAIN], camera)
     assert (back.state == SurfelState.TRACKED).sum() > 0.9 * seen.sum()
     np.testing.assert_allclose(back.T_world_camera, MOTIONS[AGAIN], atol=0.005)
     # And there again: that segment is as it was left.
-    again = tracker.track(frames[ELSEWHERE].image)
+    again = tracker.track(frames[ELSEWHERE].image, STEP_S)
     assert again.segment == 1
     np.testing.assert_array_equal(again.ids, there.ids)
     assert (again.state == SurfelState.TRACKED).mean() > 0.9
@@ -120,7 +122,7 @@ def test_the_same_bytes_and_a_bound(board: Film) -> None:
         for _ in range(5):
             blocks = generator.integers(40, 200, (30, 40), np.uint8)
             image = np.kron(blocks, np.ones((8, 8), np.uint8))
-            result = tracker.track(image, depth=frames[HERE].depth_m)
+            result = tracker.track(image, STEP_S, depth=frames[HERE].depth_m)
             assert result.segment == len(out) + 1
             out.append(result.positions.tobytes() + result.state.tobytes())
         assert len(save_state(tracker)) < size

@@ -65,14 +65,15 @@ class _Heard:
 
 @dataclass
 class _State:
-    """map_depth: where surfels are born on our own map.    tracks, points_px: of the last
-    frame.    ratio, segment: units of the surfels by one of the map, and the segment of the map,
-    when surfels were last born on it."""
+    """map_depth: where surfels are born on our own map.    stamp_ns, tracks, points_px: of the
+    last frame with pixels.    ratio, segment: units of the surfels by one of the map, and the
+    segment of the map, when surfels were last born on it."""
 
     stream: CameraStream
     tracker: SurfelTracker
     map_depth: MapDepth | None
     started: bool
+    stamp_ns: int
     tracks: FrameTracks | None
     points_px: F32
     ratio: float = 1.0
@@ -88,7 +89,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         uses_map = config.surfels.depth_from == "map"
         map_depth = MapDepth(stream.camera, config.surfels) if uses_map else None
         nothing = np.zeros((0, 2), np.float32)
-        return stream, SurfelTracker(config.surfels), map_depth, False, None, nothing
+        return stream, SurfelTracker(config.surfels), map_depth, False, 0, None, nothing
 
     state = _State(*resume(bus, start))
     rectifier = DepthRectifier(calibration_from_yaml(state.stream.calibration))
@@ -103,7 +104,9 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
                 note = str(error)
         if not missing and state.started:
             with monitor.stage("track"):
-                frame = state.tracker.track(image.grey, _prediction(state, heard, config), metres)
+                interval_s = 1e-9 * (image.stamp_ns - state.stamp_ns)
+                prediction = _prediction(state, heard, config)
+                frame = state.tracker.track(image.grey, interval_s, prediction, metres)
             if view is not None:
                 with monitor.stage("births"):
                     frame, note = _add(state, image.grey, frame, view, config)
@@ -111,6 +114,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
             with monitor.stage("start"):
                 frame, missing = _start(state, heard, metres, view, config)
         if not heard.image.missing:
+            state.stamp_ns = image.stamp_ns
             state.tracks, state.points_px = heard.tracks, frame.points_px
         message = Surfels.of(image, frame, frame_id=WORLD_FRAME_ID, missing=missing, note=note)
         bus.publish(topics.SURFELS, message)
@@ -215,4 +219,4 @@ def warm_up() -> None:
     for parameters in (still, still.model_copy(update={"camera": "moving"})):
         tracker = SurfelTracker(parameters)
         first = tracker.start(image, depth, camera)
-        tracker.track(image, predict(first.points_px, nothing, nothing), depth)
+        tracker.track(image, 1.0, predict(first.points_px, nothing, nothing), depth)

@@ -31,7 +31,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         if image.missing:
             tracks = FrameExtrema.empty()
         else:
-            tracks = tracker.track(image.grey, monitor.stage, clearance(image))
+            tracks = tracker.track(image.grey, image.stamp_ns, monitor.stage, clearance(image))
         extrema = Extrema.of(image, tracks, missing=image.missing)
         bus.publish(topics.EXTREMA, extrema, may_lag=readers_that_may_lag(image))
         monitor.report(image, tracks=len(tracks.ids), maxima=len(tracks.maxima))
@@ -42,5 +42,5 @@ def warm_up() -> None:
     """Two frames of noise."""
     grey = np.random.default_rng(0).integers(0, 256, (120, 160), np.uint8)
     tracker = ExtremaTracker(160, 120, TrackingParameters())
-    for _ in range(2):
-        tracker.track(grey)
+    for stamp_ns in range(2):
+        tracker.track(grey, stamp_ns)

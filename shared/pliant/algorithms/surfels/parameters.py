@@ -113,11 +113,11 @@ class SurfelParameters(Parameters):
     min_visible: float = Field(
         default=0.5, ge=0.0, le=1.0, description="With less of its patch seen it is occluded."
     )
-    lost_after: int = Field(
-        default=15, ge=1, description="Frames in a row without success until a surfel is lost."
+    lost_after_s: float = Field(
+        default=0.52, ge=0.0, description="Seconds without success until a surfel is lost."
     )
-    forget_after: int = Field(
-        default=150, ge=1, description="Frames lost until a surfel is given up for a new one."
+    forget_after_s: float = Field(
+        default=4.99, ge=0.0, description="Seconds lost until a surfel is given up for a new one."
     )
     min_alive: int = Field(
         default=8, ge=1, description="With fewer surfels tracked, tracking as a whole is lost."

@@ -44,7 +44,7 @@ class SurfelTable:
     ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     state: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
     born: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
-    missing: I32 = field(default_factory=lambda: np.zeros(0, np.int32))  # frames since last good
+    missing: F64 = field(default_factory=lambda: np.zeros(0))  # seconds since last good
     validations: F64 = field(default_factory=lambda: new_validations(0))
     guesses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # where to look next
     tried: F64 = field(default_factory=lambda: np.zeros((0, 3)))  # what was judged last
@@ -74,7 +74,7 @@ class SurfelTable:
         self.ids = np.concatenate([self.ids, np.arange(first_id, first_id + n)])
         self.state = np.concatenate([self.state, np.zeros(n, np.uint8)])
         self.born = np.concatenate([self.born, np.full(n, frame, np.int32)])
-        self.missing = np.concatenate([self.missing, np.zeros(n, np.int32)])
+        self.missing = np.concatenate([self.missing, np.zeros(n)])
         self.validations = np.concatenate([self.validations, validations])
 
     def copy(self) -> "SurfelTable":

@@ -61,7 +61,7 @@ class SurfelTracker:
         self._camera: PinholeCamera | None = None
         self._T_world_camera: F64 = np.eye(4)
         self._frame, self._segment, self._segments, self._next_id = 0, 0, 0, 0
-        self._lost = True
+        self._interval_s, self._lost = 0.0, True
         self._views = RememberedViews()
         self._earlier: dict[int, SurfelTable] = {}
 
@@ -86,23 +86,25 @@ class SurfelTracker:
     def track(
         self,
         image: U8,
+        interval_s: float,
         prediction: F64 | None = None,
         depth: F64 | None = None,
         timer: StageTimer = no_stages,
     ) -> SurfelFrame:
         """Follow all surfels into the next frame.
 
-        image: (H, W) uint8.  prediction: (N, 2) displacements in pixels from the last frame, in the
-        order of the last result, NaN where there is none.  depth: (H, W) metres of this frame, for
-        new surfels where there is room.  timer: told of each stage.  Raises ValueError before
-        ``start``, and for arrays of another size.
+        image: (H, W) uint8.  interval_s: since the last frame, seconds.  prediction: (N, 2)
+        displacements in pixels from the last frame, in the order of the last result, NaN where
+        there is none.  depth: (H, W) metres of this frame, for new surfels where there is room.
+        timer: told of each stage.  Raises ValueError before ``start``, and for arrays of another
+        size.
         """
         if self._camera is None:
             raise ValueError("track() before start(): surfels need a depth map to begin with")
         with timer("pyramid"):
             pyramid = self._pyramid(image)
         goals = self._goals(prediction, len(pyramid))
-        self._frame += 1
+        self._frame, self._interval_s = self._frame + 1, interval_s
         before, was_lost = self._table.copy(), self._lost
         self._follow(pyramid, goals, timer)
         with timer("views"):
@@ -321,12 +323,12 @@ class SurfelTracker:
         state[found[:, validation.FRONT] == 0.0] = SurfelState.OUTSIDE
         state[torn & (state == SurfelState.TRACKED)] = SurfelState.OUTLIER
         good = (state == SurfelState.TRACKED) & np.isfinite(poses).all(axis=1)
-        table.missing = np.where(good, 0, table.missing + 1).astype(np.int32)
-        state[~good & (table.missing > p.lost_after)] = SurfelState.LOST
+        table.missing = np.where(good, 0.0, table.missing + self._interval_s)
+        state[~good & (table.missing > p.lost_after_s)] = SurfelState.LOST
         table.state = state
         self._lost = int(good.sum()) < p.min_alive
         if self._lost:  # nobody is given up in the dark
-            table.missing = np.minimum(table.missing, p.lost_after + 1)
+            table.missing = np.minimum(table.missing, p.lost_after_s)
         world = move_poses(poses, self._T_world_camera)
         finite = np.isfinite(world).all(axis=1, keepdims=True)
         table.tried = np.where(finite, world[:, X : X + 3], table.poses[:, X : X + 3])
@@ -342,7 +344,7 @@ class SurfelTracker:
         assert camera is not None
         anew = self._lost and len(table) > 0
         if not self._lost:
-            table.keep(np.flatnonzero(table.missing <= p.lost_after + p.forget_after))
+            table.keep(np.flatnonzero(table.missing <= p.lost_after_s + p.forget_after_s))
         alive = np.flatnonzero(table.tracked & (not anew))
         occupied = table.validations[alive, validation.U : validation.V + 1]
         births = find_births(pyramid, depth, camera, p, occupied, p.max_surfels - len(alive))

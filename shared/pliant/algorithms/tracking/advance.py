@@ -1,4 +1,4 @@
-"""One step of every track to the next frame: predict, climb, check, refine (section 2.3).
+"""One step of every track to the next frame: predict, climb, refine (section 2.3).
 
 A template belongs to an octave: 0 is the full-size image, 1 half the size, where the same patch
 sees twice as far.
@@ -42,31 +42,32 @@ _LEAST_GATE, _WIDEST_GATE = np.float32(0.25), np.float32(1.0)
 
 
 class FrameImages(NamedTuple):
-    """What a step reads of a frame: smoothed grey levels, at half size too, and the curvature."""
+    """What patches are seen in: smoothed grey levels, at half size too."""
 
     full: Pixels
     half: Pixels
-    kappa: Pixels
 
 
 class StepLimits(NamedTuple):
-    """Limits and switches of a step: see the fields of TrackingParameters."""
+    """Limits and switches of a step: see the fields of TrackingParameters.
+
+    interval_s: from the frame before to this one.
+    """
 
     prediction_weight: np.float32
     prediction_sigma: np.float32
     max_correction: np.float32
-    mutual_gate: np.float32
     min_curvature: np.float32
     min_zncc: np.float32
     min_residual: np.float32
     extremum_gate: np.float32
     coast_gate: np.float32
     backward_gate: np.float32
-    mutual_check: bool
     subpixel: bool
     patch_refinement: bool
     patch_iterations: int
-    coast_frames: int
+    coast_s: np.float32
+    interval_s: np.float32
 
 
 class _Place(NamedTuple):
@@ -81,6 +82,7 @@ class _Place(NamedTuple):
 def advance_tracks(
     before: FrameImages,
     now: FrameImages,
+    kappa: Pixels,
     flow: Flow,
     limits: StepLimits,
     order: I32,
@@ -91,8 +93,8 @@ def advance_tracks(
 ) -> None:
     """Move tracks on by one frame; ``alive`` says which survive.
 
-    order: the rows, from ``scan_order``.  motions: (len(order), 2) and scratch: (TEMPLATE_FLOATS),
-    both overwritten.
+    kappa: curvature of this frame.  order: the rows, from ``scan_order``.  motions: (len(order), 2)
+    and scratch: (TEMPLATE_FLOATS), both overwritten.
     """
     count = len(order)
     for rank in range(count):
@@ -103,20 +105,18 @@ def advance_tracks(
         ahead = min(rank + AHEAD, count - 1)
         later = tracks[order[ahead]]
         image = now.full if later.octave == 0 else now.half
-        _prefetch_track(
-            image, before.kappa, now.kappa, motions[ahead, 0], motions[ahead, 1], later, templates
-        )
+        _prefetch_track(image, kappa, motions[ahead, 0], motions[ahead, 1], later, templates)
         track = tracks[order[rank]]
         track.age += 1
         du, dv = motions[rank, 0], motions[rank, 1]
         before_u, before_v = track.u, track.v
-        pixel = _find_extremum(before.kappa, now.kappa, du, dv, limits, track)
+        pixel = _find_extremum(kappa, du, dv, limits, track)
         if limits.patch_refinement:
             fine = track.octave == 0
             alive = _follow_patch(
                 before.full if fine else before.half,
                 now.full if fine else now.half,
-                now.kappa,
+                kappa,
                 pixel,
                 du,
                 dv,
@@ -128,7 +128,7 @@ def advance_tracks(
         else:
             alive = pixel >= 0
             if alive:
-                _settle(now.kappa, pixel, limits.subpixel, track)
+                _settle(kappa, pixel, limits.subpixel, track)
                 track.u, track.v = track.extremum_u, track.extremum_v
         track.motion_u, track.motion_v = track.u - before_u, track.v - before_v
         track.alive = 1 if alive else 0
@@ -143,7 +143,6 @@ def _prefetch_record(tracks: Tracks, row: int) -> None:
 @fast_kernel
 def _prefetch_track(
     image: Pixels,
-    kappa_before: Pixels,
     kappa: Pixels,
     du: np.float32,
     dv: np.float32,
@@ -158,10 +157,8 @@ def _prefetch_track(
         prefetch(image.values, (top + row) * image.width + left)
         prefetch(image.values, (top + row) * image.width + left + PATCH_SIZE)
     to = int(track.v + dv) * kappa.width + int(track.u + du)
-    at = int(track.extremum_v) * kappa.width + int(track.extremum_u)
     for row in range(-1, 3):
         prefetch(kappa.values, to + row * kappa.width)
-        prefetch(kappa_before.values, at + row * kappa.width)
 
 
 @fast_kernel
@@ -233,19 +230,14 @@ def _settle(kappa: Pixels, pixel: int, subpixel: bool, track: Track) -> None:
     track.kappa = kappa.values[pixel]
     track.pixel = pixel
     track.state = EXTREMUM
-    track.coasted = 0
+    track.coasted = np.float32(0.0)
 
 
 @fast_kernel
 def _find_extremum(
-    kappa_before: Pixels,
-    kappa: Pixels,
-    du: np.float32,
-    dv: np.float32,
-    limits: StepLimits,
-    track: Track,
+    kappa: Pixels, du: np.float32, dv: np.float32, limits: StepLimits, track: Track
 ) -> int:
-    """Climb from the prediction (Eq. 4-5), and back again.  Returns the pixel, or -1."""
+    """Climb from the prediction (Eq. 4-5).  Returns the pixel, or -1."""
     sign = np.float32(1.0) if track.kappa >= np.float32(0.0) else np.float32(-1.0)
     weight = limits.prediction_weight * abs(track.kappa)
     sigma = limits.prediction_sigma
@@ -260,15 +252,6 @@ def _find_extremum(
     off_u, off_v = np.float32(pixel % kappa.width) - u, np.float32(pixel // kappa.width) - v
     if off_u * off_u + off_v * off_v > limits.max_correction * limits.max_correction:
         return -1
-    if limits.mutual_check and track.pixel >= 0:
-        at_u, at_v = _extremum_position(kappa, pixel, limits.subpixel)
-        back = climb(kappa_before, at_u - du, at_v - dv, sign, weight, sigma)
-        if back < 0:
-            return -1
-        back_u, back_v = _extremum_position(kappa_before, back, limits.subpixel)
-        off_u, off_v = back_u - from_u, back_v - from_v
-        if off_u * off_u + off_v * off_v > limits.mutual_gate * limits.mutual_gate:
-            return -1
     return pixel
 
 
@@ -300,7 +283,8 @@ def _follow_patch(
         gate = limits.extremum_gate
         on_extremum = place.accepted and off_u * off_u + off_v * off_v < gate * gate
     if not on_extremum:
-        if track.coasted >= limits.coast_frames:
+        track.coasted += limits.interval_s
+        if track.coasted > limits.coast_s:
             return False
         place = _align_track(image, u + du, v + dv, limits.coast_gate, limits, track, templates)
         if not place.accepted or not _leads_back(
@@ -313,7 +297,6 @@ def _follow_patch(
     else:
         track.pixel = -1
         track.state = COASTING
-        track.coasted += 1
     border = np.float32(CURVATURE_BORDER)
     if place.u < border or place.v < border:
         return False

@@ -51,13 +51,6 @@ class TrackingParameters(Parameters):
         default=5.0, gt=0.0, description="Longest distance of an extremum from its prediction, px."
     )
 
-    mutual_check: bool = Field(
-        default=True,
-        description="Climb back by the inverse flow; end off the old extremum: not matched.",
-    )
-    mutual_gate_px: float = Field(
-        default=0.5, gt=0.0, description="How near the way back must come to the old extremum, px."
-    )
     local_flow: bool = Field(
         default=True,
         description="Predict with a coarse-to-fine grid of local flow, not an affine alone.",
@@ -111,8 +104,8 @@ class TrackingParameters(Parameters):
         gt=0.0,
         description="A patch that ends farther from its extremum coasts instead, px.",
     )
-    coast_frames: int = Field(
-        default=20, ge=0, le=1000, description="Most frames in a row without an extremum."
+    coast_s: float = Field(
+        default=0.68, ge=0.0, description="Most seconds in a row without an extremum."
     )
     coast_gate_px: float = Field(
         default=3.0,

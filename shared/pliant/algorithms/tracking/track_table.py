@@ -28,8 +28,8 @@ TRACK = np.dtype(
         ("motion_v", np.float32),
         ("age", np.int32),
         ("state", np.int32),
-        # Frames in a row without an extremum.
-        ("coasted", np.int32),
+        # Seconds in a row without an extremum.
+        ("coasted", np.float32),
         # Flat pixel of the extremum in this frame, or -1.
         ("pixel", np.int32),
         # Row of the template.

@@ -44,6 +44,7 @@ class ExtremaTracker:
         self._brief = BriefExtractor(np.random.default_rng(seed), parameters.flow_points)
         self._table = TrackTable.with_capacity(parameters.max_tracks)
         self._next_id = 0
+        self._kappa = np.zeros(self._shape, np.float32)
         self._owners = np.zeros(self._shape, np.int32)
         self._motions = np.zeros((parameters.max_tracks, 2), np.float32)
         self._scratch = np.zeros(TEMPLATE_FLOATS, np.float32)
@@ -51,23 +52,27 @@ class ExtremaTracker:
         self._window = np.zeros((WINDOW_SIDE, WINDOW_SIDE), np.float32)
         # Of the frame before; none of them means anything until has_previous.
         self._has_previous = False
+        self._stamp_ns = 0
         self._smooth = np.zeros(self._shape, np.float32)
-        self._kappa = np.zeros(self._shape, np.float32)
         self._spare_smooth = np.zeros(self._shape, np.float32)
-        self._spare_kappa = np.zeros(self._shape, np.float32)
         self._pyramid: list[F32] = []
         self._maxima: F32 = np.zeros((0, 3), np.float32)
         self._features: BriefFeatures | None = None
         self._local: F32 = np.zeros((*grid_shape(width, height), 2), np.float32)
 
     def track(
-        self, grey: U8, timer: StageTimer = no_stages, clearance: F32 | None = None
+        self,
+        grey: U8,
+        stamp_ns: int,
+        timer: StageTimer = no_stages,
+        clearance: F32 | None = None,
     ) -> FrameExtrema:
         """Follow all tracks into the next frame and start new ones.
 
-        grey: (H, W) uint8, of the size given at the start.  timer: told of each stage.  clearance:
-        (H, W) of its mask, see ``image.masks``; None: all of it is used.  No maximum and no patch
-        of a track touches what is not.  Raises ValueError for an image of another size or type.
+        grey: (H, W) uint8, of the size given at the start.  stamp_ns: when it was taken,
+        increasing.  timer: told of each stage.  clearance: (H, W) of its mask, see
+        ``image.masks``; None: all of it is used.  No maximum and no patch of a track touches what
+        is not.  Raises ValueError for an image of another size or type.
         """
         if grey.shape != self._shape or grey.dtype != np.uint8:
             raise ValueError(
@@ -75,13 +80,13 @@ class ExtremaTracker:
             )
         p, grey = self._parameters, filled(grey, clearance)
         with timer("curvature and maxima"):
-            smooth, kappa, pixels, maxima = curvature_and_maxima(
+            smooth, _, pixels, maxima = curvature_and_maxima(
                 grey,
                 p.blur_sigma_px,
                 p.min_curvature,
                 both_signs=p.both_signs,
                 smooth=self._spare_smooth,
-                kappa=self._spare_kappa,
+                kappa=self._kappa,
             )
             pixels, maxima = uncovered(pixels, maxima, clearance)
         with timer("dominant flow"):
@@ -90,17 +95,16 @@ class ExtremaTracker:
         with timer("local flow"):
             pyramid = _pyramid(smooth)
             flow = self._local_flow(pyramid, dominant.astype(np.float32).ravel())
-        now = FrameImages(pixels_of(smooth), pixels_of(pyramid[0]), pixels_of(kappa))
+        now = FrameImages(pixels_of(smooth), pixels_of(pyramid[0]))
         if self._has_previous:
             with timer("tracks"):
-                self._advance(now, flow, clearance)
+                self._advance(now, flow, 1e-9 * (stamp_ns - self._stamp_ns), clearance)
         with timer("upkeep"):
             self._start_tracks(now, pixels, maxima, clearance)
         self._spare_smooth, self._smooth = self._smooth, smooth
-        self._spare_kappa, self._kappa = self._kappa, kappa
         self._pyramid, self._maxima, self._features = pyramid, maxima, features
         self._local = flow.grid
-        self._has_previous = True
+        self._has_previous, self._stamp_ns = True, stamp_ns
         return self._frame_tracks(maxima, dominant)
 
     def _dominant_flow(self, features: BriefFeatures) -> F64:
@@ -119,16 +123,17 @@ class ExtremaTracker:
             return Flow(np.zeros_like(self._local), affine)
         return local_flow(self._pyramid, pyramid, self._maxima, affine, self._local)
 
-    def _advance(self, now: FrameImages, flow: Flow, clearance: F32 | None) -> None:
+    def _advance(
+        self, now: FrameImages, flow: Flow, interval_s: float, clearance: F32 | None
+    ) -> None:
         table, p = self._table, self._parameters
-        before = FrameImages(
-            pixels_of(self._smooth), pixels_of(self._pyramid[0]), pixels_of(self._kappa)
-        )
+        before = FrameImages(pixels_of(self._smooth), pixels_of(self._pyramid[0]))
         advance_tracks(
             before,
             now,
+            pixels_of(self._kappa),
             flow,
-            _step_limits(p),
+            _step_limits(p, interval_s),
             scan_order(table.tracks, self._shape[0]),
             self._motions,
             table.tracks,
@@ -202,23 +207,22 @@ def _pyramid(image: F32) -> list[F32]:
     return [half, quarter, halve(quarter)]
 
 
-def _step_limits(p: TrackingParameters) -> StepLimits:
+def _step_limits(p: TrackingParameters, interval_s: float) -> StepLimits:
     return StepLimits(
         prediction_weight=np.float32(p.prediction_weight),
         prediction_sigma=np.float32(p.prediction_sigma_px),
         max_correction=np.float32(p.max_correction_px),
-        mutual_gate=np.float32(p.mutual_gate_px),
         min_curvature=np.float32(p.min_curvature),
         min_zncc=np.float32(p.min_zncc),
         min_residual=np.float32(p.min_residual),
         extremum_gate=np.float32(p.extremum_gate_px),
         coast_gate=np.float32(p.coast_gate_px),
         backward_gate=np.float32(p.backward_gate_px),
-        mutual_check=p.mutual_check,
         subpixel=p.subpixel,
         patch_refinement=p.patch_refinement,
         patch_iterations=p.patch_iterations,
-        coast_frames=p.coast_frames,
+        coast_s=np.float32(p.coast_s),
+        interval_s=np.float32(interval_s),
     )
 
 

@@ -125,7 +125,7 @@ def start_tracks(
             track.top = np.float32(birth.top) - to_octave(v, birth.octave)
             track.energy = birth.energy
             track.motion_u, track.motion_v = np.float32(0.0), np.float32(0.0)
-            track.age, track.coasted, track.alive = 0, 0, 1
+            track.age, track.coasted, track.alive = 0, np.float32(0.0), 1
             track.state = EXTREMUM
             track.pixel, track.slot, track.octave = at, slot, birth.octave
             next_id += 1
