@@ -293,7 +293,8 @@ class Atlas:
             moved += [Moved(np.eye(4), held(each, self._spans, of)) for of, each in moves]
         if active is None:
             return moved
-        while self.whole_map.loops or self.whole_map.closing:
+        self.whole_map.withdraw()  # the final adjustment does what was asked for
+        if self.whole_map.loops:
             self._ask(0, active)
             if (answer := self.whole_map.settle()) is not None:
                 moved += self.take_over(answer)

@@ -3,17 +3,17 @@
 Place recognition proves that two keyframes look at the same thing, and how the world of the newer
 one lies in that of the older one.  That is spread over all keyframes between them by the graph of
 their similarities, points move with the keyframes on which they hang, those that are the same
-become one, and the adjustment of the whole map, which begins from there, does the rest.
+become one, and the adjustment of the whole map that comes next does the rest.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.pose_graph import Edges, optimise_pose_graph
-from pliant.algorithms.geometry import inverse, move_by_similarity, transform_each
+from pliant.algorithms.geometry import inverse, matrix_to_pose
+from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.final_adjustment import ListedMap
 from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.compiler.kernel import kernel
@@ -54,57 +54,24 @@ class Loop(NamedTuple):
 
 
 def close_loops(
-    seen: ListedMap,
-    keyframe_ids: I64,
-    hosts: I64,
-    sigmas: F64,
-    loops: list[Loop],
-    focal_px: float,
-) -> tuple[ListedMap, I64, list[Loop]]:
-    """The map after the loops have been closed, not adjusted yet.
+    seen: ListedMap, keyframe_ids: I64, sigmas: F64, loops: list[Loop], focal_px: float
+) -> tuple[MapMoves, list[Loop]]:
+    """How the map moves with its keyframes where loops are closed; the first one stays.
 
-    keyframe_ids: (M,) of its cameras, ascending.   hosts: (N,) camera on which each point hangs.
-    sigmas: (N,) of depths, a share of them.   Returns it, with the kept observations, indices into
-    those of ``seen``, and the loops that were not contradicted.
+    keyframe_ids: (M,) of its cameras, ascending.   sigmas: (N,) of depths, a share of them.
+    Returns it with the loops that were not contradicted.
     """
     ends = np.searchsorted(keyframe_ids, [(loop.old, loop.new) for loop in loops])
     edges = _edges(seen, sigmas, loops, ends.astype(np.int32), focal_px)
     S = seen.T_world_camera
     found, weights = optimise_pose_graph(S, edges, np.arange(len(S)) == 0)
     moves = found @ inverse(S)
+    scales = np.cbrt(np.linalg.det(moves[:, :3, :3]))
+    moves[:, :3, :3] /= scales[:, None, None]
     fits = weights[len(weights) - len(loops) :] > _ACCEPTED
     accepted = [loop for loop, fit in zip(loops, fits, strict=True) if fit]
-    xyz = transform_each(moves[hosts], seen.xyz)
-    point = _joined(seen, accepted)
-    # One camera sees one point at one place.
-    both = seen.camera.astype(np.int64) * len(seen.rows) + point
-    _, kept = np.unique(both, return_index=True)
-    kept = np.sort(kept)
-    closed = replace(
-        seen, T_world_camera=move_by_similarity(moves, S), xyz=xyz, camera=seen.camera[kept],
-        point=point[kept], px=seen.px[kept], weights=seen.weights[kept],
-        flow=None if seen.flow is None else seen.flow[kept],
-    )  # fmt: skip
-    return closed, kept, accepted
-
-
-def _joined(seen: ListedMap, loops: list[Loop]) -> I32:
-    """(O,) the point of each observation, the old one for both."""
-    alias = np.arange(len(seen.rows), dtype=np.int32)
-    order = np.argsort(seen.rows)
-    for loop in loops:
-        place = np.searchsorted(seen.rows, loop.rows, sorter=order)
-        place = order[np.minimum(place, len(order) - 1)]
-        known = (seen.rows[place] == loop.rows).all(axis=1)
-        for old, new in place[known].tolist():
-            while alias[old] != old:
-                old = int(alias[old])
-            while alias[new] != new:
-                new = int(alias[new])
-            alias[new] = old
-    while (alias[alias] != alias).any():
-        alias = alias[alias]
-    return alias[seen.point]
+    rows = np.column_stack([matrix_to_pose(moves), scales])
+    return MapMoves(keyframe_ids=keyframe_ids, moves=rows), accepted
 
 
 def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px: float) -> Edges:

@@ -13,7 +13,9 @@ drift is there.  What is newer moves rigidly with the last of them.  The first k
 with it place and scale of the beginning.  Lens, focal length and readout are found anew each time,
 and used for what comes next once they are certainly other than those in use.
 
-A place that is recognised asks at once.
+A place that is recognised asks at once, and is answered sooner: the graph of ``loops`` says how the
+map moves, and an adjustment, asked for at once, does the rest.  Where the graph refuses all loops
+nothing has been learnt, and nothing moves.
 """
 
 from dataclasses import dataclass, field, replace
@@ -40,13 +42,17 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 _LEAST_TOLD = 0.2
 """Share of what is known of the readout that the images must tell, and not the prior."""
 
+_GRAPH_SHARE = 0.1
+"""Of the time that an adjustment takes: the graph of its keyframes."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Question:
     """A copy of the map of a frame, to be adjusted.
 
     keyframe_ids: (M,).   seen: what they see.   known: of the camera; ``seen`` has pixels of the
-    rectified image.   loops: to be closed.   hosts, sigmas: (N,) of the points that are seen.
+    rectified image.   loops: to be closed; where there are none all of it is adjusted.
+    closed: whether some have just been.   sigmas: (N,) of the points that are seen.
     """
 
     frame: int
@@ -55,7 +61,7 @@ class Question:
     known: SelfCalibration
     parameters: MappingParameters
     loops: list[Loop] = field(default_factory=list)
-    hosts: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    closed: bool = False
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))
 
     @property
@@ -65,7 +71,8 @@ class Question:
         limits = self.parameters.whole_map
         # Few keyframes take little time, and say what those that follow wait for.
         least = min(limits.distance_frames, len(self.keyframe_ids))
-        return max(least, len(self.seen.px) // limits.observations_per_frame)
+        distance = max(least, len(self.seen.px) // limits.observations_per_frame)
+        return round(_GRAPH_SHARE * distance) if self.loops else distance
 
 
 class Answer(NamedTuple):
@@ -84,13 +91,14 @@ class WholeMap:
 
     due: keyframes made at which it asks again.    question: asked, and not yet taken over.
     answer: of the question, where somebody has found it already.    loops: to be closed by the
-    next question.
+    next question, alone.    closed: whether some have been, and nothing was adjusted since.
     """
 
     due: float = 0.0
     question: Question | None = None
     answer: Answer | None = None
     loops: list[Loop] = field(default_factory=list)
+    closed: bool = False
 
     @property
     def closing(self) -> bool:
@@ -114,24 +122,27 @@ class WholeMap:
         early = growth == 0.0 or count < least or made < self.due
         # The window would move with what was there before the camera was recognised.
         early = early or (segment.since > 0 and count - segment.since <= window)
+        early = early and not self.closed
         if self.question is not None or (early and not self.loops):
             return
-        self.due = (1.0 + growth) * count + (made - count)
-        loops, self.loops = self.loops, []
         points = segment.points
+        keyframe_ids = np.array([keyframe.id for keyframe in segment.keyframes], np.int64)
+        kept = partial(segment.given_up.host_of, kept=keyframe_ids)
+        loops = [loop._replace(old=kept(loop.old), new=kept(loop.new)) for loop in self.loops]
+        loops = [loop for loop in loops if np.isin((loop.old, loop.new), keyframe_ids).all()]
+        loops = [loop.living(points) for loop in loops if loop.old != loop.new]
+        self.loops = []
+        if not loops:
+            if early:
+                return
+            self.due = (1.0 + growth) * count + (made - count)
         seen = list_map(segment.keyframes, points, calibration, parameters)
         seen.px = calibration.view.seen(seen.px)
-        if parameters.calibration.readout > 0.0:
+        if parameters.calibration.readout > 0.0 and not loops:
             seen.flow = readout_flow(
                 seen.T_world_camera, segment.path.motions(segment.keyframes), seen.xyz, seen.camera,
                 seen.point, seen.px, camera,
             )  # fmt: skip
-        keyframe_ids = np.array([keyframe.id for keyframe in segment.keyframes], np.int64)
-        kept = partial(segment.given_up.host_of, kept=keyframe_ids)
-        loops = [loop._replace(old=kept(loop.old), new=kept(loop.new)) for loop in loops]
-        loops = [loop for loop in loops if np.isin((loop.old, loop.new), keyframe_ids).all()]
-        loops = [loop.living(points) for loop in loops if loop.old != loop.new]
-        hosts = np.searchsorted(keyframe_ids, points.first_keyframe[seen.rows], side="right") - 1
         self.question = Question(
             frame=frame,
             keyframe_ids=keyframe_ids,
@@ -139,14 +150,16 @@ class WholeMap:
             known=calibration,
             parameters=parameters,
             loops=loops,
-            hosts=np.maximum(hosts, 0),
+            closed=self.closed,
             sigmas=points.sigmas[seen.rows].astype(np.float64),
         )
+        self.closed = self.closed and len(loops) > 0
 
     def withdraw(self) -> None:
         """What was asked is not taken over; its loops are asked for again."""
         if self.question is not None:
             self.loops = [*self.question.loops, *self.loops]
+            self.closed = self.closed or self.question.closed
         self.question = self.answer = None
 
     def is_due(self, frame: int) -> bool:
@@ -168,6 +181,7 @@ class WholeMap:
         self.question = self.answer = None
         if answer.moves is not None:
             self.move(answer.moves)
+        self.closed = self.closed or len(answer.loops) > 0
         return answer
 
     def move(self, moves: MapMoves) -> None:
@@ -179,25 +193,31 @@ class WholeMap:
 
 def find_moves(question: Question) -> Answer:
     """How each keyframe moves with what hangs on it, and the readout."""
+    if question.loops:
+        return _close(question)
     before, xyz = question.seen.T_world_camera, question.seen.xyz
-    depths, loops = question.seen.depths(), question.loops
+    depths = question.seen.depths()
     seen = replace(question.seen, T_world_camera=before.copy(), xyz=xyz.copy())
     known, parameters = question.known, question.parameters
-    if loops:
-        focal_px = known.view.camera.fx
-        seen, kept, loops = close_loops(
-            seen, question.keyframe_ids, question.hosts, question.sigmas, loops, focal_px
-        )
-        depths = depths[kept]
     found = adjust_listed(
         seen, known, parameters, iterations=parameters.whole_map.iterations, start=known.in_use
     )
     after = _learned(known, found.correction, found.covariance, parameters.calibration)
-    # A window that is half of the map does as well, unless it did not know the camera.
+    # A window that is half of the map does as well, unless it did not know the camera or the loops.
     bent = (known.readout == 0.0 and after.readout != 0.0) or not after.sees_like(known)
-    moving = bent or loops or len(question.keyframe_ids) >= 2 * parameters.window.keyframes
+    bent = bent or question.closed
+    moving = bent or len(question.keyframe_ids) >= 2 * parameters.window.keyframes
     moves = _moves(question, seen, before, depths) if moving else None
-    return Answer(moves, loops, after)
+    return Answer(moves, [], after)
+
+
+def _close(question: Question) -> Answer:
+    """What the graph makes of the loops; nothing where it refuses all of them."""
+    moves, loops = close_loops(
+        question.seen, question.keyframe_ids, question.sigmas, question.loops,
+        question.known.view.camera.fx,
+    )  # fmt: skip
+    return Answer(moves if loops else None, loops, question.known)
 
 
 def _learned(
