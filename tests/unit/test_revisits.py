@@ -141,7 +141,7 @@ def test_the_mapper_closes_a_loop_that_it_sees(killed):
     squares = textures(len(points))
     parameters = MappingParameters(
         window=WindowParameters(keyframes=5),
-        reacquisition=ReacquisitionParameters(min_zncc=1.0),
+        reacquisition=ReacquisitionParameters(radius_px=0.01),
         whole_map=WholeMapParameters(growth=0.0, distance_frames=3, observations_per_frame=20_000),
     )
     mapper, published, moved = Mapper(CAMERA, parameters, 0), Published(), []
