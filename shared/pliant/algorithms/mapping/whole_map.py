@@ -70,11 +70,12 @@ class Question:
 
 class Answer(NamedTuple):
     """How the map moves, None where it does not; the loops that were closed, whose points are to be
-    joined; what is known of the camera by now."""
+    joined; what is known of the camera by now; how many loops the others contradict."""
 
     moves: MapMoves | None
     loops: list[Loop]
     calibration: SelfCalibration
+    refused: int
 
 
 @dataclass(kw_only=True)
@@ -197,7 +198,7 @@ def find_moves(question: Question) -> Answer:
     bent = (known.readout == 0.0 and after.readout != 0.0) or not after.sees_like(known)
     moving = bent or loops or len(question.keyframe_ids) >= 2 * parameters.window.keyframes
     moves = _moves(question, seen, before, depths) if moving else None
-    return Answer(moves, loops, after)
+    return Answer(moves, loops, after, len(question.loops) - len(loops))
 
 
 def _learned(
