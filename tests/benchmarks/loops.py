@@ -18,12 +18,13 @@ _FIRST, _LAST = 100, 10
 """Poses that are aligned, and that are measured."""
 _HEADER = (
     *("source", "path", "places", "ATE final", "causal", "end error", "of the path"),
-    *("pairs of places", "segments", "poses", "CPU a frame"),
+    *("compared", "pairs of places", "segments", "poses", "CPU a frame"),
 )
 
 
 def measure(sources: list[str], config: Config) -> Iterator[str]:
-    """Two rows for each source.   Pairs of places: keyframes by which loops were closed."""
+    """Two rows for each source.   Compared: pairs of keyframes, and what came of them.   Pairs of
+    places: keyframes by which loops were closed."""
     yield markdown_header(_HEADER)
     for name in sources:
         reel = Reel(name, config)
@@ -33,10 +34,16 @@ def measure(sources: list[str], config: Config) -> Iterator[str]:
             cells = (
                 *(Path(name).name, f"{path:.0f} m", "on" if places else "off"),
                 *(metres(came.ate_m(came.final)), metres(came.ate_m(came.causal))),
-                *(metres(end), f"{100.0 * end / path:.4f} %"),
+                *(metres(end), f"{100.0 * end / path:.4f} %", _told(came.compared)),
                 *(str(came.same_places), str(came.segments), came.share, f"{came.cpu_ms:.0f} ms"),
             )
             yield markdown_row(cells)
+
+
+def _told(compared: dict[str, int]) -> str:
+    """What there was of it."""
+    told = (f"{count} {name.replace('_', ' ')}" for name, count in compared.items() if count)
+    return ", ".join(told) or "-"
 
 
 def path_m(came: Played) -> float:

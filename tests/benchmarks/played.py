@@ -46,7 +46,7 @@ class Played:
     final: (7,) poses of the segment that has most of them in the end.   causal: likewise, as they
     were known when the image had come.   truth: (3,) positions.   lit: images that were not dark.
     joined: when segments became one.   same_places: pairs of keyframes that were found to show one
-    place.   cpu_ms: an image.
+    place.   compared: what came of comparing keyframes, see ``Comparisons``.   cpu_ms: an image.
     """
 
     final: dict[int, F64]
@@ -56,6 +56,7 @@ class Played:
     segments: int
     joined: list[int]
     same_places: int
+    compared: dict[str, int]
     cpu_ms: float
 
     @property
@@ -142,6 +143,7 @@ class Reel:
             segments=len({segment for segment, _ in final.values()}),
             joined=joined,
             same_places=len(history.same_places),
+            compared=vars(mapper.atlas.places.comparisons),
             cpu_ms=1e3 * spent / len(order),
         )
 

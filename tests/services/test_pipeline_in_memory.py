@@ -8,6 +8,7 @@ import pytest
 
 from pliant.algorithms.geometry import pose_to_matrix, transform
 from pliant.algorithms.map_delta import TRACKING, WAITING
+from pliant.algorithms.mapping.known_places import Comparisons
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, load_config
 from pliant.datasets import open_source
@@ -56,7 +57,10 @@ def track(config: Config, inputs: dict[Topic, list[Header]]) -> list[Header]:
 
 
 def adjust(
-    config: Config, inputs: dict[Topic, list[Header]], tracks: list[Header]
+    config: Config,
+    inputs: dict[Topic, list[Header]],
+    tracks: list[Header],
+    monitor: SilentMonitor | None = None,
 ) -> dict[Topic, list[Header]]:
     bus = ReplayBus(
         {
@@ -65,8 +69,15 @@ def adjust(
             topics.EXTREMA: tracks,
         }
     )
-    bundle_adjustment.run(bus, config, SilentMonitor())
+    bundle_adjustment.run(bus, config, monitor or SilentMonitor())
     return bus.outputs
+
+
+class LastReport(SilentMonitor):
+    """What was counted last."""
+
+    def report(self, header: Header, *, note: str = "", **counters: float) -> None:
+        self.counters = counters
 
 
 def wire(messages: list[Header]) -> list[bytes]:
@@ -108,6 +119,14 @@ def test_bundle_adjustment_sends_one_update_a_frame_and_the_same_again(
     again = adjust(config, ingested, tracked)
     for topic in bundle_topics:
         assert wire(again[topic]) == wire(first[topic])
+
+
+def test_the_last_report_says_what_came_of_comparing_places(
+    config: Config, ingested: dict[Topic, list[Header]], tracked: list[Header]
+) -> None:
+    last = LastReport()
+    adjust(config, ingested, tracked, last)
+    assert Comparisons().counters.keys() <= last.counters.keys()
 
 
 def test_another_seed_is_another_run_and_as_good(

@@ -48,8 +48,8 @@ def rooms(share: float) -> tuple[Scene, list[np.ndarray]]:
     return scene_of(points, np.concatenate([np.arange(460), other, 920 + np.arange(230)]))
 
 
-def run(shots: Film) -> tuple[Published, int]:
-    """What a run publishes, and how many segments have been joined."""
+def run(shots: Film) -> tuple[Published, int, Mapper]:
+    """What a run publishes, how many segments have been joined, and the mapper."""
     mapper, published, joined = Mapper(CAMERA, PARAMETERS, 0), Published(), 0
     for k, (tracks, grey) in enumerate(shots):
         delta = mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
@@ -57,14 +57,17 @@ def run(shots: Film) -> tuple[Published, int]:
         published.apply(delta)
         joined += len(delta.joined)
     published.apply(mapper.finish())
-    return published, joined
+    return published, joined, mapper
 
 
 @pytest.mark.parametrize("share", [0.4, 0.8])
 def test_the_same_door_again_and_again_closes_no_loop(share: float) -> None:
     poses = along(-2, 8, 0.2)
-    published, joined = run(film(*doors(share), poses, 0))
+    published, joined, mapper = run(film(*doors(share), poses, 0))
     assert joined == 0
+    assert mapper.counters["places_closed"] == 0
+    assert mapper.counters["places_refused"] == mapper.counters["places_told"]
+    assert (mapper.counters["places_told"] > 0) == (share > 0.5)
     assert len(published.poses) == len(poses)
     assert trajectory_error(published, poses)[0] < 1e-3
 
@@ -75,7 +78,7 @@ def test_of_two_rooms_that_are_alike_neither_is_taken_for_the_other(share: float
     through, back = along(-2, 12.5, 0.2), along(12.5, 11, 0.2)
     scene = rooms(share)
     shots = film(*scene, through, 0) + _NIGHT + film(*scene, back, 1)
-    published, joined = run(shots)
+    published, joined, _ = run(shots)
     assert joined == 0
     seen = {k: pose for k, pose in published.poses.items() if pose[2] == 0}
     assert set(range(len(through))) <= seen.keys()

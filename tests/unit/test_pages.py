@@ -11,6 +11,7 @@ import pytest
 import typer
 from benchmarks.__main__ import app as bench
 
+from pliant.algorithms.mapping.known_places import Comparisons
 from pliant.export.export import EXPORTS
 from pliant_services.cli import app
 
@@ -60,6 +61,11 @@ def test_commands_of_the_pages_are_commands(page: str, words: list[str]) -> None
     if hasattr(command, "commands"):
         command = command.commands[arguments.pop(0)]
     command.make_context(name, arguments)
+
+
+def test_what_came_of_comparing_places_is_told_by_its_names() -> None:
+    told = re.findall(r"`(\w+)`", (ROOT / "docs" / "places.md").read_text(encoding="utf-8"))
+    assert set(Comparisons().counters) <= set(told)
 
 
 def test_lists_of_exports_are_whole() -> None:

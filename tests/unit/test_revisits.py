@@ -7,7 +7,7 @@ from test_mapper import Published, trajectory_error
 from test_recovery import picture, textures
 
 from pliant.algorithms.mapping import known_places
-from pliant.algorithms.mapping.known_places import Revisits
+from pliant.algorithms.mapping.known_places import Comparisons, Revisits
 from pliant.algorithms.mapping.map_store import Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
@@ -50,17 +50,17 @@ def drift(shift, scale=1.0):
     return S
 
 
-def look(own, monkeypatch, segment, newest, proves, alike=None, elsewhere=()):
-    """What the newest of the keyframes tells.  proves: the drift by id of the old one.  Also who
-    was asked."""
+def look(own, monkeypatch, segment, newest, proves, alike=None, elsewhere=(), counted=None):
+    """What the newest of the keyframes tells.  proves: the drift by id of the old one, or why not.
+    Also who was asked."""
     points, keyframes = segment
     asked = []
 
     def same_place(old, new, *_):
         asked.append(old.keyframe.id)
         S = proves.get(old.keyframe.id)
-        if S is None:
-            return "nothing agrees"
+        if S is None or isinstance(S, str):
+            return S or "few_corners"
         rows = np.column_stack([old.keyframe.rows[:40], new.keyframe.rows[:40]])
         return SamePlace(S_old_new=S, rows=rows)
 
@@ -69,7 +69,8 @@ def look(own, monkeypatch, segment, newest, proves, alike=None, elsewhere=()):
     places = [Place(keyframe=k, features=None, segment=known) for k in known]
     some = [places[k] for k in alike or proves if k < newest]
     others = (places[k] for k in elsewhere)
-    told = own.look(places[-1], some, points, CAMERA, PARAMETERS, elsewhere=others)
+    counted = Comparisons() if counted is None else counted
+    told = own.look(places[-1], some, points, CAMERA, PARAMETERS, counted, elsewhere=others)
     return told, asked
 
 
@@ -119,6 +120,28 @@ def test_what_was_told_long_ago_counts_no_more(monkeypatch, segment):
     assert look(own, monkeypatch, segment, 14, {2: drift(-3.0)})[0] == []
 
 
+def test_what_came_of_comparisons_is_counted(monkeypatch, segment):
+    own, counted = Revisits(), Comparisons()
+
+    def compare(newest, proves, elsewhere=()):
+        look(own, monkeypatch, segment, newest, proves, [1], elsewhere, counted)
+        return {name: count for name, count in vars(counted).items() if count}
+
+    assert compare(10, {1: "few_points"}) == {"compared": 1, "few_points": 1}
+    told = compare(11, {1: drift(-3.0), 6: drift(2.0)}, [6])
+    assert told == {"compared": 3, "few_points": 1, "contradicted": 2}
+    told = compare(12, {1: drift(-3.0)})
+    assert told == {"compared": 4, "few_points": 1, "contradicted": 2, "unconfirmed": 1}
+    # By the next keyframe that tells the same they count both.
+    told = compare(13, {1: drift(-3.0)})
+    assert told == {"compared": 5, "few_points": 1, "contradicted": 2, "told": 2}
+    assert Comparisons(compared=5, told=2).counters == {
+        "places_compared": 5, "places_few_corners": 0, "places_few_points": 0,
+        "places_one_spot": 0, "places_repeated": 0, "places_contradicted": 0,
+        "places_unconfirmed": 0, "places_told": 2, "places_refused": 0, "places_closed": 0,
+    }  # fmt: skip
+
+
 def test_neither_the_window_nor_what_shares_points_is_asked(monkeypatch, segment):
     points, keyframes = segment
     keyframes[10].rows = np.concatenate([keyframes[10].rows, keyframes[5].rows])
@@ -141,7 +164,7 @@ def test_the_mapper_closes_a_loop_that_it_sees(killed):
     squares = textures(len(points))
     parameters = MappingParameters(
         window=WindowParameters(keyframes=5),
-        reacquisition=ReacquisitionParameters(min_zncc=1.0),
+        reacquisition=ReacquisitionParameters(radius_px=0.01),
         whole_map=WholeMapParameters(growth=0.0, distance_frames=3, observations_per_frame=20_000),
     )
     mapper, published, moved = Mapper(CAMERA, parameters, 0), Published(), []
@@ -157,4 +180,5 @@ def test_the_mapper_closes_a_loop_that_it_sees(killed):
     assert len(np.intersect1d(keyframes[0].rows, keyframes[-1].rows)) >= 30
     assert mapper.point_count < 1.3 * len(points)
     published.apply(mapper.finish())
+    assert mapper.counters["places_closed"] == mapper.counters["places_told"] >= 2
     assert trajectory_error(published, poses)[0] < 1e-3

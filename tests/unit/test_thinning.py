@@ -223,7 +223,7 @@ def test_the_map_keeps_its_size_where_the_camera_comes_back():
     assert max(rows[len(rows) // 2 :]) <= 1.1 * max(rows[: len(rows) // 2])
     assert mapper.point_count == len(published.points)
     counts = {"given_up_keyframes": len(kept.given_up), "given_up_points": kept.points.culled}
-    assert mapper.given_up == counts
+    assert counts.items() <= mapper.counters.items()
     again = load_state(save_state(mapper)).atlas.active.segment
     np.testing.assert_array_equal(again.given_up.centres, kept.given_up.centres)
     assert trajectory_error(published, poses)[0] < 1e-3

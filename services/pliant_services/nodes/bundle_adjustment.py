@@ -120,7 +120,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     for number, kept in enumerate(mapper.kept()):
         header = Header(frame=number, stamp_ns=0, frame_id=WORLD_FRAME_ID)
         bus.publish(topics.MAP_KEPT, MapKeyframe.of(header, kept))
-    monitor.report(last, note="", points=mapper.point_count, **mapper.given_up)
+    monitor.report(last, note="", points=mapper.point_count, **mapper.counters)
 
 
 class Beside:

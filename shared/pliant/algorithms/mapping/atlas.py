@@ -220,6 +220,8 @@ class Atlas:
     def take_over(self, answer: Answer) -> list[Moved]:
         """Go on with what the adjustment of the whole map has found."""
         assert self.active is not None
+        self.places.comparisons.refused += answer.refused
+        self.places.comparisons.closed += len(answer.loops)
         moved: list[Moved] = []
         if answer.moves is not None:
             told = tuple((loop.old, loop.new) for loop in answer.loops)

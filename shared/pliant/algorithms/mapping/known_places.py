@@ -34,7 +34,7 @@ from pliant.algorithms.mapping.relocalisation import (
     relocalise,
     rest_is_elsewhere,
 )
-from pliant.algorithms.mapping.same_place import same_place
+from pliant.algorithms.mapping.same_place import Refusal, same_place
 from pliant.algorithms.mapping.segment import Moved, Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.whole_map import held
@@ -58,6 +58,37 @@ _ELSEWHERE = 2
 
 
 @dataclass(kw_only=True)
+class Comparisons:
+    """How often keyframes were compared with places, and what came of it.
+
+    compared: pairs of keyframes.   few_corners, few_points, one_spot, repeated: refused, see
+    ``same_place``.   contradicted: agreed, and another place agreed otherwise, or the image did.
+    unconfirmed: told by one keyframe, of which what agrees best counts; no other one told the same
+    yet.   told: by two.   refused: of these, by the graph of all keyframes.   closed: taken in.
+    """
+
+    compared: int = 0
+    few_corners: int = 0
+    few_points: int = 0
+    one_spot: int = 0
+    repeated: int = 0
+    contradicted: int = 0
+    unconfirmed: int = 0
+    told: int = 0
+    refused: int = 0
+    closed: int = 0
+
+    def refuse(self, why: Refusal) -> None:
+        """A pair is not proved to show one place."""
+        setattr(self, why, getattr(self, why) + 1)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """By the names that ``report.json`` has."""
+        return {f"places_{name}": count for name, count in vars(self).items()}
+
+
+@dataclass(kw_only=True)
 class Revisits:
     """waiting: what one keyframe has told, until another one tells the same."""
 
@@ -70,14 +101,16 @@ class Revisits:
         points: PointRows,
         camera: PinholeCamera,
         parameters: MappingParameters,
+        comparisons: Comparisons,
         tries: int = 1,
         elsewhere: Iterable[Place] = (),
     ) -> list[Loop]:
         """The loops that a new keyframe proves: with a place that looks like it, if any.
 
-        places: of one segment that look like it, the most alike first.   tries: how many of them
-        are asked; if they contradict each other, what is alike in both proves neither.
-        elsewhere: others, which are asked as well where one of these is proved.
+        places: of one segment that look like it, the most alike first.   comparisons: are counted
+        there.   tries: how many of them are asked; if they contradict each other, what is alike in
+        both proves neither.   elsewhere: others, which are asked as well where one of these is
+        proved.
         """
         keyframe = new.keyframe
         mine = np.zeros(len(points.state), np.bool_)
@@ -92,7 +125,9 @@ class Revisits:
         def ask(some: Iterable[Place]) -> None:
             for old in some:
                 found = same_place(old, new, points, camera, parameters, generator)
+                comparisons.compared += 1
                 if isinstance(found, str):
+                    comparisons.refuse(found)
                     continue
                 rows, S_old_new = found.rows[found.rows[:, 0] != found.rows[:, 1]], found.S_old_new
                 ids = points.ids[rows]
@@ -113,11 +148,18 @@ class Revisits:
             ask(elsewhere)
         loop = max(told, key=lambda each: len(each.rows), default=None)
         if loop is None or not all(_agree(each, loop, new, points) for each in told):
+            comparisons.contradicted += len(told)
             return []
         others = [each for each in self.waiting if each.new != keyframe.id]
         agreeing = [each for each in others if _agree(each, loop, new, points)]
-        self.waiting = [] if agreeing else [*self.waiting, loop]
-        return [*agreeing, loop] if agreeing else []
+        if not agreeing:
+            comparisons.unconfirmed += 1
+            self.waiting = [*self.waiting, loop]
+            return []
+        comparisons.unconfirmed -= len(agreeing)
+        comparisons.told += len(agreeing) + 1
+        self.waiting = []
+        return [*agreeing, loop]
 
 
 def _agree(one: Loop, other: Loop, new: Place, points: PointRows) -> bool:
@@ -155,12 +197,13 @@ class Meetings:
         points: PointRows,
         camera: PinholeCamera,
         parameters: MappingParameters,
+        comparisons: Comparisons,
         contradicts: Callable[[Loop], bool],
     ) -> None:
         """Compare a new keyframe with places of earlier segments, the most alike first.
 
-        elsewhere: others of a segment, which must not tell otherwise.   contradicts: whether the
-        keyframe's image does, to what is proved.
+        elsewhere: others of a segment, which must not tell otherwise.   comparisons: are counted
+        there.   contradicts: whether the keyframe's image does, to what is proved.
         """
         by_segment: dict[int, list[Place]] = {}
         for place in places:
@@ -168,10 +211,14 @@ class Meetings:
         for segment, some in by_segment.items():
             told = self.told.setdefault(segment, Revisits())
             proved = told.look(
-                new, some, points, camera, parameters, tries=_TRIES, elsewhere=elsewhere(segment)
-            )
-            if not any(contradicts(loop) for loop in proved if loop.new == new.keyframe.id):
-                self.proved += proved
+                new, some, points, camera, parameters, comparisons, tries=_TRIES,
+                elsewhere=elsewhere(segment),
+            )  # fmt: skip
+            if any(contradicts(loop) for loop in proved if loop.new == new.keyframe.id):
+                comparisons.told -= len(proved)
+                comparisons.contradicted += len(proved)
+                continue
+            self.proved += proved
 
 
 def join(
@@ -213,12 +260,14 @@ def join(
 @dataclass(kw_only=True)
 class KnownPlaces:
     """index: of their corners, at the pixels of the rectified image.   revisits: of the segment
-    that the camera is in with itself.   meetings: with earlier ones.
+    that the camera is in with itself.   meetings: with earlier ones.   comparisons: of all, from
+    the beginning.
     """
 
     index: PlaceIndex = field(default_factory=PlaceIndex)
     revisits: Revisits = field(default_factory=Revisits)
     meetings: Meetings = field(default_factory=Meetings)
+    comparisons: Comparisons = field(default_factory=Comparisons)
 
     def know(self, kept: Iterable[KeptKeyframe], calibration: SelfCalibration) -> None:
         """Take in the places of a map that was kept.   calibration: of the camera that has come."""
@@ -269,7 +318,7 @@ class KnownPlaces:
         ones waits in ``meetings``.   image: its maxima (M, 3), and itself (H, W).
         """
         new = Place(keyframe=keyframe, features=seen, segment=segment.keyframes)
-        rest = segment.points, view.camera, parameters
+        rest = segment.points, view.camera, parameters, self.comparisons
         found = self.revisits.look(new, self._like(seen, [segment], view), *rest) if loops else []
         if earlier:
             least = parameters.localisation.min_inliers

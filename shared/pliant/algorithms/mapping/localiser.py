@@ -125,8 +125,8 @@ class Localiser:
         return int(np.count_nonzero(self._points.state == MAPPED))
 
     @property
-    def given_up(self) -> dict[str, int]:
-        """Nothing: the map is as it was."""
+    def counters(self) -> dict[str, int]:
+        """None: the map is as it was."""
         return {}
 
     def kept(self) -> list[KeptKeyframe]:

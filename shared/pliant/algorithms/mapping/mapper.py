@@ -104,9 +104,10 @@ class Mapper:
         return self.atlas.point_count
 
     @property
-    def given_up(self) -> dict[str, int]:
-        """As of the atlas."""
-        return self.atlas.given_up
+    def counters(self) -> dict[str, int]:
+        """What came of comparing places, and what the map gave up, see ``Comparisons`` and the
+        atlas."""
+        return self.atlas.places.comparisons.counters | self.atlas.given_up
 
     def kept(self) -> Iterator[KeptKeyframe]:
         """As of the atlas."""

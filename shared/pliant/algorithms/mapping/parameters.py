@@ -71,7 +71,8 @@ class ReacquisitionParameters(Parameters):
         default=0.8,
         ge=-1.0,
         le=1.0,
-        description="Least correlation of the 8x8 patches, where the image is at hand",
+        description="Least correlation of the 8x8 patches, where the image is at hand, and of "
+        "points by which two keyframes show one place",
     )
 
 

@@ -34,7 +34,7 @@ _MARGIN_PX = 8.0
 _ALIGN_REACH_PX = np.float32(1.5)
 _ITERATIONS = 4
 
-_FLAT = np.float32(1.0)
+FLAT = np.float32(1.0)
 """Standard deviation, in grey levels, under which a patch says nothing."""
 
 
@@ -275,7 +275,7 @@ def _match(
             best_u, best_v = maxima[best, 0], maxima[best, 1]
         else:
             energy = _template_of(wanted.patches[wanted.rows[i]], window, values)
-            if energy < np.float32(PATCH_PIXELS) * _FLAT * _FLAT:
+            if energy < np.float32(PATCH_PIXELS) * FLAT * FLAT:
                 continue
             template = Template(values, 0, energy, UNIFORM)
             for k in range(2):
@@ -312,7 +312,7 @@ def _match_patches(
     to_origin = np.float32(0.5 * (PATCH_SIZE - 1))
     for i in range(wanted.rows.size):
         energy = _template_of(wanted.patches[wanted.rows[i]], window, values)
-        if energy < np.float32(PATCH_PIXELS) * _FLAT * _FLAT:
+        if energy < np.float32(PATCH_PIXELS) * FLAT * FLAT:
             continue
         template = Template(values, 0, energy, UNIFORM)
         u, v = wanted.projected[i, 0], wanted.projected[i, 1]

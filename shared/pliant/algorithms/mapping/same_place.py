@@ -10,6 +10,7 @@ images and not in space.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import hat, inverse, so3_exp, transform
 from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.point_patches import look_alike
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
 from pliant.algorithms.mapping.relocalisation import Place, corners_in_map, repeats
 from pliant.algorithms.places import match
@@ -173,6 +175,12 @@ class SamePlace:
     rows: I32
 
 
+Refusal = Literal["few_corners", "few_points", "one_spot", "repeated"]
+"""Why it is not proved that two keyframes show one place: too few corners agree on a similarity,
+too few points of the two maps, all that agrees lies in one spot of the image, or is seen again a
+step aside."""
+
+
 def same_place(
     old: Place,
     new: Place,
@@ -180,10 +188,10 @@ def same_place(
     camera: PinholeCamera,
     parameters: MappingParameters,
     generator: np.random.Generator,
-) -> SamePlace | str:
+) -> SamePlace | Refusal:
     """What proves that both keyframes show one place, or why it is not proved.
 
-    In both images, corners that look alike and points of both maps must agree on the similarity,
+    In both images, corners and points of both maps that look alike must agree on the similarity,
     as many as a pose needs, and not in one spot.
     """
     limits = parameters.localisation
@@ -203,29 +211,41 @@ def same_place(
         samples=parameters.recovery.ransac_samples,
     )  # fmt: skip
     if found is None or found[1].sum() < parameters.recovery.min_agreeing:
-        count = 0 if found is None else int(found[1].sum())
-        return f"{count} of {len(pairs.xyz_a)} corners that look alike agree"
+        return "few_corners"
     S_a_b, agreeing = found
     rows, points_px = np.zeros((0, 2), np.int32), np.zeros((0, 2), np.float32)
     for gate_px in (limits.ransac_gate_px, limits.inlier_px):
-        rows, guided, points_px = _guided(S_a_b, old, new, points, camera, gate_px)
+        rows, guided, points_px = _guided(
+            S_a_b, old, new, points, camera, gate_px, parameters.reacquisition.min_zncc
+        )
         if len(rows) < limits.min_inliers:
-            return f"{len(rows)} points of the two maps agree"
+            return "few_points"
         S_a_b = refine_similarity(S_a_b, guided, scale=gate_px / camera.fx)
     spread = (points_px.std(axis=0) / np.array([camera.width, camera.height])).min()
     if spread < parameters.support.min_spread:
-        return "all that agrees lies in one spot of the image"
+        return "one_spot"
     told = alike[known][agreeing, 1]
     if repeats(new.features, told, pairs.xyz_b[agreeing], camera, parameters):
-        return "what agrees is seen again a step aside"
-    S_old_new = old.keyframe.T_world_camera @ S_a_b @ inverse(new.keyframe.T_world_camera)
-    return SamePlace(S_old_new=S_old_new, rows=rows)
+        return "repeated"
+    return SamePlace(S_old_new=_between_worlds(S_a_b, old, new), rows=rows)
+
+
+def _between_worlds(S_a_b: F64, old: Place, new: Place) -> F64:
+    """A similarity between two keyframes as one between their worlds."""
+    return old.keyframe.T_world_camera @ S_a_b @ inverse(new.keyframe.T_world_camera)
 
 
 def _guided(
-    S_a_b: F64, old: Place, new: Place, points: PointRows, camera: PinholeCamera, gate_px: float
+    S_a_b: F64,
+    old: Place,
+    new: Place,
+    points: PointRows,
+    camera: PinholeCamera,
+    gate_px: float,
+    min_zncc: float,
 ) -> tuple[I32, Pairs, F32]:
-    """Points of the old keyframe and of the new that each shows where the other one saw its own.
+    """Points of the old keyframe and of the new that each shows where the other one saw its own,
+    and that look alike: where two dense maps only have the same surfaces, many lie near another.
 
     Returns their rows (n, 2), themselves, and where the old keyframe saw them."""
     rows: list[I32] = []
@@ -243,6 +263,9 @@ def _guided(
     a = np.flatnonzero(nearest >= 0)
     a = a[back[nearest[a]] == a]
     a = a[points.kappas[rows[0][a]] * points.kappas[rows[1][nearest[a]]] > 0.0]
+    S_old_new = _between_worlds(S_a_b, old, new)
+    paired = np.column_stack([rows[0][a], rows[1][nearest[a]]])
+    a = a[look_alike(S_old_new, paired, old.segment, new.segment, points, min_zncc)]
     b = nearest[a]
     seen = [camera.normalise(px.astype(np.float64)) for px in (places[0][a], places[1][b])]
     pairs = Pairs(xyz_a=here[0][a], xyz_b=here[1][b], seen_a=seen[0], seen_b=seen[1])

@@ -111,9 +111,9 @@ class TrialMapper:
         return 0 if self._on_trial else self._mapper.point_count
 
     @property
-    def given_up(self) -> dict[str, int]:
-        """As ``Mapper.given_up``."""
-        return {} if self._on_trial else self._mapper.given_up
+    def counters(self) -> dict[str, int]:
+        """As ``Mapper.counters``."""
+        return {} if self._on_trial else self._mapper.counters
 
     def finish(self) -> MapDelta:
         """As ``Mapper.finish``; a trial that lasts until then ends with it."""

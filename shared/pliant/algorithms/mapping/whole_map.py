@@ -77,11 +77,12 @@ class Question:
 
 class Answer(NamedTuple):
     """How the map moves, None where it does not; the loops that were closed, whose points are to be
-    joined; what is known of the camera by now."""
+    joined; what is known of the camera by now; how many loops the others contradict."""
 
     moves: MapMoves | None
     loops: list[Loop]
     calibration: SelfCalibration
+    refused: int
 
 
 @dataclass(kw_only=True)
@@ -208,7 +209,7 @@ def find_moves(question: Question) -> Answer:
     bent = bent or question.closed
     moving = bent or len(question.keyframe_ids) >= 2 * parameters.window.keyframes
     moves = _moves(question, seen, before, depths) if moving else None
-    return Answer(moves, [], after)
+    return Answer(moves, [], after, 0)
 
 
 def _close(question: Question) -> Answer:
@@ -217,7 +218,8 @@ def _close(question: Question) -> Answer:
         question.seen, question.keyframe_ids, question.sigmas, question.loops,
         question.known.view.camera.fx,
     )  # fmt: skip
-    return Answer(moves if loops else None, loops, question.known)
+    refused = len(question.loops) - len(loops)
+    return Answer(moves if loops else None, loops, question.known, refused)
 
 
 def _learned(

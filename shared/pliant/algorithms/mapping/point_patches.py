@@ -1,0 +1,85 @@
+"""Whether points of two maps look alike: the patches by which they are found again.
+
+A patch is what the last keyframe that sees the point has seen about it.  Two cameras that stand
+closer or are turned about their axis see the same patch larger or turned: one is compared with the
+other as a small plane would be that faces the first camera, in as much of it as both have.
+"""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I32, U8, BoolArray
+from pliant.algorithms.geometry import inverse, transform_each
+from pliant.algorithms.image.patch_sums import PATCH_PIXELS, PATCH_SIZE
+from pliant.algorithms.mapping.map_store import PATCH_SIDE, Keyframe, PointRows
+from pliant.algorithms.mapping.reacquisition import FLAT
+from pliant.compiler.kernel import kernel
+
+
+def look_alike(
+    S_old_new: F64,
+    rows: I32,
+    old: list[Keyframe],
+    new: list[Keyframe],
+    points: PointRows,
+    min_zncc: float,
+) -> BoolArray:
+    """(n,) whether points look as others do.
+
+    S_old_new: (4, 4) similarity between their worlds, ``X_old = S_old_new X_new``.   rows: (n, 2),
+    old and new.   old, new: keyframes of their segments, oldest first.   min_zncc: least
+    correlation of the patches.
+    """
+    T_old, T_new = _last_to_see(rows[:, 0], old, points), _last_to_see(rows[:, 1], new, points)
+    X_old = transform_each(inverse(T_old), points.xyz[rows[:, 0]])
+    X_new = transform_each(inverse(T_new), points.xyz[rows[:, 1]])
+    # Of a step in the old image, at the depth of the point, the step in the new one.
+    into_new = (inverse(T_new) @ np.linalg.inv(S_old_new) @ T_old)[:, :3, :2]
+    seen = X_new[:, :2] / X_new[:, 2:]
+    steps = into_new[:, :2] - seen[:, :, None] * into_new[:, 2:]
+    steps *= (X_old[:, 2] / X_new[:, 2])[:, None, None]
+    patches = points.patches
+    return _correlations(patches[rows[:, 0]], patches[rows[:, 1]], steps) >= min_zncc
+
+
+def _last_to_see(rows: I32, segment: list[Keyframe], points: PointRows) -> F64:
+    """(n, 4, 4) poses of the last keyframes of a segment that see points."""
+    last = np.zeros(len(points.state), np.int32)
+    for number, keyframe in enumerate(segment):
+        last[keyframe.rows] = number
+    return np.array([segment[n].T_world_camera for n in last[rows]]).reshape(-1, 4, 4)
+
+
+@kernel
+def _correlations(a: U8, b: U8, steps: F64) -> F64:
+    """(n,) ZNCC of patches (n, PATCH_SIDE, PATCH_SIDE), 0 where one is flat.   steps: (n, 2, 2)
+    from pixels of a to those of b."""
+    found = np.zeros(len(a))
+    reach = 0.5 * (PATCH_SIZE - 1)
+    for i in range(len(a)):
+        A = steps[i]
+        farthest = max(abs(A[0, 0]) + abs(A[0, 1]), abs(A[1, 0]) + abs(A[1, 1]))
+        if not farthest < np.inf:
+            continue
+        share = 1.0 / max(farthest, 1.0)
+        sa = sb = saa = sbb = sab = 0.0
+        for r in range(PATCH_SIZE):
+            for c in range(PATCH_SIZE):
+                u, v = share * (c - reach), share * (r - reach)
+                x = _at(a[i], u, v)
+                y = _at(b[i], A[0, 0] * u + A[0, 1] * v, A[1, 0] * u + A[1, 1] * v)
+                sa, sb, saa, sbb, sab = sa + x, sb + y, saa + x * x, sbb + y * y, sab + x * y
+        va, vb = saa - sa * sa / PATCH_PIXELS, sbb - sb * sb / PATCH_PIXELS
+        if min(va, vb) > PATCH_PIXELS * FLAT * FLAT:
+            found[i] = (sab - sa * sb / PATCH_PIXELS) / np.sqrt(va * vb)
+    return found
+
+
+@kernel
+def _at(patch: U8, u: float, v: float) -> float:
+    """A patch's grey level so far from its centre."""
+    u, v = u + 0.5 * (PATCH_SIDE - 1), v + 0.5 * (PATCH_SIDE - 1)
+    x, y = int(u), int(v)
+    a, b = u - x, v - y
+    above = (1.0 - a) * patch[y, x] + a * patch[y, x + 1]
+    below = (1.0 - a) * patch[y + 1, x] + a * patch[y + 1, x + 1]
+    return (1.0 - b) * above + b * below
