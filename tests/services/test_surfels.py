@@ -109,6 +109,20 @@ def test_a_black_frame_loses_no_surfel_and_leaves_no_nan(
             assert np.isfinite(getattr(message, name)).all()
 
 
+def test_a_surfel_is_lost_by_the_stamps_of_frames_without_pixels_too(ingested: Messages) -> None:
+    config = load_config(None, ["surfels.max_surfels=60", "surfels.lost_after_s=0.05"])
+    inputs = with_depth(ingested, {0: depths_of(ingested)[0].data})
+    images = list(inputs[topics.IMAGE])
+    assert isinstance(images[2], Image)
+    images[2] = replace(images[2], grey=np.zeros_like(images[2].grey))
+    for dropped in (False, True):
+        if dropped:
+            images[1] = without_pixels(images[1])
+        state = follow(config, {**inputs, topics.IMAGE: images})[2].state
+        assert len(state) == 60
+        assert (state == SurfelState.LOST).all() == dropped
+
+
 def test_a_service_that_is_started_again_goes_on_with_the_same_bytes(
     config: Config, ingested: Messages
 ) -> None:
