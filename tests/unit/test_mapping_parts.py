@@ -24,7 +24,7 @@ from pliant.algorithms.mapping.map_store import (
     PointRows,
     TrackLinks,
 )
-from pliant.algorithms.mapping.observation_table import reprojection_errors, window_errors
+from pliant.algorithms.mapping.observation_table import forget_outliers, reprojection_errors
 from pliant.algorithms.mapping.parameters import (
     LocalisationParameters,
     MappingParameters,
@@ -217,16 +217,29 @@ def test_errors_are_distances_to_projections():
     observed = (px + np.array([3.0, 4.0])).astype(np.float32)
     errors = reprojection_errors(poses[0], scene.points, observed[0], CAMERA)
     np.testing.assert_allclose(errors, 5.0, atol=1e-3)
-    seen = np.ones((2, 50), np.bool_)
-    seen[1, 7] = False
-    columns = np.array([3, 7], np.int32)
-    table = window_errors(
-        poses, scene.points[columns], observed[..., 0].copy(), observed[..., 1].copy(), seen,
-        columns, CAMERA,
-    )  # fmt: skip
-    np.testing.assert_allclose(table, [[5.0, 5.0], [5.0, 0.0]], atol=1e-3)
     behind = reprojection_errors(np.eye(4), np.array([[0.0, 0.0, -1.0]]), observed[0, :1], CAMERA)
     assert np.isinf(behind[0])
+
+
+def test_cameras_forget_what_they_miss_and_what_lies_behind_them():
+    scene = Scene.box(50)
+    poses = np.array([looking((0.1, 0.0, 0.0)), looking((0.4, 0.1, 0.2), (0.0, 0.05, 0.0))])
+    px = np.array([CAMERA.project(transform(inverse(T), scene.points)) for T in poses])
+    px[0, 3] += (3.0, 4.0)
+    u, v = (np.ascontiguousarray(px[..., k], np.float32) for k in range(2))
+    seen = np.ones((2, 50), np.bool_)
+    seen[1, 7] = False
+    expected = seen.copy()
+    expected[0, 3] = expected[:, 9] = False
+    columns = np.array([3, 7, 9], np.int32)
+    points = scene.points[columns]
+    points[2] *= -1.0
+    u[:, 8] = 0.0  # its column is not asked for
+    forget_outliers(poses, points, u, v, seen, columns, CAMERA, 4.9)
+    np.testing.assert_array_equal(seen, expected)
+    seen[0, 3] = True
+    forget_outliers(poses, points[:1], u, v, seen, columns[:1], CAMERA, 5.1)
+    assert seen[0, 3]
 
 
 def localisation_case(outliers):

@@ -181,7 +181,7 @@ def reprojection_errors(
     return errors
 
 
-def window_errors(
+def forget_outliers(
     T_world_camera: F64,
     points_world: F64,
     u: F32,
@@ -189,15 +189,13 @@ def window_errors(
     seen: BoolArray,
     columns: I32,
     camera: PinholeCamera,
-) -> F32:
-    """(M, C) errors in px of the points (C, 3) in ``columns`` of the table u, v, seen (M, N).
-
-    0 where a camera does not see the point, inf where the point lies behind it.
-    """
-    errors = np.zeros((len(T_world_camera), len(columns)), np.float32)
+    outlier_px: float,
+) -> None:
+    """Let the cameras (M) of the table u, v, seen (., N) not see those of the points (C, 3) in
+    ``columns`` that they miss by more than outlier_px, or that lie behind them."""
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:, :3])
-    _window_errors(T_camera_world, points_world, u, v, seen, columns, _intrinsics(camera), errors)
-    return errors
+    K, most = _intrinsics(camera), np.float32(outlier_px)
+    _forget_outliers(T_camera_world, points_world, u, v, seen, columns, K, most)
 
 
 def list_errors(
@@ -246,11 +244,19 @@ def _list_errors(
 
 
 @kernel
-def _window_errors(
-    T: F64, points_world: F64, u: F32, v: F32, seen: BoolArray, columns: I32, K: F64, errors: F32
+def _forget_outliers(
+    T: F64,
+    points_world: F64,
+    u: F32,
+    v: F32,
+    seen: BoolArray,
+    columns: I32,
+    K: F64,
+    outlier_px: np.float32,
 ) -> None:
-    for m in range(errors.shape[0]):
+    for m in range(T.shape[0]):
         for i in range(columns.size):
             n = columns[i]
             if seen[m, n]:
-                errors[m, i] = _error(T[m], points_world[i], u[m, n], v[m, n], K)
+                error = np.float32(_error(T[m], points_world[i], u[m, n], v[m, n], K))
+                seen[m, n] = not error > outlier_px

@@ -14,12 +14,12 @@ from pliant.algorithms.mapping.observation_table import (
     columns_in_state,
     count_cameras,
     flows,
+    forget_outliers,
     gather,
     has_parallax,
     observe,
     seen_in_state,
     weigh,
-    window_errors,
 )
 from pliant.algorithms.mapping.parameters import MappingParameters, PointParameters
 from pliant.algorithms.triangulation import spread_of_rays, triangulate
@@ -229,13 +229,11 @@ class Window:
         """Forget observations that miss their point, and points with too few observations."""
         columns = self.mapped_columns()
         rows = self.rows[columns]
-        errors = window_errors(
+        forget_outliers(
             self.T_world_camera[:-1], self.points.xyz[rows], self.u, self.v, self.seen, columns,
-            self._camera,
+            self._camera, outlier_px,
         )  # fmt: skip
-        bad = errors > outlier_px
         for slot, keyframe in enumerate(self.keyframes):
-            self.seen[slot, columns[bad[slot]]] = False
             keyframe.keep(self.seen[slot, self.columns[keyframe.rows]])
         remaining = count_cameras(columns, self.seen, 0, len(self.seen))
         remaining += self.points.base_keyframes[rows]
