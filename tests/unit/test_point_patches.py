@@ -99,3 +99,15 @@ def test_what_is_flat_or_was_seen_at_the_border_looks_like_nothing(wall):
     assert look_alike(np.eye(4), rows, [old], [old], points, MIN_ZNCC).all()
     points.patches[old.rows] = 0
     assert not look_alike(np.eye(4), rows, [old], [old], points, MIN_ZNCC).any()
+
+
+def test_a_wrong_scale_matters_not_where_both_cameras_stand_at_one_place(wall):
+    points = PointRows()
+    old, new = (seen_from(AHEAD, wall, points, world) for world in (np.eye(4), WORLD))
+    S_old_new = np.linalg.inv(WORLD)
+    at = WORLD[:3, 3]  # of the new camera
+    wrong = np.eye(4)
+    wrong[:3, :3] *= 20.0
+    wrong[:3, 3] = at - 20.0 * at
+    rows = np.column_stack([old.rows, new.rows])
+    assert look_alike(S_old_new @ wrong, rows, [old], [new], points, MIN_ZNCC).mean() > 0.9

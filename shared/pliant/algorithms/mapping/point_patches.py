@@ -31,11 +31,13 @@ def look_alike(
     """
     T_old, T_new = _last_to_see(rows[:, 0], old, points), _last_to_see(rows[:, 1], new, points)
     X_old = transform_each(inverse(T_old), points.xyz[rows[:, 0]])
-    X_new = transform_each(inverse(T_new), points.xyz[rows[:, 1]])
+    # Of the old point as it lies before the new camera: where both cameras stand at one place
+    # nothing holds the scale, and it matters to nothing that they see.
+    into_new = inverse(T_new) @ np.linalg.inv(S_old_new) @ T_old
+    X_new = transform_each(into_new, X_old)
     # Of a step in the old image, at the depth of the point, the step in the new one.
-    into_new = (inverse(T_new) @ np.linalg.inv(S_old_new) @ T_old)[:, :3, :2]
     seen = X_new[:, :2] / X_new[:, 2:]
-    steps = into_new[:, :2] - seen[:, :, None] * into_new[:, 2:]
+    steps = into_new[:, :2, :2] - seen[:, :, None] * into_new[:, 2:3, :2]
     steps *= (X_old[:, 2] / X_new[:, 2])[:, None, None]
     patches = points.patches
     return _correlations(patches[rows[:, 0]], patches[rows[:, 1]], steps) >= min_zncc
