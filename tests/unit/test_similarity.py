@@ -65,6 +65,21 @@ def test_uncertain_depths_cost_less_than_in_closed_form():
     np.testing.assert_allclose(again, found[0], atol=2e-3)
 
 
+def test_where_both_cameras_stand_at_one_place_depths_tell_the_scale():
+    """Images are the same at any scale then."""
+    generator = np.random.default_rng(3)
+    S = np.diag([1.3, 1.3, 1.3, 1.0])
+    xyz_b = generator.uniform((-1.0, -0.8, 1.5), (1.0, 0.8, 4.0), (100, 3))
+    xyz_a = 1.3 * xyz_b * np.exp(0.1 * generator.normal(size=(100, 1)))
+    seen = [xyz[:, :2] / xyz[:, 2:] for xyz in (xyz_a, xyz_b)]
+    seen = [each + generator.normal(0.0, 0.001, each.shape) for each in seen]
+    pairs = Pairs(xyz_a=xyz_a, xyz_b=xyz_b, seen_a=seen[0], seen_b=seen[1])
+    start = S.copy()
+    start[:3, :3] /= 1.3
+    found = refine_similarity(start, pairs, scale=GATE)
+    assert abs(np.cbrt(np.linalg.det(found[:3, :3])) / 1.3 - 1.0) < 0.03
+
+
 @pytest.mark.parametrize("count", [0, 3, 60])
 def test_pairs_that_say_nothing_give_nothing_much(count):
     generator = np.random.default_rng(5)

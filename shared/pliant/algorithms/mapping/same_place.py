@@ -6,7 +6,8 @@ Of pairs of points most may be wrong.  Three pairs give a similarity in closed f
 1991); RANSAC (Fischler and Bolles 1981) takes the one under which most points are seen where both
 cameras saw them, as ORB-SLAM does for loops (Mur-Artal et al., T-RO 2015, section VII.B).  Depths
 of a map are far less certain than directions, so errors are counted, and then minimised, in the
-images and not in space.
+images and not in space.  Where both cameras stand at one place images say nothing of the scale,
+so that what both maps say of depths has a little say, too.
 """
 
 from dataclasses import dataclass
@@ -29,6 +30,10 @@ _MOST = 1.0
 """Turn and change of the log scale within one round."""
 
 _MIN_DEPTH = 1e-6
+
+_DEPTH_SIGMA = 0.1
+"""By what share two maps differ in the distance of a point.  Whatever parallax there is between
+the keyframes says more: of a tenth of the depth, a pixel of 500 tells it to 2 %."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,12 +84,20 @@ def similarity_by_ransac(
 
 
 def refine_similarity(S_a_b: F64, pairs: Pairs, *, scale: float) -> F64:
-    """Gauss-Newton on the errors in both images, with Geman-McClure weights of that scale."""
+    """Gauss-Newton on the errors in both images and of distances, with Geman-McClure weights.
+
+    scale: of these, on the plane z = 1.
+    """
+    as_image = scale / _DEPTH_SIGMA
     for _ in range(_ROUNDS):
         residuals, J = residuals_of(S_a_b, pairs)
-        weights = (1.0 / (1.0 + (residuals**2).sum(axis=1) / scale**2)) ** 2
-        H = np.einsum("nri,n,nrj->ij", J, weights, J)
-        g = np.einsum("nri,n,nr->i", J, weights, residuals)
+        residuals[:, 4] *= as_image
+        J[:, 4] *= as_image
+        squared = residuals**2
+        squared[:, :4] = squared[:, :4].sum(axis=1, keepdims=True)
+        weights = (1.0 / (1.0 + squared / scale**2)) ** 2
+        H = np.einsum("nri,nr,nrj->ij", J, weights, J)
+        g = np.einsum("nri,nr,nr->i", J, weights, residuals)
         step = -np.linalg.solve(H + 1e-12 * np.trace(H) * np.eye(7), g)
         if not np.abs(step[[0, 1, 2, 6]]).max() < _MOST:
             break  # nothing holds it
@@ -103,19 +116,23 @@ def moved(S: F64, step: F64) -> F64:
 
 
 def residuals_of(S_a_b: F64, pairs: Pairs) -> tuple[F64, F64]:
-    """(N, 4) errors in the image of a and in that of b, and (N, 4, 7) derivatives by ``moved``.
+    """(N, 5) errors in the image of a, in that of b, and of the logarithm of the distance from a;
+    (N, 5, 7) derivatives by ``moved``.
 
-    With Y = S X_b: ``dY = -[Y] domega + dtau + Y dsigma``; S^-1 X_a turns with the opposite step.
+    With Y = S X_b: ``dY = -[Y] domega + dtau + Y dsigma``; S^-1 X_a turns with the opposite step;
+    ``d log |Y| = Y . dY / |Y|^2``.
     """
     Y = pairs.xyz_b @ S_a_b[:3, :3].T + S_a_b[:3, 3]
     back = np.linalg.inv(S_a_b)
     Z = pairs.xyz_a @ back[:3, :3].T + back[:3, 3]
-    residuals = np.concatenate([_project(Y) - pairs.seen_a, _project(Z) - pairs.seen_b], axis=1)
+    X, farness = pairs.xyz_a, np.square(Y).sum(axis=1)
+    ratio = 0.5 * np.log(farness / np.square(X).sum(axis=1))
+    residuals = np.column_stack([_project(Y) - pairs.seen_a, _project(Z) - pairs.seen_b, ratio])
     one = np.broadcast_to(np.eye(3), (len(Y), 3, 3))
     dY = np.concatenate([-hat(Y), one, Y[:, :, None]], axis=2)
-    X = pairs.xyz_a
     dZ = -back[:3, :3] @ np.concatenate([-hat(X), one, X[:, :, None]], axis=2)
-    return residuals, np.concatenate([_slope(Y) @ dY, _slope(Z) @ dZ], axis=1)
+    away = (Y / farness[:, None])[:, None] @ dY
+    return residuals, np.concatenate([_slope(Y) @ dY, _slope(Z) @ dZ, away], axis=1)
 
 
 def _project(X: F64) -> F64:
