@@ -11,7 +11,7 @@ from test_meetings import PARAMETERS, along, film, wall
 from test_recovery import dark, textures
 from test_relocalisation import Film
 
-from pliant.algorithms.geometry import align_umeyama
+from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.mapping.kept_map import corrected_as
@@ -132,6 +132,23 @@ def test_another_correction_of_the_camera_moves_nothing_in_the_image(two: Two) -
     np.testing.assert_allclose(back.seen_px, before.seen_px, atol=1e-3)
     np.testing.assert_allclose(back.corners_px, before.corners_px, atol=1e-3)
     np.testing.assert_array_equal(back.correction, before.correction)
+
+
+def test_a_map_of_another_focal_length_is_merged_as_this_one_would_have_it(two: Two) -> None:
+    """The rays of one image differ by a twentieth, 20 px at its border."""
+    first, second = two
+    own = second[0].correction
+    other = SelfCalibration(CAMERA, own + np.array([0.05, 0, 0, 0, 0, 0]), np.eye(6))
+    before = SelfCalibration(CAMERA, own, np.eye(6)).view.camera
+    made: list[MapKeyframe] = []
+    for each in second:
+        here = transform(inverse(each.T_world_camera), each.points_world)
+        here[:, :2] *= before.fx / other.view.camera.fx
+        there = transform(each.T_world_camera, here)
+        made.append(replace(corrected_as(each, other), points_world=there))
+    merged = merge(first, made, PARAMETERS)
+    assert merged is not None
+    assert merged.joined == [(0, 0)]
 
 
 def test_another_camera_is_merged_by_its_own_rays(two: Two) -> None:

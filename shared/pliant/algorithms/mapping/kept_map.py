@@ -177,12 +177,13 @@ def numbered_after(
 
 def corrected_as(kept: KeptKeyframe, calibration: SelfCalibration) -> KeptKeyframe:
     """The keyframe with what another session has found wrong with the same camera: what was seen
-    stays where it was in the image.  One of another camera stays as it is.
+    stays where it was in the image.  One of another camera stays as it is, and one with the same.
 
     Two sessions differ by a thousandth in the focal length, and rays by as much: as rays the same
     image would be seen from two places.
     """
-    if kept.given_camera != calibration.given:
+    same = np.array_equal(kept.correction, calibration.correction)
+    if same or kept.given_camera != calibration.given:
         return kept
     moved = partial(moved_px, before=view_of(kept), after=calibration.view)
     seen_px = moved(kept.seen_px)

@@ -19,12 +19,13 @@ from pliant.algorithms.mapping.kept_map import (
     numbered_after,
     spans_of,
     take_in,
+    view_of,
 )
 from pliant.algorithms.mapping.known_places import KnownPlaces, join
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.map_store import Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.segment import Segment
+from pliant.algorithms.mapping.segment import Segment, bend
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.whole_map import WholeMap, held
 
@@ -70,14 +71,19 @@ class _Merging:
         self._given = [*first, *second]
         both = [corrected_as(each, calibration) for each in self._given]
         self._calibration, self._parameters = calibration, parameters
-        known = {each.segment for each in first}
-        self._shift = 1 + max(known)
+        numbers = {each.segment for each in first}
+        self._shift = 1 + max(numbers)
         self._spans = spans_of(both)
         self._places = KnownPlaces()
         self._places.know(both, calibration)
         segments = take_in(both, PointRows(), calibration)
-        self._worlds = [each for each in segments if each.id in known]
-        self._rest = [each for each in segments if each.id not in known]
+        corrected = (n for n, each in enumerate(both) if each is not self._given[n])
+        before = {both[n].segment: view_of(self._given[n]) for n in corrected}
+        for each in segments:
+            if each.id in before:
+                bend(each, before[each.id], calibration.view)
+        self._worlds = [each for each in segments if each.id in numbers]
+        self._rest = [each for each in segments if each.id not in numbers]
         self._proved = WholeMap()
 
     def result(self) -> Merged | None:

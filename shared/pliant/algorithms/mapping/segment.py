@@ -296,7 +296,7 @@ def see_by(segment: Segment, before: CorrectedView, known: SelfCalibration) -> N
 
     before: whose pixels its keyframes have.   known: of the camera by now.
     """
-    _bend(segment, before, known.view)
+    bend(segment, before, known.view)
     for keyframe in segment.keyframes:
         seen = moved_px(keyframe.points_px + keyframe.rolled_px, before, known.view)
         keyframe.points_px = moved_px(keyframe.points_px, before, known.view)
@@ -306,8 +306,9 @@ def see_by(segment: Segment, before: CorrectedView, known: SelfCalibration) -> N
         segment.unroll(segment.keyframes, known)
 
 
-def _bend(segment: Segment, before: CorrectedView, after: CorrectedView) -> None:
-    """Move the points, candidates with their provisional places among them."""
+def bend(segment: Segment, before: CorrectedView, after: CorrectedView) -> None:
+    """Move the points to where another camera would have mapped what it sees at the same places of
+    the image, candidates with their provisional places among them."""
     points, keyframes = segment.points, segment.keyframes
     used = slice(0, points.count)
     here = (points.state[used] != FREE) & (points.segment[used] == segment.id)
