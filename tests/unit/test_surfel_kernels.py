@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from surfel_scene import EVERYWHERE, level_of, slanted_surfels, waves
 
 from pliant.algorithms.arrays import F32, F64
+from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.surfels import deformation_models as motion
 from pliant.algorithms.surfels.births import find_corners, make_templates, smaller_eigenvalues
 from pliant.algorithms.surfels.depth_maps import fit_inverse_depth, tangent_jacobian
@@ -386,3 +387,16 @@ def test_no_tangent_without_depth() -> None:
     line = np.zeros((40, 40))
     line[20, :] = 1.0
     assert fit_inverse_depth(line, 20.0, 20.0, 11, 0.1, 1e-4, out) == 0.0
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 0.5, 2.0, np.pi])
+def test_a_step_turns_by_its_rotation_vector(angle: float) -> None:
+    axis = np.array([0.48, -0.6, 0.64])
+    pose = motion.identity_poses(1)[0]
+    pose[motion.A : motion.A + 3], pose[motion.B : motion.B + 3] = (1, 0, 0), (0, 1, 0)
+    step, out = np.zeros(motion.parameter_count(motion.EQUIAREAL)), np.zeros_like(pose)
+    step[3:6] = angle * axis
+    motion.apply_step(pose, step, motion.EQUIAREAL, out)
+    R = so3_exp(angle * axis)
+    np.testing.assert_allclose(out[motion.A : motion.A + 3], R[:, 0], atol=1e-14)
+    np.testing.assert_allclose(out[motion.B : motion.B + 3], R[:, 1], atol=1e-14)
