@@ -151,7 +151,7 @@ def test_a_run_that_a_browser_looks_on_at_gives_its_results_and_stays(tmp_path: 
         said = list(itertools.takewhile(lambda line: "until Ctrl-C" not in line, run.stderr))
         try:
             assert run.poll() is None, "".join(said)
-            assert (tmp_path / "tiny" / "report.json").is_file()
+            assert (tmp_path / "tiny" / "report.json").is_file(), "".join(said)
             assert not (tmp_path / "tiny" / "session.json").exists()
         finally:
             run.send_signal(signal.SIGINT)

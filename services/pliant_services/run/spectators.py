@@ -12,8 +12,7 @@ from pliant.errors import ResultError
 from pliant.results.folder import SESSION_NAME
 from pliant_services.runtime.launcher import Fleet
 
-_START_S = 30.0  # a viewer imports Rerun, and may wait for a busy machine
-_WAIT_S = 120.0  # services compile before they are up
+_WAIT_S = 120.0  # services compile before they are up; a viewer imports Rerun on a busy machine
 _LAST_WORDS_S = 20.0
 _LEAVE_S = 5.0
 
@@ -77,7 +76,7 @@ class Viewer:
         waited = 0.0
         while not fleet.wait_for_viewer(0.2):
             waited += 0.2
-            if self._process.poll() is not None or waited > _START_S:
+            if self._process.poll() is not None or waited > _WAIT_S:
                 raise ResultError("the viewer did not start; what it said stands above")
 
     def see_the_end(self, fleet: Fleet) -> None:
