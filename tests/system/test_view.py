@@ -15,6 +15,7 @@ from running import command, in_this_process, pliant
 
 from pliant.bus.session import free_endpoint
 from pliant.errors import ResultError
+from pliant.viewers import rerun
 from pliant.viewers.rerun import RerunCanvas
 from pliant.viewers.rerun_program import RerunProgram, listens
 from pliant_services.run import spectators
@@ -35,11 +36,11 @@ def test_a_run_is_seen_live_and_afterwards(tmp_path: Path) -> None:
     assert not (result / "session.json").exists()
     done = pliant("view", result, "--save", after)
     assert done.returncode == 0, done.stderr
-    rerun = Path(sys.executable).with_name("rerun")
-    if not rerun.is_file():
+    printer = Path(sys.executable).with_name("rerun")
+    if not printer.is_file():
         pytest.skip(f"the command of rerun {rr.__version__} is not here")
     for path in (live, after):
-        printed = subprocess.run([rerun, "rrd", "print", path], capture_output=True, text=True)
+        printed = subprocess.run([printer, "rrd", "print", path], capture_output=True, text=True)
         assert printed.returncode == 0, printed.stderr
         for entity in (
             "camera",
@@ -117,6 +118,21 @@ def test_two_are_seen_in_browsers_at_once() -> None:
         one.close()
     assert len({one.address, two.address, three.address}) == 3
     assert f":{web_port}/" in three.address
+
+
+def test_two_that_begin_at_once_do_not_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rerun's own were free when both looked, and the other one has them now."""
+    pytest.importorskip("rerun")
+    free = rerun.free_port
+    with socket.create_server(("127.0.0.1", 0)) as web, socket.create_server(("", 0)) as grpc:
+        there = {rerun._WEB_PORT: web.getsockname()[1], rerun._GRPC_PORT: grpc.getsockname()[1]}
+        monkeypatch.setattr(rerun, "free_port", lambda port=None: there.get(port) or free())
+        canvas = RerunCanvas("web", name="second")
+        try:
+            with urlopen(canvas.address) as page:
+                assert page.status == 200
+        finally:
+            canvas.close()
 
 
 def test_a_browser_is_told_to_reach_this_machine_alone() -> None:

@@ -95,17 +95,15 @@ class RerunCanvas:
                 raise ResultError(f"{where}: cannot be written ({error.strerror})") from None
             self._stream.save(where, default_blueprint=blueprint)
         elif where == "web":
-            web_port = web_port or free_port(_WEB_PORT)
-            grpc_port = grpc_port or free_port(_GRPC_PORT)
-            behind = free_port()
-            serving = ["--serve-web", "--web-viewer-port", str(behind)]
-            limit = ["--server-memory-limit", _MEMORY_LIMIT]
-            self._server = RerunProgram([grpc_port, behind], [*serving, *limit])
             try:
-                self._page = RerunPage(web_port, behind=behind, data=grpc_port)
+                web_port, grpc_port = self._serve(
+                    web_port or free_port(_WEB_PORT), grpc_port or free_port(_GRPC_PORT)
+                )
             except ResultError:
-                self._server.close()
-                raise
+                if web_port and grpc_port:
+                    raise
+                # Another viewer may have begun meanwhile, and has what was free.
+                web_port, grpc_port = self._serve(web_port or free_port(), grpc_port or free_port())
             address = address_of(grpc_port)
             self._stream.connect_grpc(address, default_blueprint=blueprint)
             query = f"url={quote(address, safe='')}&hide_welcome_screen"  # it has examples
@@ -116,6 +114,19 @@ class RerunCanvas:
                 RerunProgram([_GRPC_PORT], ["--hide-welcome-screen", "--memory-limit", "50%"])
             self._stream.connect_grpc(address_of(_GRPC_PORT), default_blueprint=blueprint)
         self._place_world(0)
+
+    def _serve(self, web_port: int, grpc_port: int) -> tuple[int, int]:
+        """Let browsers look on at these ports, which it returns."""
+        behind = free_port()
+        serving = ["--serve-web", "--web-viewer-port", str(behind)]
+        limit = ["--server-memory-limit", _MEMORY_LIMIT]
+        self._server = RerunProgram([grpc_port, behind], [*serving, *limit])
+        try:
+            self._page = RerunPage(web_port, behind=behind, data=grpc_port)
+        except ResultError:
+            self._server.close()
+            raise
+        return web_port, grpc_port
 
     address = ""
     """Where a browser finds it."""

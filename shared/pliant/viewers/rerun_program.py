@@ -12,7 +12,7 @@ from contextlib import suppress
 from pliant.errors import ResultError
 
 LOOPBACK = "127.0.0.1"
-_UP_S = 30.0
+_UP_S = 60.0
 _GONE_S = 30.0
 _LOOK_S = 0.05
 
