@@ -66,8 +66,8 @@ def test_the_same_door_again_and_again_closes_no_loop(share: float) -> None:
     published, joined, mapper = run(film(*doors(share), poses, 0))
     assert joined == 0
     assert mapper.counters["places_closed"] == 0
-    assert mapper.counters["places_refused"] == mapper.counters["places_told"]
-    assert (mapper.counters["places_told"] > 0) == (share > 0.5)
+    assert mapper.counters["places_refused"] == mapper.counters["places_confirmed"]
+    assert (mapper.counters["places_confirmed"] > 0) == (share > 0.5)
     assert len(published.poses) == len(poses)
     assert trajectory_error(published, poses)[0] < 1e-3
 

@@ -134,11 +134,11 @@ def test_what_came_of_comparisons_is_counted(monkeypatch, segment):
     assert told == {"compared": 4, "few_points": 1, "contradicted": 2, "unconfirmed": 1}
     # By the next keyframe that tells the same they count both.
     told = compare(13, {1: drift(-3.0)})
-    assert told == {"compared": 5, "few_points": 1, "contradicted": 2, "told": 2}
-    assert Comparisons(compared=5, told=2).counters == {
+    assert told == {"compared": 5, "few_points": 1, "contradicted": 2, "confirmed": 2}
+    assert Comparisons(compared=5, confirmed=2).counters == {
         "places_compared": 5, "places_few_corners": 0, "places_few_points": 0,
         "places_one_spot": 0, "places_repeated": 0, "places_contradicted": 0,
-        "places_unconfirmed": 0, "places_told": 2, "places_refused": 0, "places_closed": 0,
+        "places_unconfirmed": 0, "places_confirmed": 2, "places_refused": 0, "places_closed": 0,
     }  # fmt: skip
 
 
@@ -180,5 +180,5 @@ def test_the_mapper_closes_a_loop_that_it_sees(killed):
     assert len(np.intersect1d(keyframes[0].rows, keyframes[-1].rows)) >= 30
     assert mapper.point_count < 1.3 * len(points)
     published.apply(mapper.finish())
-    assert mapper.counters["places_closed"] == mapper.counters["places_told"] >= 2
+    assert mapper.counters["places_closed"] == mapper.counters["places_confirmed"] >= 2
     assert trajectory_error(published, poses)[0] < 1e-3

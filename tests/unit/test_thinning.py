@@ -188,7 +188,7 @@ def test_what_has_been_given_up_moves_as_what_is_near_it() -> None:
         keyframe_ids=np.array([0, 1, 3, 6, 9]),
         moves=np.array([similarity(1.0 + 0.3 * k, (0, 0, 0), (k, 0, 0)) for k in range(5)]),
     )
-    told = here.told_with(moves)
+    told = here.together_with(moves)
     assert told.keyframe_ids.tolist() == list(range(10))
     S = told.matrices(np.arange(10))
     for kept in (0, 1, 3, 6, 9):

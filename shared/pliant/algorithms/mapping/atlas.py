@@ -224,11 +224,11 @@ class Atlas:
         self.places.comparisons.closed += len(answer.loops)
         moved: list[Moved] = []
         if answer.moves is not None:
-            told = tuple((loop.old, loop.new) for loop in answer.loops)
-            moves = self.active.segment.given_up.told_with(answer.moves)
+            same_places = tuple((loop.old, loop.new) for loop in answer.loops)
+            moves = self.active.segment.given_up.together_with(answer.moves)
             at_end = self.move(held(moves, self._spans, self.segment))
             self.active.segment.adjusted = int(answer.moves.keyframe_ids[-1])
-            moved = [at_end._replace(same_places=told)]
+            moved = [at_end._replace(same_places=same_places)]
             for loop in answer.loops:
                 self.active.join(loop)
         before, self.calibration = self.calibration, answer.calibration

@@ -63,8 +63,9 @@ class Comparisons:
 
     compared: pairs of keyframes.   few_corners, few_points, one_spot, repeated: refused, see
     ``same_place``.   contradicted: agreed, and another place agreed otherwise, or the image did.
-    unconfirmed: told by one keyframe, of which what agrees best counts; no other one told the same
-    yet.   told: by two.   refused: of these, by the graph of all keyframes.   closed: taken in.
+    unconfirmed: loops of one keyframe, of which the best counts, that no other one agrees with yet.
+    confirmed: by another one.   refused: of these, by the graph of all keyframes.   closed: taken
+    in.
     """
 
     compared: int = 0
@@ -74,7 +75,7 @@ class Comparisons:
     repeated: int = 0
     contradicted: int = 0
     unconfirmed: int = 0
-    told: int = 0
+    confirmed: int = 0
     refused: int = 0
     closed: int = 0
 
@@ -90,7 +91,7 @@ class Comparisons:
 
 @dataclass(kw_only=True)
 class Revisits:
-    """waiting: what one keyframe has told, until another one tells the same."""
+    """waiting: loops of one keyframe, until another one agrees."""
 
     waiting: list[Loop] = field(default_factory=list[Loop])
 
@@ -120,7 +121,7 @@ class Revisits:
         window = {k.id for k in new.segment[-parameters.window.keyframes :]}
         # Its own, so that no frame is located otherwise because something was looked at here.
         generator = np.random.default_rng(keyframe.id)
-        least, told = parameters.localisation.min_inliers, list[Loop]()
+        least, found_loops = parameters.localisation.min_inliers, list[Loop]()
 
         def ask(some: Iterable[Place]) -> None:
             for old in some:
@@ -131,7 +132,7 @@ class Revisits:
                     continue
                 rows, S_old_new = found.rows[found.rows[:, 0] != found.rows[:, 1]], found.S_old_new
                 ids = points.ids[rows]
-                told.append(Loop(old.keyframe.id, keyframe.id, S_old_new, rows, ids))
+                found_loops.append(Loop(old.keyframe.id, keyframe.id, S_old_new, rows, ids))
 
         ask(
             islice(
@@ -144,11 +145,11 @@ class Revisits:
                 tries,
             )
         )
-        if told:
+        if found_loops:
             ask(elsewhere)
-        loop = max(told, key=lambda each: len(each.rows), default=None)
-        if loop is None or not all(_agree(each, loop, new, points) for each in told):
-            comparisons.contradicted += len(told)
+        loop = max(found_loops, key=lambda each: len(each.rows), default=None)
+        if loop is None or not all(_agree(each, loop, new, points) for each in found_loops):
+            comparisons.contradicted += len(found_loops)
             return []
         others = [each for each in self.waiting if each.new != keyframe.id]
         agreeing = [each for each in others if _agree(each, loop, new, points)]
@@ -157,7 +158,7 @@ class Revisits:
             self.waiting = [*self.waiting, loop]
             return []
         comparisons.unconfirmed -= len(agreeing)
-        comparisons.told += len(agreeing) + 1
+        comparisons.confirmed += len(agreeing) + 1
         self.waiting = []
         return [*agreeing, loop]
 
@@ -182,11 +183,11 @@ def _agree(one: Loop, other: Loop, new: Place, points: PointRows) -> bool:
 class Meetings:
     """Of the segment that the camera is in with earlier ones.
 
-    told: by each of those, what awaits a second keyframe.   proved: loops that have been confirmed,
-    from places of earlier segments to keyframes of this one, until the segments are joined.
+    revisits: of each of those, what awaits a second keyframe.   proved: loops that have been
+    confirmed, from places of earlier segments to keyframes of this one, until they are joined.
     """
 
-    told: dict[int, Revisits] = field(default_factory=dict[int, Revisits])
+    revisits: dict[int, Revisits] = field(default_factory=dict[int, Revisits])
     proved: list[Loop] = field(default_factory=list[Loop])
 
     def look(
@@ -209,13 +210,13 @@ class Meetings:
         for place in places:
             by_segment.setdefault(place.keyframe.segment, []).append(place)
         for segment, some in by_segment.items():
-            told = self.told.setdefault(segment, Revisits())
-            proved = told.look(
+            revisits = self.revisits.setdefault(segment, Revisits())
+            proved = revisits.look(
                 new, some, points, camera, parameters, comparisons, tries=_TRIES,
                 elsewhere=elsewhere(segment),
             )  # fmt: skip
             if any(contradicts(loop) for loop in proved if loop.new == new.keyframe.id):
-                comparisons.told -= len(proved)
+                comparisons.confirmed -= len(proved)
                 comparisons.contradicted += len(proved)
                 continue
             self.proved += proved
@@ -253,8 +254,8 @@ def join(
     goes_on.take_in(earlier, id)
     if calibration.readout:
         goes_on.unroll(earlier.keyframes, calibration)
-    told = tuple((loop.old, loop.new) for loop in loops)
-    return Moved(S if active_moves else np.eye(4), moves, gone, told)
+    same_places = tuple((loop.old, loop.new) for loop in loops)
+    return Moved(S if active_moves else np.eye(4), moves, gone, same_places)
 
 
 @dataclass(kw_only=True)

@@ -93,9 +93,9 @@ def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px:
     enough = np.zeros((M, M), np.bool_)
     _meet_again(shared, _COVISIBLE_SHARE, enough)
     following = np.arange(1, M)
-    told = shared[following, following - 1] >= _FOLLOWING_SHARE * np.minimum(own[1:], own[:-1])
-    enough[following, following - 1] = told
-    jumps = following[~told]
+    follow = shared[following, following - 1] >= _FOLLOWING_SHARE * np.minimum(own[1:], own[:-1])
+    enough[following, following - 1] = follow
+    jumps = following[~follow]
     if len(jumps):
         # A camera that was recognised stands where it was, whatever a loop says.
         before = np.where(np.arange(M) < jumps[:, None], shared[jumps], 0)

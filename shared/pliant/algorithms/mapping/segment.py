@@ -82,7 +82,7 @@ class GivenUp:
             keyframe = int(kept[max(np.searchsorted(kept, keyframe) - 1, 0)])
         return keyframe
 
-    def told_with(self, moves: MapMoves) -> MapMoves:
+    def together_with(self, moves: MapMoves) -> MapMoves:
         """The moves of all keyframes of the segment from those of the ones that had been kept."""
         new = ~np.isin(self.ids, moves.keyframe_ids)
         if not new.any():
@@ -271,7 +271,7 @@ class Segment:
             self.passed.forget()
         if not self.thinned:
             return found, None
-        moves = self.given_up.told_with(moves)
+        moves = self.given_up.together_with(moves)
         self.given_up.move(moves)
         rows = self.mapped_rows()
         hosts = self.points.first_keyframe[rows].astype(np.int64)
