@@ -24,7 +24,7 @@ from pliant.map_history import MapHistory
 
 _HEADER = (
     *("after the dark the camera sees", "runs", "frames", "found in the map", "wrong poses"),
-    *("wrong in segments of their own", "loops told twice", "segments joined"),
+    *("wrong in segments of their own", "loops confirmed", "segments joined"),
 )
 _DARK_S = 1.5
 _REFERENCE = 30
@@ -33,13 +33,13 @@ _REFERENCE = 30
 
 @dataclass(kw_only=True)
 class _Watched(KnownPlaces):
-    """Counts what is told."""
+    """Counts loops that are confirmed."""
 
-    told: list[Loop] = field(default_factory=list[Loop])
+    confirmed: list[Loop] = field(default_factory=list[Loop])
 
     def compare(self, *args: object, **options: object) -> list[Loop]:
         found = super().compare(*args, **options)  # pyright: ignore[reportArgumentType]
-        self.told += found
+        self.confirmed += found
         return found
 
 
@@ -54,7 +54,7 @@ class Run:
 
     frames: int
     found: int
-    told: int
+    confirmed: int
     joined: int
     wrong: list[int]
     astray: list[int]
@@ -114,7 +114,7 @@ class _Session:
         return Run(
             frames=len(after),
             found=sum(frame in final and final[frame][0] in before for frame in after),
-            told=len(self.mapper.atlas.places.told),
+            confirmed=len(self.mapper.atlas.places.confirmed),
             joined=self.joined + len(delta.joined),
             wrong=sorted({frame for segment, frame in wrong if segment in before}),
             astray=sorted({frame for segment, frame in wrong if segment not in before}),
@@ -182,7 +182,7 @@ def measure(config: Config, seeds: int, only: str) -> Iterator[str]:
                 sum(one.found for one in some),
                 sum(len(one.wrong) for one in some),
                 sum(len(one.astray) for one in some),
-                sum(one.told for one in some),
+                sum(one.confirmed for one in some),
                 sum(one.joined for one in some),
             ]
             yield markdown_row((f"{name}: {way}", *map(str, counts)))

@@ -13,7 +13,7 @@ def test_of_two_rendered_rooms_neither_is_taken_for_the_other() -> None:
     came = dict(run(rooms(0, both=True), load_config(), 0))
     assert len(came) == 3
     for one in came.values():
-        assert one.told >= 2  # it does deceive
+        assert one.confirmed >= 2  # it does deceive
         assert one.joined == 0
         assert one.wrong == one.astray == []
     assert came["the second"].found == came["the second"].frames
@@ -23,7 +23,7 @@ def test_of_two_rendered_rooms_neither_is_taken_for_the_other() -> None:
 def test_no_part_of_a_chequered_floor_is_taken_for_another() -> None:
     """Not by chance, and not by a frame of many, for the image itself says that it cannot tell."""
     for one in dict(run(floor(0), load_config(), 0)).values():
-        assert one.told == 0
+        assert one.confirmed == 0
         assert one.joined == 0
         assert one.wrong == []
         assert one.found == 0

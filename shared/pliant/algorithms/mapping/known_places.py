@@ -4,7 +4,7 @@ Within a segment.  Where the map has not drifted by more than a few pixels, poin
 by where they are, and the keyframes share them.  A place that looks like a new keyframe without
 sharing points with it has drifted away, or only looks alike.  One that is the same goes on being
 so: keyframes that follow each other must tell of the same drift, so that what is found at one is
-believed when it is told twice.
+believed when a second one confirms it.
 
 Between segments.  A segment begins where the camera was lost for long.  Where it comes to a place
 of an earlier one, keyframes tell how the two worlds lie to each other, as they do of loops; one is
