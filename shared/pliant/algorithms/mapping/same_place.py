@@ -241,8 +241,8 @@ def same_place(
     spread = (points_px.std(axis=0) / np.array([camera.width, camera.height])).min()
     if spread < parameters.support.min_spread:
         return "one_spot"
-    corners = alike[known][agreeing, 1]
-    if repeats(new.features, corners, pairs.xyz_b[agreeing], camera, parameters):
+    agreeing_corners = alike[known][agreeing, 1]
+    if repeats(new.features, agreeing_corners, pairs.xyz_b[agreeing], camera, parameters):
         return "repeated"
     return SamePlace(S_old_new=_between_worlds(S_a_b, old, new), rows=rows)
 
