@@ -86,24 +86,30 @@ def run(
 
 def run_until_killed(
     output: Path,
-    victims: Callable[[Status, Fleet], Sequence[str]] = lambda status, fleet: (),
+    *before: tuple[int, Sequence[str]],
     **options: Any,
 ) -> None:
     """A run all of whose services die with the launcher, past the middle.
 
+    before: who is killed ahead of that, as of ``once_at``.
     So short a run may be over before that is told here: then again.
     """
 
-    def also_all(status: Status, fleet: Fleet) -> Sequence[str]:
-        if status.service == "bundle_adjustment" and status.frame == 22:
-            fleet.give_up()
-            return SERVICES
-        return victims(status, fleet)
+    def attempt() -> None:
+        victims = once_at(*before)
+
+        def also_all(status: Status, fleet: Fleet) -> Sequence[str]:
+            if status.service == "bundle_adjustment" and status.frame == 22:
+                fleet.give_up()
+                return SERVICES
+            return victims(status, fleet)
+
+        run(output, also_all, **options)
 
     for _ in range(_ATTEMPTS):
         shutil.rmtree(output, ignore_errors=True)
         try:
-            run(output, also_all, **options)
+            attempt()
         except ServiceDiedError:
             return
     pytest.fail(f"{_ATTEMPTS} runs were over before they could be killed")
@@ -241,7 +247,7 @@ def test_the_recording_of_a_video_has_all_images_whoever_is_killed(
 ) -> None:
     """The ingest and the recorder, early and late, then all with the launcher, and a resume."""
     when = (1, ("ingest",)), (7, ("recorder",)), (14, ("recorder", "ingest"))
-    run_until_killed(tmp_path / "cut", once_at(*when), request=clip)
+    run_until_killed(tmp_path / "cut", *when, request=clip)
     resumed_config(tmp_path / "cut", clip)
     again = run(tmp_path / "cut", resume=True, request=clip)
     assert again == replayed(tmp_path / "cut", tmp_path / "whole")
@@ -358,11 +364,11 @@ def run_attacked(
     """
     attackers: list[threading.Thread] = []
     failures: list[Exception] = []
-    sent = -1
+    sent, let_go = -1, False
 
     def hold_and_attack(status: Status, fleet: Fleet) -> Sequence[str]:
         nonlocal sent
-        if status.service == "ingest" and (not attackers or attackers[0].is_alive()):
+        if status.service == "ingest" and not let_go:  # a slow attack may see its end, too
             sent = status.frame
         if not attackers and status.service == "tracking" and status.frame >= 4:
             source = fleet.pids["ingest"]
@@ -375,9 +381,11 @@ def run_attacked(
                     failures.append(error)
 
             def hold() -> None:
+                nonlocal let_go
                 while True:
                     attackers[0].join(_HELD_S)
                     watch(fleet)
+                    let_go = True
                     signal_if_there(source, signal.SIGCONT)
                     attackers[0].join(_LET_GO_S)
                     if not attackers[0].is_alive():
