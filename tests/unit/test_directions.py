@@ -3,19 +3,21 @@
 import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
-from test_mapper import run, trajectory_error
+from test_mapper import Published, run, trajectory_error
 from test_whole_map import similarity
 
 from pliant.algorithms.bundle.projection import move_camera
 from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.directions import (
+    at_infinity,
     linearise,
     off_epipolar_line,
     place,
     placed_candidates,
     refine_pose_spread,
 )
+from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 
@@ -233,3 +235,32 @@ def test_directions_move_with_the_map_and_are_where_an_adjustment_leaves_it():
     np.testing.assert_allclose(CAMERA.project(seen(rows)), CAMERA.project(before), atol=0.5)
     scale = np.median(grown(mapped, map_before))
     np.testing.assert_allclose(grown(rows, before), scale, rtol=0.02)
+
+
+def test_a_point_that_an_adjustment_takes_to_infinity_is_a_direction_again():
+    """Of the map that remains every point has a place, and its track tells of turns."""
+    mapper, published = Mapper(CAMERA, MappingParameters(), 0), Published()
+    for frame, tracks in enumerate(Scene.box(death=0.02).frames(sideways(60))):
+        published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+        if frame == 30:
+            points, active = mapper.atlas.points, mapper.atlas.active
+            seen = active.window.current_rows()
+            row = seen[points.state[seen] == MAPPED][0]
+            told = points.ids[row]
+            centre = active.keyframes[-1].T_world_camera[:3, 3]
+            points.xyz[row] = centre + 1e9 * (points.xyz[row] - centre)
+            for keyframe in active.keyframes:
+                T_camera_world = inverse(keyframe.T_world_camera)
+                px = CAMERA.project(transform(T_camera_world, points.xyz[row][None]))
+                keyframe.points_px[keyframe.rows == row] = px
+    assert told not in published.points
+    published.apply(mapper.finish())
+    xyz = np.array([xyz for xyz, _, _ in published.points.values()])
+    assert np.abs(xyz).max() < 1e6
+
+
+def test_a_map_without_points_has_none_at_infinity():
+    far = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 2.0], [3e6, 0.0, 0.0], [np.inf, 0.0, 0.0]])
+    assert at_infinity(far[:3], np.zeros(3)).tolist() == [False, False, True]
+    assert at_infinity(far, np.zeros(3)).tolist()[:2] == [False, False]
+    assert at_infinity(np.zeros((0, 3)), np.zeros(3)).tolist() == []

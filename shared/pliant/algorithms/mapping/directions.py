@@ -47,6 +47,9 @@ _COMMON_PX = 0.1
 _ANY_DEPTH = 10.0
 """Standard deviations of an inverse depth that leave it open: near is far from the prior."""
 
+_ENDLESS = 1e6
+"""Distance, in medians of the map, at which no camera in it can tell a point from a direction."""
+
 _STEPS = 3
 _ITERATIONS = 10
 _MIN_DEPTH = 1e-6
@@ -90,6 +93,19 @@ def _placed(rows: I32, state: U8, spread: F64) -> tuple[I64, int]:
             placed[count] = i
             count += 1
     return placed[:count].copy(), mapped
+
+
+def at_infinity(points_world: F64, centre: F64) -> BoolArray:
+    """(N,) which points of a map are directions after all.
+
+    An adjustment takes a point whose rays part, by noise, behind the infinite: farther away every
+    time, for the step grows with the distance, until its coordinates are no numbers.
+
+    points_world: (N, 3).   centre: (3,) of a camera that is among them.
+    """
+    distances = np.linalg.norm(points_world - centre, axis=1)
+    median = np.median(distances) if len(distances) else 0.0
+    return ~(distances <= _ENDLESS * median)
 
 
 def place(

@@ -14,6 +14,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import moved_px
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.directions import at_infinity
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -108,8 +109,8 @@ def adjust_keyframes(
     brought up to date.  The keyframes' pixels become those of the camera that is found, but for the
     readout.
     known: of the camera, whose pixels the keyframes have.    motions: (M, 6) of the keyframes, see
-    ``Path``.    Returns what is known now, the rows of points that too few keyframes see, and how
-    what hangs on each keyframe moves.
+    ``Path``.    Returns what is known now, the rows of points that too few keyframes see or that
+    are at infinity, and how what hangs on each keyframe moves.
     """
     before = known.view
     seen = list_map(keyframes, points, known, parameters)
@@ -137,7 +138,8 @@ def adjust_keyframes(
     for keyframe in keyframes:
         keyframe.points_px = moved_px(keyframe.points_px + keyframe.rolled_px, before, view)
         keyframe.rolled_px = np.zeros_like(keyframe.points_px)
-    return known, seen.rows[count < 2], moves
+    far = at_infinity(seen.xyz, keyframes[0].T_world_camera[:3, 3])
+    return known, seen.rows[(count < 2) | far], moves
 
 
 def adjust_listed(

@@ -8,7 +8,7 @@ from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.bundle.subspace import solve_subspace
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import move_by_similarity
-from pliant.algorithms.mapping.directions import place
+from pliant.algorithms.mapping.directions import at_infinity, place
 from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import (
     columns_in_state,
@@ -226,7 +226,10 @@ class Window:
             keyframe.T_world_camera = self.T_world_camera[slot]
 
     def remove_outliers(self, outlier_px: float) -> None:
-        """Forget observations that miss their point, and points with too few observations."""
+        """Forget observations that miss their point, and points with too few observations.
+
+        A point that has gone to infinity is a candidate again, too.
+        """
         columns = self.mapped_columns()
         rows = self.rows[columns]
         forget_outliers(
@@ -237,7 +240,8 @@ class Window:
             keyframe.keep(self.seen[slot, self.columns[keyframe.rows]])
         remaining = count_cameras(columns, self.seen, 0, len(self.seen))
         remaining += self.points.base_keyframes[rows]
-        self.points.remove(rows[remaining < 2])
+        far = at_infinity(self.points.xyz[rows], self.keyframes[-1].T_world_camera[:3, 3])
+        self.points.remove(rows[(remaining < 2) | far])
 
     def update_statistics(self) -> None:
         """Keyframes, parallax and uncertainty of the points of the window."""
