@@ -217,3 +217,16 @@ def test_cameras_that_meet_few_others_take_the_same_step_in_any_order():
     assert trial is not None
     change = (trial.points - layout.points)[:, layout.column].T
     np.testing.assert_allclose(change.reshape(-1), expected[6 * 14 :], rtol=2e-3, atol=1e-5)
+
+
+def test_doubled_steps_settle_in_fewer_iterations_where_the_kernel_is_robust():
+    """Where it is not, a step leads to where twice the step leads away from again."""
+    problem = make_scene(cameras=6, points=200, noise_px=0.8, visible=0.8).problem
+    settled = BundleParameters(kernel_sigma_px=2.0, max_iterations=200, min_relative_decrease=1e-9)
+    plain, doubled = solve_schur(problem, settled), solve_schur(problem, settled, doubled=True)
+    assert doubled.final_cost <= plain.final_cost * (1.0 + 1e-6)
+    assert doubled.iterations <= 0.7 * plain.iterations
+    assert (np.diff(doubled.costs) <= 0.0).all()
+    squares = settled.model_copy(update={"kernel_sigma_px": 0.0, "max_iterations": 20})
+    plain, doubled = solve_schur(problem, squares), solve_schur(problem, squares, doubled=True)
+    assert doubled.final_cost == pytest.approx(plain.final_cost, rel=1e-6)

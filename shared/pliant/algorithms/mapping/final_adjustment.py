@@ -162,7 +162,9 @@ def adjust_listed(
     uncertainty = known.prior(parameters.calibration, start) if uncertain else None
     kept = chosen[seen.point] & _spread_out(seen.point, counts, _MOST_SEEN)
     problem = _problem(seen, chosen, kept, known.given)
-    found = solve_schur(problem, bundle, uncertainty=uncertainty, start=start, with_covariance=True)
+    found = solve_schur(
+        problem, bundle, uncertainty=uncertainty, start=start, with_covariance=True, doubled=True
+    )
     seen.xyz[chosen] = found.points_world
     seen.T_world_camera = found.T_world_camera
     return found

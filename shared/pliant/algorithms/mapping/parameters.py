@@ -193,7 +193,7 @@ class WindowParameters(Parameters):
         default=True, description="Adjust all keyframes of a segment when the stream ends"
     )
     final_iterations: int = Field(
-        default=50, ge=1, description="Most iterations of Schur LM at the end of the stream"
+        default=30, ge=1, description="Most iterations of Schur LM at the end of the stream"
     )
     kept_observations: int = Field(
         default=6_000_000,
@@ -231,7 +231,7 @@ class WholeMapParameters(Parameters):
         "core for each of them, so 32 to 48 ms a frame",
     )
     iterations: int = Field(
-        default=20, ge=1, description="Most iterations of Schur LM; the next adjustment goes on"
+        default=12, ge=1, description="Most iterations of Schur LM; the next adjustment goes on"
     )
 
 
