@@ -1,7 +1,8 @@
 """A map that is kept: another session goes on in it, or finds itself in it."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.tracks import FrameExtrema
+from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 from pliant.errors import MapError
 from pliant.map_history import MapHistory
 from pliant.messages import codec
@@ -165,6 +166,34 @@ def test_frames_are_localised_and_nothing_is_mapped(
     error, _ = trajectory_error(published, [np.eye(4), *poses])
     assert error < 3e-3
     assert list(localiser.kept()) == []
+
+
+def test_few_tracks_that_lead_on_need_no_look_at_the_whole_map(
+    place: tuple[Scene, list[np.ndarray]],
+    kept: list[MapKeyframe],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However many points are found again without tracks."""
+    asked: list[int] = []
+    recognise = Localiser.recognise
+
+    def counted(self: Localiser, *args: Any) -> Any:
+        asked.append(1)
+        return recognise(self, *args)
+
+    monkeypatch.setattr(Localiser, "recognise", counted)
+    poses, shots = again(place)
+    localiser = Localiser(CAMERA, PARAMETERS, 0, known=kept)
+    for k, (tracks, grey) in enumerate(shots):
+        few = tracks.ids % 8 == 0
+        all_of = {field.name: getattr(tracks, field.name) for field in fields(FrameTracks)}
+        some = {name: each[few] for name, each in all_of.items() if len(each) == len(few)}
+        seen = replace(tracks, **some)
+        delta = localiser.process(k, k * INTERVAL_NS, seen, grey, None)
+        assert delta.state == TRACKING
+        assert delta.inliers > 5 * len(seen.ids)
+    assert len(shots) == len(poses)
+    assert asked == [1]
 
 
 def test_frames_of_a_rolling_shutter_are_localised_as_if_taken_at_once(

@@ -17,7 +17,7 @@ from pliant.results.judgement import BAD, DOUBTFUL, GOOD, judge, judge_surfels, 
 
 def doubt_of(points, inliers, settled):
     """settled: where tracks are that had time to become points."""
-    return doubt(support_of(points, inliers, settled, CAMERA), SupportParameters())
+    return doubt(support_of(points, inliers, len(points), settled, CAMERA), SupportParameters())
 
 
 def places(count, left=0.0, right=1.0, seed=0):

@@ -53,7 +53,7 @@ _TELLING = 500
 """Points at the least that tell whether a camera stands where it stood."""
 
 _FEW, _FIRM = 0.05, 0.2
-"""Of the points that placed the last frame: where a film is cut, 0.3 to 2 % agree on a pose by
+"""Of the tracks that led to the last frame: where a film is cut, 0.3 to 2 % agree on a pose by
 chance, and 9 % where the views overlap; the fastest turns with blur leave 11 to 20 %."""
 
 _COLUMNS, _LINES = 8, 6
@@ -77,12 +77,14 @@ class Located(NamedTuple):
 class Support:
     """What there is for a pose.
 
-    inliers: points where the pose shows them.   share: of the points seen.   contrary: share of the
+    inliers: points where the pose shows them.   tracked: those that tracks lead on to the next
+    frame.   share: of the points seen.   contrary: share of the
     cells with tracks in which hardly any point is where the pose shows it.   spread: standard
     deviation of the inliers as a share of width or height, whichever is less.
     """
 
     inliers: int
+    tracked: int
     share: float
     contrary: float
     spread: float
@@ -124,8 +126,8 @@ def localise(
         located = _by_tracks(active, predictions, rows, points_px, directions, generator)
         inliers = int(located.inliers.sum())
         if inliers >= limits.min_inliers:
-            if grey is None or inliers >= _FEW * motion.inliers:
-                return Located(located.T_world_camera, inliers >= _FIRM * motion.inliers)
+            if grey is None or inliers >= _FEW * motion.tracked:
+                return Located(located.T_world_camera, inliers >= _FIRM * motion.tracked)
             proved = prove(
                 located.T_world_camera, active.nearby(), points, seen.maxima, grey, active.camera,
                 parameters, parameters.recovery.min_agreement,
@@ -241,7 +243,10 @@ def adjust(
     inliers = errors < parameters.localisation.inlier_px
     telling = _settled(active, motion, tracks)
     telling[_contradicting(active, T_world_camera, tracks.points_px)] = True
-    return T_world_camera, support_of(points_px, inliers, tracks.points_px[telling], camera)
+    tracked = len(rows) - len(found.rows)
+    return T_world_camera, support_of(
+        points_px, inliers, tracked, tracks.points_px[telling], camera
+    )
 
 
 def _settled(active: ActiveMap, motion: Motion, tracks: FrameTracks) -> BoolArray:
@@ -303,10 +308,11 @@ def _spread(active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
 
 
 def support_of(
-    points_px: F32, inliers: BoolArray, telling_px: F32, camera: PinholeCamera
+    points_px: F32, inliers: BoolArray, tracked: int, telling_px: F32, camera: PinholeCamera
 ) -> Support:
-    """points_px: (N, 2) of the points seen, of which ``inliers`` (N,) fit.   telling_px: (M, 2) of
-    the tracks that belong to points if the pose is right, or contradict it.
+    """points_px: (N, 2) of the points seen, of which ``inliers`` (N,) fit.   tracked: so many, the
+    first, have tracks.   telling_px: (M, 2) of the tracks that belong to points if the pose is
+    right, or contradict it.
     """
     count = int(np.count_nonzero(inliers))
     fitting = points_px[inliers]
@@ -316,6 +322,7 @@ def support_of(
     size = np.array([width, height])
     return Support(
         inliers=count,
+        tracked=int(np.count_nonzero(inliers[:tracked])),
         share=count / max(len(points_px), 1),
         contrary=float((supported < _AGAINST * tracks)[telling].mean()) if telling.any() else 0.0,
         spread=float(np.min(fitting.std(axis=0) / size)) if count else 0.0,

@@ -130,13 +130,13 @@ def _cost(T_world_camera: F64, points_world: F64, points_n: F64, gate: float) ->
 class Motion:
     """How the camera moved last: T_world_camera (4, 4) of two frames, the newer one last.
 
-    inliers: points that support the newer one, as far as that is known.
+    tracked: points that support the newer one and have tracks, as far as that is known.
     """
 
     frames: tuple[int, int]
     stamps_ns: tuple[int, int]
     poses: tuple[F64, F64]
-    inliers: int = 0
+    tracked: int = 0
 
     @staticmethod
     def at(frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
@@ -144,13 +144,13 @@ class Motion:
         twice = (T_world_camera, T_world_camera)
         return Motion(frames=(frame, frame), stamps_ns=(stamp_ns, stamp_ns), poses=twice)
 
-    def then(self, frame: int, stamp_ns: int, T_world_camera: F64, inliers: int = 0) -> "Motion":
+    def then(self, frame: int, stamp_ns: int, T_world_camera: F64, tracked: int = 0) -> "Motion":
         """The motion after one more pose."""
         return Motion(
             frames=(self.frames[1], frame),
             stamps_ns=(self.stamps_ns[1], stamp_ns),
             poses=(self.poses[1], T_world_camera),
-            inliers=inliers,
+            tracked=tracked,
         )
 
     def moved(self, S: F64) -> "Motion":

@@ -97,7 +97,7 @@ class Localiser:
             self._motion = Motion.at(frame, stamp_ns, located)
             self._changes.add_same_places([(self._hanging.id, -1)])
         else:
-            self._motion = self._motion.then(frame, stamp_ns, located, support.inliers)
+            self._motion = self._motion.then(frame, stamp_ns, located, support.tracked)
         self._changes.add_pose(frame, self._hanging, located, support.inliers)
         why = doubt(support, self._parameters.support)
         return self._publish(TRACKING, why, support.inliers, looks_anew=looks_anew)
@@ -213,7 +213,9 @@ class Localiser:
         interval_s = 0.0 if self._motion is None else self._motion.interval_s()
         settled = tracks.ages * interval_s >= parameters.support.settled_s
         inliers = errors < parameters.localisation.inlier_px
-        return T_world_camera, support_of(points_px, inliers, tracks.points_px[settled], camera)
+        return T_world_camera, support_of(
+            points_px, inliers, len(linked), tracks.points_px[settled], camera
+        )
 
     def _publish(
         self, state: int, reason: str, inliers: int, *, looks_anew: bool = False

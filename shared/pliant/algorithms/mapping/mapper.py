@@ -180,7 +180,7 @@ class Mapper:
             active.pass_by(frame, T_world_camera, tracks.points_px, found)
         self._place_waiting(active, hanging, T_world_camera)
         self._lost_frames, self._waiting = 0, Waiting()
-        self._motion = self._motion.then(frame, stamp_ns, T_world_camera, support.inliers)
+        self._motion = self._motion.then(frame, stamp_ns, T_world_camera, support.tracked)
         self._add_pose(frame, hanging, T_world_camera, support.inliers)
         if hanging.frame == frame:
             atlas.ask(frame)
@@ -277,7 +277,7 @@ class Mapper:
             frames=(before.frame, newest.frame),
             stamps_ns=(stamps_ns[before.frame], stamps_ns[newest.frame]),
             poses=(before.T_world_camera, newest.T_world_camera),
-            inliers=newest.inliers,
+            tracked=newest.inliers,
         )
         self.follow(self.atlas.begin_to_unroll())
         self._keyframe_ns = waiting.frames[-1].stamp_ns
