@@ -15,6 +15,9 @@ _recording = partial(typer.Option, rich_help_panel="The recording")
 _settings = partial(typer.Option, rich_help_panel="Settings")
 _faults = partial(typer.Option, rich_help_panel="Faults and network")
 
+_LIGHT = "tracking.max_tracks=2000"
+"""A map needs no more; the others make its points denser (docs/results.md, Fewer tracks)."""
+
 
 def run(
     source: Annotated[
@@ -54,6 +57,9 @@ def run(
             "--poses",
             help="Print each pose as it is known: pose FRAME SECONDS tx ty tz qx qy qz qw.",
         ),
+    ] = False,
+    light: Annotated[
+        bool, _everyday("--light", help="A fifth of the tracks, half the CPU: for small computers.")
     ] = False,
     view: Annotated[
         Literal["window", "web"] | None, _everyday(help="Look on in Rerun (pliant view).")
@@ -137,7 +143,7 @@ def run(
 
     pliant run today.mp4 --calibration calib.yaml --map results/yesterday
 
-    pliant run camera:0 --calibration calib.yaml --map results/office --localise
+    pliant run camera:0 --calibration calib.yaml --map results/office --localise --light
 
     pliant run path/to/cloth --profile deformable --camera static
 
@@ -145,9 +151,12 @@ def run(
     """
     from pliant_services.run.command import RunRequest, run_pipeline
 
-    sets = [*(overrides or []), *([f"ingest.mode={mode}"] if mode else [])]
+    sets = [_LIGHT] if light else []
+    sets += [*(overrides or []), *([f"ingest.mode={mode}"] if mode else [])]
     if profile == "rigid" and (camera or depth_frames or depth):
         raise typer.BadParameter("--camera, --depth and --depth-frames need --profile deformable")
+    if light and profile != "rigid":
+        raise typer.BadParameter("--light needs --profile rigid: surfels cost most of the other")
     if sharpest and not every:
         raise typer.BadParameter("--sharpest needs --every: of how many frames?")
     part = {"start_s": start, "end_s": end, "every": every, "longest_side_px": max_size}
