@@ -49,13 +49,14 @@ def test_a_run_goes_on_in_a_map_and_replays(office: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("source", [TINY, f"{TINY}?width=400"])
 def test_a_run_only_localises(source: str, office: Path, tmp_path: Path) -> None:
-    """Also with a larger camera than that of the map."""
-    only = ("--map", office, "--localise", *NO_MESH)
+    """Also with a larger camera than that of the map, and with few of the tracks that it has."""
+    only = ("--map", office, "--localise", "--light", *NO_MESH)
     done = pliant("run", source, *only, "--output", tmp_path / "robot")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "robot" / "report.json").read_text())
     assert report["frames_with_pose"] == report["frames"]
     assert report["keyframes"] == 0
+    assert 1000 < report["median_tracks_per_frame"] <= 2000
     first = read_tum(office / "trajectory.txt").positions
     second = read_tum(tmp_path / "robot" / "trajectory.txt").positions
     assert np.linalg.norm(first - second, axis=1).max() < 0.01
@@ -143,7 +144,8 @@ def test_what_is_no_map_of_use_is_said_before_anything_is_touched(
         done = in_this_process("run", TINY, *arguments, *output)
         assert_one_line(done, why)
         assert not target.exists()
-    for arguments in (("--localise",), ("--map", office, "--profile", "deformable")):
+    deformable = ("--profile", "deformable")
+    for arguments in (("--localise",), ("--map", office, *deformable), ("--light", *deformable)):
         done = in_this_process("run", TINY, *arguments, "--output", target)
         assert done.returncode == 2
     assert (office / "map.pliant").is_file()
