@@ -34,6 +34,7 @@ def run(
     end: float | None = None,
     every: int | None = None,
     sharpest: bool = False,
+    light: bool = False,
     topic: str | None = None,
     max_size: int | None = None,
     mode: Literal["lossless", "live"] | None = None,
@@ -57,10 +58,10 @@ def run(
 
     output: result folder [results/<source>]; force: write into an existing one.    mask: an image
     whose black parts are ignored in all frames, or a folder of them.    start, end: seconds after
-    the first frame; every: one of so many frames; sharpest: of those, not the first.    max_size:
-    pixels along the longer side.    map: of an earlier run, to go on in; localise: only to find
-    the frames in it.    camera, depth, depth_frames: of the deformable profile.    settings: as
-    ``{"tracking.max_tracks": 5000}``.    quiet: print nothing.
+    the first frame; every: one of so many frames; sharpest: of those, not the first.    light: a
+    fifth of the tracks.    max_size: pixels along the longer side.    map: of an earlier run, to go
+    on in; localise: only to find the frames in it.    camera, depth, depth_frames: of the
+    deformable profile.    settings: as ``{"tracking.max_tracks": 5000}``.    quiet: print nothing.
 
     on_frame: called in this thread with each frame's number and its pose (4, 4), as it is known
     then (``result.causal_trajectory``), or None: ``on_frame(12, T_world_camera)``.  The run does
@@ -72,8 +73,9 @@ def run(
     folder = Path("results") / folder_name(str(source)) if output is None else Path(output)
     options: dict[str, object] = {
         "output": folder, "force": force, "calibration": calibration, "fov": fov, "mask": mask,
-        "start": start, "end": end, "every": every, "sharpest": sharpest, "topic": topic,
-        "max-size": max_size, "mode": mode, "map": map, "localise": localise, "profile": profile,
+        "start": start, "end": end, "every": every, "sharpest": sharpest, "light": light,
+        "topic": topic, "max-size": max_size, "mode": mode, "map": map, "localise": localise,
+        "profile": profile,
         "camera": camera, "depth": depth, "depth-frames": depth_frames, "no-images": not images,
         "seed": seed, "poses": on_frame is not None,
     }  # fmt: skip
