@@ -16,7 +16,7 @@ _settings = partial(typer.Option, rich_help_panel="Settings")
 _faults = partial(typer.Option, rich_help_panel="Faults and network")
 
 _LIGHT = "tracking.max_tracks=2000"
-"""A map needs no more; the others make its points denser (docs/results.md, Fewer tracks)."""
+"""What that costs and saves: docs/results.md, Fewer tracks."""
 
 
 def run(
@@ -59,7 +59,10 @@ def run(
         ),
     ] = False,
     light: Annotated[
-        bool, _everyday("--light", help="A fifth of the tracks, half the CPU: for small computers.")
+        bool,
+        _everyday(
+            "--light", help="A fifth of the tracks, less CPU, larger errors: for small computers."
+        ),
     ] = False,
     view: Annotated[
         Literal["window", "web"] | None, _everyday(help="Look on in Rerun (pliant view).")
