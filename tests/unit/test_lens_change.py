@@ -10,13 +10,13 @@ from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.corrected_view import moved_px
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
+from pliant.algorithms.mapping.first_map import WaitingFrame
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.segment import see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.start import WaitingFrame
 from pliant.algorithms.mapping.waiting import Waiting
 
 GIVEN = CalibrationUncertainty()

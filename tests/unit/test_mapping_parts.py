@@ -1,15 +1,12 @@
 """The parts of the mapper, each alone: rows, links, grid, patches, re-acquisition, errors."""
 
-import re
-
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
+from mapping_scene import CAMERA, Scene, looking
 
-from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.mapping.covisibility import missing_rows, near_keyframes, rows_of
 from pliant.algorithms.mapping.localisation import locate, refine
@@ -27,11 +24,9 @@ from pliant.algorithms.mapping.map_store import (
 from pliant.algorithms.mapping.observation_table import forget_outliers, reprojection_errors
 from pliant.algorithms.mapping.parameters import (
     LocalisationParameters,
-    MappingParameters,
     ReacquisitionParameters,
 )
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, cut_patches, reacquire
-from pliant.algorithms.mapping.start import WaitingFrame, find_start
 
 
 def test_rows_are_reused_and_ids_never():
@@ -305,68 +300,3 @@ def test_missing_points_are_mapped_have_no_track_and_wait_after_many_misses():
     assert missing_rows(rows, linked, state, misses, marks, 3).tolist() == [0]
     assert missing_rows(rows, linked, state, misses, marks, 5).tolist() == [0, 3]
     assert missing_rows(rows, linked[1:], state, misses, marks, 6).tolist() == [0, 1]
-
-
-@pytest.mark.parametrize("focal_px", [40.0, 400.0])
-@pytest.mark.parametrize("noise_px", [1.2, 1.6])
-def test_what_is_too_little_is_less_than_enough(focal_px: float, noise_px: float) -> None:
-    """A wide lens makes degrees of a pixel: the reason has the unit of what was decided by."""
-    random = np.random.default_rng(0)
-    camera = PinholeCamera(fx=focal_px, fy=focal_px, cx=320.0, cy=240.0, width=640, height=480)
-    points = random.uniform((20, 20), (620, 460), (300, 2))
-    waiting = [
-        WaitingFrame(
-            frame=frame,
-            stamp_ns=frame * INTERVAL_NS,
-            ids=np.arange(300),
-            points_px=(points + random.normal(0.0, noise_px / 2, points.shape)).astype(np.float32),
-            kappas=np.ones(300, np.float32),
-        )
-        for frame in range(6)
-    ]
-    reason = find_start(waiting, camera, MappingParameters())
-    assert isinstance(reason, str)
-    told = re.fullmatch(r"too little parallax: (\S+) of (\S+) (px beside a turn|deg)", reason)
-    assert told, reason
-    assert float(told[1]) < float(told[2])
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_a_floor_at_the_border_never_starts_with_the_wrong_motion(seed: int) -> None:
-    """Of what two views share all but a few points lie in one plane, in a corner of the image: two
-    motions explain the plane.  A start has the true one, or waits."""
-    random = np.random.default_rng(seed)
-    camera = PinholeCamera(fx=320.0, fy=320.0, cx=320.0, cy=240.0, width=640, height=480)
-    floor = np.column_stack(
-        [random.uniform(3.0, 9.0, 400), np.full(400, 1.5), random.uniform(4.0, 10.0, 400)]
-    )
-    wall = random.uniform((-0.5, -0.8, 1.6), (0.9, 0.8, 2.0), (12, 3))
-    points = np.concatenate([floor, wall])
-    way = np.array([-0.06, 0.02, 0.12])
-    waiting: list[WaitingFrame] = []
-    reason = ""
-    for frame in range(8):
-        seen = points - frame * way
-        px = seen[:, :2] / seen[:, 2:] * camera.fx + (camera.cx, camera.cy)
-        px += random.normal(0.0, 0.15, px.shape)
-        # Half of the wall's tracks slide along its joints.
-        px[-6:, 0] += 6.0 * frame
-        inside = ((px > 0.0) & (px < (camera.width, camera.height))).all(axis=1)
-        ids = np.flatnonzero(inside)
-        waiting.append(
-            WaitingFrame(
-                frame=frame,
-                stamp_ns=frame * INTERVAL_NS,
-                ids=ids,
-                points_px=px[ids].astype(np.float32),
-                kappas=np.ones(len(ids), np.float32),
-            )
-        )
-        start = find_start(waiting, camera, MappingParameters())
-        if not isinstance(start, str):
-            moved = start.T_world_camera[-1, :3, 3]
-            cosine = moved @ way / np.linalg.norm(moved) / np.linalg.norm(way)
-            assert np.degrees(np.arccos(min(cosine, 1.0))) < 10.0
-            return
-        reason = start
-    raise AssertionError(reason)

@@ -243,7 +243,7 @@ def test_frames_with_a_known_readout_are_as_good_as_if_taken_at_once(known, stra
     shaken, _, history, _, _ = known
     _, _, best, _, _ = straight
     reached = shaken.error(history, history.causal)
-    assert reached < 2.0 * shaken.error(best, best.causal)  # unknown it would be 13 times
+    assert reached < 2.5 * shaken.error(best, best.causal)  # unknown it would be 13 times
 
 
 def test_published_is_what_was_seen(known):

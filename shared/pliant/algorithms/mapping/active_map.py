@@ -16,6 +16,7 @@ from pliant.algorithms.mapping.covisibility import (
     near_keyframes,
     rows_of,
 )
+from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.map_store import (
     CANDIDATE,
@@ -29,7 +30,6 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, Reacquired, cut_patches
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.thinning import thin
 from pliant.algorithms.mapping.window import Window
 from pliant.algorithms.tracks import FrameExtrema
@@ -101,12 +101,14 @@ class ActiveMap:
         self.points.segment[rows] = self.segment.id
         self.points.first_keyframe[rows] = self.next_keyframe_id
         self.points.xyz[rows] = start.points_world
+        self.points.kappas[rows] = start.kappas
         self.points.promote(rows)
         self.links.ids, self.links.rows = start.ids, rows
         self.links.follow(newest.ids)
         self._link_new_tracks(newest.points_px)
-        image = colour if colour is not None else grey
-        self._paint(self.links.rows, newest.points_px, None if image is None else MovedImage(image))
+        image = None if grey is None else MovedImage(grey if colour is None else colour)
+        self._paint(rows, start.newest_px, image)
+        self._paint(self.links.rows, newest.points_px, image)
         self.points.kappas[self.links.rows] = newest.kappas
         frames = {frame.frame: frame for frame in waiting}
         for k, number in enumerate(start.frames.tolist()):

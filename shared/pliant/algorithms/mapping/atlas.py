@@ -17,6 +17,7 @@ from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
+from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.kept_map import Origin, keep, spans_of, take_in
 from pliant.algorithms.mapping.known_places import KnownPlaces, Meetings, join
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
@@ -24,7 +25,6 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import Recognised
 from pliant.algorithms.mapping.segment import Moved, Segment, see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_guess
-from pliant.algorithms.mapping.start import Start, WaitingFrame
 from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held
 from pliant.algorithms.places import describe
 

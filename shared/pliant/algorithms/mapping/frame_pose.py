@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
-from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.camera import PinholeCamera, size_unit
 from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.directions import (
@@ -33,7 +33,7 @@ from pliant.algorithms.mapping.localisation import (
     recover,
     refine,
 )
-from pliant.algorithms.mapping.map_store import MAPPED, UNLINKED, Observations
+from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, UNLINKED, Observations
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import SupportParameters
 from pliant.algorithms.mapping.reacquisition import reacquire
@@ -305,6 +305,19 @@ def stand(
 
 def _spread(active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
     return spread_of(active.points, rows, active.keyframes[-1]) if len(directions) else None
+
+
+def keyframe_is_due(active: ActiveMap, age_ns: int) -> bool:
+    """Whether the frame is to become a keyframe.   age_ns: of the last one."""
+    if active.segment.resumes:
+        return True  # the camera has been recognised
+    limits = active.parameters.keyframe
+    least = CANDIDATE if len(directions_of(active)) else MAPPED
+    share, flow = active.window.flow_since_keyframe(least)
+    unit = size_unit(active.camera.width, active.camera.height)
+    if share < limits.min_shared_share or flow > limits.max_flow_px * unit:
+        return True
+    return age_ns > 1e9 * limits.max_s and flow > limits.min_flow_px * unit
 
 
 def support_of(

@@ -11,32 +11,32 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
-from pliant.algorithms.camera import PinholeCamera, size_unit
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.atlas import Atlas
+from pliant.algorithms.mapping.first_map import Start
 from pliant.algorithms.mapping.frame_pose import (
     Located,
     adjust,
     at_once,
     coloured,
-    directions_of,
     doubt,
+    keyframe_is_due,
     localise,
     reacquire_points,
     stand,
 )
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.localisation import Motion
-from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import EarlierPose, refined_poses
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of
-from pliant.algorithms.mapping.start import Start
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses, returned_poses
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
@@ -77,6 +77,7 @@ class Mapper:
         self._keyframe_changes = KeyframeChanges(self.atlas.points, after=last)
         self._waiting = Waiting()
         self._motion = Motion.at(0, 0, np.eye(4))  # in the segment that the camera is in
+        self._images: tuple[U8 | None, U8 | None] = (None, None)  # of the newest frame
         self._lost_frames = 0
         self._keyframe_ns = 0
         self._keyframe_is_new = False
@@ -137,11 +138,12 @@ class Mapper:
         with self._timer("corrected view"):
             tracks = self.calibration.ideal(tracks)
             grey = self.calibration.ideal_image(grey)
+        self._images = (grey, colour)
         seen, rolled = tracks, None
         located = self._locate(frame, stamp_ns, seen, grey)
         active = atlas.active
         if active is None:
-            return self._wait(frame, stamp_ns, tracks, grey, colour)
+            return self._wait(frame, stamp_ns, tracks)
         if located is None:
             return self._lost(active, frame, stamp_ns, seen)
         with self._timer("reacquisition"):
@@ -155,7 +157,7 @@ class Mapper:
         with self._timer("triangulation"):
             active.window.triangulate(self._parameters.point)
         hanging = active.keyframes[-1]
-        self._keyframe_is_new = self._keyframe_is_due(active, stamp_ns)
+        self._keyframe_is_new = keyframe_is_due(active, stamp_ns - self._keyframe_ns)
         if self._keyframe_is_new:
             with self._timer("keyframe"):
                 T_world_camera, turned = stand(active, T_world_camera, found, tracks)
@@ -207,6 +209,7 @@ class Mapper:
 
     def finish(self) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
+        self.start_at_last()
         self.follow(self.atlas.finish())
         for segment, seen_by in self.atlas.everything():
             frames, camera = segment.passed.take_all(), seen_by.view.camera
@@ -240,23 +243,28 @@ class Mapper:
         """Numbers of the frames from which a map may yet start."""
         return [waiting.frame for waiting in self._waiting.frames]
 
-    def _wait(
-        self,
-        frame: int,
-        stamp_ns: int,
-        tracks: FrameExtrema,
-        grey: U8 | None,
-        colour: U8 | None,
-    ) -> MapDelta:
+    def _wait(self, frame: int, stamp_ns: int, tracks: FrameExtrema) -> MapDelta:
         self._waiting = self._waiting.then(frame, stamp_ns, tracks, self._camera, self._parameters)
         with self._timer("start"):
-            found = find_start_of(self._waiting.frames, self.calibration, self._parameters)
+            begun = self._begin_where_possible(self._parameters)
+        if isinstance(begun, str):
+            return self._publish(WAITING, begun, 0)
+        return self._publish(TRACKING, "", begun)
+
+    def start_at_last(self) -> bool:
+        """Begin a map with what there is, since nothing more comes.  Whether there is a map."""
+        if self.atlas.active is None and self._waiting.frames:
+            start = self._parameters.start.model_copy(update={"patient_s": 0.0})
+            self._begin_where_possible(self._parameters.model_copy(update={"start": start}))
+        return self.atlas.active is not None
+
+    def _begin_where_possible(self, parameters: MappingParameters) -> int | str:
+        """The inliers of the newest frame of the map that starts; or why none does."""
+        found = find_start_of(self._waiting.frames, self.calibration, parameters)
         if isinstance(found, str):
-            return self._publish(WAITING, found, 0)
-        with self._timer("start"):
-            colour = self.calibration.ideal_image(colour)
-            inliers = self._begin(*found, grey, colour)
-        return self._publish(TRACKING, "", inliers)
+            return found
+        grey, colour = self._images
+        return self._begin(*found, grey, self.calibration.ideal_image(colour))
 
     def _begin(
         self, start: Start, calibration: SelfCalibration, grey: U8 | None, colour: U8 | None
@@ -361,18 +369,6 @@ class Mapper:
             self.atlas.leave()
             self._lost_frames = 0
         return delta
-
-    def _keyframe_is_due(self, active: ActiveMap, stamp_ns: int) -> bool:
-        if active.segment.resumes:
-            return True  # the camera has been recognised
-        limits = self._parameters.keyframe
-        least = CANDIDATE if len(directions_of(active)) else MAPPED
-        share, flow = active.window.flow_since_keyframe(least)
-        unit = size_unit(self._camera.width, self._camera.height)
-        if share < limits.min_shared_share or flow > limits.max_flow_px * unit:
-            return True
-        late = stamp_ns - self._keyframe_ns > 1e9 * limits.max_s
-        return late and flow > limits.min_flow_px * unit
 
     def _publish(self, state: int, reason: str, inliers: int, snapshot: bool = False) -> MapDelta:
         # Now and then everything active is published, for those who came late.

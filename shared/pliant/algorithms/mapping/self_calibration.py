@@ -21,8 +21,10 @@ from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.start import Start, WaitingFrame, find_start, why_no_start
+from pliant.algorithms.mapping.reaching_back import reach_back
+from pliant.algorithms.mapping.start import find_start, why_no_start
 from pliant.algorithms.tracks import FrameExtrema
 
 _GUESS = 0.05
@@ -219,8 +221,11 @@ def find_start_of(
     """As ``find_start``, and what the start tells of the camera where that is a guess still."""
     if is_guess(parameters.calibration) and not known.next_keyframes:
         return _find_start_of_guess(waiting, known, parameters)
-    found = find_start(waiting, known.view.camera, parameters)
-    return found if isinstance(found, str) else (found, known)
+    camera = known.view.camera
+    found = find_start(waiting, camera, parameters)
+    if isinstance(found, str):
+        return found
+    return reach_back(found, waiting, camera, parameters), known
 
 
 def _find_start_of_guess(

@@ -9,13 +9,10 @@ beginnings merely wait.
 """
 
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64
-from pliant.algorithms.bundle.problem import BundleProblem, shared_intrinsics
-from pliant.algorithms.bundle.schur import solve_schur
+from pliant.algorithms.arrays import F32, F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.epipolar import (
     RelativePose,
@@ -25,6 +22,7 @@ from pliant.algorithms.epipolar import (
     two_view_depths,
 )
 from pliant.algorithms.geometry import inverse
+from pliant.algorithms.mapping.first_map import Start, WaitingFrame, adjusted_start, table_of
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.parameters import MappingParameters, StartParameters
 from pliant.algorithms.triangulation import triangulate
@@ -41,56 +39,11 @@ _NOISE_PX = 1.0
 _MIN_FRAMES = 3
 """Frames that a start needs: a point of two frames always agrees with some depth."""
 
-_ADJUSTMENTS = 3
-"""Rounds of adjusting and removing outliers."""
-
 _AS_GOOD = 1.3
 """Times the least misfit: a motion with less has not been ruled out."""
 
 _ONE_WAY = float(np.cos(0.1))
 """Cosine of the angle between translations that count as the same."""
-
-_LEAST_WAITING = 12
-"""Frames that wait for a start however old they are: a time lapse has no more."""
-
-
-class Stamped(Protocol):
-    """A frame and when it was taken."""
-
-    @property
-    def stamp_ns(self) -> int: ...
-
-
-_F = TypeVar("_F", bound=Stamped)
-
-
-@dataclass(frozen=True, kw_only=True)
-class WaitingFrame:
-    """What is kept of a frame until the map starts."""
-
-    frame: int
-    stamp_ns: int
-    ids: I64
-    points_px: F32
-    kappas: F32
-
-
-@dataclass(frozen=True, kw_only=True)
-class Start:
-    """A first map.  The world is the camera of the first keyframe; the median depth in it is 1.
-
-    frames: (K,) frame numbers of the keyframes, ascending.   T_world_camera: (K, 4, 4).
-    ids: (N,) track of each point, ascending.   points_world: (N, 3).
-    keyframe_index, point_index, points_px: (O,) observations that support the points.
-    """
-
-    frames: I64
-    T_world_camera: F64
-    ids: I64
-    points_world: F64
-    keyframe_index: I32
-    point_index: I32
-    points_px: F32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,13 +55,6 @@ class _Pair:
     indices_newest: I64
     residual_px: float
     flow_px: float
-
-
-def keep_waiting(waiting: list[_F], newest: _F, parameters: StartParameters) -> list[_F]:
-    """The waiting frames without those that are too old, and the newest one."""
-    oldest_ns = newest.stamp_ns - 1e9 * parameters.max_s
-    young = [frame for frame in waiting if frame.stamp_ns > oldest_ns]
-    return [*max(young, waiting[1 - _LEAST_WAITING :], key=len), newest]
 
 
 def find_start(
@@ -131,8 +77,9 @@ def find_start(
         return reason
     # The more parallax the better; shared tracks count less, for there are many.
     pairs.sort(key=lambda pair: -pair.residual_px * len(pair.indices_newest) ** 0.5)
+    least_deg = _least_parallax_deg(waiting, start)
     for pair in pairs[:2]:
-        found = _start_from(pair, waiting, camera, parameters, motions)
+        found = _start_from(pair, waiting, camera, parameters, motions, least_deg)
         if not isinstance(found, str):
             return found
         reason = reason or found
@@ -212,6 +159,7 @@ def _start_from(
     camera: PinholeCamera,
     parameters: MappingParameters,
     motions: int | None,
+    least_deg: float,
 ) -> Start | str:
     start = parameters.start
     a = _normalise(camera, waiting[pair.reference].points_px[pair.indices_reference])
@@ -219,26 +167,26 @@ def _start_from(
     tried = relative_poses(a, b, gate=start.epipolar_gate_px / camera.fx)
     if not tried:
         return "no essential matrix fits the tracks"
-    reason = _why_not_with(tried[0], start)
+    reason = _why_not_with(tried[0], start, least_deg)
     if reason:
         return reason  # parallax that a worse motion sees is its mistake
     shared = waiting[-1].ids[pair.indices_newest]
-    found: list[tuple[float, Start]] = []
+    found: list[tuple[float, Start, RelativePose]] = []
     for two_views in tried[:motions]:
-        each = _why_not_with(two_views, start) or _reconstruct(
+        each = _why_not_with(two_views, start, start.min_parallax_deg) or _reconstruct(
             pair, two_views, waiting, camera, parameters
         )
         if isinstance(each, str):
             reason = reason or each
             continue
-        found.append((_misfit(each, shared, waiting, camera, parameters), each))
+        found.append((_misfit(each, shared, waiting, camera, parameters), each, two_views))
     if not found:
         return reason
-    least, best = min(found, key=lambda each: each[0])
-    for misfit, other in found:
+    least, best, two_views = min(found, key=lambda each: each[0])
+    for misfit, other, _ in found:
         if misfit < _AS_GOOD * least and not _agree(best, other):
             return "two motions explain the tracks alike"
-    return best
+    return _why_not_with(two_views, start, least_deg) or best
 
 
 def _agree(a: Start, b: Start) -> bool:
@@ -247,13 +195,20 @@ def _agree(a: Start, b: Start) -> bool:
     return bool(ways[0] @ ways[1] > _ONE_WAY * np.prod(np.linalg.norm(ways, axis=1)))
 
 
-def _why_not_with(two_views: RelativePose, start: StartParameters) -> str:
+def _least_parallax_deg(waiting: list[WaitingFrame], start: StartParameters) -> float:
+    """Under little parallax a start takes noise, and the readout of a rolling shutter, for shape;
+    but where tracks end soon there is never more."""
+    waited_s = 1e-9 * (waiting[-1].stamp_ns - waiting[0].stamp_ns)
+    return start.parallax_deg if waited_s < start.patient_s else start.min_parallax_deg
+
+
+def _why_not_with(two_views: RelativePose, start: StartParameters, least_deg: float) -> str:
     share = float(two_views.inliers.mean())
     if share < start.min_inlier_share:
         return f"too few tracks agree with one motion: {share:.0%} of {start.min_inlier_share:.0%}"
     parallax = float(np.degrees(np.median(two_views.parallax_rad[two_views.inliers])))
-    if parallax < start.min_parallax_deg:
-        return _too_little(parallax, start.min_parallax_deg, "deg")
+    if parallax < least_deg:
+        return _too_little(parallax, least_deg, "deg")
     return ""
 
 
@@ -267,11 +222,7 @@ def _misfit(
     """Mean of Geman-McClure's kernel over tracks under the poses of a start, whether it has them as
     points or not: a wrong motion leaves out what tells against it."""
     chosen = [frame for frame in waiting if frame.frame in start.frames]
-    frames, columns, points_px = _observations(chosen, ids)
-    u, v = np.zeros((2, len(chosen), len(ids)), np.float32)
-    seen = np.zeros(u.shape, np.bool_)
-    u[frames, columns], v[frames, columns] = points_px.T
-    seen[frames, columns] = True
+    u, v, seen = table_of(chosen, ids)
     every = np.arange(len(ids))
     errors = triangulate(start.T_world_camera, u, v, seen, every, camera)[1].astype(np.float64)
     return float(np.mean(1.0 - 1.0 / (1.0 + (errors / parameters.bundle.kernel_sigma_px) ** 2)))
@@ -310,72 +261,4 @@ def _reconstruct(
             parameters.localisation,
         )  # fmt: skip
         T_world_camera[k] = located.T_world_camera
-    scale = 1.0 / float(np.median(points[:, 2]))
-    points *= scale
-    T_world_camera[:, :3, 3] *= scale
-    return _adjust(chosen, T_world_camera, ids, points, camera, parameters)
-
-
-def _observations(chosen: list[WaitingFrame], ids: I64) -> tuple[I32, I32, F32]:
-    keyframe_index: list[I32] = []
-    point_index: list[I32] = []
-    points_px: list[F32] = []
-    for k, frame in enumerate(chosen):
-        _, i, j = np.intersect1d(frame.ids, ids, assume_unique=True, return_indices=True)
-        keyframe_index.append(np.full(len(i), k, np.int32))
-        point_index.append(j.astype(np.int32))
-        points_px.append(frame.points_px[i])
-    return np.concatenate(keyframe_index), np.concatenate(point_index), np.concatenate(points_px)
-
-
-def _adjust(
-    chosen: list[WaitingFrame],
-    T_world_camera: F64,
-    ids: I64,
-    points: F64,
-    camera: PinholeCamera,
-    parameters: MappingParameters,
-) -> Start | str:
-    start = parameters.start
-    order = np.argsort(ids, kind="stable")
-    ids, points = ids[order], points[order]
-    keyframe_index, point_index, points_px = _observations(chosen, ids)
-    fixed = np.zeros(len(chosen), np.bool_)
-    fixed[0] = True
-    median = np.inf
-    for _ in range(_ADJUSTMENTS):
-        problem = BundleProblem(
-            T_world_camera=T_world_camera,
-            points_world=points,
-            camera_index=keyframe_index,
-            point_index=point_index,
-            points_px=points_px,
-            intrinsics=shared_intrinsics(camera, len(chosen)),
-            fixed_cameras=fixed,
-        )
-        result = solve_schur(problem, parameters.bundle)
-        T_world_camera = result.T_world_camera
-        error = np.sqrt(result.squared_residuals)
-        median = float(np.median(error))
-        keep = error < parameters.window.outlier_px
-        # A point needs three frames: two always agree with some depth.
-        seen = np.bincount(point_index[keep], minlength=len(ids))
-        stays = seen >= 3
-        keep &= stays[point_index]
-        renumber = np.cumsum(stays) - 1
-        ids, points = ids[stays], result.points_world[stays]
-        keyframe_index, points_px = keyframe_index[keep], points_px[keep]
-        point_index = renumber[point_index[keep]].astype(np.int32)
-        if len(ids) < start.min_points:
-            return f"too few points: {len(ids)} of {start.min_points}"
-    if median > start.max_median_error_px:
-        return f"no consistent start: error {median:.1f} of {start.max_median_error_px:.1f} px"
-    return Start(
-        frames=np.array([frame.frame for frame in chosen]),
-        T_world_camera=T_world_camera,
-        ids=ids,
-        points_world=points,
-        keyframe_index=keyframe_index,
-        point_index=point_index,
-        points_px=points_px,
-    )
+    return adjusted_start(chosen, T_world_camera, ids, points, camera, parameters)

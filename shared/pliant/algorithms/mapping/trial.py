@@ -16,12 +16,12 @@ from pliant.algorithms.arrays import U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDelta
+from pliant.algorithms.mapping.first_map import keep_waiting
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import is_guess, widened
-from pliant.algorithms.mapping.start import keep_waiting
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracks import FrameExtrema
@@ -117,7 +117,8 @@ class TrialMapper:
 
     def finish(self) -> MapDelta:
         """As ``Mapper.finish``; a trial that lasts until then ends with it."""
-        begun = self._begin(no_stages) if self._on_trial and self._first is not None else None
+        begins = self._on_trial and (self._first is not None or self._mapper.start_at_last())
+        begun = self._begin(no_stages) if begins else None
         final = self._mapper.finish()
         return final if begun is None else _joined([begun, final])
 

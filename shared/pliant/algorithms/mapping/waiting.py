@@ -14,11 +14,11 @@ from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.epipolar import rotation_between
+from pliant.algorithms.mapping.first_map import Start, WaitingFrame, keep_waiting
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.parameters import LocalisationParameters, MappingParameters
 from pliant.algorithms.mapping.passing import EarlierPose
-from pliant.algorithms.mapping.start import Start, WaitingFrame, keep_waiting
 from pliant.algorithms.tracks import FrameTracks
 
 _SAMPLE = 400

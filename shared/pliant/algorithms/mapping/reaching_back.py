@@ -1,0 +1,87 @@
+"""A start reaches back to the frames before it, which saw too little of what it is made of.
+
+Two frames with enough parallax may come long after the first, and share few tracks with it.  So the
+frames before are placed one by one, the newest first, by the points that are known and by those
+that the ones already placed tell of.  Some become keyframes, and all are adjusted together.
+"""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.mapping.first_map import Start, WaitingFrame, adjusted_start, table_of
+from pliant.algorithms.mapping.localisation import refine
+from pliant.algorithms.mapping.parameters import MappingParameters, PointParameters
+from pliant.algorithms.triangulation import triangulate
+
+_OVERLAP = 0.7
+"""Where fewer of the tracks that a frame shares with the next are points, as a share, more are
+looked for; and where it has fewer of those of the last keyframe, it becomes one."""
+
+_VIEWS = 8
+"""Frames from which points are found at the most, spread over all that are placed."""
+
+
+def reach_back(
+    start: Start,
+    waiting: list[WaitingFrame],
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+) -> Start:
+    """The start with what can be placed of the frames that waited longer than it takes."""
+    limits = parameters.localisation
+    frames = {each.frame: each for each in waiting}
+    poses = zip(start.frames.tolist(), start.T_world_camera, strict=True)
+    keyframes = [(frames[frame], T) for frame, T in poses][::-1]
+    placed, known = list(keyframes), (start.ids, start.points_world)
+    for frame in reversed([each for each in waiting if each.frame < start.frames[0]]):
+        newer, T_world_camera = placed[-1]
+        shared = np.intersect1d(frame.ids, newer.ids, assume_unique=True)
+        if len(shared) < limits.min_inliers:
+            break
+        if np.isin(shared, known[0], assume_unique=True).mean() < _OVERLAP:
+            known = _more_points(*known, shared, placed, camera, parameters.point)
+        _, i, j = np.intersect1d(frame.ids, known[0], assume_unique=True, return_indices=True)
+        if len(i) < limits.min_inliers:
+            break
+        located = refine(T_world_camera, known[1][j], frame.points_px[i], camera, limits)
+        if located.inliers.sum() < limits.min_inliers:
+            break
+        placed.append((frame, located.T_world_camera))
+        last = keyframes[-1][0]
+        if np.isin(last.ids, frame.ids, assume_unique=True).mean() < _OVERLAP:
+            keyframes.append(placed[-1])
+    if len(known[0]) == len(start.ids):
+        return start
+    if keyframes[-1] is not placed[-1]:
+        keyframes.append(placed[-1])
+    first = inverse(placed[-1][1])
+    chosen = [frame for frame, _ in keyframes[::-1]]
+    T_world_camera = first @ np.stack([T for _, T in keyframes[::-1]])
+    points_world = transform(first, known[1])
+    reached = adjusted_start(chosen, T_world_camera, known[0], points_world, camera, parameters)
+    return start if isinstance(reached, str) else reached
+
+
+def _more_points(
+    ids: I64,
+    points_world: F64,
+    shared: I64,
+    placed: list[tuple[WaitingFrame, F64]],
+    camera: PinholeCamera,
+    parameters: PointParameters,
+) -> tuple[I64, F64]:
+    """With those of the tracks in ``shared`` that the frames which are placed tell of."""
+    spread = np.linspace(0, len(placed) - 1, min(len(placed), _VIEWS))
+    views = [placed[i] for i in np.unique(np.round(spread).astype(int)).tolist()]
+    other = np.setdiff1d(shared, ids, assume_unique=True)
+    u, v, seen = table_of([frame for frame, _ in views], other)
+    several = np.flatnonzero(seen.sum(axis=0) >= parameters.min_observations)
+    poses = np.stack([T for _, T in views])
+    xyz, errors, parallax, _ = triangulate(poses, u, v, seen, several, camera)
+    good = errors < parameters.max_error_px
+    good &= parallax > np.radians(parameters.min_parallax_deg)
+    ids = np.concatenate([ids, other[several[good]]])
+    order = np.argsort(ids, kind="stable")
+    return ids[order], np.concatenate([points_world, xyz[good]])[order]

@@ -1,0 +1,162 @@
+"""How a map starts: the motion of two views, when it waits, and how far back it reaches."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mapping_scene import INTERVAL_NS
+
+from pliant.algorithms.arrays import F64, BoolArray
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.mapping.first_map import Start, WaitingFrame
+from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.reaching_back import reach_back
+from pliant.algorithms.mapping.start import find_start
+
+CAMERA = PinholeCamera(fx=400.0, fy=400.0, cx=320.0, cy=240.0, width=640, height=480)
+
+
+def frame_of(
+    frame: int, points: F64, centre: F64, alive: BoolArray, noise_px: float
+) -> WaitingFrame:
+    """What a camera at ``centre`` that looks along z sees of the points with living tracks."""
+    seen = points - centre
+    px = CAMERA.project(seen) + np.random.default_rng(frame).normal(0.0, noise_px, (len(seen), 2))
+    inside = ((px > 0.0) & (px < (CAMERA.width, CAMERA.height))).all(axis=1)
+    ids = np.flatnonzero(inside & alive)
+    return WaitingFrame(
+        frame=frame,
+        stamp_ns=frame * INTERVAL_NS,
+        ids=ids,
+        points_px=px[ids].astype(np.float32),
+        kappas=(0.5 * ids).astype(np.float32),
+    )
+
+
+def ride(frames: int, step_m: float, life: int) -> tuple[F64, list[WaitingFrame]]:
+    """A camera that looks at a wall and goes along it; its tracks live for so many frames.
+
+    Returns where it was (F, 3), and the frames.
+    """
+    random = np.random.default_rng(0)
+    points = random.uniform((-4.0, -1.5, 2.5), (4.0, 1.5, 4.0), (12_000, 3))
+    born = random.integers(-life, frames, len(points))
+    centres = np.arange(frames)[:, None] * np.array([step_m, 0.0, 0.0])
+    waiting = [
+        frame_of(k, points, centres[k], (born <= k) & (k < born + life), 0.1) for k in range(frames)
+    ]
+    return centres.astype(np.float64), waiting
+
+
+def started(waiting: list[WaitingFrame]) -> Start:
+    start = find_start(waiting, CAMERA, MappingParameters())
+    assert isinstance(start, Start), start
+    return start
+
+
+@pytest.mark.parametrize("focal_px", [40.0, 400.0])
+@pytest.mark.parametrize("noise_px", [1.2, 1.6])
+def test_what_is_too_little_is_less_than_enough(focal_px: float, noise_px: float) -> None:
+    """A wide lens makes degrees of a pixel: the reason has the unit of what was decided by."""
+    random = np.random.default_rng(0)
+    camera = PinholeCamera(fx=focal_px, fy=focal_px, cx=320.0, cy=240.0, width=640, height=480)
+    points = random.uniform((20, 20), (620, 460), (300, 2))
+    waiting = [
+        WaitingFrame(
+            frame=frame,
+            stamp_ns=frame * INTERVAL_NS,
+            ids=np.arange(300),
+            points_px=(points + random.normal(0.0, noise_px / 2, points.shape)).astype(np.float32),
+            kappas=np.ones(300, np.float32),
+        )
+        for frame in range(6)
+    ]
+    reason = find_start(waiting, camera, MappingParameters())
+    assert isinstance(reason, str)
+    told = re.fullmatch(r"too little parallax: (\S+) of (\S+) (px beside a turn|deg)", reason)
+    assert told, reason
+    assert float(told[1]) < float(told[2])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_floor_at_the_border_never_starts_with_the_wrong_motion(seed: int) -> None:
+    """Of what two views share all but a few points lie in one plane, in a corner of the image: two
+    motions explain the plane.  A start has the true one, or waits."""
+    random = np.random.default_rng(seed)
+    camera = PinholeCamera(fx=320.0, fy=320.0, cx=320.0, cy=240.0, width=640, height=480)
+    floor = np.column_stack(
+        [random.uniform(3.0, 9.0, 400), np.full(400, 1.5), random.uniform(4.0, 10.0, 400)]
+    )
+    wall = random.uniform((-0.5, -0.8, 1.6), (0.9, 0.8, 2.0), (12, 3))
+    points = np.concatenate([floor, wall])
+    way = np.array([-0.03, 0.01, 0.06])
+    waiting: list[WaitingFrame] = []
+    reason = ""
+    for frame in range(20):
+        seen = points - frame * way
+        px = seen[:, :2] / seen[:, 2:] * camera.fx + (camera.cx, camera.cy)
+        px += random.normal(0.0, 0.15, px.shape)
+        # Half of the wall's tracks slide along its joints.
+        px[-6:, 0] += 3.0 * frame
+        inside = ((px > 0.0) & (px < (camera.width, camera.height))).all(axis=1)
+        ids = np.flatnonzero(inside)
+        waiting.append(
+            WaitingFrame(
+                frame=frame,
+                stamp_ns=frame * INTERVAL_NS,
+                ids=ids,
+                points_px=px[ids].astype(np.float32),
+                kappas=np.ones(len(ids), np.float32),
+            )
+        )
+        start = find_start(waiting, camera, MappingParameters())
+        if not isinstance(start, str):
+            moved = start.T_world_camera[-1, :3, 3]
+            cosine = moved @ way / np.linalg.norm(moved) / np.linalg.norm(way)
+            assert np.degrees(np.arccos(min(cosine, 1.0))) < 10.0
+            return
+        reason = start
+    raise AssertionError(reason)
+
+
+@pytest.mark.parametrize("total_m", [0.1, 0.4])
+def test_it_waits_for_more_parallax_but_not_for_long(total_m: float) -> None:
+    """1.7 degrees in a second and no more are enough in the end; 7 degrees are there before."""
+    parameters = MappingParameters()
+    second = round(1e9 / INTERVAL_NS)
+    _, waiting = ride(second + 2, total_m / second, life=1000)
+    found = [
+        not isinstance(find_start(waiting[:k], CAMERA, parameters), str)
+        for k in range(2, len(waiting) + 1)
+    ]
+    assert found[-1]
+    first = 2 + found.index(True)
+    assert (first - 1 >= second) == (total_m < 0.2)
+
+
+def test_it_reaches_back_to_frames_whose_tracks_have_ended() -> None:
+    centres, waiting = ride(24, 0.06, life=8)
+    start = started(waiting[-8:])
+    assert len(np.intersect1d(waiting[0].ids, start.ids)) == 0
+    reached = reach_back(start, waiting, CAMERA, MappingParameters())
+    assert reached.frames[0] == 0
+    assert reached.frames[-1] == start.frames[-1]
+    moved = reached.T_world_camera[:, :3, 3] - reached.T_world_camera[0, :3, 3]
+    scale = moved[-1, 0] / centres[-1, 0]
+    np.testing.assert_allclose(moved / scale, centres[reached.frames], atol=0.02)
+    np.testing.assert_allclose(reached.T_world_camera[0], np.eye(4), atol=1e-12)
+    assert len(np.intersect1d(waiting[0].ids, reached.ids)) > 100
+    np.testing.assert_array_equal(reached.kappas, 0.5 * reached.ids)
+    assert (reached.newest_px >= 0.0).all()
+    assert (reached.newest_px <= (CAMERA.width - 1, CAMERA.height - 1)).all()
+
+
+def test_it_reaches_no_further_than_tracks_lead() -> None:
+    _, waiting = ride(24, 0.06, life=8)
+    start = started(waiting[-8:])
+    for broken in (2, 15):
+        dark = replace(waiting[broken], ids=waiting[broken].ids[:0])
+        cut = [dark if each.frame == broken else each for each in waiting]
+        reached = reach_back(start, cut, CAMERA, MappingParameters())
+        assert reached.frames[0] == broken + 1
