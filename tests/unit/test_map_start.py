@@ -12,6 +12,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reaching_back import reach_back
+from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, widened
 from pliant.algorithms.mapping.start import find_start
 
 CAMERA = PinholeCamera(fx=400.0, fy=400.0, cx=320.0, cy=240.0, width=640, height=480)
@@ -133,6 +134,15 @@ def test_it_waits_for_more_parallax_but_not_for_long(total_m: float) -> None:
     assert found[-1]
     first = 2 + found.index(True)
     assert (first - 1 >= second) == (total_m < 0.2)
+
+
+def test_under_a_guessed_focal_length_it_does_not_wait() -> None:
+    """The farther the camera has moved, the fewer tracks agree with a wrong one."""
+    _, waiting = ride(8, 0.023, life=1000)
+    assert str(find_start(waiting, CAMERA, MappingParameters())).startswith("too little parallax")
+    guess = widened(MappingParameters(), 0.3)
+    known = SelfCalibration.of(CAMERA, guess.calibration)
+    assert not isinstance(find_start_of(waiting, known, guess), str)
 
 
 def test_it_reaches_back_to_frames_whose_tracks_have_ended() -> None:

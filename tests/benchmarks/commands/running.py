@@ -43,6 +43,22 @@ def in_process(
     show(measure(sources, overrides or [], range(seed, seed + seeds), focal))
 
 
+@app.command("map-starts")
+def map_starts(
+    sources: Sources,
+    overrides: Overrides = None,
+    starts: Annotated[int, typer.Option(min=1, help="Places where a map begins.")] = 16,
+    following: Annotated[int, typer.Option(min=2, help="Frames after that.")] = 30,
+) -> None:
+    """Maps begun at many places of a source: how far off they are soon after.
+
+    scripts/bench map-starts path/to/tum_fr1_xyz --starts 32
+    """
+    from benchmarks.map_starts import measure
+
+    show(measure(sources, overrides or [], starts, following))
+
+
 @app.command()
 def losses(
     source: Source = "built-in:room",

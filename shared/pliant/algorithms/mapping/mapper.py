@@ -37,6 +37,7 @@ from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of
+from pliant.algorithms.mapping.start import impatient
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses, returned_poses
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
@@ -254,8 +255,7 @@ class Mapper:
     def start_at_last(self) -> bool:
         """Begin a map with what there is, since nothing more comes.  Whether there is a map."""
         if self.atlas.active is None and self._waiting.frames:
-            start = self._parameters.start.model_copy(update={"patient_s": 0.0})
-            self._begin_where_possible(self._parameters.model_copy(update={"start": start}))
+            self._begin_where_possible(impatient(self._parameters))
         return self.atlas.active is not None
 
     def _begin_where_possible(self, parameters: MappingParameters) -> int | str:

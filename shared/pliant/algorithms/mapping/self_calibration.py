@@ -24,7 +24,7 @@ from pliant.algorithms.map_delta import MapDelta
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reaching_back import reach_back
-from pliant.algorithms.mapping.start import find_start, why_no_start
+from pliant.algorithms.mapping.start import find_start, impatient, why_no_start
 from pliant.algorithms.tracks import FrameExtrema
 
 _GUESS = 0.05
@@ -236,7 +236,8 @@ def _find_start_of_guess(
     Where any of the focal lengths explains the flow by a turn alone or finds too little parallax,
     it waits: a wrong one sees parallax in every turn.  Only the motion that two views fit best is
     asked for: a wrong focal length bends all until they are alike, and the map begins anew with the
-    right one (``trial.py``), which compares them.
+    right one (``trial.py``), which compares them and waits for more parallax: the farther the
+    camera has moved, the fewer tracks agree with a wrong one.
     """
     sigma = parameters.calibration.focal
     tried = [known.correction + k * sigma * np.eye(6)[0] for k in _HYPOTHESES]
@@ -246,7 +247,7 @@ def _find_start_of_guess(
         return next(filter(None, reasons))
     best: tuple[float, Start, F64] | None = None
     for correction, camera in zip(tried, cameras, strict=True):
-        found = find_start(waiting, camera, parameters, motions=1)
+        found = find_start(waiting, camera, impatient(parameters), motions=1)
         if isinstance(found, str):
             return found
         refined = _refine(found, camera, parameters)

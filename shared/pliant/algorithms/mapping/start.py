@@ -86,6 +86,12 @@ def find_start(
     return reason
 
 
+def impatient(parameters: MappingParameters) -> MappingParameters:
+    """With these a map starts as soon as it can."""
+    start = parameters.start.model_copy(update={"patient_s": 0.0})
+    return parameters.model_copy(update={"start": start})
+
+
 def why_no_start(
     waiting: list[WaitingFrame], camera: PinholeCamera, parameters: MappingParameters
 ) -> str:
