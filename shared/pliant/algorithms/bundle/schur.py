@@ -103,12 +103,18 @@ def solve_schur(
 
 @dataclass(frozen=True)
 class State:
-    """Cameras (M, 12), points (3, P), a calibration (SHARED,) and the cost, px^2."""
+    """Cameras and observations under a calibration (SHARED,), points (3, P) and the cost, px^2."""
 
-    motion: F64
+    cameras: Cameras
+    slots: Slots
     points: F64
     calibration: F64
     cost: float
+
+    @property
+    def motion(self) -> F64:
+        """(M, 12) of the cameras."""
+        return self.cameras.motion
 
 
 def _iterate(
@@ -164,7 +170,7 @@ class SchurSystem:
         self.at: State | None = None
         self.normal = np.empty((M, 27))
         self.shared = no_shared_blocks()
-        self._records = np.empty((len(layout.places.camera) + 1, RECORD))
+        self._records = _records_for(len(layout.places.camera))
         self._factors = np.empty((layout.points.shape[1], FACTOR))
         self._S = np.empty((len(self.pattern.row), 36))
         self._scratch = scratch_for(M)
@@ -176,19 +182,22 @@ class SchurSystem:
 
     def state(self, motion: F64, points: F64, q: F64) -> State:
         """The state of given cameras, points and calibration."""
-        cameras, slots = self._seen_by(motion, q)
+        cameras, slots = self.layout.cameras, self.layout.slots
+        if self.calibration is not None:
+            cameras, slots = self.calibration.at(q)
+        cameras = cameras._replace(motion=motion)
         cost = cost_of_observations(cameras, points, slots, self.limits)
         if self.calibration is not None:
             cost += self.calibration.prior_cost(q)
-        return State(motion, points, q, cost)
+        return State(cameras, slots, points, q, cost)
 
     def linearise(self, state: State) -> None:
         """Bring all that no damping changes to a state."""
         if state is self.at:
             return
-        cameras, slots = self._seen_by(state.motion, state.calibration)
+        cameras = state.cameras
         linearise_observations(
-            cameras, state.points, slots, self.limits, self._records, self.normal
+            cameras, state.points, state.slots, self.limits, self._records, self.normal
         )  # fmt: skip
         if self.calibration is not None:
             self.shared = self.calibration.linearise(cameras, self._records, state.calibration)
@@ -268,22 +277,22 @@ class SchurSystem:
         """What ``linearise`` has found of a state."""
         return Linearised(self._records, self.shared.points, self.layout.places, state.motion)
 
-    def _seen_by(self, motion: F64, q: F64) -> tuple[Cameras, Slots]:
-        """Cameras and observations of a state."""
-        cameras, slots = self.layout.cameras, self.layout.slots
-        if self.calibration is not None:
-            cameras, slots = self.calibration.at(q)
-        return cameras._replace(motion=motion), slots
-
     def squared_residuals(self, state: State) -> F32:
         """px^2 of the observations of a ``BundleProblem``; inf where left out, or behind."""
         if not self.layout.place.size:
             return np.zeros(0, np.float32)
-        cameras, slots = self._seen_by(state.motion, state.calibration)
         squared = np.full(len(self._records), np.inf, np.float32)
-        squared_residuals(cameras, state.points, slots, self.limits, squared)
+        squared_residuals(state.cameras, state.points, state.slots, self.limits, squared)
         squared[-1] = np.inf
         return squared[self.layout.place]
+
+
+def _records_for(observations: int) -> F64:
+    """Room for the records of so many observations and a dump, each in a cache line of its own:
+    they are written in the order of cameras and read in that of points."""
+    room = np.empty((observations + 2) * RECORD)
+    skipped = -(room.ctypes.data // room.itemsize) % RECORD
+    return room[skipped : skipped + (observations + 1) * RECORD].reshape(-1, RECORD)
 
 
 @kernel
