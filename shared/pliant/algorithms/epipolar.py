@@ -5,6 +5,7 @@ views is unknown.  Points are on the plane z = 1, so errors are in units of the 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import cv2
@@ -26,19 +27,30 @@ class RelativePose:
 
     T_b_a: (4, 4), translation of length 1.  inliers: (N,) points that agree and lie before both
     cameras.  misfit: mean of Geman-McClure's kernel, at the gate's scale, over all points.
-    parallax_rad: (N,) angle between the two rays of each point.
+    rays_a, rays_b: (N, 3) of the points.
     """
 
     T_b_a: F64
     inliers: BoolArray
     misfit: float
-    parallax_rad: F64
+    rays_a: F64
+    rays_b: F64
+
+    @cached_property
+    def parallax_rad(self) -> F64:
+        """(N,) angle between the two rays of each point: of most motions nobody asks for it."""
+        return parallax(self.T_b_a, self.rays_a, self.rays_b)
 
 
 def rays(points_n: F64) -> F64:
     """(N, 2) points on the plane z = 1 to (N, 3) unit rays."""
-    homogeneous = np.column_stack([points_n, np.ones(len(points_n))])
+    homogeneous = _homogeneous(points_n)
     return homogeneous / np.linalg.norm(homogeneous, axis=1, keepdims=True)
+
+
+def _homogeneous(points_n: F64) -> F64:
+    """(N, 2) points on the plane z = 1 to (N, 3)."""
+    return np.column_stack([points_n, np.ones(len(points_n))])
 
 
 def rotation_between(points_a: F64, points_b: F64, *, scale: float) -> tuple[F64, F64]:
@@ -80,7 +92,9 @@ def relative_poses(points_a: F64, points_b: F64, *, gate: float) -> list[Relativ
     """
     if len(points_a) < 8:
         return []
-    views = _Views(points_a, points_b, rays(points_a), rays(points_b), gate)
+    views = _Views(
+        _homogeneous(points_a), _homogeneous(points_b), rays(points_a), rays(points_b), gate
+    )
     found: list[RelativePose] = []
     for method in (cv2.USAC_ACCURATE, cv2.USAC_MAGSAC):
         E: Any = cv2.findEssentialMat(
@@ -100,20 +114,20 @@ def relative_poses(points_a: F64, points_b: F64, *, gate: float) -> list[Relativ
 
 
 class _Views(NamedTuple):
-    """What two views have in common: points (N, 2) on the plane z = 1, rays (N, 3), the gate."""
+    """What two views have in common: a, b: (N, 3) points on the plane z = 1; rays (N, 3), the
+    gate."""
 
-    points_a: F64
-    points_b: F64
+    a: F64
+    b: F64
     rays_a: F64
     rays_b: F64
     gate: float
 
 
 def _two_views(T_b_a: F64, views: _Views) -> RelativePose:
-    depth_a, depth_b, parallax = two_view_depths(T_b_a, views.rays_a, views.rays_b)
-    gate = views.gate
+    depth_a, depth_b = two_view_depths(T_b_a, views.rays_a, views.rays_b)
+    a, b, gate = views.a, views.b, views.gate
     E = hat(T_b_a[:3, 3]) @ T_b_a[:3, :3]
-    a, b = (np.column_stack([each, np.ones(len(each))]) for each in views[:2])
     lines_b, lines_a = a @ E.T, b @ E
     slopes = np.hypot(np.hypot(*lines_b.T[:2]), np.hypot(*lines_a.T[:2]))
     errors = np.abs((b * lines_b).sum(axis=1)) / np.maximum(slopes, 1e-12)  # Sampson's distance
@@ -123,7 +137,8 @@ def _two_views(T_b_a: F64, views: _Views) -> RelativePose:
         T_b_a=T_b_a,
         inliers=(errors < gate) & before,
         misfit=1.0 - float(fit.mean()),
-        parallax_rad=parallax,
+        rays_a=views.rays_a,
+        rays_b=views.rays_b,
     )
 
 
@@ -155,11 +170,10 @@ def decompose_essential(E: F64) -> list[F64]:
     return motions
 
 
-def two_view_depths(T_b_a: F64, rays_a: F64, rays_b: F64) -> tuple[F64, F64, F64]:
-    """Lengths along unit rays (N, 3) of the nearest points of each pair, and the angle between.
+def two_view_depths(T_b_a: F64, rays_a: F64, rays_b: F64) -> tuple[F64, F64]:
+    """Lengths (N,) along unit rays (N, 3) of a and b of the nearest points of each pair.
 
-    Returns (length along a, length along b, parallax in radians), each (N,).  Parallel rays have
-    length 0, which is never before the camera.
+    Parallel rays have length 0, which is never before the camera.
     """
     a = rays_a @ T_b_a[:3, :3].T
     t = T_b_a[:3, 3]
@@ -170,5 +184,11 @@ def two_view_depths(T_b_a: F64, rays_a: F64, rays_b: F64) -> tuple[F64, F64, F64
     ta, tb = a @ t, rays_b @ t
     length_a = np.where(apart, (cosine * tb - ta) / safe, 0.0)
     length_b = np.where(apart, (tb - cosine * ta) / safe, 0.0)
-    parallax = np.arctan2(np.linalg.norm(np.cross(a, rays_b), axis=1), cosine)
-    return length_a, length_b, parallax
+    return length_a, length_b
+
+
+def parallax(T_b_a: F64, rays_a: F64, rays_b: F64) -> F64:
+    """(N,) angle, in radians, between the unit rays (N, 3) of each pair."""
+    a = rays_a @ T_b_a[:3, :3].T
+    cosine = (a * rays_b).sum(axis=1)
+    return np.arctan2(np.linalg.norm(np.cross(a, rays_b), axis=1), cosine)
