@@ -246,23 +246,35 @@ def _shifts(
 
 @kernel
 def _interpolate(shifts: F32, places: F32) -> None:
-    """Write the place (2, H, W) of each pixel by shifts (., ., 2) that are given at the nodes."""
+    """Write the place (2, H, W) of each pixel by shifts (., ., 2) that are given at the nodes.
+
+    By whole rows, which are SIMD code, from the corners of the cell that each pixel lies in.
+    """
     height, width = places.shape[1:]
-    across = np.arange(_GRID_PX).astype(np.float32) / np.float32(_GRID_PX)
+    cell = np.arange(width) // _GRID_PX
+    across = (np.arange(width) - _GRID_PX * cell).astype(np.float32) / np.float32(_GRID_PX)
+    own = np.arange(width).astype(np.float32)
+    corners = np.empty((4, width), np.float32)
+    for k in range(2):
+        for row in range(height):
+            r = row // _GRID_PX
+            down = np.float32(row - r * _GRID_PX) / np.float32(_GRID_PX)
+            if row == r * _GRID_PX:
+                for j in range(width):
+                    upper, lower = shifts[r, cell[j] :, k], shifts[r + 1, cell[j] :, k]
+                    corners[0, j], corners[1, j] = upper[0], upper[1]
+                    corners[2, j], corners[3, j] = lower[0], lower[1]
+            if k:
+                own[:] = np.float32(row)
+            _interpolate_row(corners, across, down, own, places[k, row])
+
+
+@kernel
+def _interpolate_row(corners: F32, across: F32, down: np.float32, own: F32, places: F32) -> None:
     one = np.float32(1.0)
-    for row in range(height):
-        r = row // _GRID_PX
-        down = across[row - r * _GRID_PX]
-        # Of the corners of a cell, for each of its columns.
-        w00, w01 = (one - down) * (one - across), (one - down) * across
-        w10, w11 = down * (one - across), down * across
-        for c in range(shifts.shape[1] - 1):
-            left = c * _GRID_PX
-            for k in range(2):
-                s00, s01 = shifts[r, c, k], shifts[r, c + 1, k]
-                s10, s11 = shifts[r + 1, c, k], shifts[r + 1, c + 1, k]
-                own = np.float32(row if k else left)
-                for j in range(min(_GRID_PX, width - left)):
-                    shift = s00 * w00[j] + s01 * w01[j] + s10 * w10[j] + s11 * w11[j]
-                    at = own if k else own + np.float32(j)
-                    places[k, row, left + j] = at + shift
+    s00, s01, s10, s11 = corners[0], corners[1], corners[2], corners[3]
+    for j in range(places.size):
+        w00, w01 = (one - down) * (one - across[j]), (one - down) * across[j]
+        w10, w11 = down * (one - across[j]), down * across[j]
+        shift = s00[j] * w00 + s01[j] * w01 + s10[j] * w10 + s11[j] * w11
+        places[j] = own[j] + shift
