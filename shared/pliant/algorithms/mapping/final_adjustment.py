@@ -35,9 +35,6 @@ _MOST_SEEN = 32
 """Keyframes that tell where a point is.  Each pair of them costs time, so that a room that is seen
 again and again would take the square of it, and the mean of 32 is known as well as need be."""
 
-_AT_ONCE = 1 << 16
-"""Observations whose poses are looked up at a time: 128 bytes each."""
-
 _MIN_DEPTH = 1e-6
 
 
@@ -61,13 +58,7 @@ class ListedMap:
 
     def depths(self) -> F64:
         """(O,) of each observed point in the camera that observes it."""
-        depths = np.empty(len(self.camera))
-        for lo in range(0, len(depths), _AT_ONCE):
-            some = slice(lo, lo + _AT_ONCE)
-            T = self.T_world_camera[self.camera[some]]
-            rays = self.xyz[self.point[some]] - T[:, :3, 3]
-            depths[some] = np.einsum("oi,oi->o", rays, T[:, :3, 2])
-        return depths
+        return _depths(self.T_world_camera, self.xyz, self.camera, self.point)
 
     def scales(self, before: F64) -> F64:
         """(M,) by how much what each keyframe sees has grown: the median.
@@ -84,6 +75,16 @@ class ListedMap:
             if len(some):
                 scales[slot] = np.median(some)
         return scales
+
+
+@kernel
+def _depths(T_world_camera: F64, xyz: F64, camera: I32, point: I32) -> F64:
+    depths = np.empty(camera.size)
+    for o in range(camera.size):
+        T, X = T_world_camera[camera[o]], xyz[point[o]]
+        x, y, z = X[0] - T[0, 3], X[1] - T[1, 3], X[2] - T[2, 3]
+        depths[o] = x * T[0, 2] + y * T[1, 2] + z * T[2, 2]
+    return depths
 
 
 def moves_between(keyframe_ids: I64, before: F64, after: F64, scales: F64) -> MapMoves:
