@@ -105,6 +105,7 @@ class Atlas:
         self._next_segment += 1
         self._forget_questions()
         active.begin(start, waiting, grey, colour)
+        self._adjusted = True  # not all of its keyframes are in the window
         self.calibrate()
         self.remember(active.keyframes[-1], grey)
         return active
