@@ -123,17 +123,17 @@ def test_a_floor_at_the_border_never_starts_with_the_wrong_motion(seed: int) -> 
 
 @pytest.mark.parametrize("total_m", [0.1, 0.4])
 def test_it_waits_for_more_parallax_but_not_for_long(total_m: float) -> None:
-    """1.7 degrees in a second and no more are enough in the end; 7 degrees are there before."""
+    """Of 1.7 degrees and no more one is enough in the end; 7 degrees are there before."""
     parameters = MappingParameters()
-    second = round(1e9 / INTERVAL_NS)
-    _, waiting = ride(second + 2, total_m / second, life=1000)
+    patient = round(1e9 * parameters.start.patient_s / INTERVAL_NS)
+    _, waiting = ride(patient + 2, total_m / patient, life=1000)
     found = [
         not isinstance(find_start(waiting[:k], CAMERA, parameters), str)
         for k in range(2, len(waiting) + 1)
     ]
     assert found[-1]
-    first = 2 + found.index(True)
-    assert (first - 1 >= second) == (total_m < 0.2)
+    first = 1 + found.index(True)
+    assert (first >= patient) == (total_m < 0.2)
 
 
 def test_under_a_guessed_focal_length_it_does_not_wait() -> None:

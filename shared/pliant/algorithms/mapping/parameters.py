@@ -16,7 +16,7 @@ class StartParameters(Parameters):
         default=3.0, gt=0.0, description="Median parallax of two frames to start with, degrees"
     )
     patient_s: float = Field(
-        default=1.0, ge=0.0, description="Seconds after which min_parallax_deg is enough"
+        default=0.5, ge=0.0, description="Seconds after which min_parallax_deg is enough"
     )
     min_parallax_deg: float = Field(
         default=1.0, gt=0.0, description="Least median parallax of the two frames, degrees"
