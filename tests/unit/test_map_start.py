@@ -13,7 +13,7 @@ from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reaching_back import reach_back
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, widened
-from pliant.algorithms.mapping.start import find_start
+from pliant.algorithms.mapping.start import find_start, impatient
 
 CAMERA = PinholeCamera(fx=400.0, fy=400.0, cx=320.0, cy=240.0, width=640, height=480)
 
@@ -160,6 +160,18 @@ def test_it_reaches_back_to_frames_whose_tracks_have_ended() -> None:
     np.testing.assert_array_equal(reached.kappas, 0.5 * reached.ids)
     assert (reached.newest_px >= 0.0).all()
     assert (reached.newest_px <= (CAMERA.width - 1, CAMERA.height - 1)).all()
+
+
+def test_it_reaches_back_over_many_lives_of_tracks() -> None:
+    centres, waiting = ride(120, 0.03, life=8)
+    start = find_start(waiting[-8:], CAMERA, impatient(MappingParameters()))
+    assert isinstance(start, Start), start
+    reached = reach_back(start, waiting, CAMERA, MappingParameters())
+    assert reached.frames[0] == 0
+    moved = reached.T_world_camera[:, :3, 3]
+    np.testing.assert_allclose(
+        moved * centres[-1, 0] / moved[-1, 0], centres[reached.frames], atol=0.02
+    )
 
 
 def test_it_reaches_no_further_than_tracks_lead() -> None:

@@ -118,12 +118,13 @@ class ActiveMap:
             )
             others = self.points.state[self.links.rows[j]] == CANDIDATE
             self._append_keyframe(
-                number,
-                start.T_world_camera[k],
+                number, start.T_world_camera[k],
                 np.concatenate([rows[start.point_index[supported]], self.links.rows[j[others]]]),
                 np.concatenate([start.points_px[supported], frames[number].points_px[i[others]]]),
                 None,
-            )
+            )  # fmt: skip
+        for keyframe in self.keyframes[: -self.parameters.window.keyframes - 1]:
+            self.segment.leave_window(keyframe)  # one more leaves with each that comes
         self._settle(self.keyframes[-1], grey)
 
     def linked(self, state: int) -> I64:

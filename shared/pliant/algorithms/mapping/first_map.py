@@ -108,7 +108,7 @@ def adjusted_start(
     start = parameters.start
     order = np.argsort(ids, kind="stable")
     ids, points = ids[order], points[order]
-    scale = 1.0 / float(np.median(points[:, 2]))
+    scale = 1.0 / float(np.median(np.abs(points[:, 2])))  # some may lie behind the first camera
     points *= scale
     T_world_camera[:, :3, 3] *= scale
     keyframe_index, point_index, points_px = _observations(chosen, ids)

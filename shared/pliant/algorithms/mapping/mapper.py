@@ -78,7 +78,7 @@ class Mapper:
         self._keyframe_changes = KeyframeChanges(self.atlas.points, after=last)
         self._waiting = Waiting()
         self._motion = Motion.at(0, 0, np.eye(4))  # in the segment that the camera is in
-        self._images: tuple[U8 | None, U8 | None] = (None, None)  # of the newest frame
+        self._images: tuple[U8 | None, U8 | None] = (None, None)  # of the newest that waits
         self._lost_frames = 0
         self._keyframe_ns = 0
         self._keyframe_is_new = False
@@ -182,7 +182,7 @@ class Mapper:
         else:
             active.pass_by(frame, T_world_camera, tracks.points_px, found)
         self._place_waiting(active, hanging, T_world_camera)
-        self._lost_frames, self._waiting = 0, Waiting()
+        self._lost_frames, self._waiting, self._images = 0, Waiting(), (None, None)
         self._motion = self._motion.then(frame, stamp_ns, T_world_camera, support.tracked)
         self._add_pose(frame, hanging, T_world_camera, support.inliers)
         if hanging.frame == frame:
@@ -270,7 +270,7 @@ class Mapper:
         self, start: Start, calibration: SelfCalibration, grey: U8 | None, colour: U8 | None
     ) -> int:
         """Let the map start, and give poses to the frames that waited, backwards."""
-        waiting, self._waiting = self._waiting, Waiting()
+        waiting, self._waiting, self._images = self._waiting, Waiting(), (None, None)
         active = self.atlas.begin(start, calibration, waiting.frames, grey, colour)
         placed = list(
             earlier_poses(

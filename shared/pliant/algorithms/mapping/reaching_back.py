@@ -19,8 +19,8 @@ _OVERLAP = 0.7
 """Where fewer of the tracks that a frame shares with the next are points, as a share, more are
 looked for; and where it has fewer of those of the last keyframe, it becomes one."""
 
-_VIEWS = 8
-"""Frames from which points are found at the most, spread over all that are placed."""
+_VIEWS, _FEW = 8, 30
+"""Points are found from so many frames at the most, spread over those that see so many of them."""
 
 
 def reach_back(
@@ -73,9 +73,16 @@ def _more_points(
     parameters: PointParameters,
 ) -> tuple[I64, F64]:
     """With those of the tracks in ``shared`` that the frames which are placed tell of."""
-    spread = np.linspace(0, len(placed) - 1, min(len(placed), _VIEWS))
-    views = [placed[i] for i in np.unique(np.round(spread).astype(int)).tolist()]
     other = np.setdiff1d(shared, ids, assume_unique=True)
+    lasting = 0  # of the frames that are placed, the last ones that see some of them
+    for frame, _ in reversed(placed):
+        if np.isin(other, frame.ids, assume_unique=True).sum() < _FEW:
+            break
+        lasting += 1
+    spread = np.linspace(len(placed) - lasting, len(placed) - 1, min(lasting, _VIEWS))
+    views = [placed[i] for i in np.unique(np.round(spread).astype(int)).tolist()]
+    if len(views) < parameters.min_observations:
+        return ids, points_world
     u, v, seen = table_of([frame for frame, _ in views], other)
     several = np.flatnonzero(seen.sum(axis=0) >= parameters.min_observations)
     poses = np.stack([T for _, T in views])
