@@ -4,6 +4,8 @@ import json
 import os
 import shutil
 import signal
+import threading
+import time
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 from running import (
     NO_MESH,
+    TIMEOUT_S,
     TINY,
     UP,
     assert_one_line,
@@ -23,8 +26,9 @@ from running import (
 )
 
 from pliant.bus.session import CONNECT_TIMEOUT_S, free_endpoint, open_router
+from pliant.errors import RecordingError
 from pliant.messages import topics
-from pliant.recording.reader import Recording
+from pliant.recording.reader import Recorded, Recording
 from pliant.recording.summary import summarise
 from pliant_services.processes import COMPILED
 
@@ -102,18 +106,28 @@ def test_ctrl_c_ends_the_stream_and_keeps_what_was_done(tmp_path: Path) -> None:
 
 
 def test_a_service_that_dies_is_named_with_its_last_words(tmp_path: Path) -> None:
-    """What came before stays; where the service died before anything came, it dies once more."""
-    for attempt in range(5):
-        folder = tmp_path / f"died_{attempt}"
-        with running(TINY, "--output", folder, "--mode", "live", *NO_MESH) as run:
-            run.wait_for(UP)
-            run.send(signal.SIGKILL, "tracking")
-            code, _, errors = run.finish()
-        assert code == 1
-        assert "tracking was killed by SIGKILL" in errors
-        if list(Recording(folder / "recording.mcap").messages(topics.STREAM)):
-            return
-    raise AssertionError("nothing was recorded of five runs")
+    folder = tmp_path / "died"
+    # On the disk after every message, so that it is seen there.
+    arguments = [TINY, "--output", folder, "--mode", "live", *NO_MESH, "--set"]
+    with running(*arguments, "recorder.sync_interval_s=1e-9") as run:
+        run.wait_for(UP)
+        run.send(signal.SIGSTOP, "tracking")  # it does not come to its end before
+        pause, deadline = threading.Event(), time.monotonic() + TIMEOUT_S
+        while not stream_of(folder) and time.monotonic() < deadline:
+            pause.wait(0.02)
+        run.send(signal.SIGKILL, "tracking")
+        code, _, errors = run.finish()
+    assert code == 1
+    assert "tracking was killed by SIGKILL" in errors
+    assert stream_of(folder)
+
+
+def stream_of(folder: Path) -> list[Recorded]:
+    """What its recording has of the stream by now."""
+    try:
+        return list(Recording(folder / "recording.mcap").messages(topics.STREAM))
+    except RecordingError:  # it has not begun
+        return []
 
 
 @pytest.mark.parametrize(

@@ -201,8 +201,7 @@ def _go_through(
                 with _told_poses(request, fleet):
                     fleet.start(lambda name: service_arguments(name, request, output))
                     look_on = f"; look on: pliant view {output}" if has_viewer() else ""
-                    progress.say(f"services are up{look_on}")
-                    interrupted = _wait(fleet, progress)
+                    interrupted = _wait(fleet, progress, f"services are up{look_on}")
                 if viewer is not None:
                     viewer.see_the_end(fleet)
                 return interrupted, None
@@ -258,9 +257,11 @@ def _has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
     return ended >= {topic.key for topic in recorded}
 
 
-def _wait(fleet: Fleet, progress: Progress) -> bool:
-    """Wait for the end of the run; True if it was brought about by Ctrl-C."""
+def _wait(fleet: Fleet, progress: Progress, up: str) -> bool:
+    """Say that the services are up, and wait for the end of the run; True if it was brought about
+    by Ctrl-C, which may follow what is said at once."""
     try:
+        progress.say(up)
         fleet.wait(progress.on_rest)
     except KeyboardInterrupt:
         progress.say("stopping after the frame at hand (Ctrl-C again to kill)")
