@@ -10,6 +10,7 @@ from pliant.algorithms.mapping.map_store import CANDIDATE, Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import PassedFrames, refined_poses
+from pliant.algorithms.mapping.start import impatient
 from pliant.map_history import MapHistory
 
 PARAMETERS = MappingParameters()
@@ -76,8 +77,8 @@ def test_what_finds_no_room_goes_first(points, monkeypatch):
 
 
 def test_frames_between_keyframes_gain_from_the_whole_map():
-    poses = sideways(60)
-    mapper, history = Mapper(CAMERA, PARAMETERS, seed=0), MapHistory()
+    poses = sideways(20)
+    mapper, history = Mapper(CAMERA, impatient(PARAMETERS), seed=0), MapHistory()
     for k, tracks in enumerate(Scene.box().frames(poses)):
         delta = mapper.process(k, k * INTERVAL_NS, tracks, None, None)
         history.apply(delta, frame=k, stamp_ns=k * INTERVAL_NS)
@@ -96,7 +97,7 @@ def test_frames_between_keyframes_gain_from_the_whole_map():
         ]
     )
     true = np.array([poses[k][:3, 3] for k in between])
-    assert error(final, true) < 0.97 * error(rigid, true)
+    assert error(final, true) < 0.9 * error(rigid, true)
 
 
 def error(mine, true):

@@ -1,7 +1,7 @@
 """Poses of the frames that waited for a map: backwards from where it starts, or goes on.
 
 They are placed by the points of the start.  Those before, which see too few of them, have but
-turned, or the map would have started there: they stand where the first one that is placed does,
+turned, or the start would reach back to them: they stand where the first one that is placed does,
 turned as the tracks that each shares with the next one tell.
 """
 
