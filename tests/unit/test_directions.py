@@ -1,5 +1,7 @@
 """Points without parallax: where they are put, what they say of a pose, and what comes of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
@@ -8,7 +10,7 @@ from test_whole_map import similarity
 
 from pliant.algorithms.bundle.projection import move_camera
 from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
-from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.map_delta import LOST, TRACKING, MapMoves
 from pliant.algorithms.mapping.directions import (
     at_infinity,
     linearise,
@@ -187,6 +189,19 @@ def test_a_full_turn_on_the_spot_stays_in_one_map(axis):
     assert {segment for _, _, segment in published.poses.values()} == {0}
     error, _ = trajectory_error(published, poses)
     assert error < 1e-3
+
+
+@pytest.mark.parametrize(("count", "state"), [(45, LOST), (80, TRACKING)])
+def test_a_direction_tells_half_of_what_a_point_does(count, state):
+    *frames, last = surroundings().frames(full_turn((0, 1, 0))[:65])
+    mapper = Mapper(CAMERA, MappingParameters(), 0)
+    states = [mapper.process(k, k * INTERVAL_NS, t, None, None).state for k, t in enumerate(frames)]
+    assert states[-1] == TRACKING
+    shared = np.flatnonzero(np.isin(last.ids, frames[-1].ids))[:count]
+    few = {name: getattr(last, name)[shared] for name in ("ids", "points_px", "ages", "kappas")}
+    left = replace(last, **few, states=last.states[shared], maxima=last.maxima[:0])
+    delta = mapper.process(len(frames), len(frames) * INTERVAL_NS, left, None, None)
+    assert delta.state == state
 
 
 def test_frames_that_turned_before_the_map_started_get_poses():

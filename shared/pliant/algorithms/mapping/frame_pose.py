@@ -46,6 +46,10 @@ _AGREEING = 0.5
 """Share of the points of the map that place a frame alone and still fit once candidates help: with
 fewer, what these are on moves by itself."""
 
+_OF_DIRECTION = 0.5
+"""Inliers that a direction which fits counts as: any depth will do, so it tells one coordinate of
+its pixel, not two."""
+
 _OFF = 2.0
 """Of the error of an inlier: a track that is farther from its epipolar line contradicts a pose."""
 
@@ -125,7 +129,8 @@ def localise(
             points_px = points_px - rolled.shifts(points_px, depths)
         located = _by_tracks(active, predictions, rows, points_px, directions, generator)
         inliers = int(located.inliers.sum())
-        if inliers >= limits.min_inliers:
+        of_points = int(located.inliers[: len(linked) - len(directions)].sum())
+        if of_points + _OF_DIRECTION * (inliers - of_points) >= limits.min_inliers:
             if grey is None or inliers >= _FEW * motion.tracked:
                 return Located(located.T_world_camera, inliers >= _FIRM * motion.tracked)
             proved = prove(
