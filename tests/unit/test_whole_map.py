@@ -26,6 +26,7 @@ from pliant.algorithms.mapping.parameters import (
 )
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.whole_map import find_moves
+from pliant.algorithms.tracks import FrameExtrema
 from pliant.map_history import MapHistory
 from pliant.state import load_state, save_state
 from pliant_services.nodes.bundle_adjustment import Beside
@@ -132,6 +133,59 @@ def test_a_drifted_map_comes_back():
     np.testing.assert_array_equal(moves.keyframe_ids, ids)  # those in the window, too
     active.move(moves)
     assert error(active) < 0.1 * drifted
+
+
+def test_a_map_moves_as_little_as_it_can():
+    """No other similarity brings keyframes and what they see nearer to where they were."""
+    mapper, _, _ = fold(AT_THE_END, frames=120)
+    active = mapper.atlas.active
+    ids = np.array([keyframe.id for keyframe in active.keyframes])
+    drift = [similarity(1.004**k, (0, 0.002 * k, 0), (0, 0, 0.001 * k)) for k in range(len(ids))]
+    active.move(MapMoves(keyframe_ids=ids, moves=np.array(drift)))
+    parameters = GROWING.model_copy(update={"window": WindowParameters(keyframes=3)})
+    mapper.whole_map.ask(120, active.segment, mapper.calibration, parameters)
+    question = mapper.whole_map.question
+    moves = find_moves(question).moves
+    before, S = question.seen.T_world_camera, similarity_to_matrix(moves.moves)
+    after, scales = move_by_similarity(S, before), moves.moves[:, 7]
+    assert np.ptp(scales) > 0.01
+    depths = question.seen.medians(question.seen.depths(), question.seen.camera)
+    U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", before[:, :3, :3], after[:, :3, :3]))
+    np.testing.assert_allclose(U @ Vt, np.eye(3), atol=1e-9)
+
+    def moved(scale, t):
+        centres = scale * after[:, :3, 3] + t - before[:, :3, 3]
+        return (centres**2).sum() + ((scale * scales * depths - depths) ** 2).sum()
+
+    least = moved(1.0, np.zeros(3))
+    assert least > 0.0
+    for scale in (0.999, 1.0, 1.001):
+        centre = (1.0 - scale) * after[:, :3, 3].mean(axis=0)
+        for t in (*(1e-3 * np.eye(3)), *(-1e-3 * np.eye(3)), np.zeros(3)):
+            assert moved(scale, centre + t) > least or (scale == 1.0 and not t.any())
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_at_the_end_the_beginning_is_where_it_was(lost):
+    mapper, deltas, history = fold(GROWING)
+    first = mapper.atlas.active.keyframes[0]
+    assert any(len(delta.moved_keyframes) for delta in deltas)
+    assert np.abs(first.T_world_camera - np.eye(4)).max() > 1e-6
+    if lost:
+        for frame in range(FRAMES, FRAMES + 60):
+            delta = mapper.process(frame, frame * 33_000_000, FrameExtrema.empty(), None, None)
+            history.apply(delta, frame=frame, stamp_ns=frame)
+        assert mapper.atlas.active is None
+    frame = deltas[-1].pose_frames[-1]
+    history.apply(mapper.finish(), frame=int(frame), stamp_ns=0, final=True)
+    np.testing.assert_allclose(first.T_world_camera, np.eye(4), atol=1e-9)
+    known = history.keyframes[first.id].pose_world_camera
+    np.testing.assert_allclose(known, matrix_to_pose(np.eye(4)), atol=1e-9)
+    poses = history.final()
+    estimated = np.array([poses[k][1][:3] for k in sorted(poses)])
+    true = np.array([path(FRAMES)[k][:3, 3] for k in sorted(poses)])
+    scale, R, t = align_umeyama(estimated, true, with_scale=True)
+    assert np.abs(scale * estimated @ R.T + t - true).max() < 0.02
 
 
 def test_a_large_map_is_taken_over_later():

@@ -302,6 +302,9 @@ class Atlas:
             if (answer := self.whole_map.settle()) is not None:
                 moved += self.take_over(answer)
         if self._adjusts:
+            back = active.segment.back()
+            if back is not None:
+                moved.append(self.move(held(back, self._spans, self.segment)))
             active.collect_garbage()
             moved.append(self._adjust(active))
         return moved

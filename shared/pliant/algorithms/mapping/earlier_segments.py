@@ -105,13 +105,16 @@ class EarlierSegments:
         """Adjust each of them, no earlier than the end of the stream; what nobody has gone on in
         is as an earlier session left it.
 
-        Returns how that moves what segments, by their number, have given up.
+        Returns how segments, by their number, and what they have given up move.
         """
         moves: list[tuple[int, MapMoves]] = []
         for n, earlier in enumerate(self._kept):
             if not earlier.known:
+                back = earlier.segment.back()
+                if back is not None:
+                    earlier.segment.move(back)
                 found, moved = earlier.segment.adjust(earlier.calibration, parameters)
                 self._kept[n] = earlier._replace(calibration=found)
-                moves += [] if moved is None else [(earlier.segment.id, moved)]
+                moves += [(earlier.segment.id, each) for each in (back, moved) if each is not None]
         self.adjusted = [earlier.segment for earlier in self._kept if not earlier.known]
         return moves

@@ -67,14 +67,20 @@ class ListedMap:
         """
         after = self.depths()
         usable = (before > _MIN_DEPTH) & (after > _MIN_DEPTH)
-        ratios = after[usable] / before[usable]
-        ends = np.searchsorted(self.camera[usable], np.arange(len(self.T_world_camera) + 1))
-        scales = np.ones(len(self.T_world_camera))
-        for slot in range(len(scales)):
-            some = ratios[ends[slot] : ends[slot + 1]]
+        return self.medians(after[usable] / before[usable], self.camera[usable])
+
+    def medians(self, values: F64, camera: I32) -> F64:
+        """(M,) of what keyframes say; 1 of those that say nothing.
+
+        values: (n,).   camera: (n,) whose each is, ascending.
+        """
+        ends = np.searchsorted(camera, np.arange(len(self.T_world_camera) + 1))
+        medians = np.ones(len(self.T_world_camera))
+        for slot in range(len(medians)):
+            some = values[ends[slot] : ends[slot + 1]]
             if len(some):
-                scales[slot] = np.median(some)
-        return scales
+                medians[slot] = np.median(some)
+        return medians
 
 
 @kernel

@@ -251,6 +251,7 @@ def join(
     moves = held(move, spans, gone)
     (active if active_moves else earlier).move(moves)
     moving.inverse_distance /= scale
+    goes_on.strayed = staying.strayed
     goes_on.take_in(earlier, id)
     if calibration.readout:
         goes_on.unroll(earlier.keyframes, calibration)

@@ -30,6 +30,9 @@ _DEPTHS = 10.0
 _ACCEPTED = 0.5
 """Weight of a loop under which the others contradict it."""
 
+_LEAST = 1e-6
+"""Depth and its sigma that a keyframe has at the least."""
+
 
 class Loop(NamedTuple):
     """Two keyframes that look at the same place.
@@ -112,7 +115,8 @@ def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px:
         for loop, (old, new) in zip(loops, ends.tolist(), strict=True)
     ]
     i, j = np.concatenate([np.column_stack([i, j]), ends]).astype(np.int32).T
-    depth, sigma = _medians(seen, sigmas)
+    depth = np.maximum(seen.medians(seen.depths(), seen.camera), _LEAST)
+    sigma = np.maximum(seen.medians(sigmas[seen.point], seen.camera), _LEAST)
     bearing = np.full(len(i), 1.0 / focal_px)
     return Edges(
         i=i.copy(), j=j.copy(), Z=np.concatenate([Z, np.array(of_loops).reshape(-1, 4, 4)]),
@@ -159,17 +163,3 @@ def _count_shared(camera: I32, starts: I64, shared: I32) -> None:
                 shared[camera[a], camera[c]] += 1
                 if a != c:
                     shared[camera[c], camera[a]] += 1
-
-
-def _medians(seen: ListedMap, sigmas: F64) -> tuple[F64, F64]:
-    """(M,) depth and its sigma of what each keyframe sees."""
-    depths = seen.depths()
-    M = len(seen.T_world_camera)
-    ends = np.searchsorted(seen.camera, np.arange(M + 1))
-    depth, sigma = np.ones(M), np.ones(M)
-    for m in range(M):
-        some = slice(ends[m], ends[m + 1])
-        if ends[m] < ends[m + 1]:
-            depth[m] = max(float(np.median(depths[some])), 1e-6)
-            sigma[m] = max(float(np.median(sigmas[seen.point[some]])), 1e-6)
-    return depth, sigma

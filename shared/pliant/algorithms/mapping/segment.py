@@ -142,7 +142,7 @@ class Segment:
     with the window.   adjusted: newest keyframe of an adjustment of all of it that was taken over
     since the last keyframe was made, by id, or -1.   thinned: whether keyframes or points have been
     given up (``thinning``).   given_up: those keyframes.   inverse_distance: median of its points
-    from the newest keyframe.
+    from the newest keyframe.   strayed: similarity (4, 4) by which its beginning has moved.
     """
 
     id: int
@@ -155,6 +155,7 @@ class Segment:
     thinned: bool = False
     given_up: GivenUp = field(default_factory=GivenUp)
     inverse_distance: float = 1.0
+    strayed: F64 = field(default_factory=lambda: np.eye(4))
 
     @property
     def resumes(self) -> bool:
@@ -231,7 +232,19 @@ class Segment:
         points.spread[rows] = (S_hosts[:, :3, :3] @ points.spread[rows][:, :, None])[:, :, 0]
         self.path.scale(moves)
         self.given_up.move(moves)
+        self.strayed = S[0] @ self.strayed
         return S[-1]
+
+    def back(self) -> MapMoves | None:
+        """What moves its beginning to where it was, and all of it likewise; None where it is."""
+        if np.array_equal(self.strayed, np.eye(4)):
+            return None
+        S = np.asarray(np.linalg.inv(self.strayed), np.float64)
+        scale = float(np.cbrt(np.linalg.det(S[:3, :3])))
+        S[:3, :3] /= scale
+        move = np.concatenate([matrix_to_pose(S), [scale]])[None]
+        first = np.array([self.keyframes[0].id], np.int64)
+        return self.given_up.together_with(MapMoves(keyframe_ids=first, moves=move))
 
     def take_in(self, earlier: "Segment", id: int) -> None:
         """Become one with a segment that rests, in whose world this one lies by now, or the other

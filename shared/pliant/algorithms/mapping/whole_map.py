@@ -9,9 +9,10 @@ Where the shutter may roll it begins with the first keyframes: they tell the rea
 Meanwhile the map has grown and the window has moved.  So the result is not where the points are,
 but how the map around each keyframe moves: one similarity for each, as drift is small within what
 a keyframe sees.  The keyframes that were in the window do, too: in a map of a few dozen most of the
-drift is there.  What is newer moves rigidly with the last of them.  The first keyframe stays, and
-with it place and scale of the beginning.  Lens, focal length and readout are found anew each time,
-and used for what comes next once they are certainly other than those in use.
+drift is there.  What is newer moves rigidly with the last of them.  All of it moves as little as it
+can, so that poses from before and after fit together; at the end the beginning is back in its place
+(``Segment.strayed``).  Lens, focal length and readout are found anew each time, and used for what
+comes next once they are certainly other than those in use.
 
 A place that is recognised asks at once, and is answered sooner: the graph of ``loops`` says how the
 map moves, and an adjustment, asked for at once, does the rest.  Where the graph refuses all loops
@@ -251,13 +252,26 @@ def _without_prior(
 
 
 def _moves(question: Question, seen: ListedMap, before: F64, depths: F64) -> MapMoves:
-    """before: (M, 4, 4) poses and depths: (O,) of the observations until now."""
-    scales = seen.scales(depths)
+    """How the map moves, which is as little as it can.
+
+    Nothing holds its place, turn and scale.  Held by its beginning, which is known least, all that
+    the camera sees now would jump with what is learnt of that.  So the turns of the keyframes
+    cancel out, by R, and their centres c and how deep d they see change least:
+    ``min over s, t: sum of |s R c' + t - c|^2 + (s d' - d)^2``.
+
+    before: (M, 4, 4) poses and depths: (O,) of the observations until now.
+    """
+    scales, d = seen.scales(depths), seen.medians(depths, seen.camera)
     T = seen.T_world_camera.copy()
-    # Nothing holds the scale of a map: that of its beginning stays.
-    T[:, :3, 3] = T[0, :3, 3] + (T[:, :3, 3] - T[0, :3, 3]) / scales[0]
-    scales /= scales[0]
-    return moves_between(question.keyframe_ids, before, T, scales)
+    U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", before[:, :3, :3], T[:, :3, :3]))
+    R = U @ Vt
+    c, c_new = before[:, :3, 3], T[:, :3, 3] @ R.T
+    from_mean, new_from_mean = c - c.mean(axis=0), c_new - c_new.mean(axis=0)
+    both = (from_mean * new_from_mean).sum() + (d * scales * d).sum()
+    s = both / ((new_from_mean**2).sum() + ((scales * d) ** 2).sum())
+    T[:, :3, :3] = R @ T[:, :3, :3]
+    T[:, :3, 3] = c.mean(axis=0) + s * new_from_mean
+    return moves_between(question.keyframe_ids, before, T, s * scales)
 
 
 def held(moves: MapMoves, spans: list[tuple[int, int]], segment: int) -> MapMoves:
