@@ -174,8 +174,10 @@ class KeyframeParameters(Parameters):
 class WindowParameters(Parameters):
     """The keyframes under adjustment."""
 
-    keyframes: int = Field(default=16, ge=3, description="Keyframes in the window")
-    fixed: int = Field(default=2, ge=1, description="Oldest keyframes of the window that stay")
+    keyframes: int = Field(default=20, ge=3, description="Keyframes in the window")
+    fixed: int = Field(
+        default=6, ge=1, description="Older keyframes that see the most of the same: they stay"
+    )
     keyframe_iterations: int = Field(
         default=4, ge=1, description="Most iterations of Schur LM at a keyframe"
     )
