@@ -59,6 +59,22 @@ def map_starts(
     show(measure(sources, overrides or [], starts, following))
 
 
+@app.command("turned-about")
+def turned_about(
+    sources: Sources,
+    overrides: Overrides = None,
+    frames: Annotated[int, typer.Option(min=3, help="Of each part.")] = 150,
+    parts: Annotated[int, typer.Option(min=1, help="Of each source.")] = 2,
+) -> None:
+    """Parts of sources forwards, backwards, with fewer frames, and mirrored: ATE of each.
+
+    scripts/bench turned-about path/to/kitti_00_small1018 path/to/tsukuba150 --parts 3
+    """
+    from benchmarks.turned_about import measure
+
+    show(measure(sources, overrides or [], frames, parts))
+
+
 @app.command()
 def losses(
     source: Source = "built-in:room",
