@@ -10,13 +10,15 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
 from test_mapper import Published, trajectory_error
 from test_recovery import dark, picture, textures
 
-from pliant.algorithms.geometry import matrix_to_pose
+from pliant.algorithms.geometry import align_umeyama, matrix_to_pose
+from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
     WholeMapParameters,
     WindowParameters,
 )
+from pliant.algorithms.mapping.whole_map import held
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.map_history import MapHistory
 from pliant.messages import topics
@@ -199,3 +201,71 @@ def test_a_viewer_draws_one_world(two):
     np.testing.assert_allclose(canvas.paths[segment], path, atol=1e-9)
     xyz, told = canvas.clouds[segment].everything()[0], made.history.points().positions
     np.testing.assert_allclose(xyz, told, atol=1e-3)
+
+
+def stray(mapper, segment):
+    """A segment strays, as adjustments of the whole map make it, and readers are told."""
+    atlas = mapper.atlas
+    first = np.array([segment.keyframes[0].id])
+    far = np.array([[0.5, 0.2, 0.1, 0.0, 0.0, 0.0, 1.0, 1.3]])
+    moves = held(MapMoves(keyframe_ids=first, moves=far), atlas._spans, segment.id)
+    if atlas.active is not None and atlas.active.segment is segment:
+        mapper.follow([atlas.move(moves)])
+    else:
+        segment.move(moves)
+        mapper._changes.move(moves)
+
+
+def followed(shots, strays):
+    """As ``run``, without the end.   strays: frames after which the segment strays."""
+    mapper, history = Mapper(CAMERA, PARAMETERS, 0), MapHistory()
+    for k, (tracks, grey) in enumerate(shots):
+        delta = mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
+        mapper.publish_keyframes()
+        history.apply(delta, frame=k, stamp_ns=k)
+        if k in strays:
+            stray(mapper, mapper.atlas.active.segment)
+    return mapper, history
+
+
+def ended(mapper, history, shots, poses):
+    """The first keyframe of the first segment in the end, and the largest error of its frames, of
+    which none is placed anew."""
+    for segment, _ in mapper.atlas.everything():
+        segment.passed.forget()
+    history.apply(mapper.finish(), frame=len(shots) - 1, stamp_ns=0, final=True)
+    final = history.final()
+    frames = [k for k in sorted(final) if final[k][0] == 0]
+    found = np.array([final[k][1][:3] for k in frames])
+    true = np.array([poses[k][:3, 3] for k in frames])
+    scale, R, t = align_umeyama(found, true, with_scale=True)
+    return history.keyframes[0].pose_world_camera, np.abs(scale * found @ R.T + t - true).max()
+
+
+@pytest.mark.parametrize("rests", [False, True])
+def test_what_lies_on_both_sides_of_another_segment_goes_back_as_one(scene, rests):
+    """A camera leaves a wall for another one, and comes back."""
+    other = wall(seed=3)
+    squares, night = textures(len(other.points))[::-1], [dark(FrameExtrema.empty())] * _DARK
+    there, away, back = along(0, 4), along(4, 1.5), along(1, 9)
+    shots = [*film(*scene, there, 0), *night, *film(other, squares, away, 1)]
+    shots += [*film(*scene, back, 2), *(night if rests else [])]
+    poses = [*there, *[np.eye(4)] * _DARK, *away, *back]
+    mapper, history = followed(shots, [])
+    assert [of for _, of in mapper.atlas._spans] == [0, 1, 0]
+    segment = next(each for each, _ in mapper.atlas.everything() if each.id == 0)
+    stray(mapper, segment)
+    first, error = ended(mapper, history, shots, poses)
+    np.testing.assert_allclose(first, matrix_to_pose(np.eye(4)), atol=1e-9)
+    assert error < 0.01
+
+
+def test_segments_that_have_strayed_and_meet_go_back_to_where_the_older_one_was(scene):
+    there, back = along(0, 3), along(11, 1)
+    night = len(there) + _DARK
+    shots = film(*scene, there, 0) + [dark(FrameExtrema.empty())] * _DARK + film(*scene, back, 1)
+    mapper, history = followed(shots, [len(there) - 1, night + 15])
+    assert mapper.atlas.active.segment.id == 0
+    first, error = ended(mapper, history, shots, [*there, *[np.eye(4)] * _DARK, *back])
+    np.testing.assert_allclose(first, matrix_to_pose(np.eye(4)), atol=1e-9)
+    assert error < 0.01

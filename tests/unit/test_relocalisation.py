@@ -108,6 +108,9 @@ def test_what_is_mapped_elsewhere_stays_where_one_segment_moves():
     told = held(moves, [(0, 0), (10, 1), (20, 0)], 0)
     x = told.matrices(np.array([0, 3, 4, 9, 10, 19, 20, 21, 22, 30]))[:, 0, 3]
     assert x.tolist() == [1, 1, 2, 2, 0, 0, 3, 3, 3, 3]
+    first = MapMoves(keyframe_ids=moves.keyframe_ids[:1], moves=rows[:1])
+    told = held(first, [(0, 0), (10, 1), (20, 0), (30, 1), (40, 0)], 0)
+    assert told.matrices(np.array([0, 10, 20, 30, 40]))[:, 0, 3].tolist() == [1, 0, 1, 0, 1]
     alone = held(moves, [(0, 0)], 0)
     assert alone.keyframe_ids.tolist() == [0, 4, 22]
 

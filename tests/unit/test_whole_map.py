@@ -18,6 +18,7 @@ from pliant.algorithms.geometry import (
 )
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.final_adjustment import _spread_out
+from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -149,13 +150,13 @@ def test_a_map_moves_as_little_as_it_can():
     before, S = question.seen.T_world_camera, similarity_to_matrix(moves.moves)
     after, scales = move_by_similarity(S, before), moves.moves[:, 7]
     assert np.ptp(scales) > 0.01
-    depths = question.seen.medians(question.seen.depths(), question.seen.camera)
+    depth = np.median(question.seen.depths())
     U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", before[:, :3, :3], after[:, :3, :3]))
     np.testing.assert_allclose(U @ Vt, np.eye(3), atol=1e-9)
 
     def moved(scale, t):
         centres = scale * after[:, :3, 3] + t - before[:, :3, 3]
-        return (centres**2).sum() + ((scale * scales * depths - depths) ** 2).sum()
+        return (centres**2).sum() + (depth**2 * (scale * scales - 1.0) ** 2).sum()
 
     least = moved(1.0, np.zeros(3))
     assert least > 0.0
@@ -165,12 +166,26 @@ def test_a_map_moves_as_little_as_it_can():
             assert moved(scale, centre + t) > least or (scale == 1.0 and not t.any())
 
 
+def depth_of(keyframe, mapper):
+    """The median of what it sees of the map."""
+    points = mapper.atlas.points
+    rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
+    return np.median(transform(inverse(keyframe.T_world_camera), points.xyz[rows])[:, 2])
+
+
 @pytest.mark.parametrize("lost", [False, True])
 def test_at_the_end_the_beginning_is_where_it_was(lost):
     mapper, deltas, history = fold(GROWING)
     first = mapper.atlas.active.keyframes[0]
+    # Far from where it was, by a scale as well, as if it had strayed for hours.
+    far = MapMoves(
+        keyframe_ids=np.array([0]), moves=similarity(1.3, (0, 0.1, 0), (0.4, 0, 0.2))[None]
+    )
     assert any(len(delta.moved_keyframes) for delta in deltas)
     assert np.abs(first.T_world_camera - np.eye(4)).max() > 1e-6
+    strayed = mapper.atlas.active.segment.strayed
+    depth = depth_of(first, mapper) / np.cbrt(np.linalg.det(strayed[:3, :3]))
+    mapper.follow([mapper.atlas.move(far)])
     if lost:
         for frame in range(FRAMES, FRAMES + 60):
             delta = mapper.process(frame, frame * 33_000_000, FrameExtrema.empty(), None, None)
@@ -181,6 +196,7 @@ def test_at_the_end_the_beginning_is_where_it_was(lost):
     np.testing.assert_allclose(first.T_world_camera, np.eye(4), atol=1e-9)
     known = history.keyframes[first.id].pose_world_camera
     np.testing.assert_allclose(known, matrix_to_pose(np.eye(4)), atol=1e-9)
+    assert depth_of(first, mapper) == pytest.approx(depth, rel=0.02)
     poses = history.final()
     estimated = np.array([poses[k][1][:3] for k in sorted(poses)])
     true = np.array([path(FRAMES)[k][:3, 3] for k in sorted(poses)])

@@ -256,19 +256,20 @@ def _moves(question: Question, seen: ListedMap, before: F64, depths: F64) -> Map
 
     Nothing holds its place, turn and scale.  Held by its beginning, which is known least, all that
     the camera sees now would jump with what is learnt of that.  So the turns of the keyframes
-    cancel out, by R, and their centres c and how deep d they see change least:
-    ``min over s, t: sum of |s R c' + t - c|^2 + (s d' - d)^2``.
+    cancel out, by R, and their centres c and the scales r of what they see, at the median depth d
+    of all, change least: ``min over s, t: sum of |s R c' + t - c|^2 + d^2 (s r - 1)^2``.
 
     before: (M, 4, 4) poses and depths: (O,) of the observations until now.
     """
-    scales, d = seen.scales(depths), seen.medians(depths, seen.camera)
+    scales, d = seen.scales(depths), float(np.median(depths)) if len(depths) else 1.0
     T = seen.T_world_camera.copy()
     U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", before[:, :3, :3], T[:, :3, :3]))
+    U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
     R = U @ Vt
     c, c_new = before[:, :3, 3], T[:, :3, 3] @ R.T
     from_mean, new_from_mean = c - c.mean(axis=0), c_new - c_new.mean(axis=0)
-    both = (from_mean * new_from_mean).sum() + (d * scales * d).sum()
-    s = both / ((new_from_mean**2).sum() + ((scales * d) ** 2).sum())
+    both = (from_mean * new_from_mean).sum() + d**2 * scales.sum()
+    s = both / ((new_from_mean**2).sum() + d**2 * (scales**2).sum())
     T[:, :3, :3] = R @ T[:, :3, :3]
     T[:, :3, 3] = c.mean(axis=0) + s * new_from_mean
     return moves_between(question.keyframe_ids, before, T, s * scales)
@@ -281,11 +282,12 @@ def held(moves: MapMoves, spans: list[tuple[int, int]], segment: int) -> MapMove
     goes on after others.
     """
     ids, rows = moves.keyframe_ids, moves.moves
+    still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0])
     for first, of in spans:
         at = int(np.searchsorted(ids, first))
         if at == 0 or (at < len(ids) and ids[at] == first):
             continue
-        still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0])
-        row = rows[min(at, len(rows) - 1)] if of == segment else still
+        own = min(int(np.searchsorted(moves.keyframe_ids, first)), len(moves.moves) - 1)
+        row = moves.moves[own] if of == segment else still
         ids, rows = np.insert(ids, at, first), np.insert(rows, at, row, axis=0)
     return MapMoves(keyframe_ids=ids, moves=rows)
