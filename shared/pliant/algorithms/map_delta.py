@@ -53,9 +53,9 @@ class MapDelta:
     """The pose of a frame and everything that it changed in the map.
 
     A pose is position and quaternion, (x, y, z, qx, qy, qz, qw), of a T_a_b that maps points of b
-    to a.  The world is the camera of the keyframe that started the segment; the scale is
-    arbitrary.  Ordinary frames hang on a keyframe (T_keyframe_camera), so that moving a keyframe
-    moves them for free.
+    to a.  The world is the camera of the keyframe that started the segment, from which it strays
+    a little while the map grows; the scale is arbitrary.  Ordinary frames hang on a keyframe
+    (T_keyframe_camera), so that moving a keyframe moves them for free.
 
     state: WAITING, TRACKING or LOST.
     reason: why the map cannot start or was lost; when TRACKING why the pose is doubtful, mostly "".
