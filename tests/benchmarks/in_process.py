@@ -17,6 +17,7 @@ from pliant.evaluation.run_evaluation import TrajectoryEvaluation, evaluate_traj
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
+from pliant.trajectory import Trajectory
 
 _HEADER = ("sequence", "seed", "ATE, final", "ATE, causal", "frames with a pose")
 
@@ -66,9 +67,7 @@ def run(
 
     Raises DatasetError where it has no true poses.
     """
-    if dataset.ground_truth_path is None:
-        raise DatasetError(f"{dataset.name}: has no true poses to compare with")
-    truth = read_trajectory(Path(dataset.ground_truth_path))
+    truth = true_poses(dataset)
     history = MapHistory()
     pipeline = Pipeline(calibration or dataset.calibration, load_config(None, overrides), history)
     counts: list[tuple[int, int]] = []
@@ -106,6 +105,23 @@ def measure(
             ates = shown_ate(found.final), shown_ate(found.causal)
             share = f"{100.0 * found.share:.1f} %"
             yield markdown_row([Path(source).name, str(seed), *ates, share])
+
+
+def true_poses(dataset: Dataset) -> Trajectory:
+    """Those that came with a source.   Raises DatasetError where none did."""
+    if dataset.ground_truth_path is None:
+        raise DatasetError(f"{dataset.name}: has no true poses to compare with")
+    return read_trajectory(Path(dataset.ground_truth_path))
+
+
+def spread_of(truth: Trajectory) -> float:
+    """RMS distance of the positions from their mean, in metres."""
+    return float(np.linalg.norm(truth.positions.std(axis=0)))
+
+
+def share_of(spread_m: float, evaluation: TrajectoryEvaluation) -> float:
+    """The RMSE as a share of that; inf where nothing could be aligned."""
+    return evaluation.ate_m.rmse / spread_m if evaluation.ate_m else np.inf
 
 
 def shown_ate(evaluation: TrajectoryEvaluation) -> str:

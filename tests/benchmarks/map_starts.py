@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.in_process import share_of, spread_of, true_poses
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.map_delta import TRACKING
 from pliant.config import Config, load_config
 from pliant.datasets import open_source
 from pliant.datasets.base import Dataset, SourceFrame
-from pliant.errors import DatasetError
-from pliant.evaluation.run_evaluation import TrajectoryEvaluation, evaluate_trajectory
-from pliant.formats.trajectory_files import read_trajectory
+from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
 from pliant.trajectory import Trajectory
@@ -31,9 +30,7 @@ def measure(
     config = load_config(None, overrides)
     for source in sources:
         dataset = open_source(source, part=config.ingest)
-        if dataset.ground_truth_path is None:
-            raise DatasetError(f"{dataset.name}: has no true poses to compare with")
-        truth = read_trajectory(Path(dataset.ground_truth_path))
+        truth = true_poses(dataset)
         frames = list(dataset)
         firsts = np.linspace(0, len(frames), starts, endpoint=False).astype(int).tolist()
         found = [_errors(dataset, frames[first:], truth, config, following) for first in firsts]
@@ -65,12 +62,8 @@ def _errors(
     found = [evaluate_trajectory(history.trajectory_in(longest, each), truth) for each in poses]
     times = history.trajectory_in(longest, poses[0]).stamps_ns
     among = (truth.stamps_ns >= times[0]) & (truth.stamps_ns <= times[-1])
-    spread = float(np.linalg.norm(truth.positions[among].std(axis=0)))
-    return _share(found[0], spread), _share(found[1], spread)
-
-
-def _share(evaluation: TrajectoryEvaluation, spread_m: float) -> float:
-    return evaluation.ate_m.rmse / spread_m if evaluation.ate_m else np.inf
+    spread = spread_of(truth.select(np.flatnonzero(among)))
+    return share_of(spread, found[0]), share_of(spread, found[1])
 
 
 def _shown(errors: np.ndarray) -> Iterator[str]:

@@ -10,15 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.in_process import share_of, spread_of, true_poses
 from benchmarks.table import markdown_header, markdown_row
 from pliant.config import Config, load_config
 from pliant.datasets import open_source
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.rectifier import decode
-from pliant.errors import DatasetError
-from pliant.evaluation.run_evaluation import TrajectoryEvaluation, evaluate_trajectory
-from pliant.formats.trajectory_files import read_trajectory
+from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
 from pliant.trajectory import Trajectory
@@ -57,9 +56,7 @@ def measure(
     found: list[tuple[float, float]] = []
     for source in sources:
         dataset = open_source(source, part=config.ingest)
-        if dataset.ground_truth_path is None:
-            raise DatasetError(f"{dataset.name}: has no true poses to compare with")
-        truth = read_trajectory(Path(dataset.ground_truth_path))
+        truth = true_poses(dataset)
         given = list(dataset)
         last = max(0, len(given) - frames)
         for first in sorted({round(last * part / max(1, parts - 1)) for part in range(parts)}):
@@ -93,10 +90,9 @@ def _drive(
     pipeline.finish()
     final, longest = history.final(), history.longest_segment()
     found = [history.trajectory_in(longest, each) for each in (final, history.causal)]
-    spread = float(np.linalg.norm(true.positions.std(axis=0)))
-    final_error, causal_error = (_share(evaluate_trajectory(each, true), spread) for each in found)
+    errors = [share_of(spread_of(true), evaluate_trajectory(each, true)) for each in found]
     segments = {segment for segment, _ in final.values()}
-    return len(found[0]), len(segments), (final_error, causal_error)
+    return len(found[0]), len(segments), (errors[0], errors[1])
 
 
 def _time(stamp_ns: int, part: list[SourceFrame], way: Way) -> int:
@@ -132,7 +128,3 @@ def _mirror(given: Calibration) -> Calibration:
     if len(k) >= 4 and given.model != "fisheye":
         k[3] = -k[3]
     return replace(given, cx=given.width - 1 - given.cx, distortion=tuple(k), depth=None)
-
-
-def _share(evaluation: TrajectoryEvaluation, spread_m: float) -> float:
-    return evaluation.ate_m.rmse / spread_m if evaluation.ate_m else np.inf

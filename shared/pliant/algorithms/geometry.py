@@ -120,6 +120,14 @@ def similarity_to_matrix(similarity: F64) -> F64:
     return S
 
 
+def matrix_to_similarity(S: F64) -> F64:
+    """(..., 4, 4) matrices of ``X -> scale R X + t`` to (..., 8) poses with a scale."""
+    scales = np.cbrt(np.linalg.det(S[..., :3, :3]))
+    turned = S.copy()
+    turned[..., :3, :3] /= scales[..., None, None]
+    return np.concatenate([matrix_to_pose(turned), scales[..., None]], axis=-1)
+
+
 def move_by_similarity(S: F64, T_world_camera: F64) -> F64:
     """Poses (..., 4, 4) after the world has moved by similarities (..., 4, 4)."""
     moved = S @ T_world_camera

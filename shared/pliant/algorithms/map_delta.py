@@ -8,7 +8,11 @@ from typing import Annotated
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray, Shape
-from pliant.algorithms.geometry import matrix_to_pose, similarity_to_matrix, transform_each
+from pliant.algorithms.geometry import (
+    matrix_to_similarity,
+    similarity_to_matrix,
+    transform_each,
+)
 
 WAITING, TRACKING, LOST = 0, 1, 2
 """State of the map after a frame: not started, localised, or lost."""
@@ -34,10 +38,8 @@ class MapMoves:
     def then(self, moves: "MapMoves") -> "MapMoves":
         """Both as one, these first."""
         ids = np.union1d(self.keyframe_ids, moves.keyframe_ids)
-        S = moves.matrices(ids) @ self.matrices(ids)
-        scales = np.cbrt(np.linalg.det(S[:, :3, :3]))
-        S[:, :3, :3] /= scales[:, None, None]
-        return MapMoves(keyframe_ids=ids, moves=np.column_stack([matrix_to_pose(S), scales]))
+        both = moves.matrices(ids) @ self.matrices(ids)
+        return MapMoves(keyframe_ids=ids, moves=matrix_to_similarity(both))
 
     def points(self, xyz: F64, hosts: I64) -> F64:
         """Points (N, 3) that hang on keyframes (N,), moved."""

@@ -20,7 +20,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView
-from pliant.algorithms.geometry import matrix_to_pose, move_by_similarity, so3_log
+from pliant.algorithms.geometry import matrix_to_similarity, move_by_similarity, so3_log
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
@@ -240,17 +240,11 @@ def join(
     moving, staying = (goes_on, earlier) if active_moves else (earlier, goes_on)
     gone, id = moving.id, staying.id
     S = to_earlier if active_moves else np.asarray(np.linalg.inv(to_earlier), np.float64)
-    scale = float(np.cbrt(np.linalg.det(S[:3, :3])))
-    turned = S.copy()
-    turned[:3, :3] /= scale
-    first = min(number for number, of in spans if of == gone)
-    move = MapMoves(
-        keyframe_ids=np.array([first], np.int64),
-        moves=np.concatenate([matrix_to_pose(turned), [scale]])[None],
-    )
-    moves = held(move, spans, gone)
+    similarity = matrix_to_similarity(S)
+    first = np.array([min(number for number, of in spans if of == gone)], np.int64)
+    moves = held(MapMoves(keyframe_ids=first, moves=similarity[None]), spans, gone)
     (active if active_moves else earlier).move(moves)
-    moving.inverse_distance /= scale
+    moving.inverse_distance /= float(similarity[7])
     goes_on.strayed = staying.strayed
     goes_on.take_in(earlier, id)
     if calibration.readout:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.pose_graph import Edges, optimise_pose_graph
-from pliant.algorithms.geometry import inverse, matrix_to_pose
+from pliant.algorithms.geometry import inverse, matrix_to_similarity
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.final_adjustment import ListedMap
 from pliant.algorithms.mapping.map_store import MAPPED, PointRows
@@ -68,13 +68,10 @@ def close_loops(
     edges = _edges(seen, sigmas, loops, ends.astype(np.int32), focal_px)
     S = seen.T_world_camera
     found, weights = optimise_pose_graph(S, edges, np.arange(len(S)) == 0)
-    moves = found @ inverse(S)
-    scales = np.cbrt(np.linalg.det(moves[:, :3, :3]))
-    moves[:, :3, :3] /= scales[:, None, None]
+    moves = matrix_to_similarity(found @ inverse(S))
     fits = weights[len(weights) - len(loops) :] > _ACCEPTED
     accepted = [loop for loop, fit in zip(loops, fits, strict=True) if fit]
-    rows = np.column_stack([matrix_to_pose(moves), scales])
-    return MapMoves(keyframe_ids=keyframe_ids, moves=rows), accepted
+    return MapMoves(keyframe_ids=keyframe_ids, moves=moves), accepted
 
 
 def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px: float) -> Edges:

@@ -26,6 +26,7 @@ from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.geometry import (
     inverse,
     matrix_to_pose,
+    matrix_to_similarity,
     move_by_similarity,
     so3_exp,
     so3_log,
@@ -239,12 +240,9 @@ class Segment:
         """What moves its beginning to where it was, and all of it likewise; None where it is."""
         if np.array_equal(self.strayed, np.eye(4)):
             return None
-        S = np.asarray(np.linalg.inv(self.strayed), np.float64)
-        scale = float(np.cbrt(np.linalg.det(S[:3, :3])))
-        S[:3, :3] /= scale
-        move = np.concatenate([matrix_to_pose(S), [scale]])[None]
         first = np.array([self.keyframes[0].id], np.int64)
-        return self.given_up.together_with(MapMoves(keyframe_ids=first, moves=move))
+        move = matrix_to_similarity(np.asarray(np.linalg.inv(self.strayed), np.float64))
+        return self.given_up.together_with(MapMoves(keyframe_ids=first, moves=move[None]))
 
     def take_in(self, earlier: "Segment", id: int) -> None:
         """Become one with a segment that rests, in whose world this one lies by now, or the other
