@@ -312,17 +312,23 @@ def _spread(active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
     return spread_of(active.points, rows, active.keyframes[-1]) if len(directions) else None
 
 
-def keyframe_is_due(active: ActiveMap, age_ns: int) -> bool:
-    """Whether the frame is to become a keyframe.   age_ns: of the last one."""
+def keyframe_is_due(active: ActiveMap, age_s: float, interval_s: float) -> bool:
+    """Whether the frame is to become a keyframe.
+
+    age_s: since the last keyframe.   interval_s: since the last frame, so that the next one may be
+    expected as long after this one.
+    """
     if active.segment.resumes:
         return True  # the camera has been recognised
     limits = active.parameters.keyframe
     least = CANDIDATE if len(directions_of(active)) else MAPPED
     share, flow = active.window.flow_since_keyframe(least)
     unit = size_unit(active.camera.width, active.camera.height)
-    if share < limits.min_shared_share or flow > limits.max_flow_px * unit:
+    # Points go from view at a constant rate, whether frames come often or not.
+    share_of_next = share ** (1.0 + interval_s / age_s)
+    if share_of_next < limits.min_shared_share or flow > limits.max_flow_px * unit:
         return True
-    return age_ns > 1e9 * limits.max_s and flow > limits.min_flow_px * unit
+    return age_s > limits.max_s and flow > limits.min_flow_px * unit
 
 
 def support_of(

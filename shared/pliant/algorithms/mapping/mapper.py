@@ -158,7 +158,8 @@ class Mapper:
         with self._timer("triangulation"):
             active.window.triangulate(self._parameters.point)
         hanging = active.keyframes[-1]
-        self._keyframe_is_new = keyframe_is_due(active, stamp_ns - self._keyframe_ns)
+        age_s = 1e-9 * (stamp_ns - self._keyframe_ns)
+        self._keyframe_is_new = keyframe_is_due(active, age_s, self._motion.lost_s(stamp_ns))
         if self._keyframe_is_new:
             with self._timer("keyframe"):
                 T_world_camera, turned = stand(active, T_world_camera, found, tracks)

@@ -150,10 +150,11 @@ class KeyframeParameters(Parameters):
     """When a frame becomes a keyframe."""
 
     min_shared_share: float = Field(
-        default=0.7,
+        default=0.6,
         ge=0.0,
         le=1.0,
-        description="A keyframe is due when fewer than this share of the last one's points remain",
+        description="A keyframe is due when fewer than this share of the last one's points would "
+        "remain in the next frame",
     )
     max_flow_px: float = Field(
         default=20.0,
