@@ -3,7 +3,7 @@
 Everything works on the list of observations, so that time and memory grow with their number.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,6 +56,27 @@ class ListedMap:
     fixed: BoolArray
     flow: F32 | None = None
 
+    def most_seen(self, per_keyframe: int) -> "ListedMap":
+        """With the fewest points, those that most keyframes see first, that leave every keyframe
+        so many of its own, or all that another one sees, too."""
+        counts = np.bincount(self.point, minlength=len(self.rows))
+        order = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts >= 2)]
+        chosen = _enough(
+            self.camera, self.point, counts, order, len(self.T_world_camera), per_keyframe
+        )
+        number = np.cumsum(chosen, dtype=np.int32) - 1
+        kept = chosen[self.point]
+        return replace(
+            self,
+            rows=self.rows[chosen],
+            xyz=self.xyz[chosen],
+            camera=self.camera[kept],
+            point=number[self.point[kept]],
+            px=self.px[kept],
+            weights=self.weights[kept],
+            flow=None if self.flow is None else self.flow[kept],
+        )
+
     def depths(self) -> F64:
         """(O,) of each observed point in the camera that observes it."""
         return _depths(self.T_world_camera, self.xyz, self.camera, self.point)
@@ -91,6 +112,32 @@ def _depths(T_world_camera: F64, xyz: F64, camera: I32, point: I32) -> F64:
         x, y, z = X[0] - T[0, 3], X[1] - T[1, 3], X[2] - T[2, 3]
         depths[o] = x * T[0, 2] + y * T[1, 2] + z * T[2, 2]
     return depths
+
+
+@kernel
+def _enough(
+    camera: I32, point: I32, counts: I64, order: I64, cameras: int, per_camera: int
+) -> BoolArray:
+    """(N,) whether a point is chosen: in the given order, each of which a camera has too few yet.
+
+    counts: (N,) observations of each.
+    """
+    ends = np.cumsum(counts)
+    at = ends - counts
+    seen_by = np.empty(point.size, np.int32)
+    for o in range(point.size):
+        seen_by[at[point[o]]] = camera[o]
+        at[point[o]] += 1
+    chosen = np.zeros(counts.size, np.bool_)
+    have = np.zeros(cameras, np.int64)
+    for n in order:
+        sees = seen_by[ends[n] - counts[n] : ends[n]]
+        for m in sees:
+            chosen[n] |= have[m] < per_camera
+        if chosen[n]:
+            for m in sees:
+                have[m] += 1
+    return chosen
 
 
 def moves_between(keyframe_ids: I64, before: F64, after: F64, scales: F64) -> MapMoves:

@@ -239,6 +239,12 @@ class WholeMapParameters(Parameters):
         description="Observations for which that is a frame at least: it takes 4 to 6 us of one "
         "core for each of them, so 32 to 48 ms a frame",
     )
+    points_per_keyframe: int = Field(
+        default=1000,
+        ge=100,
+        description="Points that each keyframe has in it, of those that most keyframes see: all of "
+        "them tell of poses and lens what hardly more than these do",
+    )
     iterations: int = Field(
         default=12, ge=1, description="Most iterations of Schur LM; the next adjustment goes on"
     )

@@ -139,6 +139,8 @@ class WholeMap:
                 return
             self.due = (1.0 + growth) * count + (made - count)
         seen = list_map(segment.keyframes, points, calibration, parameters)
+        if not loops:
+            seen = seen.most_seen(parameters.whole_map.points_per_keyframe)
         seen.px = calibration.view.seen(seen.px)
         if parameters.calibration.readout > 0.0 and not loops:
             seen.flow = readout_flow(
