@@ -19,7 +19,7 @@ def test_pixels_are_where_the_image_shows_them(
 ) -> None:
     whole = corrected_view(CAMERA, correction)
     view = ShownView(whole)
-    rolled = RolledFrame(whole.camera, readout, MOTION, 0.4) if readout else None
+    rolled = RolledFrame(whole, readout, MOTION, 0.4) if readout else None
     u, v = np.meshgrid(np.arange(160), np.arange(120))
     shown = view.image(np.stack([u, v, 0 * u], axis=2).astype(np.uint8), rolled)
     assert shown.shape[:2] == (view.camera.height, view.camera.width)

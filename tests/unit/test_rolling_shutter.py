@@ -7,6 +7,7 @@ from mapping_scene import INTERVAL_NS, Scene, looking
 
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import align_umeyama, inverse, so3_exp
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.localisation import Motion
@@ -19,6 +20,7 @@ from pliant.algorithms.mapping.start import impatient
 from pliant.map_history import MapHistory
 
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
+VIEW = CorrectedView(CAMERA, ())
 OMEGA, NU = np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.01, 0.02])
 
 
@@ -113,7 +115,7 @@ def test_what_a_readout_has_moved_is_moved_back():
     rng = np.random.default_rng(1)
     world = rng.uniform((-1.5, -1.0, 3.0), (1.5, 1.0, 6.0), (200, 3))
     q, p = taken_at_once(world)
-    rolled = RolledFrame(CAMERA, READOUT, MOTION, 0.25)
+    rolled = RolledFrame(VIEW, READOUT, MOTION, 0.25)
     error = np.linalg.norm(p - rolled.shifts(p, 1.0 / world[:, 2]) - q, axis=1)
     assert np.linalg.norm(p - q, axis=1).max() > 2.5
     assert error.max() < 0.03  # the motion is taken as straight
@@ -137,17 +139,17 @@ def test_an_upright_image_is_read_out_across():
     flow = readout_flow(at[0], MOTION[None], world, *at[1:], px, CAMERA)
     other = readout_flow(at[0], turned[None], world[:, swapped], *at[1:], other_px, upright)
     np.testing.assert_allclose(other, flow[:, ::-1], atol=1e-4)
-    shifts = RolledFrame(CAMERA, READOUT, MOTION, 0.25).shifts(px)
-    other = RolledFrame(upright, READOUT, turned, 0.25)
+    shifts = RolledFrame(VIEW, READOUT, MOTION, 0.25).shifts(px)
+    other = RolledFrame(CorrectedView(upright, ()), READOUT, turned, 0.25)
     np.testing.assert_allclose(other.shifts(other_px), shifts[:, ::-1], atol=1e-4)
     image = rng.integers(0, 255, (480, 640), np.uint8)
-    at_once = RolledFrame(CAMERA, READOUT, MOTION, 0.25).image(image)
+    at_once = RolledFrame(VIEW, READOUT, MOTION, 0.25).image(image)
     swapped_image = other.image(np.ascontiguousarray(image.T)).T
     assert np.abs(swapped_image.astype(int) - at_once).max() <= 1
 
 
 def test_an_image_is_as_if_taken_at_once():
-    rolled = RolledFrame(CAMERA, READOUT, MOTION, 0.25)
+    rolled = RolledFrame(VIEW, READOUT, MOTION, 0.25)
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
     for seen in np.array([[100.3, 40.8], [320.0, 239.5], [560.7, 420.2]], np.float32):
         blob = 250.0 * np.exp(-((u - seen[0]) ** 2 + (v - seen[1]) ** 2) / 18.0)

@@ -47,14 +47,12 @@ class CorrectedView:
 
     def image(self, pixels: U8) -> U8:
         """(H, W) or (H, W, 3) the ideal image of a rectified one."""
-        if not self._correction.any():
-            return pixels
-        return moved_image(pixels, self._places)
+        return pixels if self.move is None else moved_image(pixels, self.move)
 
     @property
-    def moves(self) -> tuple[Move, ...]:
+    def move(self) -> Move | None:
         """What ``image`` does to an image, as of ``MovedImage``."""
-        return (self._places,) if self._correction.any() else ()
+        return self._places if self._correction.any() else None
 
     @property
     def shows(self) -> BoolArray:

@@ -49,8 +49,7 @@ class ShownView:
 
     def image(self, pixels: U8, rolled: RolledFrame | None = None) -> U8:
         """(h, w) or (h, w, 3) of a rectified image.  rolled: taken as if it had been at once."""
-        ideal = self._view.image(pixels)
-        return (ideal if rolled is None else rolled.image(ideal))[self._shown]
+        return (self._view if rolled is None else rolled).image(pixels)[self._shown]
 
     def pixels(self, points_px: F32, rolled: RolledFrame | None = None) -> F32:
         """(N, 2) where ``image`` shows what the rectified image shows there."""

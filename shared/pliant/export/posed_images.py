@@ -74,7 +74,7 @@ class IdealCamera:
         correction = run.correction_of(self.segment)
         self._readout = correction[3] if len(correction) > 3 else 0.0
         view = corrected_view(run.stream.camera, correction)
-        self._whole, self._view = view.camera, ShownView(view)
+        self._whole, self._view = view, ShownView(view)
         self.camera = self._view.camera
         self._positions = run.history.points_in(self.segment).positions
         self._rolled = lru_cache(maxsize=1)(self._rolled_frame)

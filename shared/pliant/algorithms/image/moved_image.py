@@ -5,6 +5,7 @@ Each pixel is found by itself, so that both have the same bytes.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import cv2
@@ -27,33 +28,30 @@ def moved_image(pixels: U8, move: Move) -> U8:
 
 @dataclass(frozen=True)
 class MovedImage:
-    """pixels: (H, W) or (H, W, 3) RGB of the first image.   moves: from each to the next."""
+    """pixels: (H, W) or (H, W, 3) RGB of the image before.   move: from it; None: it stays."""
 
     pixels: U8
-    moves: tuple[Move, ...] = ()
+    move: Move | None = None
+
+    @cached_property
+    def whole(self) -> U8:
+        """All of the new image."""
+        return self.pixels if self.move is None else moved_image(self.pixels, self.move)
 
     def colours(self, points_px: F32) -> U8:
-        """(N, 3) RGB of the pixels of the last image that are nearest to points (N, 2)."""
+        """(N, 3) RGB of the pixels of the new image that are nearest to points (N, 2)."""
         height, width = self.pixels.shape[:2]
         nearest = (points_px.astype(np.float64) + 0.5).astype(np.int64)
         columns, rows = np.clip(nearest, 0, (width - 1, height - 1)).T
-        found = _pixels_at(self.pixels, self.moves, columns, rows)
+        found = _pixels_at(self.pixels, self.move, columns, rows)
         return found if found.ndim == 2 else np.repeat(found[:, None], 3, axis=1)
 
 
-def _pixels_at(pixels: U8, moves: tuple[Move, ...], columns: I64, rows: I64) -> U8:
-    """(N,) or (N, 3) pixels of the image after all moves."""
-    if not moves or not len(columns):
+def _pixels_at(pixels: U8, move: Move | None, columns: I64, rows: I64) -> U8:
+    """(N,) or (N, 3) pixels of the new image."""
+    if move is None or not len(columns):
         return pixels[rows, columns]
-    u, v = (each[rows, columns] for each in moves[-1])
-    if moves[:-1]:
-        # Of the image before only the four pixels are made between which each of these lies.
-        before, (height, width) = np.empty_like(pixels), pixels.shape[:2]
-        left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
-        for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            at = np.clip(top + down, 0, height - 1), np.clip(left + across, 0, width - 1)
-            before[at] = _pixels_at(pixels, moves[:-1], at[1], at[0])
-        pixels = before
+    u, v = (each[rows, columns] for each in move)
     shape = (-(-len(u) // _WIDEST), _WIDEST)
     moved = moved_image(pixels, (np.resize(u, shape), np.resize(v, shape)))
     return moved.reshape(-1, *moved.shape[2:])[: len(u)]

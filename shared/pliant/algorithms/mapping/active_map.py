@@ -93,7 +93,11 @@ class ActiveMap:
         return self.segment.keyframes
 
     def begin(
-        self, start: Start, waiting: list[WaitingFrame], grey: U8 | None, colour: U8 | None
+        self,
+        start: Start,
+        waiting: list[WaitingFrame],
+        grey: U8 | None,
+        colours: MovedImage | None,
     ) -> None:
         """Take over a start.  The images are those of the newest of the waiting frames."""
         newest = waiting[-1]
@@ -106,9 +110,8 @@ class ActiveMap:
         self.links.ids, self.links.rows = start.ids, rows
         self.links.follow(newest.ids)
         self._link_new_tracks(newest.points_px)
-        image = None if grey is None else MovedImage(grey if colour is None else colour)
-        self._paint(rows, start.newest_px, image)
-        self._paint(self.links.rows, newest.points_px, image)
+        self._paint(rows, start.newest_px, colours)
+        self._paint(self.links.rows, newest.points_px, colours)
         self.points.kappas[self.links.rows] = newest.kappas
         frames = {frame.frame: frame for frame in waiting}
         for k, number in enumerate(start.frames.tolist()):
@@ -242,11 +245,11 @@ class ActiveMap:
         """Make the frame a keyframe and adjust the window.
 
         points_px, rolled_px: of all living tracks.   found: points that it sees without a track.
-        grey: (H, W).   colours: None: as grey.   turned: whether it stands where the last one does.
+        grey: (H, W), with all of it where the tracks are.   turned: whether it stands where the
+        last one does.
         """
         new = self._link_new_tracks(points_px)
-        image = MovedImage(grey) if colours is None and grey is not None else colours
-        self._paint(self.links.rows[new], points_px[new], image)
+        self._paint(self.links.rows[new], points_px[new], colours)
         keyframe = self._append_keyframe(
             frame,
             T_world_camera,

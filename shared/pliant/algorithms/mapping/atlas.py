@@ -13,6 +13,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8
 from pliant.algorithms.geometry import inverse
+from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
@@ -96,7 +97,7 @@ class Atlas:
         calibration: SelfCalibration,
         waiting: list[WaitingFrame],
         grey: U8 | None,
-        colour: U8 | None,
+        colours: MovedImage | None,
     ) -> ActiveMap:
         """A segment begins.  calibration: as the start tells it.   The images are those of the
         newest of the frames that waited."""
@@ -104,7 +105,7 @@ class Atlas:
         active = self._enter(Segment(id=self._next_segment, points=self.points))
         self._next_segment += 1
         self._forget_questions()
-        active.begin(start, waiting, grey, colour)
+        active.begin(start, waiting, grey, colours)
         self._adjusted = True  # not all of its keyframes are in the window
         self.calibrate()
         self.remember(active.keyframes[-1], grey)

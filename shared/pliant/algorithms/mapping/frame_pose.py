@@ -106,7 +106,7 @@ def localise(
     motion: Motion,
     stamp_ns: int,
     seen: FrameExtrema,
-    grey: U8 | None,
+    image: MovedImage | None,
     generator: np.random.Generator,
 ) -> Located | None:
     """The frame from the tracks of mapped points, or else from the map's points in the image; None
@@ -131,19 +131,19 @@ def localise(
         inliers = int(located.inliers.sum())
         of_points = int(located.inliers[: len(linked) - len(directions)].sum())
         if of_points + _OF_DIRECTION * (inliers - of_points) >= limits.min_inliers:
-            if grey is None or inliers >= _FEW * motion.tracked:
+            if image is None or inliers >= _FEW * motion.tracked:
                 return Located(located.T_world_camera, inliers >= _FIRM * motion.tracked)
             proved = prove(
-                located.T_world_camera, active.nearby(), points, seen.maxima, grey, active.camera,
-                parameters, parameters.recovery.min_agreement,
+                located.T_world_camera, active.nearby(), points, seen.maxima, image.whole,
+                active.camera, parameters, parameters.recovery.min_agreement,
             )  # fmt: skip
             if proved is not None:
                 return Located(proved.T_world_camera, True)
-    if grey is None:
+    if image is None:
         return None
     recovered = recover(
-        motion, stamp_ns, active.nearby(), points, seen.maxima, grey, active.camera, parameters,
-        generator,
+        motion, stamp_ns, active.nearby(), points, seen.maxima, image.whole, active.camera,
+        parameters, generator,
     )  # fmt: skip
     return None if recovered is None else Located(recovered, True)
 
@@ -275,14 +275,14 @@ def _contradicting(active: ActiveMap, T_world_camera: F64, points_px: F32) -> I6
     return candidates[off > _OFF * active.parameters.localisation.inlier_px]
 
 
-def coloured(
-    calibration: SelfCalibration, rolled: RolledFrame | None, colour: U8 | None
+def image_of_tracks(
+    calibration: SelfCalibration, rolled: RolledFrame | None, pixels: U8 | None
 ) -> MovedImage | None:
-    """The colours (H, W, 3) of a frame where its tracks are."""
-    if colour is None:
+    """A rectified image (H, W) or (H, W, 3) with all of it where the tracks of the frame are, which
+    are of the camera found so far.   rolled: and have been taken ``at_once``."""
+    if pixels is None:
         return None
-    at_once = () if rolled is None else (rolled.places,)
-    return MovedImage(colour, (*calibration.view.moves, *at_once))
+    return MovedImage(pixels, calibration.view.move if rolled is None else rolled.places)
 
 
 def stand(

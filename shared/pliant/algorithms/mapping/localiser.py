@@ -12,6 +12,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
+from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
@@ -19,6 +20,7 @@ from pliant.algorithms.mapping.frame_pose import (
     Support,
     at_once,
     doubt,
+    image_of_tracks,
     localise,
     reacquire_points,
     support_of,
@@ -82,10 +84,10 @@ class Localiser:
     ) -> MapDelta:
         """Find a frame in the map.  stamp_ns, grey, colour: as of ``Mapper.process``."""
         tracks = self.calibration.ideal(tracks)
-        grey = self.calibration.ideal_image(grey)
+        image = image_of_tracks(self.calibration, None, grey)
         if self._map is not None:
             self._map.links.follow(tracks.ids)
-        located = self._locate(stamp_ns, tracks, grey, timer)
+        located = self._locate(stamp_ns, tracks, image, timer)
         if located is None or self._map is None or self._hanging is None:
             return self._publish(LOST if self._map else WAITING, "not recognised in the map", 0)
         with timer("reacquisition"):
@@ -142,22 +144,22 @@ class Localiser:
         return KeyframeChanges(self._points).publish(None)
 
     def _locate(
-        self, stamp_ns: int, tracks: FrameExtrema, grey: U8 | None, timer: StageTimer
+        self, stamp_ns: int, tracks: FrameExtrema, image: MovedImage | None, timer: StageTimer
     ) -> F64 | None:
         there = None
         if self._map is not None and self._motion is not None:
             with timer("localisation"):
                 located = localise(
-                    self._map, self.calibration, self._motion, stamp_ns, tracks, grey,
+                    self._map, self.calibration, self._motion, stamp_ns, tracks, image,
                     self._generator,
                 )  # fmt: skip
             there = None if located is None else located.T_world_camera
             if located is not None and located.is_firm:
                 return there
-        if grey is None:
+        if image is None:
             return there
         with timer("places"):
-            found = self.recognise(tracks.maxima, grey, self._generator)
+            found = self.recognise(tracks.maxima, image.whole, self._generator)
         if found is None:
             return there
         if there is not None and self._map is not None:
@@ -202,9 +204,9 @@ class Localiser:
         if self.calibration.readout and self._motion is not None:
             velocity = self._motion.velocity_at(frame, T_world_camera)
             tracks, rolled = at_once(active, self.calibration, T_world_camera, velocity, tracks)
-            grey = grey if grey is None else rolled.image(grey)
+        image = image_of_tracks(self.calibration, rolled, grey)
         T_world_camera, found = reacquire_points(
-            active, frame, T_world_camera, tracks, grey, rolled
+            active, frame, T_world_camera, tracks, None if image is None else image.whole, rolled
         )
         linked = active.linked(MAPPED)
         rows, points_px = active.observed(tracks.points_px, found, np.zeros(0, np.int64))

@@ -12,6 +12,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
@@ -21,8 +22,8 @@ from pliant.algorithms.mapping.frame_pose import (
     Located,
     adjust,
     at_once,
-    coloured,
     doubt,
+    image_of_tracks,
     keyframe_is_due,
     localise,
     reacquire_points,
@@ -138,10 +139,9 @@ class Mapper:
             atlas.active.links.follow(tracks.ids)
         with self._timer("corrected view"):
             tracks = self.calibration.ideal(tracks)
-            grey = self.calibration.ideal_image(grey)
-        self._images = (grey, colour)
-        seen, rolled = tracks, None
-        located = self._locate(frame, stamp_ns, seen, grey)
+        self._images = (grey, grey if colour is None else colour)
+        seen, rolled, image = tracks, None, image_of_tracks(self.calibration, None, grey)
+        located = self._locate(frame, stamp_ns, seen, image)
         active = atlas.active
         if active is None:
             return self._wait(frame, stamp_ns, tracks)
@@ -151,8 +151,9 @@ class Mapper:
             if self.calibration.readout:
                 velocity = self._motion.velocity_at(frame, located)
                 tracks, rolled = at_once(active, self.calibration, located, velocity, seen)
-                grey = grey if grey is None else rolled.image(grey)
-            T_world_camera, found = reacquire_points(active, frame, located, tracks, grey, rolled)
+                image = image_of_tracks(self.calibration, rolled, grey)
+            shown = None if image is None else image.whole
+            T_world_camera, found = reacquire_points(active, frame, located, tracks, shown, rolled)
         with self._timer("subspace adjustment"):
             T_world_camera, support = adjust(active, self._motion, T_world_camera, found, tracks)
         with self._timer("triangulation"):
@@ -163,11 +164,12 @@ class Mapper:
         if self._keyframe_is_new:
             with self._timer("keyframe"):
                 T_world_camera, turned = stand(active, T_world_camera, found, tracks)
+                colours = image_of_tracks(self.calibration, rolled, self._images[1])
                 if rolled is not None:
                     active.segment.unroll(active.window.keyframes, self.calibration)
                 hanging = active.insert_keyframe(
                     frame, T_world_camera, tracks.points_px, seen.points_px - tracks.points_px,
-                    found, grey, coloured(self.calibration, rolled, colour), turned,
+                    found, shown, colours, turned,
                 )  # fmt: skip
             self.follow(atlas.calibrate())
             T_world_camera = hanging.T_world_camera
@@ -176,7 +178,7 @@ class Mapper:
                 self._changes.add_same_places([(self._recognised, hanging.id)])
                 self._recognised = None
             with self._timer("places"):
-                atlas.remember(hanging, grey, tracks.maxima)
+                atlas.remember(hanging, shown, tracks.maxima)
             with self._timer("passed frames"):
                 surplus = active.segment.passed.take_surplus(self._parameters)
                 self._correct(refined_poses(surplus, active.points, self._camera, self._parameters))
@@ -264,15 +266,19 @@ class Mapper:
         found = find_start_of(self._waiting.frames, self.calibration, parameters)
         if isinstance(found, str):
             return found
-        grey, colour = self._images
-        return self._begin(*found, grey, self.calibration.ideal_image(colour))
+        grey, colours = (image_of_tracks(self.calibration, None, each) for each in self._images)
+        return self._begin(*found, None if grey is None else grey.whole, colours)
 
     def _begin(
-        self, start: Start, calibration: SelfCalibration, grey: U8 | None, colour: U8 | None
+        self,
+        start: Start,
+        calibration: SelfCalibration,
+        grey: U8 | None,
+        colours: MovedImage | None,
     ) -> int:
         """Let the map start, and give poses to the frames that waited, backwards."""
         waiting, self._waiting, self._images = self._waiting, Waiting(), (None, None)
-        active = self.atlas.begin(start, calibration, waiting.frames, grey, colour)
+        active = self.atlas.begin(start, calibration, waiting.frames, grey, colours)
         placed = list(
             earlier_poses(
                 start, active.keyframes, waiting, self._camera, self._parameters.localisation
@@ -294,26 +300,26 @@ class Mapper:
         return newest.inliers
 
     def _locate(
-        self, frame: int, stamp_ns: int, tracks: FrameExtrema, grey: U8 | None
+        self, frame: int, stamp_ns: int, tracks: FrameExtrema, image: MovedImage | None
     ) -> F64 | None:
         """T_world_camera of the frame where it goes on, or else where it was seen before."""
         active, located = self.atlas.active, None
         if active is not None:
             with self._timer("localisation"):
                 located = localise(
-                    active, self.calibration, self._motion, stamp_ns, tracks, grey, self._generator
+                    active, self.calibration, self._motion, stamp_ns, tracks, image, self._generator
                 )
             if located is not None and located.is_firm:
                 return located.T_world_camera
         with self._timer("places"):
-            return self._recognise(frame, stamp_ns, tracks, grey, located)
+            return self._recognise(frame, stamp_ns, tracks, image, located)
 
     def _recognise(
         self,
         frame: int,
         stamp_ns: int,
         tracks: FrameExtrema,
-        grey: U8 | None,
+        image: MovedImage | None,
         located: Located | None,
     ) -> F64 | None:
         """T_world_camera in the segment that the image shows, which then goes on.
@@ -321,9 +327,9 @@ class Mapper:
         located: where a few tracks lead, which counts where the image shows no other place.
         """
         there = None if located is None else located.T_world_camera
-        if grey is None:
+        if image is None:
             return there
-        found = self.atlas.recognise(grey, tracks.maxima, self._generator)
+        found = self.atlas.recognise(image.whole, tracks.maxima, self._generator)
         if found is None:
             return there
         keyframe, pose = found.keyframe, found.T_world_camera

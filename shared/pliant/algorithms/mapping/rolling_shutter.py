@@ -22,6 +22,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import inverse, so3_log
 from pliant.algorithms.image.moved_image import Move, moved_image
 from pliant.algorithms.map_delta import MapMoves
@@ -38,7 +39,7 @@ _STEPS = 2
 """Of the fixed point: a shift of a hundredth of the image changes itself by a hundredth."""
 
 _GRID_PX = 16
-"""Between these the shift of an image is interpolated: it is nearly quadratic."""
+"""Between these the move of an image is interpolated: it is nearly quadratic."""
 
 
 def _read_out_along(camera: PinholeCamera) -> tuple[int, float]:
@@ -117,14 +118,20 @@ def motion_between(first: F64, last: F64, T_world_camera: F64) -> F64:
 class RolledFrame:
     """What a rolling shutter did to a frame.
 
+    view: of the frame; pixels are of its camera, but those of images, which are rectified.
     readout: share of the frame interval.   motion: (6,) as of ``Path.motions``.
     inverse_depth: of what has no depth of its own.
     """
 
-    camera: PinholeCamera
+    view: CorrectedView
     readout: float
     motion: F64
     inverse_depth: float
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """Of the view."""
+        return self.view.camera
 
     def shifts(self, points_px: F32, inverse_depths: F64 | None = None) -> F32:
         """(N, 2) px by which that moved what is seen at points_px (N, 2)."""
@@ -138,19 +145,21 @@ class RolledFrame:
         return seen - shifts, shifts
 
     def image(self, pixels: U8) -> U8:
-        """The image (H, W) or (H, W, 3), had it been taken at once: all of it at one depth."""
+        """The rectified image (H, W) or (H, W, 3) as the view would have it, had it been taken at
+        once: all of it at one depth."""
         return moved_image(pixels, self.places)
 
     @cached_property
     def places(self) -> Move:
-        """(H, W) columns and rows in which the pixels of the image taken at once are seen."""
+        """(H, W) columns and rows of the rectified image in which the pixels of the image taken at
+        once are seen."""
         width, height = self.camera.width, self.camera.height
         columns, rows = -(-width // _GRID_PX) + 1, -(-height // _GRID_PX) + 1
         v, u = np.mgrid[:rows, :columns].astype(np.float32) * _GRID_PX
         nodes = np.stack([u.ravel(), v.ravel()], axis=1)
-        shifts = self._shifts(nodes, None, seen=False).reshape(rows, columns, 2)
+        moves = self.view.seen(nodes + self._shifts(nodes, None, seen=False)) - nodes
         places = np.empty((2, height, width), np.float32)
-        _interpolate(shifts, places)
+        _interpolate(moves.reshape(rows, columns, 2), places)
         return places[0], places[1]
 
     def _shifts(self, points_px: F32, inverse_depths: F64 | None, *, seen: bool) -> F32:
@@ -245,8 +254,8 @@ def _shifts(
 
 
 @kernel
-def _interpolate(shifts: F32, places: F32) -> None:
-    """Write the place (2, H, W) of each pixel by shifts (., ., 2) that are given at the nodes.
+def _interpolate(moves: F32, places: F32) -> None:
+    """Write the place (2, H, W) of each pixel by moves (., ., 2) that are given at the nodes.
 
     By whole rows, which are SIMD code, from the corners of the cell that each pixel lies in.
     """
@@ -261,7 +270,7 @@ def _interpolate(shifts: F32, places: F32) -> None:
             down = np.float32(row - r * _GRID_PX) / np.float32(_GRID_PX)
             if row == r * _GRID_PX:
                 for j in range(width):
-                    upper, lower = shifts[r, cell[j] :, k], shifts[r + 1, cell[j] :, k]
+                    upper, lower = moves[r, cell[j] :, k], moves[r + 1, cell[j] :, k]
                     corners[0, j], corners[1, j] = upper[0], upper[1]
                     corners[2, j], corners[3, j] = lower[0], lower[1]
             if k:

@@ -192,19 +192,17 @@ class Segment:
 
     def rolled(self, calibration: SelfCalibration, motion: F64) -> RolledFrame:
         """What the readout does to a frame that moves so."""
-        camera, readout = calibration.view.camera, calibration.readout
-        return RolledFrame(camera, readout, motion, self.inverse_distance)
+        return RolledFrame(calibration.view, calibration.readout, motion, self.inverse_distance)
 
     def unroll(self, keyframes: list[Keyframe], calibration: SelfCalibration) -> None:
         """Let keyframes see as if they had been taken at once, as is now known of readout, motion
         and depths; those of which no motion is known any more stay."""
-        camera, readout = calibration.view.camera, calibration.readout
         for keyframe, motion in zip(keyframes, self.path.motions(keyframes), strict=True):
             if not motion.any():
                 continue
             seen = keyframe.points_px + keyframe.rolled_px
             depths = self.inverse_depths(keyframe.rows, keyframe.T_world_camera)
-            rolled = RolledFrame(camera, readout, motion, self.inverse_distance)
+            rolled = self.rolled(calibration, motion)
             keyframe.rolled_px = rolled.shifts(seen, depths)
             keyframe.points_px = seen - keyframe.rolled_px
 

@@ -10,7 +10,7 @@ import dataclasses
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.arrays import F64
 from pliant.algorithms.bundle.problem import (
     BundleProblem,
     BundleResult,
@@ -160,10 +160,6 @@ class SelfCalibration:
         maxima = tracks.maxima.copy()
         maxima[:, :2] = view.pixels(tracks.maxima[:, :2])
         return dataclasses.replace(tracks, points_px=view.pixels(tracks.points_px), maxima=maxima)
-
-    def ideal_image(self, pixels: U8 | None) -> U8 | None:
-        """(H, W) or (H, W, 3) an image of the camera found so far."""
-        return None if pixels is None else self.view.image(pixels)
 
     def published_with(self, delta: MapDelta) -> MapDelta:
         """What is published, with what the map was made with."""
