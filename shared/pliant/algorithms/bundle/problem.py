@@ -62,9 +62,10 @@ class CalibrationUncertainty(Parameters):
         description="Standard deviation of the focal length, as a share of it; 0 holds it",
     )
     k1: float = Field(
-        default=0.01,
+        default=0.02,
         ge=0.0,
-        description="Standard deviation of the radial distortion k1 after rectification; 0: held",
+        description="Standard deviation of the radial distortion k1 after rectification, by which "
+        "the border of the image counts less until k1 is found; 0: held",
     )
     k2: float = Field(
         default=0.0,

@@ -55,20 +55,20 @@ class ActiveMap:
 
     points: rows shared by all segments.   next_keyframe_id: of the keyframe to come.
     links: rows of the living tracks.   window: the keyframes under adjustment.
-    room: observations that it may have.
+    room: observations that it may have.   seen_by: the calibration whose pixels it has.
     """
 
     def __init__(
         self,
         segment: Segment,
         next_keyframe_id: int,
-        camera: PinholeCamera,
+        seen_by: SelfCalibration,
         parameters: MappingParameters,
     ) -> None:
         self.segment = segment
         self.points = segment.points
         self.next_keyframe_id = next_keyframe_id
-        self.camera = camera
+        self.seen_by = seen_by
         self.parameters = parameters
         self.room = parameters.window.kept_observations
         self.links = TrackLinks()
@@ -84,8 +84,13 @@ class ActiveMap:
             outside=outside,
             points=self.points,
             camera=self.camera,
-            lens_radius=self.parameters.window.lens_radius,
+            k_sigmas=self.seen_by.k_sigmas(self.parameters.calibration),
         )
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """Whose pixels it has."""
+        return self.seen_by.view.camera
 
     @property
     def keyframes(self) -> list[Keyframe]:
@@ -321,9 +326,9 @@ class ActiveMap:
         self.window.see_anew()
         self._adjust_window()
 
-    def see_anew(self, camera: PinholeCamera) -> None:
+    def see_anew(self, seen_by: SelfCalibration) -> None:
         """The camera is another one by now, and the keyframes have its pixels."""
-        self.camera, before = camera, self.window
+        self.seen_by, before = seen_by, self.window
         self.window = self._window(before.keyframes, fixed=before.fixed, outside=before.outside)
         self.window.T_world_camera[-1] = before.T_world_camera[-1]
         if before.keyframes:
@@ -391,7 +396,7 @@ class ActiveMap:
     def adjust_all(self, known: SelfCalibration) -> tuple[SelfCalibration, MapMoves | None]:
         """As ``Segment.adjust``."""
         known, moves = self.segment.adjust(known, self.parameters)
-        self.camera = known.view.camera
+        self.seen_by = known
         self.rebuild_window()
         self._place_directions()  # they were placed in the map that it was
         return known, moves

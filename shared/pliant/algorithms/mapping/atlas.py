@@ -113,8 +113,7 @@ class Atlas:
 
     def _enter(self, segment: Segment) -> ActiveMap:
         """The camera is in a segment."""
-        camera = self.calibration.view.camera
-        self.active = ActiveMap(segment, self._next_keyframe, camera, self._parameters)
+        self.active = ActiveMap(segment, self._next_keyframe, self.calibration, self._parameters)
         self.active.room = self._earlier.share_room(self.points, self._parameters.window)
         self.segment = segment.id
         self._spans.append((self._next_keyframe, segment.id))
@@ -246,7 +245,7 @@ class Atlas:
         newest = active.keyframes[-1]
         pose = newest.T_world_camera
         see_by(active.segment, before.view, self.calibration)
-        active.see_anew(self.calibration.view.camera)
+        active.see_anew(self.calibration)
         self._earlier.see_by(before, self.calibration)
         self._adjusted = True  # readers have the points as the other lens had them
         return Moved(newest.T_world_camera @ inverse(pose))

@@ -23,11 +23,6 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.triangulation import spread_of_rays
 from pliant.compiler.kernel import kernel
 
-_FREE_LENS = 2.0
-"""Times the lens radius where focal length and k1 are adjusted, too: what these explain is no error
-of the calibration any more.  Not while it is a guess: far from the truth the lens is no small error
-that the images explain step by step, and the border would lead it astray."""
-
 _CHUNK = 4096
 """Points whose rays are compared at a time: bounds a dense table of keyframes x points."""
 
@@ -253,15 +248,17 @@ def list_map(
         camera=np.repeat(np.arange(len(keyframes), dtype=np.int32), sizes),
         point=number[seen],
         px=px,
-        weights=weigh(px, known.view.camera, _lens_radius(parameters, known)),
+        weights=weigh(px, known.view.camera, _k_sigmas(parameters, known)),
         fixed=np.array([k.turned for k in keyframes]) | (np.arange(len(keyframes)) == 0),
     )
 
 
-def _lens_radius(parameters: MappingParameters, known: SelfCalibration) -> float:
-    uncertain = parameters.calibration
-    free = uncertain.focal > 0.0 and uncertain.k1 > 0.0 and not known.is_guess
-    return parameters.window.lens_radius * (_FREE_LENS if free else 1.0)
+def _k_sigmas(parameters: MappingParameters, known: SelfCalibration) -> tuple[float, float]:
+    """What an adjustment leaves of a lens.  It explains the error of k1 itself; but not while that
+    is a guess: far from the truth it is no small error, which the images explain step by step, and
+    the border would lead it astray."""
+    k1, k3 = known.k_sigmas(parameters.calibration)
+    return k1 if known.is_guess else 0.0, k3
 
 
 @kernel

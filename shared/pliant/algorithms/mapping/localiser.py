@@ -168,7 +168,7 @@ class Localiser:
                 return there
         self._hanging, self._motion = found.keyframe, None
         segment = next(each for each in self._segments if each.id == found.keyframe.segment)
-        self._map = ActiveMap(segment, 0, self.calibration.view.camera, self._parameters)
+        self._map = ActiveMap(segment, 0, self.calibration, self._parameters)
         self._map.links.follow(tracks.ids)
         self._map.look_around(found.T_world_camera)
         self._looked_from = found.T_world_camera

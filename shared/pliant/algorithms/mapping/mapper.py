@@ -181,7 +181,9 @@ class Mapper:
                 atlas.remember(hanging, shown, tracks.maxima)
             with self._timer("passed frames"):
                 surplus = active.segment.passed.take_surplus(self._parameters)
-                self._correct(refined_poses(surplus, active.points, self._camera, self._parameters))
+                self._correct(
+                    refined_poses(surplus, active.points, self.calibration, self._parameters)
+                )
         else:
             active.pass_by(frame, T_world_camera, tracks.points_px, found)
         self._place_waiting(active, hanging, T_world_camera)
@@ -216,8 +218,8 @@ class Mapper:
         self.start_at_last()
         self.follow(self.atlas.finish())
         for segment, seen_by in self.atlas.everything():
-            frames, camera = segment.passed.take_all(), seen_by.view.camera
-            self._correct(refined_poses(frames, segment.points, camera, self._parameters))
+            frames = segment.passed.take_all()
+            self._correct(refined_poses(frames, segment.points, seen_by, self._parameters))
         if self.atlas.active is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         self._keyframe_changes.settle(self.atlas.active.keyframes)

@@ -142,7 +142,7 @@ class _Merging:
         self._worlds.append(segment)
 
     def _active(self, segment: Segment) -> ActiveMap:
-        return ActiveMap(segment, 0, self._calibration.view.camera, self._parameters)
+        return ActiveMap(segment, 0, self._calibration, self._parameters)
 
     def _kept(self) -> Iterator[KeptKeyframe]:
         """Of all segments: those that have met nothing are as they were given."""

@@ -10,24 +10,30 @@ from pliant.algorithms.geometry import inverse
 from pliant.compiler.kernel import fast_kernel, kernel
 
 
-def weigh(points_px: F32, camera: PinholeCamera, lens_radius: float) -> F32:
-    """(n,) weights of observations at points_px (n, 2).
+def weigh(points_px: F32, camera: PinholeCamera, k_sigmas: tuple[float, float]) -> F32:
+    """(n,) weights of observations at points_px (n, 2), 1 on the axis.
 
-    No calibration is perfect, and what it misses grows with the distance from the axis: an
-    observation at the lens radius, on the plane z = 1, counts half.
+    k_sigmas: standard deviations of the distortions k1 and k3.  So what is seen at the distance r
+    from the axis, on the plane z = 1, may be off by f k1 r^3 + f k3 r^7 px beside its noise of 1
+    px: the weight is the inverse of all three variances together.  A focal length that is off moves
+    all alike, and depths take it up.
     """
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, lens_radius], np.float32)
+    k1, k3 = k_sigmas
+    lens = np.array(
+        [camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * k1, camera.fx * k3], np.float32
+    )
     return _weigh(points_px, lens)
 
 
 @kernel
 def _weigh(points_px: F32, lens: F32) -> F32:
     weights = np.empty(points_px.shape[0], np.float32)
-    scale = np.float32(1.0) / (lens[4] * lens[4])
+    one, of_k1, of_k3 = np.float32(1.0), lens[4] * lens[4], lens[5] * lens[5]
     for i in range(points_px.shape[0]):
         x, y = (points_px[i, 0] - lens[2]) / lens[0], (points_px[i, 1] - lens[3]) / lens[1]
-        share = (x * x + y * y) * scale
-        weights[i] = np.float32(1.0) / (np.float32(1.0) + share * share)
+        r2 = x * x + y * y
+        r4 = r2 * r2
+        weights[i] = one / (one + r2 * r4 * (of_k1 + of_k3 * r4 * r4))
     return weights
 
 

@@ -188,13 +188,6 @@ class WindowParameters(Parameters):
         description="Subspace Gauss-Newton sweeps on every frame, over its pose and the points "
         "that it sees; 0 means none",
     )
-    lens_radius: float = Field(
-        default=0.25,
-        gt=0.0,
-        description="Distance from the optical axis, on the plane z = 1, at which an observation "
-        "counts half: calibrations are worst at the border. Twice that where focal length and k1 "
-        "are adjusted, too, and are no guess",
-    )
     outlier_px: float = Field(
         default=2.5, gt=0.0, description="Observations with a larger error are removed, px"
     )

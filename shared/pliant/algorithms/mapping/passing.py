@@ -13,13 +13,13 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.bundle.subspace import refine_pose
-from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.mapping.directions import MAPPED_SHARE
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 
 _ROOM = 2_000_000
 """Most observations that are kept, 24 MB: some 250 frames of 8000."""
@@ -112,11 +112,14 @@ class PassedFrames:
 def refined_poses(
     frames: Iterable[_Passed],
     points: PointRows,
-    camera: PinholeCamera,
+    seen_by: SelfCalibration,
     parameters: MappingParameters,
 ) -> list[EarlierPose]:
-    """Poses of those of the frames that see enough of the map as it is now."""
-    limits = parameters.localisation
+    """Poses of those of the frames that see enough of the map as it is now.
+
+    seen_by: whose pixels the frames have.
+    """
+    limits, camera = parameters.localisation, seen_by.view.camera
     placed: list[EarlierPose] = []
     for each in frames:
         keyframe = each.keyframe
@@ -130,7 +133,7 @@ def refined_poses(
         T_world_camera, fits, _ = refine_pose(
             keyframe.T_world_camera @ each.T_keyframe_camera, points.xyz[each.rows[still]],
             points_px, camera, parameters.bundle, inlier_px=limits.inlier_px,
-            weights=weigh(points_px, camera, parameters.window.lens_radius),
+            weights=weigh(points_px, camera, seen_by.k_sigmas(parameters.calibration)),
         )  # fmt: skip
         inliers = int(np.count_nonzero(fits))
         if inliers >= max(limits.min_inliers, limits.min_predicted_share * len(fits)):

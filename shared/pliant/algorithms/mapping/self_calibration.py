@@ -84,6 +84,11 @@ class SelfCalibration:
         """(6,) standard deviations of the correction."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
+    def k_sigmas(self, given: CalibrationUncertainty) -> tuple[float, float]:
+        """Standard deviations of the distortions k1, and of k3, which nobody looks for: a lens that
+        may have a k2 may have as much of it."""
+        return float(self.sigmas[1]), given.k2
+
     @property
     def is_guess(self) -> bool:
         """Whether the focal length is so uncertain still."""

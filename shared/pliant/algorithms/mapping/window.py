@@ -51,16 +51,14 @@ class Window:
         outside: int,
         points: PointRows,
         camera: PinholeCamera,
-        lens_radius: float,
+        k_sigmas: tuple[float, float],
     ) -> None:
         self.keyframes = keyframes
         self.fixed = fixed
         self.outside = outside
         self.points = points
-        self.lens: F32 = np.array(
-            [camera.fx, camera.fy, camera.cx, camera.cy, lens_radius], np.float32
-        )
-        self._camera, self._lens_radius = camera, lens_radius
+        self.lens: F32 = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+        self._camera, self._k_sigmas = camera, k_sigmas
         self.columns: I32 = np.full(len(points.state), OUTSIDE, np.int32)
         for keyframe in keyframes:
             self.columns[keyframe.rows] = 0
@@ -80,7 +78,7 @@ class Window:
             self._observe(slot, keyframe.rows, keyframe.points_px)
 
     def _observe(self, slot: int, rows: I32, points_px: F32) -> None:
-        weights = weigh(points_px, self._camera, self._lens_radius)
+        weights = weigh(points_px, self._camera, self._k_sigmas)
         observe(
             rows, points_px, weights, self.columns, slot, self.u, self.v, self.w, self.seen
         )  # fmt: skip
@@ -158,7 +156,7 @@ class Window:
 
         least: state of the points.   The flow is what the turn of the camera leaves of it.
         """
-        fx, fy, cx, cy = self.lens[:4].astype(np.float64)
+        fx, fy, cx, cy = self.lens.astype(np.float64)
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         turn = self.T_world_camera[-1, :3, :3].T @ self.T_world_camera[-2, :3, :3]
         H = K @ turn @ np.linalg.inv(K)
