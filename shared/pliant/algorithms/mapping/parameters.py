@@ -235,8 +235,8 @@ class WholeMapParameters(Parameters):
     points_per_keyframe: int = Field(
         default=1000,
         ge=100,
-        description="Points that each keyframe has in it, of those that most keyframes see: all of "
-        "them tell of poses and lens what hardly more than these do",
+        description="Points of each keyframe in it, those that most keyframes see: they tell as "
+        "much of poses and lens as all of them",
     )
     iterations: int = Field(
         default=12, ge=1, description="Most iterations of Schur LM; the next adjustment goes on"

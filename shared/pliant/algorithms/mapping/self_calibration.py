@@ -46,9 +46,9 @@ _CERTAIN = 4.0
 """Standard deviations by which the readout of a rolling shutter differs from none, and a lens from
 the one in use."""
 
-_UNLIKELY = 2.0
+_UNLIKELY = 1.0
 """Standard deviations of the given calibration by which a lens that is taken over differs from it:
-what changes under way costs more than what a smaller error does."""
+what changes under way costs more than a smaller error does."""
 
 _ROLLING = 1.0
 """Standard deviation of the readout of a shutter that is known to roll."""
@@ -85,9 +85,9 @@ class SelfCalibration:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     def k_sigmas(self, given: CalibrationUncertainty) -> tuple[float, float]:
-        """Standard deviations of the distortions k1, and of k3, which nobody looks for: a lens that
-        may have a k2 may have as much of it."""
-        return float(self.sigmas[1]), given.k2
+        """Standard deviations of the distortions k1, no worse than given, and of k3, which nobody
+        looks for: a lens that may have a k2 may have as much of it."""
+        return min(float(self.sigmas[1]), given.k1), given.k2
 
     @property
     def is_guess(self) -> bool:
