@@ -10,10 +10,12 @@ from pliant.algorithms.mapping.map_store import CANDIDATE, Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import PassedFrames, refined_poses
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.start import impatient
 from pliant.map_history import MapHistory
 
 PARAMETERS = MappingParameters()
+KNOWN = SelfCalibration.of(CAMERA, PARAMETERS.calibration)
 TRUE = looking((0.3, 0.1, 0.05), (0.0, 0.02, 0.01))
 
 
@@ -43,7 +45,7 @@ def passed(points, id=3):
 
 def test_a_frame_is_placed_where_it_sees_the_points_as_they_are_now(points):
     frames = passed(points)
-    (placed,) = refined_poses(frames.take_all(), points, CAMERA, PARAMETERS)
+    (placed,) = refined_poses(frames.take_all(), points, KNOWN, PARAMETERS)
     assert (placed.frame, placed.keyframe.id, placed.inliers) == (23, 3, 200)
     np.testing.assert_allclose(placed.T_world_camera, TRUE, atol=1e-5)
     assert frames.take_all() == []
@@ -53,7 +55,7 @@ def test_rows_that_became_other_points_tell_nothing(points):
     frames = passed(points).take_all()
     points.xyz[:120] += 0.03  # all in one direction: robustness alone would not do
     points.first_keyframe[:120] = 4
-    (placed,) = refined_poses(frames, points, CAMERA, PARAMETERS)
+    (placed,) = refined_poses(frames, points, KNOWN, PARAMETERS)
     assert placed.inliers == 80
     np.testing.assert_allclose(placed.T_world_camera, TRUE, atol=1e-5)
 
@@ -61,7 +63,7 @@ def test_rows_that_became_other_points_tell_nothing(points):
 def test_a_frame_that_sees_little_of_the_map_stays(points):
     frames = passed(points).take_all()
     points.state[:160] = CANDIDATE
-    assert refined_poses(frames, points, CAMERA, PARAMETERS) == []
+    assert refined_poses(frames, points, KNOWN, PARAMETERS) == []
 
 
 def test_what_finds_no_room_goes_first(points, monkeypatch):
