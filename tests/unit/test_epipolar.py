@@ -6,6 +6,7 @@ import pytest
 
 from pliant.algorithms.epipolar import (
     decompose_essential,
+    likely_pose,
     parallax,
     rays,
     relative_poses,
@@ -51,6 +52,34 @@ def test_relative_pose_does_not_depend_on_the_random_numbers_of_opencv():
 def test_relative_pose_needs_eight_points():
     _, _, points_a, points_b = two_views()
     assert relative_poses(points_a[:7], points_b[:7], gate=0.01) == []
+    assert likely_pose(points_a[:7], points_b[:7], gate=0.01) is None
+
+
+def test_a_motion_that_a_part_of_the_points_tells_is_judged_by_all():
+    """Ten times as many points as motions are found by."""
+    _, _, points_a, points_b = two_views(outliers=150, noise=0.0002)
+    found = relative_poses(np.tile(points_a, (20, 1)), np.tile(points_b, (20, 1)), gate=0.002)[0]
+    assert len(found.inliers) == 20 * len(points_a)
+    assert found.inliers.reshape(20, -1)[:, 150:].mean() > 0.95
+
+
+def test_a_likely_pose_has_about_the_parallax_of_the_best():
+    _, _, points_a, points_b = two_views(outliers=150, noise=0.0002)
+    likely = likely_pose(points_a, points_b, gate=0.002)
+    assert likely is not None
+    best = relative_poses(points_a, points_b, gate=0.002)[0]
+    angles = [np.median(each.parallax_rad[each.inliers]) for each in (likely, best)]
+    assert angles[0] == pytest.approx(angles[1], rel=0.05)
+
+
+def test_rotations_of_several_pairs_are_those_of_each():
+    _, _, points_a, points_b = two_views(outliers=150, noise=0.0002)
+    pairs_a, pairs_b = points_a.reshape(5, 100, 2), points_b.reshape(5, 100, 2)
+    rotations, residuals = rotation_between(pairs_a, pairs_b, scale=0.002)
+    for k in range(5):
+        rotation, residual = rotation_between(pairs_a[k], pairs_b[k], scale=0.002)
+        np.testing.assert_allclose(rotations[k], rotation, atol=1e-12)
+        np.testing.assert_allclose(residuals[k], residual, atol=1e-12)
 
 
 def test_a_plane_leaves_two_motions():

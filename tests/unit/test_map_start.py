@@ -9,6 +9,8 @@ from mapping_scene import INTERVAL_NS
 
 from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.epipolar import RelativePose
+from pliant.algorithms.mapping import start as start_of_a_map
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reaching_back import reach_back
@@ -140,6 +142,26 @@ def test_it_waits_for_more_parallax_but_not_for_long(total_m: float) -> None:
     assert found[-1]
     first = 1 + found.index(True)
     assert (first >= patient) == (total_m < 0.2)
+
+
+def test_a_camera_that_has_hardly_moved_is_told_by_a_glance(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All tracks are compared once it has moved: that takes ten times as long."""
+    compared: list[int] = []
+    closely = start_of_a_map.relative_poses
+
+    def count(*points: F64, gate: float) -> list[RelativePose]:
+        compared.append(len(points[0]))
+        return closely(*points, gate=gate)
+
+    monkeypatch.setattr(start_of_a_map, "relative_poses", count)
+    _, waiting = ride(14, 0.02, life=1000)
+    reason = find_start(waiting[:7], CAMERA, MappingParameters())
+    assert re.fullmatch(r"too little parallax: [01]\.\d\d of 3\.00 deg", str(reason))
+    assert not compared
+    started(waiting)
+    assert compared
 
 
 def test_under_a_guessed_focal_length_it_does_not_wait() -> None:

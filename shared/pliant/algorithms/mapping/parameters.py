@@ -180,7 +180,7 @@ class WindowParameters(Parameters):
         default=6, ge=1, description="Older keyframes that see the most of the same: they stay"
     )
     keyframe_iterations: int = Field(
-        default=4, ge=1, description="Most iterations of Schur LM at a keyframe"
+        default=2, ge=1, description="Most iterations of Schur LM at a keyframe"
     )
     sweeps: int = Field(
         default=2,

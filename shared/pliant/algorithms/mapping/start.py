@@ -16,6 +16,7 @@ from pliant.algorithms.arrays import F32, F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.epipolar import (
     RelativePose,
+    likely_pose,
     rays,
     relative_poses,
     rotation_between,
@@ -31,7 +32,14 @@ _TRIED_REFERENCES = 8
 """Earlier frames compared with a new one."""
 
 _ROTATION_SAMPLE = 400
-"""Tracks that decide whether a rotation explains the flow."""
+"""Tracks that decide whether a rotation explains the flow; of fewer some count twice."""
+
+_GLANCE = 400
+"""Tracks that tell at every frame that waits whether to look closer, which takes ten times as
+long."""
+
+_CLEARLY_LESS = 0.7
+"""Share of the parallax wanted: with less of it by a glance, a closer look finds too little."""
 
 _NOISE_PX = 1.0
 """Error of a track that is no parallax."""
@@ -113,29 +121,37 @@ def _pairs(
     waiting: list[WaitingFrame], camera: PinholeCamera, parameters: StartParameters
 ) -> list[_Pair]:
     newest = waiting[-1]
-    pairs: list[_Pair] = []
     earlier = len(waiting) - 1
     tried = np.unique(np.linspace(0, earlier - 1, min(earlier, _TRIED_REFERENCES)).astype(int))
+    shared: list[tuple[int, I64, I64]] = []
     for index in tried.tolist():
-        reference = waiting[index]
-        _, a, b = np.intersect1d(reference.ids, newest.ids, assume_unique=True, return_indices=True)
-        if len(a) < parameters.min_tracks:
-            continue
-        every = max(1, len(a) // _ROTATION_SAMPLE)
-        points_a, points_b = reference.points_px[a[::every]], newest.points_px[b[::every]]
-        _, residuals = rotation_between(
-            _normalise(camera, points_a), _normalise(camera, points_b), scale=_NOISE_PX / camera.fx
+        _, a, b = np.intersect1d(
+            waiting[index].ids, newest.ids, assume_unique=True, return_indices=True
         )
-        pairs.append(
-            _Pair(
-                reference=index,
-                indices_reference=a,
-                indices_newest=b,
-                residual_px=float(np.median(residuals)) * camera.fx,
-                flow_px=float(np.median(np.linalg.norm(points_a - points_b, axis=1))),
-            )
+        if len(a) >= parameters.min_tracks:
+            shared.append((index, a, b))
+    if not shared:
+        return []
+    samples: list[tuple[F32, F32]] = []
+    for index, a, b in shared:
+        some = np.linspace(0, len(a) - 1, _ROTATION_SAMPLE).astype(int)
+        samples.append((waiting[index].points_px[a[some]], newest.points_px[b[some]]))
+    points_a, points_b = np.array(samples).swapaxes(0, 1)
+    _, residuals = rotation_between(
+        _normalise(camera, points_a), _normalise(camera, points_b), scale=_NOISE_PX / camera.fx
+    )
+    residuals_px = np.median(residuals, axis=-1) * camera.fx
+    flows_px = np.median(np.linalg.norm(points_a - points_b, axis=-1), axis=-1)
+    return [
+        _Pair(
+            reference=index,
+            indices_reference=a,
+            indices_newest=b,
+            residual_px=float(residuals_px[k]),
+            flow_px=float(flows_px[k]),
         )
-    return pairs
+        for k, (index, a, b) in enumerate(shared)
+    ]
 
 
 def _normalise(camera: PinholeCamera, points_px: F32) -> F64:
@@ -170,7 +186,14 @@ def _start_from(
     start = parameters.start
     a = _normalise(camera, waiting[pair.reference].points_px[pair.indices_reference])
     b = _normalise(camera, waiting[-1].points_px[pair.indices_newest])
-    tried = relative_poses(a, b, gate=start.epipolar_gate_px / camera.fx)
+    gate = start.epipolar_gate_px / camera.fx
+    every = max(1, len(a) // _GLANCE)
+    glance = likely_pose(a[::every], b[::every], gate=gate)
+    if glance is not None and glance.inliers.mean() >= start.min_inlier_share:
+        parallax = _parallax_deg(glance)
+        if parallax < _CLEARLY_LESS * least_deg:
+            return _too_little(parallax, least_deg, "deg")
+    tried = relative_poses(a, b, gate=gate)
     if not tried:
         return "no essential matrix fits the tracks"
     reason = _why_not_with(tried[0], start, least_deg)
@@ -212,10 +235,14 @@ def _why_not_with(two_views: RelativePose, start: StartParameters, least_deg: fl
     share = float(two_views.inliers.mean())
     if share < start.min_inlier_share:
         return f"too few tracks agree with one motion: {share:.0%} of {start.min_inlier_share:.0%}"
-    parallax = float(np.degrees(np.median(two_views.parallax_rad[two_views.inliers])))
+    parallax = _parallax_deg(two_views)
     if parallax < least_deg:
         return _too_little(parallax, least_deg, "deg")
     return ""
+
+
+def _parallax_deg(two_views: RelativePose) -> float:
+    return float(np.degrees(np.median(two_views.parallax_rad[two_views.inliers])))
 
 
 def _misfit(

@@ -30,7 +30,7 @@ _CLEAR_SHARE = 0.7
 """Share of the least parallax under which noise does not make rays differ enough."""
 
 _SETTLED = 0.01
-"""Share of the cost that the last iteration may still take off: the next keyframe goes on."""
+"""Share of the cost that the last iteration may still take off."""
 
 
 class Window:
@@ -117,7 +117,8 @@ class Window:
         return self.T_world_camera[-1].copy()
 
     def adjust(self, parameters: MappingParameters) -> None:
-        """Schur LM over the keyframes and all points that two of them see, until it settles.
+        """Schur LM over the keyframes and all points that two of them see, until it settles or
+        for a few iterations: the next keyframe goes on from there.
 
         The points seen longest alone are quicker, but they are those that the camera's motion moves
         least in the image: with them scale drifts ten times as far on the way along a corridor.
