@@ -162,13 +162,27 @@ def looked_for(shift, grey, min_zncc=0.8, kappa=10.0, kept=None):
     rows, points = mapped(np.array([[0.0, 0.0, 4.0]]), grey if kept is None else kept)
     maxima = np.array([[CAMERA.cx + shift, CAMERA.cy, kappa]], np.float32)
     parameters = ReacquisitionParameters(min_zncc=min_zncc)
-    return reacquire(np.eye(4), rows, points, maxima, grey, CAMERA, parameters)
+    return reacquire(np.eye(4), rows, points, maxima, maxima, grey, CAMERA, parameters)
 
 
 def test_reacquisition_refines_the_maximum_by_the_patch():
     found = looked_for(0.7, texture())
     assert found.rows.tolist() == [0]
     np.testing.assert_allclose(found.points_px[0], (CAMERA.cx, CAMERA.cy), atol=0.1)
+
+
+def test_reacquisition_looks_where_the_image_shows_a_maximum():
+    """A lens, or a rolling shutter, has moved the image, and nothing has moved it back."""
+    rows, points = mapped(np.array([[0.0, 0.0, 4.0]]), texture())
+    grey = np.roll(texture(), (2, 7), axis=(0, 1))
+    maxima = np.array([[CAMERA.cx + 0.7, CAMERA.cy, 10.0]], np.float32)
+    seen = maxima + np.array([7.0, 2.0, 0.0], np.float32)
+    parameters = ReacquisitionParameters()
+    found = reacquire(np.eye(4), rows, points, maxima, seen, grey, CAMERA, parameters)
+    np.testing.assert_allclose(found.points_px, [(CAMERA.cx, CAMERA.cy)], atol=0.1)
+    assert (
+        len(reacquire(np.eye(4), rows, points, maxima, maxima, grey, CAMERA, parameters).rows) == 0
+    )
 
 
 @pytest.mark.parametrize("gain", [0.5, 0.7, 1.26, 1.5])
@@ -193,7 +207,9 @@ def test_reacquisition_gives_a_maximum_to_one_point_only():
     xyz = np.array([[0.0, 0.0, 4.0], [0.001, 0.0, 4.0], [0.0, 0.0, -4.0]])
     rows, points = mapped(xyz, grey)
     maxima = np.array([[CAMERA.cx, CAMERA.cy, 10.0]], np.float32)
-    found = reacquire(np.eye(4), rows, points, maxima, grey, CAMERA, ReacquisitionParameters())
+    found = reacquire(
+        np.eye(4), rows, points, maxima, maxima, grey, CAMERA, ReacquisitionParameters()
+    )
     assert found.rows.tolist() == [0]
     assert found.visible.tolist() == [0, 1]
 

@@ -197,17 +197,21 @@ def reacquire_points(
     frame: int,
     T_world_camera: F64,
     tracks: FrameExtrema,
+    seen: F32,
     grey: U8 | None,
     rolled: RolledFrame | None,
 ) -> tuple[F64, Observations]:
-    """Find points without a track among the maxima, and refine the pose with them."""
+    """Find points without a track among the maxima, and refine the pose with them.
+
+    seen: (M, 3) maxima of the tracks where grey shows them, see ``reacquire``.
+    """
     points, parameters = active.points, active.parameters
     no_px = np.zeros((0, 2), np.float32)
     none = Observations(rows=np.zeros(0, np.int32), points_px=no_px, rolled_px=no_px)
     if not parameters.reacquisition.enabled:
         return T_world_camera, none
     reacquired = reacquire(
-        T_world_camera, active.missing(frame), points, tracks.maxima, grey, active.camera,
+        T_world_camera, active.missing(frame), points, tracks.maxima, seen, grey, active.camera,
         parameters.reacquisition,
     )  # fmt: skip
     found = active.take_over(reacquired, tracks)

@@ -284,7 +284,9 @@ def prove(
     min_agreement: least share of the points found that support it, see ``RecoveryParameters``.
     Wrong poses find points as well: wherever a maximum is near and its patch looks alike.
     """
-    found = reacquire(T_world_camera, rows, points, maxima, grey, camera, parameters.reacquisition)
+    found = reacquire(
+        T_world_camera, rows, points, maxima, maxima, grey, camera, parameters.reacquisition
+    )
     if len(found.rows) < parameters.localisation.min_inliers:
         return None
     located = refine(

@@ -77,13 +77,13 @@ class Localiser:
         self,
         frame: int,
         stamp_ns: int,
-        tracks: FrameExtrema,
+        extrema: FrameExtrema,
         grey: U8 | None,
         colour: U8 | None,
         timer: StageTimer = no_stages,
     ) -> MapDelta:
         """Find a frame in the map.  stamp_ns, grey, colour: as of ``Mapper.process``."""
-        tracks = self.calibration.ideal(tracks)
+        tracks = self.calibration.ideal(extrema)
         image = image_of_tracks(self.calibration, None, grey)
         if self._map is not None:
             self._map.links.follow(tracks.ids)
@@ -92,7 +92,7 @@ class Localiser:
             return self._publish(LOST if self._map else WAITING, "not recognised in the map", 0)
         with timer("reacquisition"):
             looks_anew = self._look_from(self._map, located)
-            located, support = self._find(self._map, frame, located, tracks, grey)
+            located, support = self._find(self._map, frame, located, tracks, extrema.maxima, grey)
         if support.inliers < self._parameters.localisation.min_inliers:
             return self._publish(LOST, f"lost: {support.inliers} points of the map are seen", 0)
         if self._motion is None:
@@ -197,16 +197,19 @@ class Localiser:
         frame: int,
         T_world_camera: F64,
         tracks: FrameExtrema,
+        maxima: F32,
         grey: U8 | None,
     ) -> tuple[F64, Support]:
-        """The pose by all points that are found again, and what there is for it."""
+        """The pose by all points that are found again, and what there is for it.
+
+        maxima: (M, 3) of the tracks, where grey shows them.
+        """
         parameters, camera, rolled = self._parameters, active.camera, None
         if self.calibration.readout and self._motion is not None:
             velocity = self._motion.velocity_at(frame, T_world_camera)
             tracks, rolled = at_once(active, self.calibration, T_world_camera, velocity, tracks)
-        image = image_of_tracks(self.calibration, rolled, grey)
         T_world_camera, found = reacquire_points(
-            active, frame, T_world_camera, tracks, None if image is None else image.whole, rolled
+            active, frame, T_world_camera, tracks, maxima, grey, rolled
         )
         linked = active.linked(MAPPED)
         rows, points_px = active.observed(tracks.points_px, found, np.zeros(0, np.int64))

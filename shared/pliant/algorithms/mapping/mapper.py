@@ -120,7 +120,7 @@ class Mapper:
         self,
         frame: int,
         stamp_ns: int,
-        tracks: FrameExtrema,
+        extrema: FrameExtrema,
         grey: U8 | None,
         colour: U8 | None,
         timer: StageTimer = no_stages,
@@ -136,9 +136,9 @@ class Mapper:
                 self.follow(atlas.catch_up(frame))
                 if not self.calibration.sees_like(before):
                     self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
-            atlas.active.links.follow(tracks.ids)
+            atlas.active.links.follow(extrema.ids)
         with self._timer("corrected view"):
-            tracks = self.calibration.ideal(tracks)
+            tracks = self.calibration.ideal(extrema)
         self._images = (grey, grey if colour is None else colour)
         seen, rolled, image = tracks, None, image_of_tracks(self.calibration, None, grey)
         located = self._locate(frame, stamp_ns, seen, image)
@@ -151,9 +151,9 @@ class Mapper:
             if self.calibration.readout:
                 velocity = self._motion.velocity_at(frame, located)
                 tracks, rolled = at_once(active, self.calibration, located, velocity, seen)
-                image = image_of_tracks(self.calibration, rolled, grey)
-            shown = None if image is None else image.whole
-            T_world_camera, found = reacquire_points(active, frame, located, tracks, shown, rolled)
+            T_world_camera, found = reacquire_points(
+                active, frame, located, tracks, extrema.maxima, grey, rolled
+            )
         with self._timer("subspace adjustment"):
             T_world_camera, support = adjust(active, self._motion, T_world_camera, found, tracks)
         with self._timer("triangulation"):
@@ -164,7 +164,10 @@ class Mapper:
         if self._keyframe_is_new:
             with self._timer("keyframe"):
                 T_world_camera, turned = stand(active, T_world_camera, found, tracks)
-                colours = image_of_tracks(self.calibration, rolled, self._images[1])
+                image, colours = (
+                    image_of_tracks(self.calibration, rolled, each) for each in self._images
+                )
+                shown = None if image is None else image.whole
                 if rolled is not None:
                     active.segment.unroll(active.window.keyframes, self.calibration)
                 hanging = active.insert_keyframe(

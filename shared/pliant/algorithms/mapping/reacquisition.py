@@ -144,14 +144,16 @@ def reacquire(
     rows: I32,
     points: PointRows,
     maxima: F32,
+    seen: F32,
     grey: U8 | None,
     camera: PinholeCamera,
     parameters: ReacquisitionParameters,
 ) -> Reacquired:
     """Match points to the maxima of a frame whose pose is known.
 
-    rows: (R,) points looked for.  maxima: (M, 3) of the frame.  grey: (H, W), or None: then
-    distance and the sign of the curvature alone decide.
+    rows: (R,) points looked for.  maxima: (M, 3) of the frame.  seen: (M, 3) the same where grey
+    (H, W) shows them, which may be an image that nothing has corrected: what is found lies as far
+    from its maximum there as here.  grey None: distance and the sign of the curvature alone decide.
     """
     projected, visible = _projected(T_world_camera, rows, points, camera)
     visible_rows = rows[visible]
@@ -161,7 +163,7 @@ def reacquire(
     points_px = np.zeros((len(visible_rows), 2), np.float32)
     image = np.zeros((0, 0), np.float32) if grey is None else grey.astype(np.float32)
     limits = _Limits(parameters.radius_px, parameters.min_zncc)
-    _match(wanted, grid, pixels_of(image), limits, choice, points_px)
+    _match(wanted, grid, seen, pixels_of(image), limits, choice, points_px)
     found = choice >= 0
     return Reacquired(
         rows=visible_rows[found],
@@ -252,6 +254,7 @@ def _project(T: F64, rows: I32, xyz: F64, K: F64, projected: F32) -> BoolArray:
 def _match(
     wanted: _Wanted,
     grid: MaximaGrid,
+    seen: F32,
     image: Pixels,
     limits: _Limits,
     choice: I32,
@@ -282,11 +285,11 @@ def _match(
                 m = first if k == 0 else second
                 if m < 0:
                     break
-                u, v = maxima[m, 0] - to_origin, maxima[m, 1] - to_origin
+                u, v = seen[m, 0] - to_origin, seen[m, 1] - to_origin
                 found = align_patch(image, u, v, template, _ITERATIONS, _ALIGN_REACH_PX)
                 if found.zncc >= limits.min_zncc and found.zncc > best_score:
                     best, best_score = m, float(found.zncc)
-                    best_u, best_v = found.u + to_origin, found.v + to_origin
+                    best_u, best_v = maxima[m, 0] + (found.u - u), maxima[m, 1] + (found.v - v)
         if best < 0 or (owner[best] >= 0 and scores[best] >= best_score):
             continue
         if owner[best] >= 0:
