@@ -41,6 +41,9 @@ long."""
 _CLEARLY_LESS = 0.7
 """Share of the parallax wanted: with less of it by a glance, a closer look finds too little."""
 
+_TELLING = 500
+"""Tracks, evenly of all, that tell which of several motions it was; the start has all of them."""
+
 _NOISE_PX = 1.0
 """Error of a track that is no parallax."""
 
@@ -200,22 +203,25 @@ def _start_from(
     if reason:
         return reason  # parallax that a worse motion sees is its mistake
     shared = waiting[-1].ids[pair.indices_newest]
+    telling = shared[:: max(1, len(shared) // _TELLING)]
     found: list[tuple[float, Start, RelativePose]] = []
     for two_views in tried[:motions]:
         each = _why_not_with(two_views, start, start.min_parallax_deg) or _reconstruct(
-            pair, two_views, waiting, camera, parameters
+            pair, two_views, waiting, camera, parameters, most=_TELLING
         )
         if isinstance(each, str):
             reason = reason or each
             continue
-        found.append((_misfit(each, shared, waiting, camera, parameters), each, two_views))
+        found.append((_misfit(each, telling, waiting, camera, parameters), each, two_views))
     if not found:
         return reason
     least, best, two_views = min(found, key=lambda each: each[0])
     for misfit, other, _ in found:
         if misfit < _AS_GOOD * least and not _agree(best, other):
             return "two motions explain the tracks alike"
-    return _why_not_with(two_views, start, least_deg) or best
+    return _why_not_with(two_views, start, least_deg) or _reconstruct(
+        pair, two_views, waiting, camera, parameters
+    )
 
 
 def _agree(a: Start, b: Start) -> bool:
@@ -267,7 +273,9 @@ def _reconstruct(
     waiting: list[WaitingFrame],
     camera: PinholeCamera,
     parameters: MappingParameters,
+    most: int | None = None,
 ) -> Start | str:
+    """most: points, evenly of all; None: all."""
     start = parameters.start
     newest = len(waiting) - 1
     spread = np.linspace(pair.reference, newest, min(start.keyframes, newest - pair.reference + 1))
@@ -282,7 +290,8 @@ def _reconstruct(
     points = rays_a * two_view_depths(two_views.T_b_a, rays_a, rays_b)[0][:, None]
     # Depths of nearly parallel rays are noise; they come back once the poses are better.
     firm = two_views.parallax_rad[good] > np.radians(0.5 * start.min_parallax_deg)
-    ids, points = ids[firm], points[firm]
+    every = 1 if most is None else max(1, int(firm.sum()) // most)
+    ids, points = ids[firm][::every], points[firm][::every]
     T_world_camera = np.tile(np.eye(4), (len(chosen), 1, 1))
     T_world_camera[-1] = inverse(two_views.T_b_a)
     for k in range(1, len(chosen) - 1):

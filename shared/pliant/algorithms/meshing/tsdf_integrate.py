@@ -70,17 +70,16 @@ def pixel_planes(depth: F32, weight: F32, camera: PinholeCamera) -> PixelPlanes:
     shape = (camera.height, camera.width)
     if depth.shape != shape or weight.shape != shape:
         raise ValueError(f"depth and weight: expected {shape}, got {depth.shape}, {weight.shape}")
-    planes, depths = np.zeros((*shape, 4), np.float32), np.zeros(shape, np.float32)
-    weights = np.zeros(shape, np.uint8)
-    tiles = (-(-camera.height // TILE_PX), -(-camera.width // TILE_PX))
-    furthest = np.zeros(tiles, np.float32)
-    inverse = np.zeros(shape, np.float32)
-    usable = np.isfinite(depth) & (depth > 0.0) & (weight > 0.0)
-    np.divide(np.float32(1.0), depth, out=inverse, where=usable)
+    inverse = np.zeros((camera.height + 2, camera.width + 2), np.float32)  # nothing around it
+    weights = np.empty(shape, np.uint8)
+    _invert(depth, weight, inverse, weights)
+    planes, depths = np.empty((*shape, 4), np.float32), np.empty(shape, np.float32)
+    furthest = np.zeros((-(-camera.height // TILE_PX), -(-camera.width // TILE_PX)), np.float32)
+    x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
+    y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
+    _fit(inverse, x, y, (np.float32(camera.fx), np.float32(camera.fy)), planes, depths, furthest)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    pixels = PixelPlanes(planes, depths, weights, furthest, intrinsics)
-    _fit(inverse, weight.astype(np.float32), pixels)
-    return pixels
+    return PixelPlanes(planes, depths, weights, furthest, intrinsics)
 
 
 def blocks_in_band(pixels: PixelPlanes, T_world_camera: F64, scale: Scale) -> I32:
@@ -95,45 +94,71 @@ def blocks_in_band(pixels: PixelPlanes, T_world_camera: F64, scale: Scale) -> I3
 
 
 @fast_kernel
-def _fit(inverse: F32, weight: F32, pixels: PixelPlanes) -> None:
-    planes, depths, weights, furthest, K = pixels
-    fx, fy, cx, cy = K[0], K[1], K[2], K[3]
-    height, width = inverse.shape
+def _invert(depth: F32, weight: F32, inverse: F32, weights: U8) -> None:
+    """Inverse depths in the middle of (H + 2, W + 2), and weights in their units; 0 where there is
+    none."""
+    zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+    units, most = np.float32(WEIGHT_UNITS), np.float32(np.inf)
+    for v in range(depth.shape[0]):
+        to = inverse[v + 1]
+        for u in range(depth.shape[1]):
+            z, w = depth[v, u], weight[v, u]
+            usable = z > zero and z < most and w > zero
+            to[u + 1] = one / z if usable else zero
+            share = max(min(w, one) * units + half, one)
+            weights[v, u] = np.uint8(share if usable else zero)
+
+
+@fast_kernel
+def _fit(
+    inverse: F32, x: F32, y: F32, focal: tuple[np.float32, np.float32], planes: F32, depths: F32,
+    furthest: F32,
+) -> None:  # fmt: skip
+    """Planes, depths and the largest of each tile, all 0 where the inverse depth is.
+
+    inverse: (H + 2, W + 2), 0 where there is none, and around it.   x: (W,), y: (H,) of the pixels
+    on the plane z = 1.   The first loop over a row has no branch, so that it is SIMD code.
+    """
+    fx, fy = focal
+    zero, one, least = np.float32(0.0), np.float32(1.0), np.float32(_MIN_COSINE)
+    height, width = depths.shape
+    found, column = np.empty((4, width), np.float32), np.zeros(width, np.float32)
     for v in range(height):
+        above, row, below = inverse[v], inverse[v + 1], inverse[v + 2]
+        a, b, c, d, z, y_v = found[0], found[1], found[2], found[3], depths[v], y[v]
         for u in range(width):
-            here = inverse[v, u]
-            if not here > 0.0:
-                continue
-            before = inverse[v, u - 1] if u > 0 else np.float32(0.0)
-            behind = inverse[v, u + 1] if u + 1 < width else np.float32(0.0)
-            above = inverse[v - 1, u] if v > 0 else np.float32(0.0)
-            below = inverse[v + 1, u] if v + 1 < height else np.float32(0.0)
-            nx, ny = fx * _slope(before, here, behind), fy * _slope(above, here, below)
-            x, y = (u - cx) / fx, (v - cy) / fy
-            nz = here - nx * x - ny * y
-            norm = np.sqrt(nx * nx + ny * ny + nz * nz)
-            length = np.sqrt(x * x + y * y + 1.0)
-            if here < _MIN_COSINE * norm * length:
-                nx, ny, nz = here * x / length**2, here * y / length**2, here / length**2
-                norm = here / length
-            planes[v, u, 0], planes[v, u, 1], planes[v, u, 2] = nx / norm, ny / norm, nz / norm
-            planes[v, u, 3] = 1.0 / norm
-            depths[v, u] = 1.0 / here
-            share = min(weight[v, u], np.float32(1.0)) * WEIGHT_UNITS
-            weights[v, u] = max(int(share + 0.5), 1)
-            tile_v, tile_u = v // TILE_PX, u // TILE_PX
-            furthest[tile_v, tile_u] = max(furthest[tile_v, tile_u], depths[v, u])
+            here, x_u = row[u + 1], x[u]
+            nx = fx * _slope(row[u], here, row[u + 2])
+            ny = fy * _slope(above[u + 1], here, below[u + 1])
+            nz = here - nx * x_u - ny * y_v
+            squared = x_u * x_u + y_v * y_v + one
+            norm = nx * nx + ny * ny + nz * nz
+            across = here / squared
+            step = here * across < least * least * norm
+            nx, ny = across * x_u if step else nx, across * y_v if step else ny
+            nz, norm = across if step else nz, across * here if step else norm
+            d[u] = one / np.sqrt(norm) if here > zero else zero
+            a[u], b[u], c[u] = nx * d[u], ny * d[u], nz * d[u]
+            z[u] = one / here if here > zero else zero
+            column[u] = max(column[u], z[u])
+        for u in range(width):
+            planes[v, u, 0], planes[v, u, 1] = a[u], b[u]
+            planes[v, u, 2], planes[v, u, 3] = c[u], d[u]
+        if v % TILE_PX == TILE_PX - 1 or v == height - 1:
+            largest = furthest[v // TILE_PX]
+            for u in range(width):
+                largest[u // TILE_PX] = max(largest[u // TILE_PX], column[u])
+            column[:] = zero
 
 
 @fast_kernel
 def _slope(before: np.float32, here: np.float32, behind: np.float32) -> np.float32:
     """The smaller of the slopes to both sides: the other one may cross a step.  0: no neighbour."""
-    first, second = here - before, behind - here
-    if not before > 0.0:
-        return second if behind > 0.0 else np.float32(0.0)
-    if not behind > 0.0:
-        return first
-    return first if abs(first) < abs(second) else second
+    zero = np.float32(0.0)
+    first = here - before if before > zero else zero
+    second = behind - here if behind > zero else zero
+    other = behind > zero and (not before > zero or not abs(first) < abs(second))
+    return second if other else first
 
 
 @kernel
