@@ -35,7 +35,11 @@ from pliant.algorithms.mapping.localisation import (
 )
 from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, UNLINKED, Observations
 from pliant.algorithms.mapping.observation_table import reprojection_errors
-from pliant.algorithms.mapping.parameters import SupportParameters
+from pliant.algorithms.mapping.parameters import (
+    MappingParameters,
+    PointParameters,
+    SupportParameters,
+)
 from pliant.algorithms.mapping.reacquisition import reacquire
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
@@ -314,6 +318,14 @@ def stand(
 
 def _spread(active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
     return spread_of(active.points, rows, active.keyframes[-1]) if len(directions) else None
+
+
+def limits_of_points(inliers: int, parameters: MappingParameters) -> PointParameters:
+    """Of a frame that sees fewer points than a map starts with, two observations make one: what few
+    tracks there are may not live to a third, and then the map ends."""
+    if inliers >= parameters.start.min_points:
+        return parameters.point
+    return parameters.point.model_copy(update={"min_observations": 2})
 
 
 def keyframe_is_due(active: ActiveMap, age_s: float, interval_s: float) -> bool:

@@ -25,6 +25,7 @@ from pliant.algorithms.mapping.frame_pose import (
     doubt,
     image_of_tracks,
     keyframe_is_due,
+    limits_of_points,
     localise,
     reacquire_points,
     stand,
@@ -157,7 +158,7 @@ class Mapper:
         with self._timer("subspace adjustment"):
             T_world_camera, support = adjust(active, self._motion, T_world_camera, found, tracks)
         with self._timer("triangulation"):
-            active.window.triangulate(self._parameters.point)
+            active.window.triangulate(limits_of_points(support.inliers, self._parameters))
         hanging = active.keyframes[-1]
         age_s = 1e-9 * (stamp_ns - self._keyframe_ns)
         self._keyframe_is_new = keyframe_is_due(active, age_s, self._motion.lost_s(stamp_ns))
