@@ -115,7 +115,7 @@ def test_a_camera_of_ros_is_mapped_and_published_in_ros(tmp_path: Path) -> None:
     assert ros.returncode == 0, said
     report = json.loads((result / "report.json").read_text())
     assert (report["source"], report["complete"]) == (source, True)
-    assert report["frames"] > tiny.frame_count
+    assert report["frames"] >= tiny.frame_count  # of the camera that stands still none may come
     seen = watcher.seen
     assert {p.header.frame_id for p in seen["pliant/pose"]} == {"map"}
     positions = [(p.pose.position.x, p.pose.position.y) for p in seen["pliant/pose"]]
