@@ -203,11 +203,14 @@ def _start_from(
     if reason:
         return reason  # parallax that a worse motion sees is its mistake
     shared = waiting[-1].ids[pair.indices_newest]
-    telling = shared[:: max(1, len(shared) // _TELLING)]
+    compared = tried[:motions]
+    # One motion is compared with none, and fewer tracks than these are all needed.
+    most = _TELLING if len(compared) > 1 and len(shared) >= 2 * _TELLING else len(shared)
+    telling = shared[:: max(1, len(shared) // most)]
     found: list[tuple[float, Start, RelativePose]] = []
-    for two_views in tried[:motions]:
+    for two_views in compared:
         each = _why_not_with(two_views, start, start.min_parallax_deg) or _reconstruct(
-            pair, two_views, waiting, camera, parameters, most=_TELLING
+            pair, two_views, waiting, camera, parameters, most
         )
         if isinstance(each, str):
             reason = reason or each
@@ -219,9 +222,10 @@ def _start_from(
     for misfit, other, _ in found:
         if misfit < _AS_GOOD * least and not _agree(best, other):
             return "two motions explain the tracks alike"
-    return _why_not_with(two_views, start, least_deg) or _reconstruct(
-        pair, two_views, waiting, camera, parameters
-    )
+    reason = _why_not_with(two_views, start, least_deg)
+    if reason or most == len(shared):
+        return reason or best
+    return _reconstruct(pair, two_views, waiting, camera, parameters, len(shared))
 
 
 def _agree(a: Start, b: Start) -> bool:
@@ -273,9 +277,9 @@ def _reconstruct(
     waiting: list[WaitingFrame],
     camera: PinholeCamera,
     parameters: MappingParameters,
-    most: int | None = None,
+    most: int,
 ) -> Start | str:
-    """most: points, evenly of all; None: all."""
+    """most: points, evenly of all, up to twice as many."""
     start = parameters.start
     newest = len(waiting) - 1
     spread = np.linspace(pair.reference, newest, min(start.keyframes, newest - pair.reference + 1))
@@ -290,7 +294,7 @@ def _reconstruct(
     points = rays_a * two_view_depths(two_views.T_b_a, rays_a, rays_b)[0][:, None]
     # Depths of nearly parallel rays are noise; they come back once the poses are better.
     firm = two_views.parallax_rad[good] > np.radians(0.5 * start.min_parallax_deg)
-    every = 1 if most is None else max(1, int(firm.sum()) // most)
+    every = max(1, int(firm.sum()) // most)
     ids, points = ids[firm][::every], points[firm][::every]
     T_world_camera = np.tile(np.eye(4), (len(chosen), 1, 1))
     T_world_camera[-1] = inverse(two_views.T_b_a)
