@@ -117,6 +117,22 @@ def test_another_place_is_not_taken_for_the_map(seen):
     assert published.states[-1] == TRACKING
 
 
+@pytest.mark.parametrize(("every", "state"), [(1, TRACKING), (6, LOST)])
+def test_the_map_does_not_go_on_by_fewer_points_than_it_starts_with(seen, every, state):
+    """Of some 300 points in view all or a sixth are to be seen after the dark."""
+    scene, poses, images, frames = seen
+    flat, limits = np.full((_SIDE, _SIDE), 120, np.float32), MappingParameters()
+    kept = [each if i % every == 0 else flat for i, each in enumerate(textures(500))]
+    mapper = Mapper(CAMERA, limits, 0)
+    for k in range(20):
+        mapper.process(k, k * INTERVAL_NS, frames[k], images[k], None)
+    assert mapper.process(20, 20 * INTERVAL_NS, *dark(frames[20]), None).state == LOST
+    grey = picture(scene, kept, poses[21])
+    found = mapper.process(21, 21 * INTERVAL_NS, anew(frames[21]), grey, None)
+    assert found.state == state
+    assert every > 1 or found.inliers >= limits.start.min_points
+
+
 def test_a_few_tracks_that_a_cut_has_left_place_no_camera():
     """Forty of hundreds agree on a pose: only where the image proves it the camera is there."""
     scene, poses = Scene.box(2500, noise_px=0.1), sideways(20, step=0.04)

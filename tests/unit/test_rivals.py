@@ -110,6 +110,14 @@ def test_what_the_image_shows_again_a_step_aside_proves_no_pose(
     assert ask(monkeypatch, {0: (170, 2400)}, repeated=0.6) is None
 
 
+def test_fewer_points_than_a_map_starts_with_prove_no_place_but_rival_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert ask(monkeypatch, {0: (170, 99)}) is None
+    assert ask(monkeypatch, {0: (170, 100)}) is not None
+    assert ask(monkeypatch, {0: (60, 120), 2: (60, 70)}) is None
+
+
 def test_places_elsewhere_are_asked_where_one_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
     own, points, asked = KnownPlaces(), PointRows(), list[int]()
     known = keyframes(points, 12)

@@ -28,6 +28,7 @@ from pliant.algorithms.mapping.directions import (
 from pliant.algorithms.mapping.localisation import (
     Localisation,
     Motion,
+    are_enough,
     locate,
     prove,
     recover,
@@ -141,7 +142,7 @@ def localise(
                 located.T_world_camera, active.nearby(), points, seen.maxima, image.whole,
                 active.camera, parameters, parameters.recovery.min_agreement,
             )  # fmt: skip
-            if proved is not None:
+            if proved is not None and are_enough(len(proved.rows), parameters):
                 return Located(proved.T_world_camera, True)
     if image is None:
         return None

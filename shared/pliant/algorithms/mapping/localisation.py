@@ -230,9 +230,18 @@ def recover(
                 T_world_camera, rows, points, maxima, grey, camera, parameters,
                 parameters.recovery.min_agreement,
             )  # fmt: skip
-            if proved is not None:
+            if proved is not None and are_enough(len(proved.rows), parameters):
                 return proved.T_world_camera
     return None
+
+
+def are_enough(points: int, parameters: MappingParameters) -> bool:
+    """Whether so many points that prove a pose place a camera to which no tracks lead.
+
+    A few dozen agree on a pose a step aside as well, by what looks alike there.  No map starts with
+    so few, and none goes on by them.
+    """
+    return points >= parameters.start.min_points
 
 
 def look_about(

@@ -17,7 +17,7 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.mapping.covisibility import most_shared, rows_of
-from pliant.algorithms.mapping.localisation import look_about, prove, refine
+from pliant.algorithms.mapping.localisation import are_enough, look_about, prove, refine
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
@@ -118,7 +118,7 @@ def relocalise(
                 best, proof, found = found, proposed, best
             if not same:
                 rivals.append(found)
-    if best is None or proof is None:
+    if best is None or proof is None or not are_enough(best.inliers, parameters):
         return None
     if any(_is_as_good(rival, best, points, parameters) for rival in rivals):
         return None
