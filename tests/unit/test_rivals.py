@@ -46,15 +46,17 @@ def ask(
     said: dict[int, tuple[int, int]],
     first: int = 1,
     repeated: float = 0.0,
+    places_with_corners: int | None = None,
 ) -> Recognised | None:
     """What is recognised where keyframes have so many corners and points for them, each at a pose
     of its own.   first: places that look most like the frame; the others are elsewhere.
-    repeated: share of the corners that the image shows again."""
+    repeated: share of the corners that the image shows again.   places_with_corners: of those said,
+    all if None; the others are poses that points alone may tell."""
     points = PointRows()
     places = [
         Place(keyframe=k, features=NOTHING, segment=[k])
         for k in keyframes(points, 1 + max(said))
-        if k.id in said
+        if k.id in list(said)[:places_with_corners]
     ]
 
     def propose(_: Features, place: Place, *__: object) -> list[SimpleNamespace]:
@@ -116,6 +118,25 @@ def test_fewer_points_than_a_map_starts_with_prove_no_place_but_rival_another(
     assert ask(monkeypatch, {0: (170, 99)}) is None
     assert ask(monkeypatch, {0: (170, 100)}) is not None
     assert ask(monkeypatch, {0: (60, 120), 2: (60, 70)}) is None
+
+
+@pytest.mark.parametrize(("points", "place"), [(3000, 4), (2300, 4), (1000, 0)])
+def test_points_that_prove_another_pose_about_one_decide(
+    monkeypatch: pytest.MonkeyPatch, points: int, place: int
+) -> None:
+    """More of them place the camera; half as many leave it open."""
+
+    def look_about(*_: object) -> F64:
+        return looking((3.0 * 4, 0.0, 0.0))
+
+    monkeypatch.setattr(relocalisation, "look_about", look_about)
+    found = ask(monkeypatch, {0: (170, 2400), 4: (0, points)}, places_with_corners=1)
+    if points == 2300:
+        assert found is None
+        return
+    assert found is not None
+    assert found.T_world_camera[0, 3] == 3.0 * place
+    assert found.inliers == max(points, 2400)
 
 
 def test_places_elsewhere_are_asked_where_one_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,7 +36,7 @@ _PREDICTION_GATE_PX = 20.0
 _SPEEDING_UP = 0.5
 """Share of its last acceleration that a camera is taken to keep: all of it lets noise grow."""
 
-_NEAR = 0.3
+NEAR = 0.3
 """Share of the radius that is searched first: mostly enough, and far less to confuse."""
 
 
@@ -218,7 +218,7 @@ def recover(
     """
     predictions = motion.predictions(stamp_ns)
     radius_px = search_radius_px(motion.lost_s(stamp_ns), camera, parameters.recovery)
-    for radius in (_NEAR * radius_px, radius_px):
+    for radius in (NEAR * radius_px, radius_px):
         grid = MaximaGrid.build(maxima, camera.width, camera.height, radius)
         for prediction in predictions:
             T_world_camera = look_about(

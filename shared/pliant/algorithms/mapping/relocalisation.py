@@ -6,7 +6,7 @@ and where no other place is proved nearly as well: what looks the same in two pl
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.mapping.covisibility import most_shared, rows_of
-from pliant.algorithms.mapping.localisation import are_enough, look_about, prove, refine
+from pliant.algorithms.mapping.localisation import NEAR, are_enough, look_about, prove, refine
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
@@ -125,11 +125,46 @@ def relocalise(
     here = transform(inverse(proof.T_world_camera), proof.xyz)
     if repeats(seen, proof.corners, here, camera, parameters):
         return None
+    place = proof.place
+    best = _looked_about(best, place, points, maxima, grey, camera, parameters, generator)
     moved = rest_is_elsewhere(
-        best.T_world_camera, proof.place.keyframe, proof.place.segment, points, maxima, grey,
-        camera, parameters, generator,
+        best.T_world_camera, place.keyframe, place.segment, points, maxima, grey, camera,
+        parameters, generator,
     )  # fmt: skip
     return None if moved else best
+
+
+def _looked_about(
+    found: Recognised,
+    place: Place,
+    points: PointRows,
+    maxima: F32,
+    grey: U8,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    generator: np.random.Generator,
+) -> Recognised:
+    """The pose that most of the map's points prove, of the one that corners tell and of one that
+    points tell which are looked for about it.
+
+    A few blurred corners on one wall leave a turn open that a step aside makes up for, and points
+    on it are found within their radius then, too.
+    """
+    rows = _rows_near(place.keyframe, place.segment, points)
+    radius_px = NEAR * parameters.recovery.max_radius_share * camera.width
+    grid = MaximaGrid.build(maxima, camera.width, camera.height, radius_px)
+    T_world_camera = look_about(
+        found.T_world_camera, rows, points, grid, grey, radius_px, camera, parameters, generator
+    )
+    if T_world_camera is None:
+        return found
+    proved = prove(
+        T_world_camera, rows, points, maxima, grey, camera, parameters,
+        parameters.recovery.min_agreement,
+    )  # fmt: skip
+    if proved is None or len(proved.rows) <= found.inliers:
+        return found
+    return replace(found, T_world_camera=proved.T_world_camera, inliers=len(proved.rows))
 
 
 def _rows_near(keyframe: Keyframe, segment: list[Keyframe], points: PointRows) -> I32:
