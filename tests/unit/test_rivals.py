@@ -112,11 +112,12 @@ def test_what_the_image_shows_again_a_step_aside_proves_no_pose(
     assert ask(monkeypatch, {0: (170, 2400)}, repeated=0.6) is None
 
 
-def test_fewer_points_than_a_map_starts_with_prove_no_place_but_rival_another(
+def test_fewer_points_and_corners_than_a_map_starts_with_prove_no_place_but_rival_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert ask(monkeypatch, {0: (170, 99)}) is None
-    assert ask(monkeypatch, {0: (170, 100)}) is not None
+    assert ask(monkeypatch, {0: (99, 99)}) is None
+    assert ask(monkeypatch, {0: (99, 100)}) is not None
+    assert ask(monkeypatch, {0: (100, 99)}) is not None
     assert ask(monkeypatch, {0: (60, 120), 2: (60, 70)}) is None
 
 

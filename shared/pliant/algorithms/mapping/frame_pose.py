@@ -28,7 +28,6 @@ from pliant.algorithms.mapping.directions import (
 from pliant.algorithms.mapping.localisation import (
     Localisation,
     Motion,
-    are_enough,
     locate,
     prove,
     recover,
@@ -142,7 +141,7 @@ def localise(
                 located.T_world_camera, active.nearby(), points, seen.maxima, image.whole,
                 active.camera, parameters, parameters.recovery.min_agreement,
             )  # fmt: skip
-            if proved is not None and are_enough(len(proved.rows), parameters):
+            if proved is not None:
                 return Located(proved.T_world_camera, True)
     if image is None:
         return None

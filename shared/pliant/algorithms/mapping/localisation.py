@@ -236,7 +236,8 @@ def recover(
 
 
 def are_enough(points: int, parameters: MappingParameters) -> bool:
-    """Whether so many points that prove a pose place a camera to which no tracks lead.
+    """Whether so many points that prove a pose, or corners that tell it, place a camera to which no
+    tracks lead.
 
     A few dozen agree on a pose a step aside as well, by what looks alike there.  No map starts with
     so few, and none goes on by them.

@@ -118,7 +118,9 @@ def relocalise(
                 best, proof, found = found, proposed, best
             if not same:
                 rivals.append(found)
-    if best is None or proof is None or not are_enough(best.inliers, parameters):
+    if best is None or proof is None:
+        return None
+    if not are_enough(max(best.inliers, best.corners), parameters):
         return None
     if any(_is_as_good(rival, best, points, parameters) for rival in rivals):
         return None
