@@ -148,7 +148,9 @@ def test_one_is_not_many(tmp_path: Path) -> None:
 def test_a_recorder_that_was_killed_did_not_cut_the_source_off(tmp_path: Path) -> None:
     """The topic of the camera is closed before the first frame; those of the frames are open."""
     lines = record(tmp_path, [""] * 4, announced=10, ended=[topics.STREAM])
-    assert not [line for line in lines if "ended early" in line]
+    told = "4 of 10 frames came: the run was stopped or cut off"
+    assert [line for line in lines if "ended early" in line] == [f"ended early: {told}"]
+    assert told in (tmp_path / "report.html").read_text()
     assert json.loads((tmp_path / "report.json").read_text())["complete"] is False
 
 
@@ -188,7 +190,7 @@ def test_the_end_of_a_run_says_what_to_look_at_and_how_large_it_is(
 
 def test_a_source_that_failed_says_why(tmp_path: Path) -> None:
     lines = record(tmp_path, [""] * 3, note="camera:0: delivers no more images", complete=False)
-    assert "the source ended early: camera:0: delivers no more images" in lines
+    assert "ended early: camera:0: delivers no more images" in lines
 
 
 @pytest.mark.parametrize(
@@ -199,9 +201,7 @@ def test_a_video_that_is_cut_off_is_noticed(
     tmp_path: Path, announced: int, complete: bool, said: bool
 ) -> None:
     lines = record(tmp_path, [""] * 4, announced=announced, complete=complete)
-    assert (
-        "the source ended early: 4 of 10 frames came: the file is cut off or damaged" in lines
-    ) is said
+    assert ("ended early: 4 of 10 frames came: the file is cut off or damaged" in lines) is said
 
 
 def test_a_run_that_was_interrupted_before_it_recorded_has_nothing_to_mesh(

@@ -108,14 +108,15 @@ def process_figures(run: Run, frames: int) -> dict[str, Any]:
 
 
 def ended_early(run: Run, came: int) -> str:
-    """Why the source gave less frames than it said; "" if it did not, or was told to stop."""
-    if run.source_failure or run.stream is None or not run.complete:
+    """Why less frames came than the source had said; "" if they did not."""
+    if run.source_failure or run.stream is None:
         return run.source_failure
     announced = run.stream.frames
     # Containers of videos count their frames roughly.
     if announced - came <= max(2, _ROUGHLY * announced):
         return ""
-    return f"{came} of {announced} frames came: the file is cut off or damaged"
+    why = "the file is cut off or damaged" if run.complete else "the run was stopped or cut off"
+    return f"{came} of {announced} frames came: {why}"
 
 
 def _well_observed(run: Run, final: dict[int, Any]) -> int:

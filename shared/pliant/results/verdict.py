@@ -113,7 +113,7 @@ def _faults(report: dict[str, Any]) -> list[str]:
     if broken:
         lines.append(f"{counted(len(broken), 'broken image')}: {_told_of_broken(broken)}")
     if report["ended_early"]:
-        lines.append(f"the source ended early: {report['ended_early']}")
+        lines.append(f"ended early: {report['ended_early']}")
     return lines
 
 

@@ -58,6 +58,11 @@ def _part(name: str) -> str:
     return (files("pliant.results.page") / name).read_text(encoding="utf-8")
 
 
+def ended(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """Why fewer frames came than the source has, where that is so."""
+    return [("ended early", report["ended_early"])] if report["ended_early"] else []
+
+
 def table_rows(told: Iterable[tuple[str, str]]) -> str:
     """Of a <table>: what, and how much of it."""
     return "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in told)

@@ -19,7 +19,7 @@ from pliant.recording.reader import Recording
 from pliant.results.mesh_files import mesh_of
 from pliant.results.page.advice import advice
 from pliant.results.page.chart import BLUE, ORANGE, Line, chart
-from pliant.results.page.page import bullets, canvas, fill_page, table_rows
+from pliant.results.page.page import bullets, canvas, ended, fill_page, table_rows
 from pliant.results.page.scene import make_scene
 from pliant.results.run import Run, SeenKeyframe, seen_by_keyframes
 from pliant.wording import counted
@@ -121,6 +121,7 @@ def _figures(run: Run, report: dict[str, Any]) -> list[tuple[str, str]]:
     waited = "every frame waited for the map to begin"
     rows = [
         ("frames", f"{report['frames']}, {report['frames_with_pose']} with a pose"),
+        *ended(report),
         ("map", f"{counted(report['keyframes'], 'keyframe')}, {report['points']:,} points"),
         (
             "median per frame",

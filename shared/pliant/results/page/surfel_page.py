@@ -7,7 +7,7 @@ from typing import Any
 
 from pliant.results.page.chart import BLUE, ORANGE, Line, chart
 from pliant.results.page.moved_surface import Surface
-from pliant.results.page.page import bullets, canvas, fill_page, table_rows
+from pliant.results.page.page import bullets, canvas, ended, fill_page, table_rows
 from pliant.wording import counted
 
 _TINTS = (
@@ -41,6 +41,7 @@ def _surfel_figures(report: dict[str, Any]) -> list[tuple[str, str]]:
     alive = report["alive_per_frame"] or [0]
     return [
         ("frames", f"{report['frames']}, {report['frames_with_pose']} followed"),
+        *ended(report),
         ("surfels", f"{report['median_alive']:.0f} in the median frame, {alive[-1]} in the last"),
         ("born", f"{report['births']:,}"),
         ("started", counted(len(report["segments"]), "time")),
