@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -23,7 +24,10 @@ from pliant.messages import topics
 from pliant.messages.types import MapUpdate
 from pliant.results.folder import prepare
 from pliant.results.known_scale import MetricRecording
+from pliant.results.mesh_files import mesh_of
+from pliant.results.run import read_run
 from pliant.scale.command import Known, scale_result
+from pliant.scale.lengths import from_points
 
 pytestmark = pytest.mark.system
 
@@ -120,6 +124,30 @@ def test_a_marker_tells_the_scale(tmp_path: Path) -> None:
     assert abs(found.scale - 1.0) < 0.015
 
 
+def test_exports_made_before_are_named(tiny_run: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(tiny_run, tmp_path / "tiny"))
+    poses = export_result(folder, "tum", None)
+    before = poses.read_bytes()
+    for name in ("nerfstudio", "images", "picture.png"):
+        (folder / name).mkdir()
+    _, told = scale_result(folder, Known(points=((-0.5, 0.0, 1.0), (0.5, 0.0, 1.0), 2.0)))
+    assert told.startswith("made before, in the old unit: trajectory_tum.txt, nerfstudio: ")
+    assert poses.read_bytes() == before
+    assert export_result(folder, "tum", None, force=True).read_bytes() != before
+
+
+def test_a_vertex_of_the_mesh_is_of_the_map_too(tiny_run: Path) -> None:
+    run = read_run(tiny_run / "recording.mcap")
+    longest = run.history.longest_segment()
+    points, mesh = run.history.points_in(longest).positions, mesh_of(run.mesh, longest)
+    assert mesh is not None
+    some = mesh.positions[::20].tolist()
+    vertex = max(some, key=lambda place: np.linalg.norm(points - place, axis=1).min())
+    assert from_points(run, vertex, points[0], 1.0).metres_per_unit > 0.0
+    with pytest.raises(PliantError, match="nowhere in the map"):
+        from_points(replace(run, mesh=[]), vertex, points[0], 1.0)
+
+
 def put_marker_into(sequence: Path, side_m: float) -> None:
     """Draw a board with a marker that stands still in the world into every image."""
     calibration = yaml.safe_load((sequence / "calib.yaml").read_text())
@@ -158,6 +186,8 @@ def put_marker_into(sequence: Path, side_m: float) -> None:
         (Known(marker=-1.0), "no length"),
         (Known(points=((1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 1.0)), "the two points are one"),
         (Known(points=((1.0, 2.0, 3.0), (1.0, 2.0, 4.0), np.nan)), "no length"),
+        (Known(points=((-0.5, 0.0, 1.0), (900.0, 1.0, 1.0), 1.0)), "900,1,1 is nowhere in the map"),
+        (Known(points=((0.0, 0.0, -9.0), (0.5, 0.0, 1.0), 1.0)), "0,0,-9 is nowhere in the map"),
         (Known(depth="nowhere"), "nowhere"),
     ],
 )

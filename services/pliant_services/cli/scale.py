@@ -37,7 +37,9 @@ def scale(
         ),
     ] = None,
 ) -> None:
-    """Make a result metric: every file in its folder, its exports, and runs that go on in its map.
+    """Make a result metric: its files, later exports of it, and runs that go on in its map.
+
+    Exports made before stay in the old unit: those in its folder are named, to be made again.
 
     pliant scale results/desk --marker 0.08
 

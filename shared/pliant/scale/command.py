@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pliant.errors import ResultError
+from pliant.export.export import EXPORTS
 from pliant.recording import parts
 from pliant.results.folder import RECORDING_NAME, check_free, written
 from pliant.results.known_scale import MetricRecording, Scale
@@ -13,6 +14,9 @@ from pliant.results.surfels import has_surfels
 from pliant.results.write import write_rigid_results
 from pliant.scale.lengths import from_depth, from_points
 from pliant.scale.marker import from_marker
+
+_WITHOUT_LENGTHS = ("images", "overlay", "picture", "overview")
+"""Kinds of export that are the same in any unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +33,8 @@ class Known:
 
 
 def scale_result(result: Path, known: Known) -> Iterator[str]:
-    """Measure, write the files of a result folder in metres, and say how long a unit was.
+    """Measure, write the files of a result folder in metres, and say how long a unit was, and which
+    exports in the folder are not in metres.
 
     What was told before is forgotten.  Raises PliantError, and has written nothing then.
     """
@@ -52,12 +57,21 @@ def scale_result(result: Path, known: Known) -> Iterator[str]:
     sure = f", +- {found.sigma:.1%}" if found.sigma >= 0.001 else ""
     unit = "a unit of the map" if before is None else "a metre so far"
     yield f"{unit} is {found.metres_per_unit:.4g} m ({found.source}{sure}): {result}/ is in metres"
+    exports = _with_lengths(result)
+    if exports:
+        yield f"made before, in the old unit: {', '.join(exports)}: export again with --force"
 
 
 def _measure(recording: MetricRecording, run: Run, known: Known) -> Scale:
     if known.points is not None:
-        return from_points(*known.points)
+        return from_points(run, *known.points)
     if known.marker is not None:
         return from_marker(recording, run, known.marker)
     assert known.depth is not None
     return from_depth(recording, run, known.depth)
+
+
+def _with_lengths(folder: Path) -> list[str]:
+    """Names of the exports in a result folder that hold lengths."""
+    names = (name for kind, (name, _) in EXPORTS.items() if kind not in _WITHOUT_LENGTHS)
+    return [name for name in names if (folder / name).exists()]

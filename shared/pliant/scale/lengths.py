@@ -15,15 +15,18 @@ from pliant.errors import ResultError
 from pliant.export.images import camera_of
 from pliant.recording.reader import Recording
 from pliant.results.known_scale import Scale
+from pliant.results.mesh_files import mesh_of
 from pliant.results.run import Run, seen_by_keyframes
 from pliant.wording import counted
 
 _LEAST_DEPTHS = 100
 _TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution by its median absolute deviation."""
+_FAR = 0.1
+"""From all of the map, as a share of the spread of its points: no place of it."""
 
 
-def from_points(a: Sequence[float], b: Sequence[float], metres: float) -> Scale:
+def from_points(run: Run, a: Sequence[float], b: Sequence[float], metres: float) -> Scale:
     """By two points of the map, in its units, that are so far apart.  Raises ResultError.
 
     Who picked them knows how well: the sigma is 0.
@@ -33,8 +36,28 @@ def from_points(a: Sequence[float], b: Sequence[float], metres: float) -> Scale:
         raise ResultError("--points: the two points are one: choose others")
     if not 0.0 < metres < np.inf:
         raise ResultError(f"{metres:g} metres: no length")
+    _check_mapped(run, a, b)
     told = f"two points {metres:g} m apart"
     return Scale(metres_per_unit=metres / apart, sigma=0.0, source=told)
+
+
+def _check_mapped(run: Run, *places: Sequence[float]) -> None:
+    """Raise ResultError for a place that is near no point of the map and no vertex of its mesh,
+    which report.html picks, too: where there is little texture, it is far from all points."""
+    longest = run.history.longest_segment()
+    mapped: F64 = np.asarray(run.history.points_in(longest).positions, np.float64)
+    spread = float(np.linalg.norm(mapped.std(axis=0)))
+    mesh = mesh_of(run.mesh, longest)
+    if mesh is not None:
+        mapped = np.concatenate([mapped, mesh.positions.astype(np.float64)])
+    for place in places:
+        off = float(np.linalg.norm(mapped - np.asarray(place), axis=1).min(initial=np.inf))
+        if off > _FAR * spread:
+            told = ",".join(f"{value:g}" for value in place)
+            raise ResultError(
+                f"--points: {told} is nowhere in the map, whose nearest point is {off:.3g} away: "
+                "pick both in report.html"
+            )
 
 
 def from_depth(recording: Recording, run: Run, source: str) -> Scale:
