@@ -57,7 +57,7 @@ def refused(command: Callable[[], object], folder: Path, says: str = "is read fr
     assert contents(folder) == before
 
 
-def evaluation(truth: Path, **outputs: object) -> Callable[[], object]:
+def evaluation(truth: Path, **outputs: object) -> Callable[[], list[str]]:
     request: dict[str, Any] = {
         "results": [truth / "result.txt"], "groundtruth": str(truth), "times": None, "frames": None,
         "tracks": False, "points": False, "mesh": False, "surfels": False, "json": None,

@@ -132,6 +132,22 @@ def test_an_evaluation_replaces_what_is_there_with_force_alone(truth: Path) -> N
     refused(both, truth, "choose another --plot")
 
 
+def test_an_evaluation_against_the_truth_of_another_recording(truth: Path) -> None:
+    """Where no stamps meet it is an error, and nothing is written; where some do it is said."""
+    groundtruth = truth / "groundtruth.txt"
+    poses = groundtruth.read_text()
+    groundtruth.write_text("".join(f"{100 + i} {i} {i * i} 0 0 0 0 1\n" for i in range(5)))
+    says = r"^.*/result.txt: no accuracy, only 0 of 5 poses .* within 0.004 s in .*--groundtruth"
+    refused(evaluation(truth, json=truth / "figures.json"), truth, says)
+    groundtruth.write_text("".join(poses.splitlines(keepends=True)[:3]))
+    [said] = evaluation(truth)()
+    warning = f"warning: only 3 of 5 poses have a true pose: is {truth} of this recording?"
+    assert said.splitlines()[-1] == warning
+    groundtruth.write_text(poses)
+    [said] = evaluation(truth)()
+    assert "warning" not in said
+
+
 @pytest.mark.parametrize(
     ("output", "says"),
     [

@@ -51,6 +51,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "misspelt.yaml").write_text("tracking:\n  min_curvatur: 8\n")
     (tmp_path / "binary.yaml").write_bytes(b"\0\xff\xfe")
     (tmp_path / "broken.yaml").write_text("bus: [1\n")
+    for name, since in (("poses.txt", 0), ("later.txt", 100)):
+        (tmp_path / name).write_text("".join(f"{since + i} {i} 0 0 0 0 0 1\n" for i in range(3)))
     write_sequence(tmp_path / "result", IMAGES)
     write_sequence(tmp_path / "nan", IMAGES, fx=float("nan"))
     write_sequence(tmp_path / "negative", IMAGES, fy=-50.0)
@@ -107,6 +109,7 @@ MISTAKES: list[tuple[Sequence[str], int, Sequence[str]]] = [
     (["run", TINY, "--mode", "nonsense"], 2, ["--mode", "lossless", "live", "--help"]),
     (["run", TINY, "--port", "99999"], 2, ["--port", "65535"]),
     (["run", TINY, "--no-such-option"], 2, ["--no-such-option", "run --help"]),
+    (["eval", "poses.txt", "-g", "later.txt"], 1, ["poses.txt: no accuracy", "in later.txt: "]),
     (["run"], 2, ["source", "run --help"]),
     (["juggle"], 2, ["juggle", "--help"]),
     (["service", "tracking", "--connect", "nonsense"], 1, ["nonsense", "tcp/127.0.0.1:7447"]),

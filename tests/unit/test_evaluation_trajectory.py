@@ -176,6 +176,25 @@ def test_too_few_poses_say_so(rows: list[int], reason: str) -> None:
     assert part.reason.startswith(reason)
 
 
+@pytest.mark.parametrize(("compared", "apart", "partly"), [(2, True, False), (89, False, True)])
+def test_poses_that_the_truth_does_not_meet(compared: int, apart: bool, partly: bool) -> None:
+    truth = walk()
+    part = evaluate_trajectory(truth, truth.select(np.arange(compared)), frames=100)
+    assert (part.apart, part.partly_compared) == (apart, partly)
+
+
+def test_a_failure_or_a_short_map_is_not_apart_from_the_truth() -> None:
+    truth = walk()
+    later = truth.select(np.arange(60, 100))
+    failure = evaluate_trajectory(truth.select(np.arange(50)), later, frames=100)
+    assert (failure.apart, failure.partly_compared) == (False, True)
+    for count in (0, 2):
+        short = evaluate_trajectory(truth.select(np.arange(count)), later)
+        assert (short.apart, short.partly_compared) == (False, False)
+    whole = evaluate_trajectory(truth, truth.select(np.arange(90)), frames=100)
+    assert (whole.apart, whole.partly_compared) == (False, False)
+
+
 def test_a_camera_that_stands_still_has_no_accuracy() -> None:
     truth = walk()
     still = Trajectory(

@@ -54,10 +54,7 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         truth = builtin_folder(request.groundtruth)
     elif request.tracks or request.points:
         raise ResultError("--tracks and --map need exact depth: --groundtruth built-in:NAME")
-    evaluations = [
-        evaluate_result(result, groundtruth=truth, times=request.times, frames=request.frames)
-        for result in request.results
-    ]
+    evaluations = [_evaluated(result, truth, request) for result in request.results]
     figures: dict[str, Any] = evaluation_to_json(evaluations[0])
     for evaluation in evaluations:
         yield format_evaluation(evaluation)
@@ -86,6 +83,19 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         yield from mesh_against_truth(request.results[0], truth, evaluations[0], figures)
     if request.json is not None:
         write_json(request.json, figures)
+
+
+def _evaluated(result: Path, truth: Path, request: EvaluationRequest) -> Evaluation:
+    """Evaluate one result.  Raises ResultError where poses and truth do not meet in time."""
+    evaluation = evaluate_result(
+        result, groundtruth=truth, times=request.times, frames=request.frames
+    )
+    if evaluation.final.apart:
+        raise ResultError(
+            f"{result}: no accuracy, {evaluation.final.reason} in {request.groundtruth}: "
+            "--groundtruth must be of this recording, its stamps by the same clock"
+        )
+    return evaluation
 
 
 def _check_outputs(request: EvaluationRequest) -> None:

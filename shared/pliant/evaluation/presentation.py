@@ -166,6 +166,12 @@ def format_evaluation(evaluation: Evaluation) -> str:
         f"initialisation retries: {'-' if retries is None else retries}",
     ]
     lines += [f"{part.kind}: no accuracy, {part.reason}" for part in parts if part.reason]
+    final = evaluation.final
+    if final.partly_compared:
+        lines.append(
+            f"warning: only {final.matched} of {final.localised} poses have a true pose: "
+            f"is {evaluation.groundtruth} of this recording?"
+        )
     return "\n".join(lines)
 
 

@@ -31,6 +31,8 @@ from pliant.trajectory import (
 
 MIN_SUCCESS = 0.9
 """Below this share of localised frames a trial is a failure and gets no accuracy (section 5.2)."""
+MIN_COMPARED = 0.9
+"""Where a smaller share of the poses has a true pose, the truth may be of another recording."""
 
 FINAL_NAME = "trajectory.txt"
 CAUSAL_NAME = "trajectory_causal.txt"
@@ -78,6 +80,20 @@ class TrajectoryEvaluation:
         if self.ate_m is None or not self.path_m:
             return None
         return 100.0 * self.ate_m.rmse / self.path_m
+
+    @property
+    def apart(self) -> bool:
+        """Whether there is no accuracy for one reason alone: poses and truth do not meet in time.
+
+        A failure has none in any case, and fewer than three poses cannot be aligned.
+        """
+        return self.matched < MIN_POSES <= self.localised and self.success is not False
+
+    @property
+    def partly_compared(self) -> bool:
+        """Whether so many poses have no true pose that the user should look at the truth."""
+        few = self.matched < MIN_COMPARED * self.localised
+        return few and self.localised >= MIN_POSES and not self.apart
 
 
 @dataclass(frozen=True, kw_only=True)
