@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import tarfile
 import tomllib
 import zipfile
 from collections.abc import Iterable
@@ -87,8 +86,7 @@ def test_the_archive_of_the_sources_gives_the_same_wheel(wheel: Path, tmp_path: 
     build = (sys.executable, "-m", "hatchling", "build", "-d", tmp_path, "--target")
     run(*build, "sdist", cwd=ROOT)
     (archive,) = tmp_path.glob("*.tar.gz")
-    with tarfile.open(archive) as packed:
-        packed.extractall(tmp_path, filter="data")
+    run("tar", "-xzf", archive, cwd=tmp_path)  # tarfile's has no safe way before Python 3.11.4
     sources = tmp_path / archive.name.removesuffix(".tar.gz")
     named = ("README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")
     assert all((sources / name).is_file() for name in named)
