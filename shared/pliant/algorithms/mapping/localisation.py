@@ -126,6 +126,13 @@ def _cost(T_world_camera: F64, points_world: F64, points_n: F64, gate: float) ->
     )  # fmt: skip
 
 
+class Proved(NamedTuple):
+    """A pose, and the rows of the points that prove it."""
+
+    T_world_camera: F64
+    rows: I32
+
+
 @dataclass(kw_only=True)
 class Motion:
     """How the camera moved last: T_world_camera (4, 4) of two frames, the newer one last.
@@ -221,15 +228,9 @@ def recover(
     for radius in (NEAR * radius_px, radius_px):
         grid = MaximaGrid.build(maxima, camera.width, camera.height, radius)
         for prediction in predictions:
-            T_world_camera = look_about(
+            proved = look_about(
                 prediction, rows, points, grid, grey, radius, camera, parameters, generator
             )
-            if T_world_camera is None:
-                continue
-            proved = prove(
-                T_world_camera, rows, points, maxima, grey, camera, parameters,
-                parameters.recovery.min_agreement,
-            )  # fmt: skip
             if proved is not None and are_enough(len(proved.rows), parameters):
                 return proved.T_world_camera
     return None
@@ -255,8 +256,8 @@ def look_about(
     camera: PinholeCamera,
     parameters: MappingParameters,
     generator: np.random.Generator,
-) -> F64 | None:
-    """The pose that points agree on which are looked for about where a pose shows them.
+) -> Proved | None:
+    """The pose that points agree on which are looked for about where a pose shows them, and prove.
 
     rows: of the points.   grid: the maxima of the image, for this radius.
     """
@@ -269,14 +270,12 @@ def look_about(
     if len(found) < own.min_agreeing:
         return None
     located = locate([T_world_camera], points.xyz[found], points_px, camera, limits, generator)
-    return located.T_world_camera if located.inliers.sum() >= own.min_agreeing else None
-
-
-class Proved(NamedTuple):
-    """A pose, and the rows of the points that prove it."""
-
-    T_world_camera: F64
-    rows: I32
+    if located.inliers.sum() < own.min_agreeing:
+        return None
+    return prove(
+        located.T_world_camera, rows, points, grid.maxima, grey, camera, parameters,
+        own.min_agreement,
+    )  # fmt: skip
 
 
 def prove(

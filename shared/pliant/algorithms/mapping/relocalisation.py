@@ -155,15 +155,9 @@ def _looked_about(
     rows = _rows_near(place.keyframe, place.segment, points)
     radius_px = NEAR * parameters.recovery.max_radius_share * camera.width
     grid = MaximaGrid.build(maxima, camera.width, camera.height, radius_px)
-    T_world_camera = look_about(
+    proved = look_about(
         found.T_world_camera, rows, points, grid, grey, radius_px, camera, parameters, generator
     )
-    if T_world_camera is None:
-        return found
-    proved = prove(
-        T_world_camera, rows, points, maxima, grey, camera, parameters,
-        parameters.recovery.min_agreement,
-    )  # fmt: skip
     if proved is None or len(proved.rows) <= found.inliers:
         return found
     return replace(found, T_world_camera=proved.T_world_camera, inliers=len(proved.rows))
@@ -200,12 +194,9 @@ def rest_is_elsewhere(
     radius_px = camera.width * own.max_radius_share
     grid = MaximaGrid.build(maxima, camera.width, camera.height, radius_px)
     rest = np.setdiff1d(rows, seen.rows)
-    aside = look_about(
+    other = look_about(
         seen.T_world_camera, rest, points, grid, grey, radius_px, camera, parameters, generator
     )
-    if aside is None:
-        return False
-    other = prove(aside, rest, points, maxima, grey, camera, parameters, own.min_agreement)
     return (
         other is not None
         and len(other.rows) > _AS_GOOD * len(seen.rows)
