@@ -122,7 +122,11 @@ def run(
         _faults(help="A service that dies ends the run, or goes on where it was."),
     ] = "stop",
     resume: Annotated[
-        bool, _faults("--resume", help="Take up a run again that was cut off (power, kill).")
+        bool,
+        _faults(
+            "--resume",
+            help="Take up a run again that was cut off (power, kill), with --on-crash restart.",
+        ),
     ] = False,
     port: Annotated[
         int | None, _faults(min=1, max=65535, help="Port of the router [a free one].")

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -20,13 +21,18 @@ from pliant.errors import CalibrationError, PliantError, ResultError
 from pliant.exit_codes import INTERRUPTED
 from pliant.files import make_folder, write_whole
 from pliant.fusion.memory import check_voxel_sizes
+from pliant.messages import topics
+from pliant.messages.types import Status
 from pliant.recording import parts
 from pliant.recording.map_file import MapFile
+from pliant.recording.reader import Recording
 from pliant.recording.recover import mend
+from pliant.results import earlier
 from pliant.results.folder import (
     CONFIG_NAME,
     PAGE_NAME,
     RECORDING_NAME,
+    REPORT_NAME,
     STATE_FOLDER,
     discard,
     files_of,
@@ -155,7 +161,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
         fleet = Fleet(
             services,
             log_folder=output / "logs",
-            on_status=progress.on_status,
+            on_status=partial(_on_status, output, progress),
             port=request.port,
             state=state,
         )
@@ -173,6 +179,11 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
     if failure is None and not interrupted:
         shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
     return _finish(output, interrupted=interrupted, failure=failure)
+
+
+def _on_status(output: Path, progress: Progress, status: Status) -> None:
+    earlier.replace(output)  # a frame has come
+    progress.on_status(status)
 
 
 def _go_through(
@@ -225,9 +236,7 @@ def _told_poses(request: RunRequest, fleet: Fleet) -> AbstractContextManager[Non
 def resumed_config(output: Path, request: RunRequest) -> Config:
     """The configuration of the run that is taken up again.  Raises ResultError, ConfigError."""
     if not (output / STATE_FOLDER).is_dir():
-        raise ResultError(
-            f"{output} holds no run that can be resumed: start it with --on-crash restart"
-        )
+        raise ResultError(f"{output}: {_why_not_resumed(output)}")
     kept = load_config(output / CONFIG_NAME)
     said = request.overrides or request.config_file or request.seed is not None
     if said and kept != load_config(request.config_file, request.overrides, seed=request.seed):
@@ -236,6 +245,17 @@ def resumed_config(output: Path, request: RunRequest) -> Config:
             "--set, --seed and what else changes it"
         )
     return kept
+
+
+def _why_not_resumed(output: Path) -> str:
+    if not parts.exists(output / RECORDING_NAME):
+        return "there is no run to resume: leave --resume"
+    if (output / REPORT_NAME).exists():
+        return "its run came to its end, and nothing is left to resume: --force begins anew"
+    return (
+        "its run was begun without --on-crash restart, and cannot go on: `pliant recover` keeps "
+        "what was recorded, --force begins anew"
+    )
 
 
 def resumed_map(output: Path, request: RunRequest) -> Path | None:
@@ -288,33 +308,44 @@ def service_arguments(name: str, request: RunRequest, output: Path) -> list[str]
 
 
 def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> int:
-    """Write what can be written of the recording, and say where it is; then raise the failure."""
-    if not parts.exists(output / RECORDING_NAME):
-        if failure is not None:
-            raise failure
-        raise KeyboardInterrupt if interrupted else ResultError(f"{output}: nothing was recorded")
+    """Write what can be written of the recording, and say where it is; then raise the failure.
+
+    A run that came to nothing leaves nothing, but for the logs of a service that crashed.
+    """
     # They load what a launcher that waits has no use for.
+    from pliant.export.export import exports_in
     from pliant.results.verdict import grade, summary
     from pliant.results.write import write_results
 
+    recording = output / RECORDING_NAME
     try:
-        report = write_results(output)
+        report = write_results(output) if parts.exists(recording) else None
     except PliantError:
         if failure is not None:  # it came first, and says why this one followed
             raise failure from None
         raise
-    if isinstance(failure, ServiceDiedError) and not (failure.crashed or report["frames"]):
-        discard(output)  # its line says it all
-        raise failure
+    if report is None or not (report["frames"] or _has_images(recording)):
+        if not (isinstance(failure, ServiceDiedError) and failure.crashed):
+            discard(output)
+        nothing = KeyboardInterrupt() if interrupted else ResultError(f"{output}: no frame came")
+        raise failure or nothing
     with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
         files = ", ".join(files_of(output, report))
         print(f"results in {output}/ ({_sizes(output)}): {files}, {_recording_in(output)}")
         print(f"to look at: {output / PAGE_NAME}, in a browser")
+        exports = ", ".join(exports_in(output))
+        if exports:
+            print(f"of the result before: {exports}: export again with --force")
         for line in summary(report):
             print(line)
     if failure is not None:
         raise failure
     return INTERRUPTED if interrupted else grade(report)
+
+
+def _has_images(recording: Path) -> bool:
+    """Whether there is one that a run can begin with, though nothing may have become of it."""
+    return next(Recording(recording).messages(topics.SOURCE), None) is not None
 
 
 def _sizes(output: Path) -> str:

@@ -111,6 +111,12 @@ def export_result(
     return path
 
 
+def exports_in(folder: Path, *, but: Container[str] = ()) -> list[str]:
+    """Names of the exports in a result folder that are called as by default, but for some kinds."""
+    names = (name for kind, (name, _) in EXPORTS.items() if kind not in but)
+    return [name for name in names if (folder / name).exists()]
+
+
 def _check_ending(path: Path, to: str, name: str) -> None:
     """Raise ResultError where others would take a file for another kind than it is.
 

@@ -6,11 +6,10 @@ import json
 import os
 import platform
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -21,6 +20,7 @@ from pliant.errors import ResultError
 from pliant.files import make_folder, move_all, write_whole
 from pliant.recording import parts
 from pliant.recording.map_file import MAP_NAME
+from pliant.results.earlier import is_aside, put_back, remove, set_aside
 from pliant.version import __version__
 
 RECORDING_NAME = "recording.mcap"
@@ -114,8 +114,14 @@ def written(output: Path, *, force: bool) -> Generator[None]:
             raise _unwritable(output, error) from None
         try:
             check_output(output, force=force)  # another one may have been here meanwhile
+            try:
+                put_back(output, _result_in(output))
+            except OSError as error:
+                raise _unwritable(output, error) from None
             yield
         finally:
+            with suppress(OSError):
+                put_back(output, _result_in(output))
             (output / _LOCK_NAME).unlink(missing_ok=True)
             os.close(lock)
     finally:
@@ -234,31 +240,40 @@ def check_output(output: Path, *, force: bool) -> None:
 
 
 def prepare(output: Path, config: str) -> None:
-    """Make the folder, free of earlier results, with what the services read."""
+    """Make the folder, with what the services read.
+
+    An earlier result is set aside until this one has begun (`earlier.replace`): where the folder
+    is let go before that, it is as it was.
+    """
     try:
         make_folder(output / "logs")
-        _clear(output)
+        set_aside(output, list(_result_in(output)))
         write_whole(output / CONFIG_NAME, config)
         write_whole(output / "logs" / "metadata.json", json.dumps(run_metadata(config)))
     except OSError as error:
         raise _unwritable(output, error) from None
 
 
-def _clear(output: Path) -> None:
-    parts.remove(output / RECORDING_NAME)
-    shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
-    for name in (*_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME):
-        (output / name).unlink(missing_ok=True)
-    for path in output.glob("*_segment_*"):
-        path.unlink()
+def _result_in(output: Path) -> Iterator[Path]:
+    """The files and folders of a result that are there; not what was exported of it, nor logs."""
+    recorded = output / RECORDING_NAME
+    names = (CONFIG_NAME, SESSION_NAME, STATE_FOLDER, SURFELS_NAME)
+    names += (*_RIGID_FILES, *SOMETIMES, *MESH_FILES)
+    yield from parts.parts_in(parts.folder_of_parts(recorded))
+    for path in (recorded, *(output / name for name in names), *output.glob("*_segment_*")):
+        if os.path.lexists(path):
+            yield path
 
 
 def discard(output: Path) -> None:
-    """Take away all that a run has left, of one that came to nothing."""
+    """Take away all that a run has left, of one that came to nothing.
+
+    Logs are those of a result that comes back, too.
+    """
+    logs = () if is_aside(output) else (output / "logs",)
     with suppress(OSError):
-        _clear(output)
-        (output / CONFIG_NAME).unlink(missing_ok=True)
-        shutil.rmtree(output / "logs", ignore_errors=True)
+        for path in (*_result_in(output), *logs):
+            remove(path)
 
 
 def _unwritable(output: Path, error: OSError) -> ResultError:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pliant.errors import ResultError
-from pliant.export.export import EXPORTS
+from pliant.export.export import exports_in
 from pliant.recording import parts
 from pliant.results.folder import RECORDING_NAME, check_free, written
 from pliant.results.known_scale import MetricRecording, Scale
@@ -57,7 +57,7 @@ def scale_result(result: Path, known: Known) -> Iterator[str]:
     sure = f", +- {found.sigma:.1%}" if found.sigma >= 0.001 else ""
     unit = "a unit of the map" if before is None else "a metre so far"
     yield f"{unit} is {found.metres_per_unit:.4g} m ({found.source}{sure}): {result}/ is in metres"
-    exports = _with_lengths(result)
+    exports = exports_in(result, but=_WITHOUT_LENGTHS)
     if exports:
         yield f"made before, in the old unit: {', '.join(exports)}: export again with --force"
 
@@ -69,9 +69,3 @@ def _measure(recording: MetricRecording, run: Run, known: Known) -> Scale:
         return from_marker(recording, run, known.marker)
     assert known.depth is not None
     return from_depth(recording, run, known.depth)
-
-
-def _with_lengths(folder: Path) -> list[str]:
-    """Names of the exports in a result folder that hold lengths."""
-    names = (name for kind, (name, _) in EXPORTS.items() if kind not in _WITHOUT_LENGTHS)
-    return [name for name in names if (folder / name).exists()]
