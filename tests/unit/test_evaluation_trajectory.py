@@ -183,6 +183,15 @@ def test_poses_that_the_truth_does_not_meet(compared: int, apart: bool, partly: 
     assert (part.apart, part.partly_compared) == (apart, partly)
 
 
+def test_poses_that_are_not_those_of_the_truth() -> None:
+    truth = walk()
+    assert not evaluate_trajectory(truth, truth).unlike
+    other = Trajectory(stamps_ns=truth.stamps_ns, T_world_camera=truth.T_world_camera.copy())
+    generator = np.random.default_rng(0)
+    other.T_world_camera[:, :3, 3] = generator.normal(size=(len(truth), 3))
+    assert evaluate_trajectory(other, truth).unlike
+
+
 def test_a_failure_or_a_short_map_is_not_apart_from_the_truth() -> None:
     truth = walk()
     later = truth.select(np.arange(60, 100))

@@ -139,6 +139,13 @@ def test_a_run_of_which_many_images_are_broken_is_doubtful() -> None:
     assert (few[0], many) == (GOOD, (DOUBTFUL, "40% of the images are broken"))
 
 
+def test_a_run_that_did_not_keep_up_is_doubtful() -> None:
+    some = judge(frames=60, in_segments=[60], doubtful=0, unused=50, behind=40)
+    most = judge(frames=29, in_segments=[29], doubtful=0, unused=71, behind=71)
+    assert (some[0], most[0]) == (GOOD, DOUBTFUL)
+    assert "kept up with 29% of the frames" in most[1]
+
+
 @pytest.mark.parametrize(
     ("changed", "word", "says"),
     [

@@ -172,6 +172,11 @@ def format_evaluation(evaluation: Evaluation) -> str:
             f"warning: only {final.matched} of {final.localised} poses have a true pose: "
             f"is {evaluation.groundtruth} of this recording?"
         )
+    if final.unlike and final.ate_m:
+        lines.append(
+            f"warning: the error is as large as the motion, as true positions spread by "
+            f"{metres(final.spread_m)}: is {evaluation.groundtruth} of this recording?"
+        )
     return "\n".join(lines)
 
 

@@ -33,6 +33,8 @@ MIN_SUCCESS = 0.9
 """Below this share of localised frames a trial is a failure and gets no accuracy (section 5.2)."""
 MIN_COMPARED = 0.9
 """Where a smaller share of the poses has a true pose, the truth may be of another recording."""
+MAX_SHARE = 0.5
+"""With an error above this share of the spread of the true positions it may be, too."""
 
 FINAL_NAME = "trajectory.txt"
 CAUSAL_NAME = "trajectory_causal.txt"
@@ -52,6 +54,7 @@ class TrajectoryEvaluation:
     success: True, False, or None (unknown).     reason: why there is no accuracy, else "".
     matched: localised frames that have a true pose within the time limit: the others have no error.
     ate_m: of all matched frames, after alignment.      path_m: length of their true path.
+    spread_m: RMS distance of their true positions from the mean of them.
     rpe_frame, rpe_second: from one frame to the next, and over one second.
     times_s, errors_m: (M,) error over time (Fig. 4), seconds since the first pose; also there for
         a failure, as in the paper's figure, and empty where no alignment exists.
@@ -68,6 +71,7 @@ class TrajectoryEvaluation:
     reason: str
     ate_m: ErrorStatistics | None
     path_m: float | None
+    spread_m: float | None
     rpe_frame: RelativeErrors | None
     rpe_second: RelativeErrors | None
     alignment: Similarity | None
@@ -80,6 +84,14 @@ class TrajectoryEvaluation:
         if self.ate_m is None or not self.path_m:
             return None
         return 100.0 * self.ate_m.rmse / self.path_m
+
+    @property
+    def unlike(self) -> bool:
+        """Whether the error is of the size of the motion, as with the truth of another recording.
+
+        What is aligned with poses that have nothing to do with it shrinks to a point.
+        """
+        return bool(self.ate_m and self.spread_m and self.ate_m.rmse > MAX_SHARE * self.spread_m)
 
     @property
     def apart(self) -> bool:
@@ -159,6 +171,7 @@ def evaluate_trajectory(
         reason=reason,
         ate_m=accuracy.ate_m,
         path_m=accuracy.path_m,
+        spread_m=accuracy.spread_m,
         rpe_frame=accuracy.rpe_frame,
         rpe_second=accuracy.rpe_second,
         alignment=alignment,
@@ -180,6 +193,7 @@ def _no_alignment(why: str, part: Trajectory, matched: int, max_difference_ns: i
 class _Accuracy:
     ate_m: ErrorStatistics | None = None
     path_m: float | None = None
+    spread_m: float | None = None
     rpe_frame: RelativeErrors | None = None
     rpe_second: RelativeErrors | None = None
 
@@ -188,6 +202,7 @@ class _Accuracy:
         return _Accuracy(
             ErrorStatistics.of(absolute_errors(aligned, truth)),
             path_length(truth),
+            float(np.linalg.norm(truth[:, :3, 3].std(axis=0))),
             relative_errors(aligned, truth, frame_pairs(stamps_ns), step="frame"),
             relative_errors(aligned, truth, second_pairs(stamps_ns), step="1 s"),
         )

@@ -31,14 +31,14 @@ def doubtful_frames(history: MapHistory) -> list[int]:
 
 def judge(
     *, frames: int, in_segments: list[int], doubtful: int, unused: int = 0, broken: int = 0,
-    calibration: str = "",
+    behind: int = 0, calibration: str = "",
 ) -> tuple[str, str]:  # fmt: skip
     """Good, doubtful or bad, and why.
 
     frames: of the sequence that were used.   in_segments: poses in each segment of the map.
     doubtful: poses told as such.   unused: frames that were broken, dropped or passed over.
-    broken: those of them that no frame could be made of, as nobody wanted it.   calibration: why it
-    bends the map; "" where it does not.
+    broken: those of them that no frame could be made of, as nobody wanted it.   behind: those that
+    there was no time for.   calibration: why it bends the map; "" where it does not.
     """
     longest, posed = max(in_segments, default=0), sum(in_segments)
     if not longest:
@@ -54,6 +54,11 @@ def judge(
         return DOUBTFUL, told
     if broken > (1.0 - _WHOLE) * (frames + broken):
         return DOUBTFUL, f"{broken / (frames + broken):.0%} of the images are broken"
+    if behind > (1.0 - _LITTLE) * (frames + behind):
+        return DOUBTFUL, (
+            f"the computer kept up with {frames / (frames + behind):.0%} of the frames: take "
+            "smaller images (--max-size) or fewer tracks (--light)"
+        )
     if calibration:
         return DOUBTFUL, calibration
     return GOOD, told if longest < frames else f"all {which} have a pose in one segment"
@@ -67,7 +72,7 @@ def slipping_frames(tracked: Sequence[int], in_view: Sequence[int]) -> list[int]
 
 def judge_surfels(
     *, frames: int, in_segments: list[int], slipping: int, depth_from: str, unusable: int,
-    together: int = 0, unused: int = 0, broken: int = 0,
+    together: int = 0, unused: int = 0, broken: int = 0, behind: int = 0,
 ) -> tuple[str, str]:  # fmt: skip
     """As ``judge``, of a surface that deforms.
 
@@ -76,8 +81,9 @@ def judge_surfels(
     together: frames of a camera that was said to stand still in which all move like one thing.
     """
     word, why = judge(
-        frames=frames, in_segments=in_segments, doubtful=0, unused=unused, broken=broken
-    )
+        frames=frames, in_segments=in_segments, doubtful=0, unused=unused, broken=broken,
+        behind=behind,
+    )  # fmt: skip
     posed = sum(in_segments)
     if not posed:
         return BAD, "no surfels were followed"

@@ -41,6 +41,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         frames=frames - unused,
         unused=unused,
         broken=len(broken_images(run.missing)),
+        behind=[*run.missing.values()].count(DROPPED) + len(run.passed_over),
         in_segments=[len(members) for members in by_segment.values()],
         doubtful=len(doubtful),
         calibration=calibration_doubt(run, final),

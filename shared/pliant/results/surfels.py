@@ -14,7 +14,7 @@ from pliant.config import recorded_config
 from pliant.formats.npz import NpzWriter
 from pliant.formats.tum import write_tum
 from pliant.messages import topics
-from pliant.messages.types import WAITING_FOR_DEPTH, CameraStream, Surfels
+from pliant.messages.types import DROPPED, WAITING_FOR_DEPTH, CameraStream, Surfels
 from pliant.recording.reader import Recording
 from pliant.results.folder import (
     PAGE_NAME,
@@ -231,6 +231,7 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         together=len(counts.together.frames) if _stands_still(run.recorded.metadata) else 0,
         unused=len(without_pixels),
         broken=len(broken_images(without_pixels)),
+        behind=reasons.count(DROPPED),
     )
     return {
         "verdict": word,

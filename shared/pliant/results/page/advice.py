@@ -73,6 +73,6 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
     ):
         told.append(
             "The machine did not keep up with the camera: record first and run the recording, or "
-            "use smaller images (--max-size)."
+            "use smaller images (--max-size) or fewer tracks (--light)."
         )
     return told
