@@ -1,6 +1,7 @@
 """Runs one service in this process: connects the bus, hands it its inputs, closes in order."""
 
 import contextlib
+import ctypes
 import importlib
 import os
 import signal
@@ -25,6 +26,11 @@ from pliant_services import processes
 from pliant_services.runtime.monitor import StatusMonitor
 
 _GRACE_S = 3.0
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+_KEPT_BLOCK = 32 << 20
+"""The largest block that malloc itself looks after, and that it can be told to, bytes."""
+_KEPT = 256 << 20
+"""Free memory at the end of the heap that is kept, bytes."""
 _TOLD_MESSAGES = 128  # two seconds at 60 frames/s, and a few
 
 
@@ -58,6 +64,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
     Raises SourceLostError, after everything before has been sent, for a source that failed.
     """
     process = processes.BY_NAME[name]
+    _keep_freed_memory()
     module = importlib.import_module(process.module)
     arguments = dict(options.arguments)
     if not process.inputs and not process.observer:
@@ -118,6 +125,18 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
         bus.see_off()
     if lost is not None:
         raise lost
+
+
+def _keep_freed_memory() -> None:
+    """Have malloc keep what is freed: each frame needs as much as the last one, and pages that come
+    from the system again are cleared again, which costs a twentieth of all CPU time.
+
+    Does nothing where malloc is not glibc's.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _KEPT_BLOCK)
+        mallopt(_M_TRIM_THRESHOLD, _KEPT)
 
 
 def observer_windows(config: Config, fleet: Sequence[str]) -> dict[str, Window]:
