@@ -1,6 +1,7 @@
 """A result stays until the one that replaces it has begun, whatever ends that before."""
 
 import os
+import shutil
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from pliant.errors import ResultError
 from pliant.files import make_folder
 from pliant.recording.parts import PART
 from pliant.results import earlier
-from pliant.results.folder import prepare, written
+from pliant.results.folder import prepare, recorded_into, settle, written
 from pliant_services.run.command import RunRequest, run_pipeline
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
@@ -24,15 +25,26 @@ class KilledError(BaseException):
 
 
 @pytest.fixture
-def result(room: Path) -> Path:
+def one_frame(room: Path) -> bytes:
+    """A recording."""
+    return (room / "recording.mcap").read_bytes()
+
+
+@pytest.fixture
+def result(room: Path, one_frame: bytes) -> Path:
     """With all that a result may have, and what is not of a result."""
+    assert one_frame
     (room / "recording.mcap").unlink()
     make_folder(room / "recording")
     for number in range(2):
         (room / "recording" / PART.format(number)).write_text(f"part {number}")
     (room / "recording" / "recovered.mcap").write_text("somebody's")
     make_folder(room / "state" / "tracking")
+    make_folder(room / "state" / "ingest")
     (room / "state" / "tracking" / "7.state").write_text("a checkpoint")
+    make_folder(room / "points_segment_2.ply")
+    (room / "points_segment_2.ply" / "notes").write_text("somebody's")
+    (room / "my_segment_1.txt").write_text("somebody's")
     (room / "trajectory_segment_0.txt").write_text("poses")
     (room / "notes").write_text("somebody's")
     return room
@@ -45,18 +57,49 @@ def begin(output: Path) -> None:
     (output / "recording.mcap").write_text("no frame in it")
 
 
-def test_what_was_there_comes_back_or_goes_when_another_has_begun(result: Path) -> None:
+def test_what_was_there_comes_back_or_goes_when_another_has_begun(
+    result: Path, one_frame: bytes
+) -> None:
     before = contents(result)
     with written(result, force=True):
         begin(result)
     assert contents(result) == before
     with written(result, force=True):
         begin(result)
-        earlier.replace(result)
-        earlier.replace(result)
+        (result / "recording.mcap").write_bytes(one_frame)
     after = {str(p.relative_to(result)) for p in result.rglob("*") if p.is_file()}
-    kept = {"notes", "recording/recovered.mcap"}
+    kept = {"notes", "recording/recovered.mcap", "my_segment_1.txt", "points_segment_2.ply/notes"}
     assert after == kept | {"config.yaml", "recording.mcap", "logs/metadata.json"}
+
+
+def test_what_cannot_be_deleted_costs_no_new_result(
+    room: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one_frame = (room / "recording.mcap").read_bytes()
+
+    def left(folder: Path, ignore_errors: bool = False) -> None:
+        assert ignore_errors
+
+    monkeypatch.setattr(shutil, "rmtree", left)
+    for _ in range(2):
+        with written(room, force=True):
+            prepare(room, CONFIG)
+            (room / "recording.mcap").write_bytes(one_frame)
+            (room / "report.json").write_text("new")
+        assert (room / "report.json").read_text() == "new"
+        assert not earlier.is_aside(room)
+    monkeypatch.undo()
+    with written(room, force=True):
+        pass
+    assert not list(room.glob(".*"))
+
+
+def test_a_recorder_finds_the_folder_as_it_was_before_a_run_that_was_killed(room: Path) -> None:
+    before = contents(room)
+    prepare(room, CONFIG)
+    with recorded_into(room):
+        pass
+    assert {**contents(room), "metadata.json": before["metadata.json"]} == before
 
 
 def test_a_kill_at_any_point_costs_nothing(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,14 +119,15 @@ def test_a_kill_at_any_point_costs_nothing(result: Path, monkeypatch: pytest.Mon
         with monkeypatch.context() as patch, suppress(KilledError):
             patch.setattr(Path, "rename", killed)
             begin(result)
-            earlier.put_back(result, [result / "config.yaml", result / "recording.mcap"])
+            settle(result)
         with written(result, force=True):
             pass
         assert contents(result) == before, steps
         if left >= 0:
             break
         steps += 1
-    assert steps > 2 * len(before) - 6
+    assert steps > 15
+    assert (result / "state" / "ingest").is_dir()
 
 
 def test_a_run_that_ends_before_its_first_frame_leaves_a_result_as_it_was(
@@ -102,12 +146,16 @@ def test_a_run_that_ends_before_its_first_frame_leaves_a_result_as_it_was(
         ServiceDiedError("tracking was killed", crashed=True),
     ):
         ends.append(error)
-        for output in (room, tmp_path / "new"):
+        others = tmp_path / "others"
+        make_folder(others / "logs")
+        (others / "logs" / "diary.txt").write_text("somebody's")
+        for output in (room, tmp_path / "new", others):
             with pytest.raises((KeyboardInterrupt, ResultError, ServiceDiedError)) as raised:
                 run_pipeline(RunRequest(source="built-in:tiny", output=output, force=True))
             assert raised.type is type(error)
         assert {**contents(room), "metadata.json": before["metadata.json"]} == before
         assert (tmp_path / "new").exists() == (getattr(error, "crashed", False))
+        assert (others / "logs" / "diary.txt").exists()
 
 
 def test_a_full_disk_leaves_a_result_as_it_was(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,7 +77,8 @@ def _replay_into(output: Path, request: ReplayRequest) -> int:
         print(line, file=sys.stderr)
     replay.run(output / RECORDING_NAME, metadata)
     report = write_results(output)
-    earlier.replace(output)
+    if earlier.is_aside(output):
+        earlier.replace(output)
     has_map = topics.MAP_UPDATE in replay.made or topics.MAP_UPDATE.key not in replay.affected
     for line in summary(report, has_map=has_map):
         print(line)

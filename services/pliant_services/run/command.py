@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -21,11 +20,9 @@ from pliant.errors import CalibrationError, PliantError, ResultError
 from pliant.exit_codes import INTERRUPTED
 from pliant.files import make_folder, write_whole
 from pliant.fusion.memory import check_voxel_sizes
-from pliant.messages import topics
 from pliant.messages.types import Status
 from pliant.recording import parts
 from pliant.recording.map_file import MapFile
-from pliant.recording.reader import Recording
 from pliant.recording.recover import mend
 from pliant.results import earlier
 from pliant.results.folder import (
@@ -38,6 +35,7 @@ from pliant.results.folder import (
     files_of,
     files_read,
     folder_name,
+    has_frames,
     keep_apart,
     prepare,
     written,
@@ -161,7 +159,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
         fleet = Fleet(
             services,
             log_folder=output / "logs",
-            on_status=partial(_on_status, output, progress),
+            on_status=_Followed(output, progress).on_status,
             port=request.port,
             state=state,
         )
@@ -178,12 +176,25 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
             failure = error
     if failure is None and not interrupted:
         shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
-    return _finish(output, interrupted=interrupted, failure=failure)
+    return _finish(output, interrupted=interrupted, failure=failure, resumed=request.resume)
 
 
-def _on_status(output: Path, progress: Progress, status: Status) -> None:
-    earlier.replace(output)  # a frame has come
-    progress.on_status(status)
+class _Followed:
+    """Shows how a run goes on, and lets an earlier result go once a frame is on the disk."""
+
+    def __init__(self, output: Path, progress: Progress) -> None:
+        self._output, self._progress, self._size = output, progress, -1
+
+    def on_status(self, status: Status) -> None:
+        """Take in a status; called from the bus' thread."""
+        if earlier.is_aside(self._output):
+            recorded = parts.parts_of(self._output / RECORDING_NAME)
+            size = sum(path.stat().st_size for path in recorded)
+            if size != self._size and has_frames(self._output):
+                with suppress(OSError):  # tried again when the folder is let go
+                    earlier.replace(self._output)
+            self._size = size
+        self._progress.on_status(status)
 
 
 def _go_through(
@@ -307,28 +318,30 @@ def service_arguments(name: str, request: RunRequest, output: Path) -> list[str]
     return extra
 
 
-def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> int:
+def _finish(
+    output: Path, *, interrupted: bool, failure: PliantError | None, resumed: bool = False
+) -> int:
     """Write what can be written of the recording, and say where it is; then raise the failure.
 
-    A run that came to nothing leaves nothing, but for the logs of a service that crashed.
+    A run without a frame leaves nothing, but for what a service that crashed has left.
     """
+    if not has_frames(output):
+        crashed = isinstance(failure, ServiceDiedError) and failure.crashed
+        if not (crashed or resumed):
+            discard(output)
+        nothing = KeyboardInterrupt() if interrupted else ResultError(f"{output}: no frame came")
+        raise failure or nothing
     # They load what a launcher that waits has no use for.
     from pliant.export.export import exports_in
     from pliant.results.verdict import grade, summary
     from pliant.results.write import write_results
 
-    recording = output / RECORDING_NAME
     try:
-        report = write_results(output) if parts.exists(recording) else None
+        report = write_results(output)
     except PliantError:
         if failure is not None:  # it came first, and says why this one followed
             raise failure from None
         raise
-    if report is None or not (report["frames"] or _has_images(recording)):
-        if not (isinstance(failure, ServiceDiedError) and failure.crashed):
-            discard(output)
-        nothing = KeyboardInterrupt() if interrupted else ResultError(f"{output}: no frame came")
-        raise failure or nothing
     with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
         files = ", ".join(files_of(output, report))
         print(f"results in {output}/ ({_sizes(output)}): {files}, {_recording_in(output)}")
@@ -341,11 +354,6 @@ def _finish(output: Path, *, interrupted: bool, failure: PliantError | None) -> 
     if failure is not None:
         raise failure
     return INTERRUPTED if interrupted else grade(report)
-
-
-def _has_images(recording: Path) -> bool:
-    """Whether there is one that a run can begin with, though nothing may have become of it."""
-    return next(Recording(recording).messages(topics.SOURCE), None) is not None
 
 
 def _sizes(output: Path) -> str:

@@ -1,67 +1,101 @@
-"""An earlier result stays where it was until the one that replaces it has its first frame.
+"""An earlier result stays within its folder until the one that replaces it has its first frame.
 
-Folders within the result's tell how far that came, so that it can end at any point, by a kill or a
-power cut, and nothing is lost: ``.half`` while files move, either way; ``.earlier`` once all are
-aside, so that what lies beside it is new; ``.replaced`` once they are not wanted any more.
+The names of folders tell how far that came, so that it can end at any point, by a kill or a power
+cut, and nothing is lost: ``earlier_result.half`` while entries move, either way;
+``earlier_result.pliant`` once all are aside: what lies beside it is new, and this is a result that
+can be looked at; ``.pliant-replaced-*`` once it is not wanted any more.
 """
 
+import os
 import shutil
+import tempfile
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
 from pliant.files import make_folder, sync
 
-_HALF, _WHOLE, _REPLACED = ".half", ".earlier", ".replaced"
+_HALF, _WHOLE, _REPLACED = "earlier_result.half", "earlier_result.pliant", ".pliant-replaced-"
 
 
-def set_aside(output: Path, paths: Iterable[Path]) -> None:
-    """Move files and folders of a result out of the way.  Raises OSError."""
-    half = output / _HALF
-    _move(paths, output, half)
-    if half.exists():
+def set_aside(output: Path, entries: Iterable[Path]) -> None:
+    """Move files and folders of a result out of the way, if there are any.  Raises OSError."""
+    half, entries = output / _HALF, list(entries)
+    _move(entries, output, half)
+    _clear_folders(entries, output)
+    if half.is_dir():
         half.rename(output / _WHOLE)
         sync(output)
 
 
+def is_aside(output: Path) -> bool:
+    """Whether there is a result that is set aside, and neither replaced nor put back."""
+    return (output / _WHOLE).is_dir()
+
+
+def is_moving(output: Path) -> bool:
+    """Whether something came between while a result was set aside or put back."""
+    return (output / _HALF).is_dir()
+
+
 def replace(output: Path) -> None:
-    """Let go of what was set aside: another result has begun.  Does nothing where nothing is."""
-    aside, replaced = output / _WHOLE, output / _REPLACED
-    if aside.exists():
-        with suppress(OSError):
-            aside.rename(replaced)
-            sync(output)
-    if replaced.exists():
+    """Let go of what is set aside: another result has begun.  Raises OSError."""
+    # Into a folder of its own: one that could not be emptied may be there still.
+    (output / _WHOLE).rename(Path(tempfile.mkdtemp(prefix=_REPLACED, dir=output)) / _WHOLE)
+    sync(output)
+    clear(output)
+
+
+def clear(output: Path) -> None:
+    """Delete what has been replaced, as far as it can be."""
+    for replaced in output.glob(f"{_REPLACED}*"):
         shutil.rmtree(replaced, ignore_errors=True)
 
 
-def is_aside(output: Path) -> bool:
-    """Whether there is a result that comes back unless it is replaced."""
-    return (output / _WHOLE).exists()
+def put_back(output: Path, new: Iterable[Path]) -> None:
+    """Put what is set aside where it was.  Raises OSError.
 
-
-def put_back(output: Path, new: Iterable[Path]) -> bool:
-    """Put what was set aside and not replaced where it was; whether there was any.
-
-    new: what lies beside it, and goes then; it is asked for in that case only.
-    Raises OSError.
+    new: what lies beside it, and goes.
     """
-    aside, half = output / _WHOLE, output / _HALF
-    if aside.exists():
-        for path in new:
-            remove(path)
-        aside.rename(half)
-        sync(output)
-    if not half.exists():
-        return False
-    _move([path for path in half.rglob("*") if not path.is_dir()], half, output)
-    shutil.rmtree(half)
-    return True
+    remove(output, new)
+    (output / _WHOLE).rename(output / _HALF)
+    sync(output)
+    move_back(output)
 
 
-def _move(paths: Iterable[Path], source: Path, target: Path) -> None:
+def move_back(output: Path) -> None:
+    """Put back what was moving.  Raises OSError."""
+    half = output / _HALF
+    # A folder that is there has what was not of the result.
+    for folder in [path for path in half.iterdir() if _is_folder(output / path.name)]:
+        _move(folder.iterdir(), half, output)
+        folder.rmdir()
+    _move(half.iterdir(), half, output)
+    half.rmdir()
+    sync(output)
+
+
+def remove(output: Path, entries: Iterable[Path]) -> None:
+    """Delete files, links, and folders with all that is in them, of a result.  Raises OSError."""
+    entries = list(entries)
+    for path in entries:
+        if _is_folder(path):
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+    _clear_folders(entries, output)
+
+
+def _clear_folders(entries: Iterable[Path], output: Path) -> None:
+    """Folders within the result's that these were in go, but for those with something else."""
+    for folder in {entry.parent for entry in entries} - {output}:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _move(entries: Iterable[Path], source: Path, target: Path) -> None:
     """Move what lies in one folder to the same place in another, which is on the disk then."""
-    moves = [(path, target / path.relative_to(source)) for path in paths]
+    moves = [(path, target / path.relative_to(source)) for path in entries]
     for folder in sorted({to.parent for _, to in moves}):
         make_folder(folder)
     for path, to in moves:
@@ -70,9 +104,5 @@ def _move(paths: Iterable[Path], source: Path, target: Path) -> None:
         sync(folder)
 
 
-def remove(path: Path) -> None:
-    """Delete a file, or a folder with all that is in it.  Raises OSError."""
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not os.path.islink(path)

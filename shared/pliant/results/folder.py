@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from pliant.arithmetic import target
-from pliant.errors import ResultError
+from pliant.errors import RecordingError, ResultError
 from pliant.files import make_folder, move_all, write_whole
+from pliant.messages import topics
 from pliant.recording import parts
 from pliant.recording.map_file import MAP_NAME
-from pliant.results.earlier import is_aside, put_back, remove, set_aside
+from pliant.recording.reader import Recorded, Recording
+from pliant.results import earlier
 from pliant.version import __version__
 
 RECORDING_NAME = "recording.mcap"
@@ -49,6 +51,10 @@ SOMETIMES = (MAP_NAME, SCALE_NAME)
 """Of a map that came to its end, and of one whose scale is known."""
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
 _LOCK_NAME = ".lock"
+_LOGS, _METADATA = "logs", "metadata.json"
+_OF_SEGMENT = re.compile(r"_segment_\d+(?=\.\w+$)")
+_OF_FRAMES = (topics.SOURCE, topics.EXTREMA, topics.SURFELS)
+"""One of these has each frame, whatever the profile, and whether images are recorded or not."""
 _VERSIONS = ("eclipse-zenoh", "mcap", "msgpack", "numba", "numpy", "opencv-python-headless")
 
 
@@ -115,13 +121,13 @@ def written(output: Path, *, force: bool) -> Generator[None]:
         try:
             check_output(output, force=force)  # another one may have been here meanwhile
             try:
-                put_back(output, _result_in(output))
+                settle(output)
             except OSError as error:
                 raise _unwritable(output, error) from None
             yield
         finally:
             with suppress(OSError):
-                put_back(output, _result_in(output))
+                settle(output)
             (output / _LOCK_NAME).unlink(missing_ok=True)
             os.close(lock)
     finally:
@@ -136,6 +142,9 @@ def recorded_into(folder: Path) -> Generator[None]:
 
     Others may record into it beside us.  Raises ResultError where results are written to it.
     """
+    if earlier.is_aside(folder) or earlier.is_moving(folder):
+        with written(folder, force=True):
+            pass  # what a run that was killed has left there is settled
     try:
         make_folder(folder)
         lock = _locked(folder, fcntl.LOCK_SH)
@@ -242,38 +251,64 @@ def check_output(output: Path, *, force: bool) -> None:
 def prepare(output: Path, config: str) -> None:
     """Make the folder, with what the services read.
 
-    An earlier result is set aside until this one has begun (`earlier.replace`): where the folder
-    is let go before that, it is as it was.
+    An earlier result is set aside until the new one has frames: see ``settle``.
     """
     try:
-        make_folder(output / "logs")
-        set_aside(output, list(_result_in(output)))
+        make_folder(output / _LOGS)
+        earlier.set_aside(output, _result_in(output))
         write_whole(output / CONFIG_NAME, config)
-        write_whole(output / "logs" / "metadata.json", json.dumps(run_metadata(config)))
+        write_whole(output / _LOGS / _METADATA, json.dumps(run_metadata(config)))
     except OSError as error:
         raise _unwritable(output, error) from None
 
 
+def settle(output: Path) -> None:
+    """Where an earlier result is set aside: let it go if the new one has frames, else put it back.
+
+    Logs are those of the last run in any case.  Raises OSError.
+    """
+    if earlier.is_moving(output):
+        earlier.move_back(output)
+    if earlier.is_aside(output) and has_frames(output):
+        earlier.replace(output)
+    elif earlier.is_aside(output):
+        earlier.put_back(output, _result_in(output))
+    earlier.clear(output)
+
+
+def has_frames(output: Path) -> bool:
+    """Whether anything of a frame is recorded, of which more may be made, though it is damaged."""
+    if not parts.exists(output / RECORDING_NAME):
+        return False
+    found = Recording(output / RECORDING_NAME).everything(*_OF_FRAMES)
+    try:
+        return any(isinstance(item, Recorded) for item in found)
+    except RecordingError:
+        return False
+
+
 def _result_in(output: Path) -> Iterator[Path]:
     """The files and folders of a result that are there; not what was exported of it, nor logs."""
-    recorded = output / RECORDING_NAME
-    names = (CONFIG_NAME, SESSION_NAME, STATE_FOLDER, SURFELS_NAME)
-    names += (*_RIGID_FILES, *SOMETIMES, *MESH_FILES)
-    yield from parts.parts_in(parts.folder_of_parts(recorded))
-    for path in (recorded, *(output / name for name in names), *output.glob("*_segment_*")):
-        if os.path.lexists(path):
+    folder = parts.folder_of_parts(output / RECORDING_NAME)
+    yield from parts.parts_in(folder)
+    files = {*_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME}
+    others = (RECORDING_NAME, CONFIG_NAME, SESSION_NAME, STATE_FOLDER)
+    for path in sorted(output.iterdir()):
+        file = not path.is_dir() and _OF_SEGMENT.sub("", path.name) in files
+        if file or path.name in others or (path == folder and not any(folder.iterdir())):
             yield path
 
 
 def discard(output: Path) -> None:
-    """Take away all that a run has left, of one that came to nothing.
+    """Take away all that a run has left of which no frame is recorded, its logs, too.
 
-    Logs are those of a result that comes back, too.
+    Where an earlier result is set aside, it comes back by itself, with the logs of the last run.
     """
-    logs = () if is_aside(output) else (output / "logs",)
+    if earlier.is_aside(output):
+        return
+    logs = output / _LOGS
     with suppress(OSError):
-        for path in (*_result_in(output), *logs):
-            remove(path)
+        earlier.remove(output, [*_result_in(output), *logs.glob("*.log"), logs / _METADATA])
 
 
 def _unwritable(output: Path, error: OSError) -> ResultError:
