@@ -10,7 +10,6 @@ from pliant.errors import PliantError
 
 _OFF = {
     "local flow": ["tracking.local_flow=false"],
-    "de-duplication": ["tracking.deduplicate=false"],
     "sub-pixel extrema": ["tracking.subpixel=false"],
     "patch refinement and coasting": ["tracking.patch_refinement=false"],
     "turned patches": ["tracking.turn_patches=false"],
@@ -21,8 +20,8 @@ _OFF = {
     "final adjustment": ["bundle_adjustment.window.final_adjustment=false"],
     "readout of a rolling shutter": ["bundle_adjustment.calibration.readout=0"],
 }
-_TRACKER = ("local flow", "de-duplication", "sub-pixel extrema")
-_LITERAL = [s for name in (*_TRACKER, "patch refinement and coasting") for s in _OFF[name]]
+_TRACKER = ("local flow", "sub-pixel extrema", "patch refinement and coasting")
+_LITERAL = [s for name in _TRACKER for s in _OFF[name]]
 _LITERAL += _OFF["minima beside maxima"]
 
 VARIANTS: dict[str, list[str]] = {

@@ -55,9 +55,6 @@ class TrackingParameters(Parameters):
         default=True,
         description="Predict with a coarse-to-fine grid of local flow, not an affine alone.",
     )
-    deduplicate: bool = Field(
-        default=True, description="Of tracks that run together (within 1 px) keep the oldest."
-    )
     subpixel: bool = Field(default=True, description="Place extrema by a parabola, not on pixels.")
     patch_refinement: bool = Field(
         default=True,

@@ -19,7 +19,7 @@ from pliant.algorithms.tracking.local_flow import Flow, grid_shape, local_flow
 from pliant.algorithms.tracking.maxima import REACH_PX, curvature_and_maxima, uncovered
 from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.algorithms.tracking.track_table import Tracks, TrackTable
-from pliant.algorithms.tracking.upkeep import BirthLimits, compact, remove_doubles, start_tracks
+from pliant.algorithms.tracking.upkeep import BirthLimits, compact, start_tracks
 from pliant.algorithms.tracks import FrameExtrema
 
 MAX_BRIEF_DISTANCE_BITS = 64
@@ -45,7 +45,6 @@ class ExtremaTracker:
         self._table = TrackTable.with_capacity(parameters.max_tracks)
         self._next_id = 0
         self._kappa = np.zeros(self._shape, np.float32)
-        self._owners = np.zeros(self._shape, np.int32)
         self._motions = np.zeros((parameters.max_tracks, 2), np.float32)
         self._scratch = np.zeros(TEMPLATE_FLOATS, np.float32)
         self._rows = np.zeros(parameters.max_tracks, np.int32)
@@ -141,8 +140,6 @@ class ExtremaTracker:
             self._scratch,
         )
         _end_covered(table.tracks, clearance)
-        if p.deduplicate:
-            remove_doubles(table.tracks, self._owners)
         self._compact()
         if p.patch_refinement and p.turn_patches:
             slopes = slopes_of_motion(table.tracks, flow.affine, *self._shape)

@@ -1,4 +1,4 @@
-"""Keeps the set of tracks in order: doubles and the dead go, new extrema take their places."""
+"""Keeps the set of tracks in order: the dead go, new extrema take their places."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from pliant.algorithms.tracking.advance import (
     to_octave,
 )
 from pliant.algorithms.tracking.deformation import keep_birth
-from pliant.algorithms.tracking.track_table import Patches, Track, Tracks
+from pliant.algorithms.tracking.track_table import Patches, Tracks
 from pliant.algorithms.tracks import EXTREMUM
 from pliant.compiler.kernel import fast_kernel
 
@@ -192,66 +192,6 @@ def _strongest_first(maxima: F32) -> I32:
 
 
 @fast_kernel
-def remove_doubles(tracks: Tracks, owners: I32) -> None:
-    """Clear ``alive`` of tracks within 1 px of an older one.
-
-    owners: (H, W) scratch.  All living tracks lie a pixel or more inside.  Hardly any has another
-    beside it.  A bit for every pixel, which stays in cache as ``owners`` does not, finds those
-    that do; only they are looked at closely.
-    """
-    height, width = owners.shape
-    taken, crowded = no_bits(height, width), no_bits(height, width)
-    found = False
-    for i in range(len(tracks)):
-        if tracks[i].alive == 0:
-            continue
-        at = _pixel(tracks[i], width)
-        if any_around(taken, at, width):
-            found = True
-            for row in range(-1, 2):
-                for column in range(-1, 2):
-                    set_bit(crowded, at + row * width + column)
-        set_bit(taken, at)
-    if found:
-        taken[:] = np.uint64(0)
-        _keep_oldest(tracks, crowded, taken, owners.reshape(-1), width)
-
-
-@fast_kernel
-def _keep_oldest(
-    tracks: Tracks,
-    crowded: NDArray[np.uint64],
-    taken: NDArray[np.uint64],
-    owners: I32,
-    width: int,
-) -> None:
-    """Compare the tracks of crowded pixels with those around.  taken: bits, none of them set."""
-    for i in range(len(tracks)):
-        track = tracks[i]
-        at = _pixel(track, width)
-        if track.alive == 0 or not get_bit(crowded, at):
-            continue
-        for row in range(-1, 2):
-            for column in range(-1, 2):
-                beside = at + row * width + column
-                if not get_bit(taken, beside):
-                    continue
-                other = tracks[owners[beside]]
-                du, dv = other.u - track.u, other.v - track.v
-                if du * du + dv * dv < np.float32(1.0):
-                    track.alive = 0
-        if track.alive == 1:
-            owners[at] = i
-            set_bit(taken, at)
-
-
-@fast_kernel
-def _pixel(track: Track, width: int) -> int:
-    half = np.float32(0.5)
-    return int(track.v + half) * width + int(track.u + half)
-
-
-@fast_kernel
 def no_bits(height: int, width: int) -> NDArray[np.uint64]:
     """Bits of an image, by flat pixel in words of 64, and one word more; none is set."""
     return np.zeros(height * width // 64 + 2, np.uint64)
@@ -267,19 +207,6 @@ def get_bit(bits: NDArray[np.uint64], at: int) -> bool:
 def set_bit(bits: NDArray[np.uint64], at: int) -> None:
     """Set the bit of a flat pixel."""
     bits[at >> 6] |= np.uint64(1) << np.uint64(at & 63)
-
-
-@fast_kernel
-def any_around(bits: NDArray[np.uint64], at: int, width: int) -> bool:
-    """Whether a bit of a pixel or of its eight neighbours is set."""
-    seen = np.uint64(0)
-    for row in range(-1, 2):
-        first = at + row * width - 1
-        shift = np.uint64(first & 63)
-        # The next word's bits come in from above; shifted twice, as by 64 is undefined.
-        high = (bits[(first >> 6) + 1] << np.uint64(1)) << (np.uint64(63) - shift)
-        seen |= (bits[first >> 6] >> shift) | high
-    return bool(seen & np.uint64(7))
 
 
 @fast_kernel
