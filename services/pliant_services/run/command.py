@@ -188,13 +188,16 @@ class _Followed:
     def on_status(self, status: Status) -> None:
         """Take in a status; called from the bus' thread."""
         if earlier.is_aside(self._output):
-            recorded = parts.parts_of(self._output / RECORDING_NAME)
-            size = sum(path.stat().st_size for path in recorded)
-            if size != self._size and has_frames(self._output):
-                with suppress(OSError):  # tried again when the folder is let go
-                    earlier.replace(self._output)
-            self._size = size
+            with suppress(OSError):  # looked at again when the folder is let go
+                self._look()
         self._progress.on_status(status)
+
+    def _look(self) -> None:
+        recorded = parts.parts_of(self._output / RECORDING_NAME)
+        size = sum(path.stat().st_size for path in recorded)
+        if size != self._size and has_frames(self._output):
+            earlier.replace(self._output)
+        self._size = size
 
 
 def _go_through(
