@@ -9,11 +9,12 @@ import pytest
 from result_room import contents
 
 from pliant.config import config_yaml, load_config
-from pliant.errors import ResultError
+from pliant.errors import RecordingError, ResultError
 from pliant.files import make_folder
 from pliant.recording.parts import PART
 from pliant.results import earlier
-from pliant.results.folder import prepare, recorded_into, settle, written
+from pliant.results.folder import prepare, recorded_into, settle_killed, written
+from pliant_services.run import command as pipeline
 from pliant_services.run.command import RunRequest, run_pipeline
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
@@ -94,6 +95,58 @@ def test_what_cannot_be_deleted_costs_no_new_result(
     assert not list(room.glob(".*"))
 
 
+def test_what_cannot_be_read_is_not_taken_for_nothing(
+    room: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither result goes, and the one who comes next is told."""
+    prepare(room, CONFIG)
+    (room / "recording.mcap").write_bytes(b"a recording")
+
+    def unreadable(*_: object) -> None:
+        raise RecordingError("recording.mcap: Input/output error")
+
+    monkeypatch.setattr("pliant.results.folder.Recording", unreadable)
+    before = contents(room)
+    with pytest.raises(RecordingError, match="Input/output error"):
+        settle_killed(room)
+    with pytest.raises(RecordingError, match="Input/output error"):
+        pipeline._finish(room, interrupted=False, failure=None)
+    assert contents(room) == before
+
+
+def test_one_part_with_a_frame_is_enough(result: Path, one_frame: bytes) -> None:
+    prepare(result, CONFIG)
+    make_folder(result / "recording")
+    for number, data in enumerate((b"", b"no recording", one_frame)):
+        (result / "recording" / PART.format(number)).write_bytes(data)
+    settle_killed(result)
+    assert (result / "recording" / PART.format(2)).read_bytes() == one_frame
+    assert not (result / "trajectory.txt").exists()
+
+
+def test_what_was_put_back_by_hand_stays(room: Path) -> None:
+    (room / "recording.mcap").unlink()
+    prepare(room, CONFIG)
+    (aside,) = room.glob("earlier_result.*")
+    for path in aside.iterdir():
+        path.rename(room / path.name)
+    before = contents(room)
+    settle_killed(room)
+    with written(room, force=True):
+        pass
+    assert contents(room) == before
+    assert not aside.exists()
+
+
+def test_a_recording_behind_a_link_is_not_touched(result: Path, tmp_path: Path) -> None:
+    elsewhere = (result / "recording").rename(tmp_path / "elsewhere")
+    (result / "recording").symlink_to(elsewhere)
+    before = contents(result), contents(elsewhere)
+    with pytest.raises(ResultError, match="is a link"), written(result, force=True):
+        prepare(result, CONFIG)
+    assert (contents(result), contents(elsewhere)) == before
+
+
 def test_a_recorder_finds_the_folder_as_it_was_before_a_run_that_was_killed(room: Path) -> None:
     before = contents(room)
     prepare(room, CONFIG)
@@ -119,9 +172,8 @@ def test_a_kill_at_any_point_costs_nothing(result: Path, monkeypatch: pytest.Mon
         with monkeypatch.context() as patch, suppress(KilledError):
             patch.setattr(Path, "rename", killed)
             begin(result)
-            settle(result)
-        with written(result, force=True):
-            pass
+            earlier.put_back(result, [result / "config.yaml", result / "recording.mcap"])
+        settle_killed(result)
         assert contents(result) == before, steps
         if left >= 0:
             break

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from pliant import __version__
+from pliant.errors import PliantError
 from pliant.exit_codes import DONE, FAILED, INCOMPLETE
-from pliant.results.folder import REPORT_NAME, STATE_FOLDER, is_being_written
+from pliant.results.folder import REPORT_NAME, STATE_FOLDER, is_being_written, settle_killed
 from pliant.results.verdict import grade
 
 _LOOK_S = 0.2
@@ -67,6 +68,8 @@ def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
         if stopped():
             return Outcome(exit_code=None)
         time.sleep(_LOOK_S)
+    with suppress(PliantError):  # the run itself will say it
+        settle_killed(result)
     report = _report_of(result) if begun else None
     resumes = (result / STATE_FOLDER).is_dir()
     if report is not None and not resumes:

@@ -14,7 +14,14 @@ from pliant.recording.parts import parts_of
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
 from pliant.results import earlier
-from pliant.results.folder import RECORDING_NAME, keep_apart, prepare, run_metadata, written
+from pliant.results.folder import (
+    RECORDING_NAME,
+    keep_apart,
+    let_go,
+    prepare,
+    run_metadata,
+    written,
+)
 from pliant.results.verdict import summary
 from pliant.results.write import write_results
 from pliant.wording import counted
@@ -78,7 +85,7 @@ def _replay_into(output: Path, request: ReplayRequest) -> int:
     replay.run(output / RECORDING_NAME, metadata)
     report = write_results(output)
     if earlier.is_aside(output):
-        earlier.replace(output)
+        let_go(output)
     has_map = topics.MAP_UPDATE in replay.made or topics.MAP_UPDATE.key not in replay.affected
     for line in summary(report, has_map=has_map):
         print(line)

@@ -37,12 +37,14 @@ from pliant.results.folder import (
     folder_name,
     has_frames,
     keep_apart,
+    let_go,
     prepare,
+    settle_killed,
     written,
 )
 from pliant.wording import counted
 from pliant_services.nodes.ingest import plays_live
-from pliant_services.processes import deformable_fleet, inputs_of, reads_depth
+from pliant_services.processes import BY_NAME, deformable_fleet, inputs_of, reads_depth
 from pliant_services.profiles import PROFILES
 from pliant_services.run.progress import Progress
 from pliant_services.run.spectators import Viewer, announced, check_viewer, has_viewer
@@ -87,6 +89,7 @@ def run_pipeline(request: RunRequest) -> int:
     source = Path(request.source)
     read = [source, *parts.parts_of(source)] if os.path.exists(request.source) else []
     if request.resume:
+        settle_killed(output)
         request = replace(request, known=resumed_map(output, request))
     known = None if request.known is None else MapFile(request.known)
     if known is not None:
@@ -188,7 +191,7 @@ class _Followed:
     def on_status(self, status: Status) -> None:
         """Take in a status; called from the bus' thread."""
         if earlier.is_aside(self._output):
-            with suppress(OSError):  # looked at again when the folder is let go
+            with suppress(OSError, PliantError):  # looked at again when the folder is left
                 self._look()
         self._progress.on_status(status)
 
@@ -196,7 +199,7 @@ class _Followed:
         recorded = parts.parts_of(self._output / RECORDING_NAME)
         size = sum(path.stat().st_size for path in recorded)
         if size != self._size and has_frames(self._output):
-            earlier.replace(self._output)
+            let_go(self._output)
         self._size = size
 
 
@@ -328,12 +331,16 @@ def _finish(
 
     A run without a frame leaves nothing, but for what a service that crashed has left.
     """
-    if not has_frames(output):
+    try:
+        nothing = not has_frames(output)
+    except PliantError as error:
+        raise failure or error from None
+    if nothing:
         crashed = isinstance(failure, ServiceDiedError) and failure.crashed
         if not (crashed or resumed):
-            discard(output)
-        nothing = KeyboardInterrupt() if interrupted else ResultError(f"{output}: no frame came")
-        raise failure or nothing
+            discard(output, [f"{name}.log" for name in BY_NAME])
+        silent = KeyboardInterrupt() if interrupted else ResultError(f"{output}: no frame came")
+        raise failure or silent
     # They load what a launcher that waits has no use for.
     from pliant.export.export import exports_in
     from pliant.results.verdict import grade, summary

@@ -17,7 +17,13 @@ from pliant.errors import ResultError, SessionOverError, SourceLostError
 from pliant.exit_codes import DONE
 from pliant.files import make_folder, put_in_place, write_whole
 from pliant.recording import parts
-from pliant.results.folder import CONFIG_NAME, RECORDING_NAME, recorded_into, written
+from pliant.results.folder import (
+    CONFIG_NAME,
+    RECORDING_NAME,
+    recorded_into,
+    settle_killed,
+    written,
+)
 from pliant_services.processes import BY_NAME, PROCESSES
 from pliant_services.runtime.host import ServiceOptions, run_service
 
@@ -37,6 +43,7 @@ def run_alone(name: str, config: Config, options: ServiceOptions, *, results: bo
     code = DONE
     if not _is_done(name, options.state, recorded):
         if recorded is not None:
+            settle_killed(recorded.parent)
             _check_recording(recorded, options.state)
         with _held(output, results=recorded is not None):
             try:

@@ -30,7 +30,8 @@ def set_aside(output: Path, entries: Iterable[Path]) -> None:
 
 def is_aside(output: Path) -> bool:
     """Whether there is a result that is set aside, and neither replaced nor put back."""
-    return (output / _WHOLE).is_dir()
+    whole = output / _WHOLE
+    return whole.is_dir() and any(whole.iterdir())  # somebody may have put it back by hand
 
 
 def is_moving(output: Path) -> bool:
@@ -47,7 +48,10 @@ def replace(output: Path) -> None:
 
 
 def clear(output: Path) -> None:
-    """Delete what has been replaced, as far as it can be."""
+    """Delete what has been replaced, as far as it can be, and folders that nothing is in."""
+    for name in (_HALF, _WHOLE):
+        with suppress(OSError):
+            (output / name).rmdir()
     for replaced in output.glob(f"{_REPLACED}*"):
         shutil.rmtree(replaced, ignore_errors=True)
 

@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from pliant.arithmetic import target
-from pliant.errors import RecordingError, ResultError
-from pliant.files import make_folder, move_all, write_whole
+from pliant.errors import PliantError, ResultError
+from pliant.files import make_folder, move_all, sync, write_whole
 from pliant.messages import topics
 from pliant.recording import parts
 from pliant.recording.map_file import MAP_NAME
 from pliant.recording.reader import Recorded, Recording
+from pliant.recording.scan import NothingReadableError
 from pliant.results import earlier
 from pliant.version import __version__
 
@@ -120,16 +121,15 @@ def written(output: Path, *, force: bool) -> Generator[None]:
             raise _unwritable(output, error) from None
         try:
             check_output(output, force=force)  # another one may have been here meanwhile
-            try:
-                settle(output)
-            except OSError as error:
-                raise _unwritable(output, error) from None
+            _settle(output)
             yield
         finally:
-            with suppress(OSError):
-                settle(output)
-            (output / _LOCK_NAME).unlink(missing_ok=True)
-            os.close(lock)
+            try:
+                with suppress(PliantError):  # the next one who writes here tells of it
+                    _settle(output)
+            finally:
+                (output / _LOCK_NAME).unlink(missing_ok=True)
+                os.close(lock)
     finally:
         for folder in missing:
             with suppress(OSError):
@@ -142,9 +142,7 @@ def recorded_into(folder: Path) -> Generator[None]:
 
     Others may record into it beside us.  Raises ResultError where results are written to it.
     """
-    if earlier.is_aside(folder) or earlier.is_moving(folder):
-        with written(folder, force=True):
-            pass  # what a run that was killed has left there is settled
+    settle_killed(folder)
     try:
         make_folder(folder)
         lock = _locked(folder, fcntl.LOCK_SH)
@@ -251,8 +249,12 @@ def check_output(output: Path, *, force: bool) -> None:
 def prepare(output: Path, config: str) -> None:
     """Make the folder, with what the services read.
 
-    An earlier result is set aside until the new one has frames: see ``settle``.
+    An earlier result is set aside until the new one has frames; `written` puts it back where there
+    are none in the end.  Raises ResultError.
     """
+    folder = parts.folder_of_parts(output / RECORDING_NAME)
+    if folder.is_symlink() and parts.parts_in(folder):
+        raise ResultError(f"{folder} is a link, and a recording is there: move it, or the link")
     try:
         make_folder(output / _LOGS)
         earlier.set_aside(output, _result_in(output))
@@ -262,53 +264,91 @@ def prepare(output: Path, config: str) -> None:
         raise _unwritable(output, error) from None
 
 
-def settle(output: Path) -> None:
+def settle_killed(output: Path) -> None:
+    """Settle which result a folder keeps, where the run that was to replace it was killed.
+
+    Raises PliantError.
+    """
+    if earlier.is_aside(output) or earlier.is_moving(output):
+        with written(output, force=True):
+            pass
+
+
+def let_go(output: Path) -> None:
+    """Delete the earlier result: the new one has begun, and its recording is put on the disk.
+
+    Raises ResultError.
+    """
+    try:
+        for part in parts.parts_of(output / RECORDING_NAME):
+            sync(part)
+        earlier.replace(output)
+    except OSError as error:
+        raise _unwritable(output, error) from None
+
+
+def _settle(output: Path) -> None:
     """Where an earlier result is set aside: let it go if the new one has frames, else put it back.
 
-    Logs are those of the last run in any case.  Raises OSError.
+    Logs are those of the last run in any case.  Raises PliantError, and has deleted nothing then.
     """
-    if earlier.is_moving(output):
-        earlier.move_back(output)
-    if earlier.is_aside(output) and has_frames(output):
-        earlier.replace(output)
-    elif earlier.is_aside(output):
-        earlier.put_back(output, _result_in(output))
-    earlier.clear(output)
+    try:
+        if earlier.is_moving(output):
+            earlier.move_back(output)
+        if earlier.is_aside(output):
+            if has_frames(output):
+                let_go(output)
+            else:
+                earlier.put_back(output, _begun_in(output))
+        earlier.clear(output)
+    except OSError as error:
+        raise _unwritable(output, error) from None
 
 
 def has_frames(output: Path) -> bool:
-    """Whether anything of a frame is recorded, of which more may be made, though it is damaged."""
-    if not parts.exists(output / RECORDING_NAME):
-        return False
-    found = Recording(output / RECORDING_NAME).everything(*_OF_FRAMES)
-    try:
-        return any(isinstance(item, Recorded) for item in found)
-    except RecordingError:
-        return False
+    """Whether anything of a frame is recorded, of which more may be made, though it is damaged.
+
+    Raises RecordingError where that cannot be known.
+    """
+    for part in parts.parts_of(output / RECORDING_NAME):
+        with suppress(NothingReadableError):
+            found = Recording(part).everything(*_OF_FRAMES)
+            if any(isinstance(item, Recorded) and item.checked for item in found):
+                return True
+    return False
 
 
 def _result_in(output: Path) -> Iterator[Path]:
     """The files and folders of a result that are there; not what was exported of it, nor logs."""
-    folder = parts.folder_of_parts(output / RECORDING_NAME)
-    yield from parts.parts_in(folder)
+    yield from _begun_in(output)
     files = {*_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME}
-    others = (RECORDING_NAME, CONFIG_NAME, SESSION_NAME, STATE_FOLDER)
     for path in sorted(output.iterdir()):
-        file = not path.is_dir() and _OF_SEGMENT.sub("", path.name) in files
-        if file or path.name in others or (path == folder and not any(folder.iterdir())):
+        if not path.is_dir() and _OF_SEGMENT.sub("", path.name) in files:
             yield path
 
 
-def discard(output: Path) -> None:
-    """Take away all that a run has left of which no frame is recorded, its logs, too.
+def _begun_in(output: Path) -> Iterator[Path]:
+    """Those that a run without a frame may have made."""
+    folder = parts.folder_of_parts(output / RECORDING_NAME)
+    found = parts.parts_in(folder)
+    yield from found
+    if folder.is_dir() and not folder.is_symlink() and not found and not any(folder.iterdir()):
+        yield folder
+    for name in (RECORDING_NAME, CONFIG_NAME, SESSION_NAME, STATE_FOLDER):
+        if os.path.lexists(output / name):
+            yield output / name
+
+
+def discard(output: Path, logs: Iterable[str]) -> None:
+    """Take away all that a run has left of which no frame is recorded, with logs of these names.
 
     Where an earlier result is set aside, it comes back by itself, with the logs of the last run.
     """
     if earlier.is_aside(output):
         return
-    logs = output / _LOGS
+    made = [output / _LOGS / name for name in (*logs, _METADATA)]
     with suppress(OSError):
-        earlier.remove(output, [*_result_in(output), *logs.glob("*.log"), logs / _METADATA])
+        earlier.remove(output, [*_begun_in(output), *made])
 
 
 def _unwritable(output: Path, error: OSError) -> ResultError:

@@ -7,7 +7,7 @@ from pathlib import Path
 from pliant.errors import ResultError
 from pliant.export.export import exports_in
 from pliant.recording import parts
-from pliant.results.folder import RECORDING_NAME, check_free, written
+from pliant.results.folder import RECORDING_NAME, check_free, settle_killed, written
 from pliant.results.known_scale import MetricRecording, Scale
 from pliant.results.run import Run, read_run
 from pliant.results.surfels import has_surfels
@@ -41,6 +41,7 @@ def scale_result(result: Path, known: Known) -> Iterator[str]:
     given = [each for each in (known.points, known.marker, known.depth) if each is not None]
     if len(given) != 1:
         raise ResultError("say what is known of the scene: one of --points, --marker, --depth")
+    settle_killed(result)
     if not parts.exists(result / RECORDING_NAME):
         raise ResultError(f"{result}: no result folder with a recording")
     if has_surfels(result / RECORDING_NAME):
