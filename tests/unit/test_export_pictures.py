@@ -7,10 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.tracks import COASTING, FrameTracks
 from pliant.errors import ResultError
 from pliant.pictures.caption import with_caption
-from pliant.pictures.map import FOCAL, MapView, choose_view, render_map, turned
+from pliant.pictures.map import BACKGROUND, FOCAL, MapView, choose_view, render_map, turned
+from pliant.pictures.mesh import draw_mesh
 from pliant.pictures.movie import beside, write_animation, write_image, write_movie
 from pliant.pictures.overlay import (
     OverlayFrame,
@@ -224,3 +226,25 @@ def test_maps_of_nothing() -> None:
     none, no_colours = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     view = choose_view(none, T[:1])
     assert render_map(none, no_colours, T[:1], view=view, size=(80, 60)).shape == (60, 80, 3)
+
+
+def test_a_wall_before_the_eye_is_of_one_colour_from_edge_to_edge() -> None:
+    """Whatever rows are drawn together, and from its front alone."""
+    view = MapView(
+        T_world_view=np.eye(4), centre=np.zeros(3), up=np.zeros(3), ceiling=np.inf, reach=10.0
+    )
+    wall = TriangleMesh(
+        positions=np.array([[-9, -9, 3], [9, -9, 3], [-9, 9, 3], [9, 9, 3]], np.float32),
+        normals=np.tile(np.array([0, 0, -1], np.float32), (4, 1)),
+        colours=np.full((4, 3), (200, 100, 50), np.uint8),
+        triangles=np.array([[0, 1, 2], [1, 2, 3]], np.int32),
+    )
+    drawn = draw_mesh(wall, view, size=(64, 51))
+    for picture in (drawn.colours, drawn.shaded, drawn.normals):
+        assert picture.shape == (51, 64, 3)
+        assert (picture == picture[0, 0]).all()
+    assert drawn.normals[0, 0].tolist() == [128, 128, 255]
+    assert drawn.colours[0, 0] / drawn.colours[0, 0, 0] == pytest.approx([1, 0.5, 0.25], abs=0.01)
+    assert np.ptp(drawn.shaded[0, 0]) == 0
+    behind = draw_mesh(replace(wall, normals=-wall.normals), view, size=(64, 51))
+    assert (behind.shaded == BACKGROUND).all()

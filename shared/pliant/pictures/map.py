@@ -99,11 +99,11 @@ def _levelled(body: F64, up: F64, forward: F64) -> tuple[F64, F64]:
     """Up and forward, turned by the angle that the cameras looked down or up: floors and tables
     are level, so that upright most points share a few heights."""
     best, least = 0.0, -np.inf
+    # In bins of one size at every angle, or a flatter scene would have finer ones.
+    extent = _HEIGHT_BIN * max(float(np.linalg.norm(np.ptp(body, axis=0))), 1e-9)
     for angle in np.radians(np.arange(-_MOST_UP_DEG, _MOST_DOWN_DEG + 1)):
         heights = body @ (np.cos(angle) * up - np.sin(angle) * forward)
         low, high = np.percentile(heights, (2.0, 98.0))
-        # In bins of one size at every angle, or a flatter scene would have finer ones.
-        extent = _HEIGHT_BIN * max(float(np.linalg.norm(np.ptp(body, axis=0))), 1e-9)
         counts = np.bincount(((np.clip(heights, low, high) - low) / extent).astype(np.int64))
         score = float((counts / len(body)) @ (counts / len(body)))
         if score > least + 1e-9:

@@ -8,10 +8,12 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
-from pliant.algorithms.meshing.rendering import view_mesh
+from pliant.algorithms.meshing.rendering import MeshView, view_mesh
 from pliant.pictures.map import BACKGROUND, FOCAL, MapView, choose_view, dimmed_behind
 
 _SUPERSAMPLE = 2
+_BAND = 32
+"""Rows that are drawn at a time: what is in between stays small, and in the processor's cache."""
 _CLAY = 235.0
 # A lamp above the left shoulder shows form, one at the eye leaves nothing black.
 _LAMP = np.array([-0.43, -0.72, -0.55])
@@ -54,22 +56,31 @@ def draw_mesh(
     )
     faces = mesh.triangles[_towards(mesh, view)]
     seen = view_mesh(mesh.positions, faces, camera, view.T_world_view)
-    covered = seen.triangles >= 0
-    normals = _unit(seen.interpolate(faces, mesh.normals) @ view.T_world_view[:3, :3])
-    from_eye = np.clip(-normals[..., 2:3], 0.0, 1.0)
-    from_lamp = np.clip(normals @ (_LAMP / np.linalg.norm(_LAMP)), 0.0, 1.0)[..., None]
-    depths = np.where(covered, seen.depths, np.float32(np.inf))
-    edges = dimmed_behind(depths, view.reach)[..., None]
+    depths = np.where(seen.triangles >= 0, seen.depths, np.float32(np.inf))
+    edges = dimmed_behind(depths, view.reach)
+    normals = mesh.normals @ view.T_world_view[:3, :3]
+    values = np.hstack([normals, mesh.colours]).astype(np.float32)
+    bands: list[list[U8]] = []
+    for top in range(0, height, _BAND):
+        rows = slice(top, top + _BAND)
+        band = MeshView(seen.depths[rows], seen.triangles[rows], seen.shares[rows])
+        planes = np.ascontiguousarray(band.interpolate(faces, values).transpose(2, 0, 1))
+        lit = _lit(planes[:3], planes[3:], edges[rows])
+        bands.append([_finish(picture, band.triangles >= 0) for picture in lit])
+    return MeshPictures(*(np.concatenate(parts) for parts in zip(*bands, strict=True)))
+
+
+def _lit(normals: F32, colours: F32, edges: F32) -> tuple[F32, F32, F32]:
+    """(3, H, W) colours, clay and normals; normals: (3, H, W) of the eye's frame, of any length."""
+    normals = normals / np.maximum(np.sqrt((normals**2).sum(axis=0)), np.float32(1e-9))
+    from_eye = np.clip(-normals[2], 0.0, 1.0)
+    lamp = (_LAMP / np.linalg.norm(_LAMP)).astype(np.float32)
+    from_lamp = np.clip(np.tensordot(lamp, normals, 1), 0.0, 1.0)
     light = edges * (_AMBIENT + _FROM_EYE * from_eye + _FROM_LAMP * from_lamp)
-    colours = seen.interpolate(faces, mesh.colours.astype(np.float32))
     lit = colours * (_OWN_LIGHT * edges + (1.0 - _OWN_LIGHT) * _BRIGHT * light)
     # Right, up and towards the eye are positive, as normal maps are usually shown.
-    mapped = 127.5 * (1.0 + normals * np.array([1.0, -1.0, -1.0]))
-    return MeshPictures(
-        colours=_finish(lit, covered, size),
-        shaded=_finish(_CLAY * light * np.ones(3), covered, size),
-        normals=_finish(mapped, covered, size),
-    )
+    mapped = 127.5 * (1.0 + normals * np.array([1.0, -1.0, -1.0], np.float32)[:, None, None])
+    return lit, np.broadcast_to(_CLAY * light, normals.shape), mapped
 
 
 def _towards(mesh: TriangleMesh, view: MapView) -> BoolArray:
@@ -82,16 +93,9 @@ def _towards(mesh: TriangleMesh, view: MapView) -> BoolArray:
     return (away * rays).sum(axis=1) < 0.0
 
 
-def _unit(vectors: F32 | F64) -> F64:
-    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(lengths, 1e-9), np.float64)
-
-
-def _finish(
-    picture: F32 | F64,
-    covered: BoolArray,
-    size: tuple[int, int],
-) -> U8:
-    whole = np.where(covered[..., None], picture, np.array(BACKGROUND, np.float64))
-    small = cv2.resize(whole.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return np.clip(np.round(small), 0, 255).astype(np.uint8)
+def _finish(planes: F32, covered: BoolArray) -> U8:
+    """(H, W, 3) before the background, of (3, H, W), at the size that is shown."""
+    size = covered.shape[1] // _SUPERSAMPLE, covered.shape[0] // _SUPERSAMPLE
+    whole = np.where(covered, planes, np.array(BACKGROUND, np.float32)[:, None, None])
+    small = [cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in whole]
+    return np.clip(np.round(np.stack(small, axis=-1)), 0, 255).astype(np.uint8)

@@ -1,6 +1,7 @@
 """Turns a recording into the files that a user opens.  A function of the recording alone."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from pliant.results.folder import (
 )
 from pliant.results.known_scale import MetricRecording, Scale
 from pliant.results.mesh_files import write_meshes
-from pliant.results.page.rigid_page import write_page
+from pliant.results.page.rigid_page import clip_of_keyframes, drawn_map, write_page
 from pliant.results.report import rigid_report
 from pliant.results.run import Run, read_run
 from pliant.results.surfels import has_surfels, write_surfel_results
@@ -45,12 +46,18 @@ def write_rigid_results(output: Path, scale: Scale | None = None) -> dict[str, A
     recording = MetricRecording(output / RECORDING_NAME, scale)
     run = read_run(recording.path, scale)
     final = run.history.final()
-    report = rigid_report(run, final)
-    with all_or_none(output) as folder:
+    # What takes the longest, on other cores.  They write nothing: an interruption waits for them.
+    with ThreadPoolExecutor() as others, all_or_none(output) as folder:
+        drawn = others.submit(drawn_map, run, final)
+        clip = others.submit(clip_of_keyframes, run, recording)
+        report = rigid_report(run, final)
         _write_map(folder, recording, run)
         if scale is not None:
             (folder / SCALE_NAME).write_text(scale.yaml(), encoding="utf-8")
-        _write_files(folder, run, recording, final, report)  # at last the page, which lists all
+        _write_files(folder, run, final, report)
+        names = {path.name for path in folder.iterdir()} | {RECORDING_NAME}
+        page = folder / PAGE_NAME
+        write_page(page, run, final, report, names, drawn=drawn.result(), clip=clip.result())
     return report
 
 
@@ -66,9 +73,7 @@ def _write_map(folder: Path, recording: Recording, run: Run) -> None:
     write_map(folder / MAP_NAME, header, kept)
 
 
-def _write_files(
-    folder: Path, run: Run, recording: Recording, final: dict[int, Any], report: dict[str, Any]
-) -> None:
+def _write_files(folder: Path, run: Run, final: dict[int, Any], report: dict[str, Any]) -> None:
     history = run.history
     trajectories = {
         "trajectory": final,
@@ -95,5 +100,3 @@ def _write_files(
         (folder / CALIBRATION_NAME).write_text(text, encoding="utf-8")
     text = json.dumps(report, indent=1) + "\n"
     (folder / REPORT_NAME).write_text(text, encoding="utf-8")
-    names = {path.name for path in folder.iterdir()} | {RECORDING_NAME}
-    write_page(folder / PAGE_NAME, run, recording, final, report, names)

@@ -33,23 +33,26 @@ _SOME_READOUT = 0.05
 
 
 def write_page(
-    path: Path, run: Run, recording: Recording, final: dict[int, tuple[int, F64]],
-    report: dict[str, Any], names: Container[str],
+    path: Path, run: Run, final: dict[int, tuple[int, F64]], report: dict[str, Any],
+    names: Container[str], *, drawn: str, clip: str,
 ) -> None:  # fmt: skip
-    """Write report.html of a rigid run.  names: of the other files beside it."""
+    """Write report.html of a rigid run.  names: of the other files beside it.
+
+    drawn, clip: as ``drawn_map`` and ``clip_of_keyframes`` make them.
+    """
     fill_page(
         path, report, names,
         verdict=escape(report["verdict"]),
         reason=escape(report["verdict_reason"]),
-        map=_map(run, final),
-        clip=_clip(run, recording),
+        map=drawn,
+        clip=clip,
         figures=table_rows(_figures(run, report)),
         chart=_chart(run, report, final),
         advice=bullets("What to do better next time", advice(report, run.history.stamps_ns)),
     )  # fmt: skip
 
 
-def _map(run: Run, final: dict[int, tuple[int, F64]]) -> str:
+def drawn_map(run: Run, final: dict[int, tuple[int, F64]]) -> str:
     """The map that can be turned; "" without one."""
     longest = run.history.longest_segment()
     poses = np.array([pose for segment, pose in final.values() if segment == longest])
@@ -64,7 +67,7 @@ def _map(run: Run, final: dict[int, tuple[int, F64]]) -> str:
     )  # fmt: skip
 
 
-def _clip(run: Run, recording: Recording) -> str:
+def clip_of_keyframes(run: Run, recording: Recording) -> str:
     """Keyframes with the points of the map that they see; "" where no images were recorded."""
     longest = run.history.longest_segment()
     keyframes = run.history.keyframes.items()
