@@ -109,28 +109,32 @@ def twelve(T_world_camera):
 
 def test_the_normal_equations_are_those_of_finite_differences():
     T, X, spread, px = uncertain_view()
-    pose, normal, squared = twelve(T), np.zeros(28), np.zeros(40)
-    linearise(pose, X, spread, px, K, 4.0, squared, normal)
-    moved = transform(inverse(T), X)
+    common = 0.3
+    pose, normal, squared = twelve(T), np.zeros(36), np.zeros(40)
+    linearise(pose, common, X, spread, px, K, 4.0, squared, normal)
+    moved = transform(inverse(T), X + common * spread)
     local = np.einsum("ij,nj->ni", inverse(T)[:3, :3], spread)
     shift = (CAMERA.project(moved + 1e-5 * local) - CAMERA.project(moved - 1e-5 * local)) / 2e-5
     W = np.linalg.inv(np.eye(2) + np.einsum("ni,nj->nij", shift, shift))
 
     def residuals(step):
         out = np.zeros(12)
-        move_camera(pose, step, out)
-        return px - CAMERA.project(X @ out[:9].reshape(3, 3).T + out[9:])
+        move_camera(pose, step[:6], out)
+        points = X + (common + step[6]) * spread
+        return px - CAMERA.project(points @ out[:9].reshape(3, 3).T + out[9:])
 
-    r = residuals(np.zeros(6))
+    r = residuals(np.zeros(7))
     expected = np.einsum("ni,nij,nj->n", r, W, r)
     np.testing.assert_allclose(squared, expected, rtol=1e-6)
-    assert normal[27] == pytest.approx((expected / (1 + expected / 4.0)).sum())
+    assert normal[35] == pytest.approx((expected / (1 + expected / 4.0)).sum() + common**2)
     k = 1.0 / (1.0 + expected / 4.0) ** 2
-    J = np.stack([(residuals(-1e-6 * e) - residuals(1e-6 * e)) / 2e-6 for e in np.eye(6)], axis=2)
+    J = np.stack([(residuals(-1e-6 * e) - residuals(1e-6 * e)) / 2e-6 for e in np.eye(7)], axis=2)
     H = np.einsum("n,nia,nij,njb->ab", k, J, W, J)
-    np.testing.assert_allclose(normal[:21], H[np.tril_indices(6)], rtol=1e-5, atol=1e-3)
+    H[6, 6] += 1.0
+    np.testing.assert_allclose(normal[:28], H[np.tril_indices(7)], rtol=1e-5, atol=1e-3)
     g = np.einsum("n,nia,nij,nj->a", k, J, W, r)
-    np.testing.assert_allclose(normal[21:27], g, rtol=1e-5, atol=1e-3)
+    g[6] -= common
+    np.testing.assert_allclose(normal[28:35], g, rtol=1e-5, atol=1e-3)
 
 
 def refined(true, X, spread, noise_px=0.2):
@@ -168,6 +172,23 @@ def test_points_of_the_map_tell_a_step_and_wrong_depths_do_not_bend_it():
     assert not stands
     assert np.linalg.norm(T[:3, 3] - true[:3, 3]) < 5e-3
     assert np.linalg.norm(so3_log(T[:3, :3].T @ true[:3, :3])) < 1e-3
+
+
+@pytest.mark.parametrize("nearer", [0.5, 0.7, 1.5, 2.5])
+def test_depths_that_err_together_do_not_bend_a_step_that_few_points_tell(nearer):
+    """As where the camera looks at what is not mapped, and it is not as far as the map."""
+    generator = np.random.default_rng(0)
+    X = generator.uniform((-2, -2, 3), (2, 2, 8), (4000, 3))
+    true = looking((0.01, 0, 0.0), (0.002, -0.003, 0.004))
+    spread, taken = 0.5 * X * nearer, X * nearer
+    spread[:100], taken[:100] = 0.0, X[:100]
+    px = CAMERA.project(transform(inverse(true), X)) + generator.normal(0, 0.1, (4000, 2))
+    T, _, stands = refine_pose_spread(
+        np.eye(4), taken, spread, px.astype(np.float32), CAMERA,
+        kernel_sigma_px=2.0, standing=np.zeros(3),
+    )  # fmt: skip
+    assert not stands
+    assert np.linalg.norm(T[:3, 3] - true[:3, 3]) < 1e-3
 
 
 def full_turn(axis, before=20, turn=90, after=20):

@@ -19,6 +19,10 @@ turned, and the more the farther it went.  With 1 px of noise, the unknown depth
 weighs the residual r.  So the observation tells the rotation in full, and the translation in full
 across the ray's epipolar line and along it only as far as the depth is known.  A point of the map
 has spread 0 and W = I.
+
+What is not mapped may all be nearer or farther than what is, so that depths err together, too: a
+frame sees candidates at X + g spread, with one g ~ N(0, 1) that is found with its pose.  Thousands
+that err alike would outweigh the points that tell how far the camera went.
 """
 
 from dataclasses import dataclass
@@ -49,6 +53,9 @@ _ANY_DEPTH = 10.0
 
 _ENDLESS = 1e6
 """Distance, in medians of the map, at which no camera in it can tell a point from a direction."""
+
+_NEAREST = -1.8
+"""Least g: at -2 what no other keyframe has seen would be at the camera."""
 
 _STEPS = 3
 _ITERATIONS = 10
@@ -235,7 +242,8 @@ def refine_pose_spread(
     kernel_sigma_px: float,
     standing: F64,
 ) -> tuple[F64, F64, bool]:
-    """Robust Levenberg-Marquardt on one pose: the least ``sum rho(r^T W r)``, rho Geman-McClure's.
+    """Robust Levenberg-Marquardt on one pose and g: the least ``sum rho(r^T W r) + g^2``, rho
+    Geman-McClure's.
 
     points_world, spread: (N, 3), see the module.   points_px: (N, 2).   standing: (3,) where the
     camera is unless it is told to have moved: over a view of some 60 degrees a translation and a
@@ -268,50 +276,80 @@ def _iterate(
     pose: F64, X: F64, spread: F64, px: F32, K: F64, sigma2: float, turn_only: bool, squared: F64
 ) -> float:
     """Moves the pose (12,) to the least cost, which it returns; turn_only: its centre stays."""
-    trial, step, normal, fresh = pose.copy(), np.zeros(6), np.zeros(28), np.zeros(28)
-    damping, lowest = 1e-4, np.inf
+    trial, step, normal, fresh = pose.copy(), np.zeros(6), np.zeros(36), np.zeros(36)
+    common, trial_common, damping, lowest = 0.0, 0.0, 1e-4, np.inf
     for _ in range(_ITERATIONS):
-        linearise(trial, X, spread, px, K, sigma2, squared, fresh)
+        linearise(trial, trial_common, X, spread, px, K, sigma2, squared, fresh)
         if turn_only:
-            for r in range(6):
+            for r in range(7):
                 for c in range(min(r + 1, 3)):
                     fresh[r * (r + 1) // 2 + c] = 1.0 if r == c else 0.0
-            fresh[21:24] = 0.0
-        if fresh[27] <= lowest:
-            small = lowest - fresh[27] <= 1e-5 * fresh[27]
-            lowest = fresh[27]
+            fresh[28:31] = 0.0
+        if fresh[35] <= lowest:
+            small = lowest - fresh[35] <= 1e-5 * fresh[35]
+            lowest = fresh[35]
             pose[:] = trial
+            common = trial_common
             normal[:] = fresh
             damping = max(0.1 * damping, 1e-9)
             if small:
                 break
         else:
             damping *= 10.0
-        if not solve_camera(normal, damping, step):
+        if not solve_camera(_of_pose(normal), damping, step):
             break
         move_camera(pose, step, trial)
-    linearise(pose, X, spread, px, K, sigma2, squared, fresh)
-    return fresh[27]
+        rest = normal[34]
+        for r in range(6):
+            rest -= normal[21 + r] * step[r]
+        trial_common = max(common + rest / normal[27], _NEAREST)
+    linearise(pose, common, X, spread, px, K, sigma2, squared, fresh)
+    return fresh[35]
+
+
+@kernel
+def _of_pose(normal: F64) -> F64:
+    """(27,) as of ``solve_camera``, of ``linearise``'s equations with g eliminated."""
+    reduced = np.empty(27)
+    at = 0
+    for r in range(6):
+        share = normal[21 + r] / normal[27]
+        for c in range(r + 1):
+            reduced[at] = normal[at] - share * normal[21 + c]
+            at += 1
+        reduced[21 + r] = normal[28 + r] - share * normal[34]
+    return reduced
 
 
 @kernel
 def linearise(
-    pose: F64, X: F64, spread: F64, px: F32, K: F64, sigma2: float, squared: F64, normal: F64
+    pose: F64,
+    common: float,
+    X: F64,
+    spread: F64,
+    px: F32,
+    K: F64,
+    sigma2: float,
+    squared: F64,
+    normal: F64,
 ) -> None:
-    """Write (28,): H (lower triangle by rows), negative gradient, cost, W and weight held.
+    """Write (36,): H (lower triangle by rows), negative gradient, cost, W and weight held.
 
-    pose: (12,) T_camera_world; the step is ``move_camera``'s.   squared: (N,) written, r^T W r.
+    pose: (12,) T_camera_world; the step is ``move_camera``'s, and then that of g.   common: g.
+    squared: (N,) written, r^T W r.
     """
     normal[:] = 0.0
-    J = np.empty((2, 6))
+    J, P = np.empty((2, 7)), np.empty(3)
     for n in range(X.shape[0]):
-        z = pose[6] * X[n, 0] + pose[7] * X[n, 1] + pose[8] * X[n, 2] + pose[11]
+        for k in range(3):
+            P[k] = X[n, k] + common * spread[n, k]
+        z = pose[6] * P[0] + pose[7] * P[1] + pose[8] * P[2] + pose[11]
         if z < _MIN_DEPTH:
             squared[n] = np.inf
-            normal[27] += sigma2
+            normal[35] += sigma2
             continue
-        x = (pose[0] * X[n, 0] + pose[1] * X[n, 1] + pose[2] * X[n, 2] + pose[9]) / z
-        y = (pose[3] * X[n, 0] + pose[4] * X[n, 1] + pose[5] * X[n, 2] + pose[10]) / z
+        x = (pose[0] * P[0] + pose[1] * P[1] + pose[2] * P[2] + pose[9]) / z
+        y = (pose[3] * P[0] + pose[4] * P[1] + pose[5] * P[2] + pose[10]) / z
         mx = pose[0] * spread[n, 0] + pose[1] * spread[n, 1] + pose[2] * spread[n, 2]
         my = pose[3] * spread[n, 0] + pose[4] * spread[n, 1] + pose[5] * spread[n, 2]
         mz = pose[6] * spread[n, 0] + pose[7] * spread[n, 1] + pose[8] * spread[n, 2]
@@ -321,19 +359,23 @@ def linearise(
         du, dv = px[n, 0] - K[0] * x - K[2], px[n, 1] - K[1] * y - K[3]
         wu, wv = w00 * du + w01 * dv, w01 * du + w11 * dv
         s = du * wu + dv * wv
-        k = 1.0 / (1.0 + s / sigma2)
+        weight = 1.0 / (1.0 + s / sigma2)
         squared[n] = s
-        normal[27] += s * k
-        k *= k
+        normal[35] += s * weight
+        weight *= weight
         J[0, 0], J[0, 1], J[0, 2] = K[0] / z, 0.0, -K[0] * x / z
         J[0, 3], J[0, 4], J[0, 5] = -K[0] * x * y, K[0] * (1.0 + x * x), -K[0] * y
         J[1, 0], J[1, 1], J[1, 2] = 0.0, K[1] / z, -K[1] * y / z
         J[1, 3], J[1, 4], J[1, 5] = -K[1] * (1.0 + y * y), K[1] * x * y, K[1] * x
+        J[0, 6], J[1, 6] = eu, ev
         at = 0
-        for r in range(6):
-            a = k * (w00 * J[0, r] + w01 * J[1, r])
-            b = k * (w01 * J[0, r] + w11 * J[1, r])
+        for r in range(7):
+            a = weight * (w00 * J[0, r] + w01 * J[1, r])
+            b = weight * (w01 * J[0, r] + w11 * J[1, r])
             for c in range(r + 1):
                 normal[at] += a * J[0, c] + b * J[1, c]
                 at += 1
-            normal[21 + r] += k * (J[0, r] * wu + J[1, r] * wv)
+            normal[28 + r] += weight * (J[0, r] * wu + J[1, r] * wv)
+    normal[27] += 1.0
+    normal[34] -= common
+    normal[35] += common * common
