@@ -20,6 +20,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "compiler": {"compiler", "cache", "errors"},
     "algorithms": {"algorithms", "compiler"},
     "errors": set(),
+    "open3d_library": {"errors"},
     "cache": set(),
     "files": set(),
     "exit_codes": set(),
@@ -101,14 +102,29 @@ def test_algorithms_are_pure() -> None:
     assert not breaches
 
 
-def test_open3d_is_for_comparisons_alone() -> None:
-    """It needs libraries of the system, which nobody installs without root."""
-    breaches = [
+def test_open3d_is_loaded_by_one_module() -> None:
+    """Which says what to install where a library of the system is missing."""
+    loaded_by = [
         str(path.relative_to(ROOT))
         for path in python_files(LIBRARY) + python_files(SERVICES)
-        if "open3d" in path.read_text(encoding="utf-8")
+        if "open3d" in {name.split(".")[0] for name in imports(path)}
+        or re.search(r"""import_module\(["']open3d""", path.read_text(encoding="utf-8"))
     ]
-    assert not breaches
+    assert loaded_by == ["shared/pliant/open3d_library.py"]
+
+
+def test_no_module_loads_open3d_when_it_is_imported() -> None:
+    """A second and 200 MB for each command and service, and on a bare machine an error."""
+    code = (
+        "import importlib, pkgutil, sys\n"
+        "import pliant, pliant_services\n"
+        "for package in (pliant, pliant_services):\n"
+        "    for found in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
+        "        if not found.name.endswith('__main__'): importlib.import_module(found.name)\n"
+        "        if 'open3d' in sys.modules: sys.exit(f'{found.name} loads open3d')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_no_file_names_a_machine() -> None:
@@ -154,7 +170,7 @@ def test_what_calls_no_kernel_loads_none() -> None:
 
 
 HEAVY = {
-    *("cv2", "matplotlib", "numba", "scipy"),
+    *("cv2", "matplotlib", "numba", "open3d", "scipy"),
     *("pliant.datasets", "pliant.formats", "pliant.map_history", "pliant.pictures"),
 }
 COMMANDS = {

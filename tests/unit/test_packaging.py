@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
 
 from pliant import __version__
 
@@ -99,7 +100,7 @@ def test_the_archive_of_the_sources_gives_the_same_wheel(wheel: Path, tmp_path: 
 
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:
     """Not what comes with another package by chance; what some commands need is an extra."""
-    imported: set[str] = set()
+    imported = {"open3d"}  # by its name: see pliant/open3d_library.py
     for folder in (ROOT / "shared", ROOT / "services"):
         for path in folder.rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -114,13 +115,28 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None
     extras = distributions(
         need for needs in project["optional-dependencies"].values() for need in needs
     )
-    assert used - extras == distributions(project["dependencies"])
+    assert used - extras == distributions(
+        need
+        for need in project["dependencies"]
+        if (marker := Requirement(need).marker) is None or marker.evaluate()
+    )
 
 
 def distributions(requirements: Iterable[str]) -> set[str]:
     """Their names alone, as package indices write them."""
     names = (re.split(r"[^\w.-]", requirement)[0] for requirement in requirements)
     return {re.sub(r"[-_.]+", "-", name).lower() for name in names}
+
+
+def test_open3d_is_a_dependency_everywhere_and_small_where_it_can_be() -> None:
+    """Its wheel without a GPU has a quarter of the size, and is for Linux on x86-64 alone."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needs = [Requirement(need) for need in project["dependencies"]]
+    machines = {("linux", "x86_64"): "open3d-cpu", ("linux", "aarch64"): "open3d"}
+    for (system, machine), wanted in {**machines, ("darwin", "arm64"): "open3d"}.items():
+        here = {"sys_platform": system, "platform_machine": machine}
+        found = [n.name for n in needs if n.marker is not None and n.marker.evaluate(here)]
+        assert found == [wanted]
 
 
 def test_what_is_installed_here_fits_what_is_declared() -> None:

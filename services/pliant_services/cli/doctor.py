@@ -12,6 +12,7 @@ import typer
 from pliant import arithmetic
 from pliant.cache import cache_folder
 from pliant.errors import PliantError
+from pliant.open3d_library import OPEN3D_IS_FOR, Open3dError, load_open3d
 
 _PACKAGES = {
     "eclipse-zenoh": "zenoh",
@@ -53,6 +54,7 @@ def diagnose() -> list[Finding]:
         _python(),
         *(_package(distribution, module) for distribution, module in _PACKAGES.items()),
         _optional("matplotlib", "plots of `pliant eval`", "pip install 'pliant[plot]'"),
+        _open3d(),
         _arithmetic(),
         _scratch(),
         _bus(),
@@ -82,6 +84,13 @@ def _optional(module: str, purpose: str, remedy: str) -> Finding:
         return Finding("ok", module, str(importlib.import_module(module).__version__))
     except (ImportError, OSError) as error:
         return Finding("warning", module, f"{_line(error)}; for {purpose}: {remedy}")
+
+
+def _open3d() -> Finding:
+    try:
+        return Finding("ok", "open3d", str(load_open3d().__version__))
+    except Open3dError as error:
+        return Finding("warning", "open3d", f"{error}; for {OPEN3D_IS_FOR}")
 
 
 def _arithmetic() -> Finding:
