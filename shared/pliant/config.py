@@ -49,6 +49,11 @@ class IngestParameters(Parameters):
     sharpest: bool = Field(
         default=False, description="Of these, that with the finest details, not the first."
     )
+    mask_static: bool = Field(
+        default=True,
+        description="Borders and overlays that never change while the scene moves are found in the "
+        "first seconds, and masked.  A given mask replaces them.",
+    )
     mapping_lag_s: float = Field(
         default=0.4,
         ge=0.0,

@@ -41,6 +41,13 @@ def run(
         Path | None,
         _everyday(help="Image whose black parts are ignored in all frames, or a folder of them."),
     ] = None,
+    auto_mask: Annotated[
+        bool,
+        _everyday(
+            "--auto-mask/--no-auto-mask",
+            help="Mask borders and overlays that never change, without --mask.",
+        ),
+    ] = True,
     start: Annotated[
         float | None, _everyday(min=0.0, help="Begin so many seconds after the first frame.")
     ] = None,
@@ -168,6 +175,7 @@ def run(
         raise typer.BadParameter("--sharpest needs --every: of how many frames?")
     part = {"start_s": start, "end_s": end, "every": every, "longest_side_px": max_size}
     sets += [f"ingest.{name}={value}" for name, value in part.items() if value is not None]
+    sets += [] if auto_mask else ["ingest.mask_static=false"]
     sets += ["ingest.sharpest=true"] if sharpest else []
     sets += [f"surfels.camera={camera}"] if camera else []
     sets += [f"surfels.depth_from={depth}"] if depth else []

@@ -106,6 +106,7 @@ def service(
             longest_side_px=config.ingest.longest_side_px,
             part=config.ingest,
             mask=mask,
+            mask_static=config.ingest.mask_static,
         )
         arguments["known"] = None if known is None else MapFile(known)
     elif name == "recorder":

@@ -24,6 +24,7 @@ from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.calibration import calibration_yaml
 from pliant.datasets.clip import Clip, clip_of
 from pliant.datasets.rectifier import Rectifier, rectified
+from pliant.datasets.static_mask import static_counters
 from pliant.datasets.working_size import SmallerImages
 from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import topics
@@ -103,6 +104,7 @@ def run(
             bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)
             bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
             counters = {"dropped": dropped, "broken": broken, "unmapped": pace.passed}
+            counters |= static_counters(dataset)
             monitor.report(image, note="", **counters, **drops.counters)
             kept = (tuple(vars(pace).values()), (drops.counters,))
             bus.checkpoint(image.frame, (image.frame + 1, dropped, broken, *kept, sent))

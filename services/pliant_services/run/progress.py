@@ -9,6 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from rich.progress import Progress as RichProgress
 
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
+from pliant.datasets.static_mask import static_line
 from pliant.messages.types import Status
 from pliant_services.processes import BY_NAME
 
@@ -30,6 +31,7 @@ class Progress:
         self._lock = threading.Lock()
         self._counters: dict[str, float] = {}
         self._note = ""
+        self._static = ""
         self._bar = RichProgress(
             TextColumn("{task.fields[state]:>9}"),
             BarColumn(bar_width=24),
@@ -52,6 +54,10 @@ class Progress:
         """Take in a status; called from the bus' thread."""
         with self._lock:
             self._counters.update(zip(status.counters, status.values.tolist(), strict=True))
+            static = static_line(self._counters)
+            if static != self._static:
+                self._static = static
+                self.say(static or "what never changed has changed: nothing is masked any more")
             if status.service == "surfels":
                 self._show_surfels(status)
             if status.service != "bundle_adjustment":

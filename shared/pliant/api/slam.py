@@ -173,6 +173,7 @@ def follow(
         longest_side_px=config.ingest.longest_side_px,
         part=config.ingest,
         mask=None if mask is None else Path(mask),
+        mask_static=config.ingest.mask_static,
     )
     slam = Slam(dataset.calibration, settings=settings, seed=seed)
     for frame in dataset:

@@ -28,6 +28,7 @@ from pliant.datasets.mcap_file import is_mcap, open_mcap
 from pliant.datasets.own_recording import is_own_recording, open_own_recording
 from pliant.datasets.rectifier import Rectifier, decode
 from pliant.datasets.ros_bag import is_ros_bag, open_ros_bag
+from pliant.datasets.static_mask import StaticallyMasked
 from pliant.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from pliant.datasets.video import VideoFile
 from pliant.datasets.working_size import SmallerImages, at_working_size
@@ -145,6 +146,7 @@ def open_source(
     longest_side_px: int = 0,
     part: Part | None = None,
     mask: Path | None = None,
+    mask_static: bool = False,
 ) -> Dataset:
     """Open a source of frames of any of the ``FORMATS``, and check it as far as can be seen.
 
@@ -155,6 +157,8 @@ def open_source(
     longest_side_px: to which larger images are made smaller; 0: as large as their details need.
     part: which frames are taken; None: all.
     mask: an image, or a folder of them, that says which part of frames is used: see ``masks``.
+    mask_static: whether borders and overlays are found and masked, where no mask is given: see
+    ``static_mask``.
 
     Raises DatasetError or CalibrationError: one line with what is wrong, where, and what to do.
     """
@@ -177,6 +181,8 @@ def open_source(
                 opened = opened if mask is None else Masked(opened, mask)
                 if part is not None and not is_all(part):
                     opened = Excerpt(opened, part, first_depth_only=first_depth)
+                if mask_static and mask is None:
+                    opened = StaticallyMasked(opened)
                 if kind.sized and not longest_side_px:
                     return opened
                 return at_working_size(opened, longest_side_px)
@@ -197,15 +203,17 @@ def open_source(
 
 def notes_on(dataset: Dataset) -> list[str]:
     """What is done to the images of a source, in lines for people."""
-    if not isinstance(dataset, Excerpt | Masked | SmallerImages):
+    if not isinstance(dataset, Excerpt | Masked | SmallerImages | StaticallyMasked):
         return []
-    own = [] if isinstance(dataset, Excerpt) else [dataset.note]
+    own = [] if isinstance(dataset, Excerpt | StaticallyMasked) else [dataset.note]
     return notes_on(dataset.source) + own
 
 
 def check_start(dataset: Dataset) -> None:
     """Raise DatasetError where a source that is opened in part ends before the part begins."""
-    whole = dataset.source if isinstance(dataset, SmallerImages) else dataset
+    whole = dataset
+    while isinstance(whole, SmallerImages | StaticallyMasked):
+        whole = whole.source
     if isinstance(whole, Excerpt) and not whole.is_live:
         whole.check_start()
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from pliant.datasets.base import Dataset
 from pliant.datasets.excerpt import Excerpt, Part
 from pliant.datasets.masks import Masked
+from pliant.datasets.static_mask import StaticallyMasked
 from pliant.datasets.video import VideoFile, file_version
 from pliant.datasets.working_size import SmallerImages
 from pliant.errors import DatasetError
@@ -73,7 +74,7 @@ def clip_of(source: Dataset) -> Clip | None:
     Raises DatasetError where it cannot be read.
     """
     origin, parts = source, list[Part]()
-    while isinstance(origin, SmallerImages | Excerpt | Masked):
+    while isinstance(origin, SmallerImages | Excerpt | Masked | StaticallyMasked):
         parts += [origin.part] if isinstance(origin, Excerpt) else []
         origin = origin.source
     if not isinstance(origin, VideoFile):

@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from pliant.datasets.static_mask import static_line
 from pliant.exit_codes import DONE, INCOMPLETE
 from pliant.messages.types import BROKEN, DROPPED, MASKED
 from pliant.results.report import broken_images
@@ -98,6 +99,8 @@ def _faults(report: dict[str, Any]) -> list[str]:
     broken = broken_images(report["frames_without_pixels"])
     reasons = list(report["frames_without_pixels"].values())
     dropped, masked = (reasons.count(why) for why in (DROPPED, MASKED))
+    static = static_line(report.get("counters", {}).get("ingest", {}))
+    lines += [static] if static else []
     if masked:
         lines.append(f"{counted(masked, 'image')} passed over: masked as a whole")
     if dropped:
