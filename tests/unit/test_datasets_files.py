@@ -11,8 +11,9 @@ import yaml
 from pliant.datasets import FORMATS, open_source
 from pliant.datasets.base import Dataset
 from pliant.datasets.calibration import UNSAID_SIGMA
-from pliant.datasets.images import image_files, parse_stamp
+from pliant.datasets.images import image_files
 from pliant.datasets.rectifier import Rectifier, decode
+from pliant.datasets.times import nanoseconds, number_of
 from pliant.errors import CalibrationError, DatasetError, PliantError
 
 WIDTH, HEIGHT = 64, 48
@@ -139,9 +140,12 @@ def test_file_names_with_spaces(tmp_path: Path) -> None:
 
 
 def test_stamps_are_exact() -> None:
-    assert parse_stamp("1403715273.262142976", "") == 1403715273262142976
-    assert parse_stamp("1.036224e-01", "") == 103622400
-    assert parse_stamp("1403715273262142976", "", seconds=False) == 1403715273262142976
+    def stamp(text: str, unit: str = "seconds") -> int:
+        return nanoseconds(number_of(text, "rgb.txt: line 1"), unit, "rgb.txt: line 1")
+
+    assert stamp("1403715273.262142976") == 1403715273262142976
+    assert stamp("1.036224e-01") == 103622400
+    assert stamp("1403715273262142976", "nanoseconds") == 1403715273262142976
     for text, says in (
         ("nan", "not finite"),
         ("inf", "not finite"),
@@ -151,7 +155,7 @@ def test_stamps_are_exact() -> None:
         ("x", "is not a time"),
     ):
         with pytest.raises(DatasetError, match=says):
-            parse_stamp(text, "rgb.txt: line 1")
+            stamp(text)
 
 
 def test_names_of_files_lie(tmp_path: Path) -> None:

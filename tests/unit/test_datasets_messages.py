@@ -222,18 +222,15 @@ def test_the_choice_of_a_topic(tmp_path: Path) -> None:
 
 def test_what_cannot_be_understood_is_said(tmp_path: Path) -> None:
     ros = Ros(2)
-    yuv = ros.image(0, encoding="yuv422", pixels=bags.picture(0)[:, :, :2])
-    bags.write_ros2_bag(tmp_path / "yuv", ros, {"/image": [yuv]})
-    assert "encoding 'yuv422' are not understood" in refused(tmp_path / "yuv", fov_deg=70.0)
+    odd = ros.image(0, encoding="8UC2", pixels=bags.picture(0)[:, :, :2])
+    bags.write_ros2_bag(tmp_path / "odd", ros, {"/image": [odd]})
+    assert "encoding '8UC2' are not understood" in refused(tmp_path / "odd", fov_deg=70.0)
     never = ros.camera_info(0)
     never.k[:] = 0.0
     never.p[:] = 0.0
     messages = {"/image": [ros.image(0)], "/camera_info": [never]}
     bags.write_ros2_bag(tmp_path / "never", ros, messages)
     assert "the camera was not calibrated" in refused(tmp_path / "never")
-    images = [ros.image(0), ros.image(1), ros.image(1)]
-    bags.write_ros2_bag(tmp_path / "twice", ros, {"/image": images})
-    assert "the time of image 2" in refused(tmp_path / "twice", fov_deg=70.0)
 
 
 @pytest.mark.parametrize("kind", FILES)

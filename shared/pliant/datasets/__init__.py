@@ -202,11 +202,12 @@ def open_source(
 
 
 def notes_on(dataset: Dataset) -> list[str]:
-    """What is done to the images of a source, in lines for people."""
-    if not isinstance(dataset, Excerpt | Masked | SmallerImages | StaticallyMasked):
-        return []
-    own = [] if isinstance(dataset, Excerpt | StaticallyMasked) else [dataset.note]
-    return notes_on(dataset.source) + own
+    """How a source is read and what is done to its images, in lines for people."""
+    if isinstance(dataset, Excerpt | StaticallyMasked):
+        return notes_on(dataset.source)
+    if isinstance(dataset, Masked | SmallerImages):
+        return [*notes_on(dataset.source), dataset.note]
+    return list(getattr(dataset, "notes", ()))
 
 
 def check_start(dataset: Dataset) -> None:

@@ -23,7 +23,8 @@ class SourceFrame:
     the others of ``rectifier.RAW_BYTES``).
     data: bytes as they are in the file, or the raw pixels.
     width, height: of raw pixels; 0 for file formats, which say it themselves.
-    made_from: "" as it came; else what it was before, for people.
+    made_from: "" as it came; else what it was before, for people; of a frame without data, why it
+    has none.
     clip_frame: number of the frame of a video file that it is made from; -1: of none.
     depth: the file of the depth map that belongs to it, as it is; b"" where there is none.
     mask: an image file that says which part of it is used; b"": all of it.
@@ -48,6 +49,11 @@ class SourceFrame:
     def dropped(self) -> bool:
         """Whether it was passed over on purpose (an empty file is not: that one is broken)."""
         return self.encoding == ""
+
+    def broken(self, why: str) -> "SourceFrame":
+        """This frame as one of which nothing can be used.  why: for people."""
+        nothing = {"encoding": "unknown", "width": 0, "height": 0, "clip_frame": -1}
+        return replace(self, **nothing, data=b"", depth=b"", mask=b"", made_from=why)
 
     @property
     def called(self) -> str:

@@ -23,7 +23,8 @@ from pliant.algorithms.rectification import rectified_camera
 from pliant.datasets import stereo
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import Calibration, DepthImages
-from pliant.datasets.images import ListedImage, SourceOptions, read_list
+from pliant.datasets.image_lists import ImageList, read_list
+from pliant.datasets.images import ListedImage, SourceOptions
 from pliant.datasets.stereo import StereoPair
 from pliant.errors import CalibrationError, DatasetError
 from pliant.trajectory import associate
@@ -33,15 +34,21 @@ _MAX_DIFFERENCE_NS = 20_000_000
 
 
 def with_depth(
-    images: Sequence[ListedImage], folder: Path, calibration: Calibration, options: SourceOptions
+    listed: ImageList, folder: Path, calibration: Calibration, options: SourceOptions
 ) -> Sequence[ListedImage]:
     """The images with the depth maps that are wanted of them.
 
     Raises DatasetError where there is no list or nothing in it belongs to an image, and
     CalibrationError where the unit of the depth maps is not known.
     """
+    images = listed.images
     if options.depth == "none":
         return images
+    if listed.others:
+        _check_scale(folder, calibration)
+        taken = listed.others[: 1 if options.depth == "first" else None]
+        depths = [*taken, *[None] * (len(images) - len(taken))]
+        return [replace(image, depth=path) for image, path in zip(images, depths, strict=True)]
     file = folder / LIST_NAME
     is_stereo = not file.is_file() and (folder / stereo.LIST_NAME).is_file()
     if is_stereo:
@@ -53,12 +60,8 @@ def with_depth(
             f"the images in rgb.txt, or right images of a rectified pair in {stereo.LIST_NAME}; "
             "without any, see --depth map and --depth flat"
         )
-    maps = read_list(file, folder)
-    if calibration.depth is None:
-        raise CalibrationError(
-            f"{folder}: has depth maps, but its calibration has no depth_scale: add the metres per "
-            "unit, e.g. depth_scale: 0.001"
-        )
+    maps = [each for each in read_list(file, folder).images if not each.fault]
+    _check_scale(folder, calibration)
     rows, of_maps = associate(_stamps(images), _stamps(maps), max_difference_ns=_MAX_DIFFERENCE_NS)
     if not len(rows):
         raise DatasetError(f"{file}: no depth map is within 20 ms of an image; correct its times")
@@ -67,12 +70,21 @@ def with_depth(
     found: dict[int, Path | StereoPair] = {row: maps[of_map].path for row, of_map in pairs}
     if is_stereo:
         depth = calibration.depth
+        assert depth is not None  # of a calibration with stereo_baseline
         found = {
             row: StereoPair(right, depth.camera.fx, depth.baseline_m, depth.scale_m)
             for row, right in found.items()
             if isinstance(right, Path)
         }
     return [replace(image, depth=found.get(row)) for row, image in enumerate(images)]
+
+
+def _check_scale(folder: Path, calibration: Calibration) -> None:
+    if calibration.depth is None:
+        raise CalibrationError(
+            f"{folder}: has depth maps, but its calibration has no depth_scale: add the metres per "
+            "unit, e.g. depth_scale: 0.001"
+        )
 
 
 def _check_stereo(folder: Path, calibration: Calibration) -> None:

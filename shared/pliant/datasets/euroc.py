@@ -1,6 +1,6 @@
 """EuRoC and other sequences in ASL format; the left camera is used.
 
-    SEQUENCE/mav0/cam0/data.csv       "nanoseconds,file" a line
+    SEQUENCE/mav0/cam0/data.csv       "nanoseconds,file" a line; seconds are told by themselves
     SEQUENCE/mav0/cam0/data/*.png
     SEQUENCE/mav0/cam0/sensor.yaml    the calibration (or --calibration FILE, e.g. Kalibr's)
     SEQUENCE/mav0/state_groundtruth_estimate0/data.csv
@@ -11,13 +11,13 @@ The source is SEQUENCE, SEQUENCE/mav0 or SEQUENCE/mav0/cam0 (or another camera's
 from pathlib import Path
 
 from pliant.datasets.base import Dataset
+from pliant.datasets.image_lists import read_list
 from pliant.datasets.images import (
     ImageFiles,
     SourceOptions,
     choose_calibration,
     existing,
     image_size,
-    read_list,
 )
 from pliant.errors import DatasetError
 
@@ -32,14 +32,15 @@ def open_euroc(source: str, options: SourceOptions) -> Dataset:
     camera = _camera_folder(Path(source))
     if camera is None:
         raise DatasetError(f"{source}: no mav0/cam0 with data.csv and data/")
-    images = read_list(camera / "data.csv", camera / "data", seconds=False)
+    listed = read_list(camera / "data.csv", camera / "data", unit="nanoseconds")
     resolved = camera.resolve()
     sequence = resolved.parent.parent if resolved.parent.name == "mav0" else resolved.parent
     return ImageFiles(
         name=sequence.name if resolved.name == "cam0" else f"{sequence.name}_{resolved.name}",
-        images=images,
+        images=listed.images,
+        notes=listed.notes,
         calibration=choose_calibration(
-            options, image_size(images), found=camera / "sensor.yaml", where=str(camera)
+            options, image_size(listed.images), found=camera / "sensor.yaml", where=str(camera)
         ),
         ground_truth_path=existing(
             camera.parent / "state_groundtruth_estimate0" / "data.csv",

@@ -7,25 +7,30 @@
     FOLDER/depth.txt        optional: depth maps, listed like the images; see pliant.datasets.depth
     FOLDER/right.txt        optional: right images of a stereo pair; see pliant.datasets.stereo
 
-or a bare folder of images in the order of their names, 2 before 10, with ``--calibration FILE``
-or ``--fov DEGREES`` where it holds no calib.yaml.  Their times are made up: ``fps`` of the
-calibration, 30 frames a second if it does not say.
+or ``associations.txt`` ("seconds file seconds file") instead of rgb.txt, or a bare folder of images
+(directly, or in rgb/, color/, images/ and the like), with ``--calibration FILE`` or ``--fov
+DEGREES`` where it holds no calib.yaml.  Times are those that the names of the images tell.  Where
+they tell none, images are in the order of their names, 2 before 10, and ``fps`` of the calibration
+apart, 30 a second if it does not say.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from pliant.datasets.base import Dataset
 from pliant.datasets.depth import with_depth
+from pliant.datasets.image_kinds import folder_of_images, images_of_one_kind
+from pliant.datasets.image_lists import read_list
 from pliant.datasets.images import (
     ImageFiles,
     ListedImage,
     SourceOptions,
     choose_calibration,
     existing,
-    image_files,
     image_size,
-    read_list,
 )
+from pliant.datasets.named_times import times_in_names
+from pliant.datasets.times import rate
 
 LIST_NAME = "rgb.txt"
 CALIBRATION_NAME = "calib.yaml"
@@ -33,9 +38,20 @@ GROUND_TRUTH_NAME = "groundtruth.txt"
 DEFAULT_FPS = 30.0
 
 
+_ASSOCIATIONS = (
+    *("associations.txt", "associate.txt", "association.txt", "associated.txt", "assoc.txt"),
+    "rgb_depth.txt",
+)
+
+
+def list_of(folder: Path) -> Path | None:
+    """The list of the images in a folder."""
+    return existing(folder / LIST_NAME, *(folder / name for name in _ASSOCIATIONS))
+
+
 def is_listed_folder(source: str) -> bool:
     """Whether it is a folder with a list."""
-    return (Path(source) / LIST_NAME).is_file()
+    return list_of(Path(source)) is not None
 
 
 def open_listed_folder(source: str, options: SourceOptions, *, name: str = "") -> Dataset:
@@ -44,37 +60,67 @@ def open_listed_folder(source: str, options: SourceOptions, *, name: str = "") -
     Raises DatasetError and CalibrationError.
     """
     folder = Path(source)
-    images = read_list(folder / LIST_NAME, folder)
+    listed = read_list(list_of(folder) or folder / LIST_NAME, folder)
     calibration = choose_calibration(
-        options, image_size(images), found=folder / CALIBRATION_NAME, where=source
+        options, image_size(listed.images), found=calibration_in(folder), where=source
     )
     return ImageFiles(
         name=name or folder.resolve().name,
-        images=with_depth(images, folder, calibration, options),
+        images=with_depth(listed, folder, calibration, options),
         calibration=calibration,
         ground_truth_path=existing(folder / GROUND_TRUTH_NAME),
+        notes=listed.notes,
     )
 
 
 def is_bare_folder(source: str) -> bool:
     """Whether it is a folder with images and no list."""
-    return Path(source).is_dir() and bool(image_files(Path(source)))
+    return folder_of_images(Path(source)) is not None
 
 
 def open_bare_folder(source: str, options: SourceOptions) -> Dataset:
     """A folder of images without a list.  Raises DatasetError and CalibrationError."""
     folder = Path(source)
-    paths = image_files(folder)
+    inner = folder_of_images(folder) or folder
+    paths, notes = images_of_one_kind(inner)
+    if inner != folder:
+        notes.append(f"the images are those in {inner.name}/")
     untimed = [ListedImage(stamp_ns=0, path=path) for path in paths]
     calibration = choose_calibration(
-        options, image_size(untimed), found=folder / CALIBRATION_NAME, where=source
+        options, image_size(untimed), found=calibration_in(folder, inner), where=source
     )
-    fps = calibration.fps or DEFAULT_FPS
+    images, told = _timed(paths, calibration.fps)
     return ImageFiles(
         name=folder.resolve().name,
-        images=[
-            ListedImage(stamp_ns=round(i * 1e9 / fps), path=path) for i, path in enumerate(paths)
-        ],
+        images=images,
         calibration=calibration,
         ground_truth_path=existing(folder / GROUND_TRUTH_NAME),
+        notes=[*notes, *told],
     )
+
+
+def calibration_in(*folders: Path) -> Path | None:
+    """The calibration that lies beside the images."""
+    names = (CALIBRATION_NAME, "calibration.yaml", "cameras.txt", "cameras.bin")
+    return existing(*(folder / name for folder in folders for name in names))
+
+
+def _timed(paths: Sequence[Path], fps: float | None) -> tuple[list[ListedImage], list[str]]:
+    """The images with the times that their names tell, else at a rate, and a note on it."""
+    named = times_in_names([path.stem for path in paths])
+    if named is not None:
+        ordered = [paths[row] for row in named.order]
+        images = [
+            ListedImage(stamp_ns=t, path=p) for t, p in zip(named.stamps_ns, ordered, strict=True)
+        ]
+        return images, [f"times: from the file names, in {named.unit}: {rate(named.stamps_ns)}"]
+    images = [
+        ListedImage(stamp_ns=round(i * 1e9 / (fps or DEFAULT_FPS)), path=path)
+        for i, path in enumerate(paths)
+    ]
+    if fps is not None or len(images) == 1:
+        return images, []
+    return images, [
+        f"times: the file names tell none: {DEFAULT_FPS:.0f} images/s are assumed (fps in "
+        f"{CALIBRATION_NAME} or times in {LIST_NAME} say better)"
+    ]

@@ -11,11 +11,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from pliant.datasets.base import SourceFrame, encoding_of
+from pliant.datasets.base import BrokenFrame, SourceFrame, encoding_of
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_files import calibration_from_camera_info
 from pliant.datasets.rectifier import RAW_BYTES
-from pliant.errors import CalibrationError, DatasetError
+from pliant.errors import CalibrationError
+from pliant.wording import shown
 
 IMAGE_TYPES = (
     "sensor_msgs/Image",
@@ -32,10 +33,14 @@ _ENCODINGS = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16
 
 @dataclass(frozen=True)
 class RecordedImage:
-    """An image message: when it was recorded, and the fields of its type."""
+    """An image message: when it was recorded, and the fields of its type.
+
+    fault: why there are none; "" where there are.
+    """
 
     log_time_ns: int
     message: Any
+    fault: str = ""
 
 
 def plain_type(name: str) -> str:
@@ -59,19 +64,21 @@ def capture_time(image: RecordedImage) -> int:
     return stamp_ns or image.log_time_ns
 
 
-def source_frame(kind: str, image: RecordedImage, index: int, where: str) -> SourceFrame:
+def source_frame(kind: str, image: RecordedImage, index: int) -> SourceFrame:
     """The frame in a message of one of the ``IMAGE_TYPES``.
 
-    Raises DatasetError, naming ``where``, for pixels of a kind that is not understood.
+    Raises BrokenFrame for a message that is damaged, or pixels of a kind that is not understood.
     """
+    if image.fault:
+        raise BrokenFrame(image.fault)
     message, stamp_ns = image.message, capture_time(image)
     if kind not in _RAW_TYPES:
         data = bytes(message.data)
         return SourceFrame(index=index, stamp_ns=stamp_ns, encoding=encoding_of(data), data=data)
     encoding = _ENCODINGS.get(message.encoding, message.encoding)
     if encoding not in RAW_BYTES:
-        raise DatasetError(
-            f"{where}: images with encoding {message.encoding!r} are not understood; convert them "
+        raise BrokenFrame(
+            f"images with encoding {shown(message.encoding)} are not understood; convert them "
             f"to one of {', '.join(RAW_BYTES)}"
         )
     return SourceFrame(

@@ -1,24 +1,20 @@
-"""Sources made of image files: the data set itself, and the lists that say what belongs to it."""
+"""Sources made of image files: the data set itself, and what is asked of its images."""
 
-import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from pliant.datasets.base import BrokenFrame, SourceFrame, encoding_of
 from pliant.datasets.calibration import Calibration, calibration_from_fov
 from pliant.datasets.calibration_files import check_size, read_calibration
-from pliant.datasets.rectifier import decode
+from pliant.datasets.image_sizes import LOOKED_AT, most_frequent, size_of
 from pliant.datasets.stereo import StereoPair
 from pliant.errors import CalibrationError, DatasetError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".pnm")
-_MAX_STAMP_NS = (1 << 63) - 1
 _TRIED_FOR_SIZE = 20
-_LIST_LINE = re.compile(r"([^\s,;]+)[\s,;]+(\S.*)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,11 +37,15 @@ class SourceOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ListedImage:
-    """An image file and its capture time.  depth: a depth map, or what one is made from."""
+    """An image file and its capture time.
+
+    depth: a depth map, or what one is made from.   fault: why it cannot be used; "" where it can.
+    """
 
     stamp_ns: int
     path: Path
     depth: Path | StereoPair | None = None
+    fault: str = ""
 
 
 class ImageFiles:
@@ -60,8 +60,11 @@ class ImageFiles:
         images: Sequence[ListedImage],
         calibration: Calibration,
         ground_truth_path: Path | None = None,
+        notes: Sequence[str] = (),
     ) -> None:
+        """notes: what a user should know of how it is read, in lines."""
         self.name = name
+        self.notes = list(notes)
         self.calibration = calibration
         self.ground_truth_path = ground_truth_path
         self._images = images
@@ -90,6 +93,9 @@ class ImageFiles:
 
 
 def _read(index: int, image: ListedImage) -> SourceFrame:
+    if image.fault:
+        frame = SourceFrame(index=index, stamp_ns=image.stamp_ns, encoding="unknown", data=b"")
+        return replace(frame.broken(image.fault), name=image.path.name)
     try:
         data = image.path.read_bytes()
     except OSError:
@@ -112,18 +118,24 @@ def _read(index: int, image: ListedImage) -> SourceFrame:
 
 
 def image_size(images: Sequence[ListedImage]) -> tuple[int, int]:
-    """(width, height) of the first image that decodes.
+    """(width, height) of most of the images, as some of them from all over the list tell.
 
-    Raises DatasetError where none of the first twenty does.
+    Raises DatasetError where none of the first twenty, nor of these, decodes.
     """
-    for index, image in enumerate(images[:_TRIED_FOR_SIZE]):
+    count = len(images)
+    spread = {round(i * (count - 1) / max(1, LOOKED_AT - 1)) for i in range(LOOKED_AT)}
+    sizes: list[tuple[int, int]] = []
+    for index in [*sorted(spread), *range(min(count, _TRIED_FOR_SIZE))]:
+        if len(sizes) >= len(spread) or (sizes and index not in spread):
+            break
         try:
-            height, width = decode(_read(index, image)).shape[:2]
+            sizes.append(size_of(_read(index, images[index])))
         except BrokenFrame:
             continue
-        return width, height
-    count = min(len(images), _TRIED_FOR_SIZE)
-    which = "the only image does not" if count == 1 else f"none of the first {count} images does"
+    if sizes:
+        return most_frequent(sizes)
+    tried = min(count, _TRIED_FOR_SIZE)
+    which = "the only image does not" if tried == 1 else f"none of the first {tried} images does"
     raise DatasetError(f"{images[0].path}: {which} decode; are these image files?")
 
 
@@ -154,95 +166,6 @@ def choose_calibration(
 def existing(*candidates: Path) -> Path | None:
     """The first of the files that exists."""
     return next((path for path in candidates if path.is_file()), None)
-
-
-def data_lines(file: Path) -> Iterator[tuple[int, str]]:
-    """(number from 1, text) of the lines of a list that are neither empty nor comments."""
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise DatasetError(f"{file}: missing; every image needs its time stamp there") from None
-    except UnicodeDecodeError:
-        raise DatasetError(f"{file}: is not a text file") from None
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read: {error.strerror}") from None
-    for number, line in enumerate(text.splitlines(), start=1):
-        line = line.strip()
-        if line and not line.startswith("#"):
-            yield number, line
-
-
-def read_list(file: Path, folder: Path, *, seconds: bool = True) -> list[ListedImage]:
-    """Read a list of "time file" or "time,file" lines; files are relative to ``folder``.
-
-    seconds: times are in seconds, else in whole nanoseconds.
-    Raises DatasetError, with the number of the line, for times that do not increase, files that
-    are not there or not in the folder, and lines that are something else.
-    """
-    images: list[ListedImage] = []
-    lines: list[int] = []
-    missing: list[tuple[int, str]] = []
-    for number, line in data_lines(file):
-        where = f"{file}: line {number}"
-        match = _LIST_LINE.fullmatch(line)
-        if match is None:
-            raise DatasetError(f'{where}: expected "time file", got {line[:60]!r}')
-        name = match.group(2).strip().strip('"')
-        path = inside(folder, name, where)
-        if not path.is_file():
-            missing.append((number, name))
-        images.append(
-            ListedImage(stamp_ns=parse_stamp(match.group(1), where, seconds=seconds), path=path)
-        )
-        lines.append(number)
-    if not images:
-        raise DatasetError(f"{file}: lists no images")
-    if missing:
-        number, name = missing[0]
-        raise DatasetError(
-            f"{file}: line {number}: no file {name} in {folder} ({len(missing)} of {len(images)} "
-            "listed images are missing); bring them back or remove their lines"
-        )
-    check_increasing([image.stamp_ns for image in images], lines, file)
-    return images
-
-
-def inside(folder: Path, name: str, where: str) -> Path:
-    """The path of a listed file.  Raises DatasetError where it would leave the folder."""
-    normal = os.path.normpath(name)
-    if "\0" in name or os.path.isabs(name) or normal.split(os.sep)[0] == "..":
-        raise DatasetError(f"{where}: {name!r} is outside of {folder}; list files inside it")
-    return folder / normal
-
-
-def parse_stamp(text: str, where: str, *, seconds: bool = True) -> int:
-    """Nanoseconds of a time in seconds (or nanoseconds), exact: a float would lose digits."""
-    try:
-        value = Decimal(text)
-    except InvalidOperation:
-        raise DatasetError(f"{where}: {text[:40]!r} is not a time") from None
-    if not value.is_finite() or value < 0:
-        raise DatasetError(f"{where}: the time {text[:40]} is not finite and positive")
-    if value > (Decimal(_MAX_STAMP_NS) / 10**9 if seconds else _MAX_STAMP_NS):
-        unit = "seconds, not nanoseconds" if seconds else "nanoseconds"
-        raise DatasetError(f"{where}: the time {text[:40]} is too large; it is given in {unit}")
-    return int((value * (10**9 if seconds else 1)).to_integral_value())
-
-
-def check_increasing(stamps_ns: Sequence[int], lines: Sequence[int], file: Path) -> None:
-    """Raise DatasetError at the first time that repeats or runs backwards."""
-    for i in range(1, len(stamps_ns)):
-        if stamps_ns[i] <= stamps_ns[i - 1]:
-            what = "repeats" if stamps_ns[i] == stamps_ns[i - 1] else "runs backwards from"
-            before, here = _seconds(stamps_ns[i - 1]), _seconds(stamps_ns[i])
-            raise DatasetError(
-                f"{file}: line {lines[i]}: the time {here} s {what} that of line {lines[i - 1]} "
-                f"({before} s); sort the list, remove doubles"
-            )
-
-
-def _seconds(stamp_ns: int) -> str:
-    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
 def image_files(folder: Path) -> list[Path]:

@@ -9,17 +9,15 @@ poses/00.txt                  true poses, of camera 0
 from pathlib import Path
 
 from pliant.datasets.base import Dataset
+from pliant.datasets.image_lists import data_lines, mended, stamps_of
 from pliant.datasets.images import (
     ImageFiles,
     ListedImage,
     SourceOptions,
-    check_increasing,
     choose_calibration,
-    data_lines,
     existing,
     image_files,
     image_size,
-    parse_stamp,
 )
 from pliant.errors import DatasetError
 
@@ -43,18 +41,19 @@ def open_kitti(source: str, options: SourceOptions) -> Dataset:
     file = folder / "times.txt"
     numbered = list(data_lines(file))
     lines = [number for number, _ in numbered]
-    stamps = [parse_stamp(text, f"{file}: line {number}") for number, text in numbered]
+    stamps, notes = stamps_of(numbered, file, "seconds")
     if len(stamps) != len(paths):
         raise DatasetError(
             f"{file}: {len(stamps)} times for {len(paths)} images in image_{camera}; every image "
             "needs one"
         )
-    check_increasing(stamps, lines, file)
-    images = [ListedImage(stamp_ns=t, path=path) for t, path in zip(stamps, paths, strict=True)]
+    listed = [ListedImage(stamp_ns=t, path=path) for t, path in zip(stamps, paths, strict=True)]
+    images, told = mended(listed, lines, file)
     resolved = folder.resolve()
     return ImageFiles(
         name=f"kitti_{resolved.name}" if resolved.name.isdigit() else resolved.name,
         images=images,
+        notes=[*notes, *told],
         calibration=choose_calibration(
             options,
             image_size(images),

@@ -28,6 +28,7 @@ from pliant.datasets.message_files import (
     MessageTopic,
     damaged,
     missing_library,
+    recorded_image,
 )
 from pliant.errors import DatasetError, PliantError
 
@@ -95,7 +96,7 @@ class _OpenMcap:
                 if decode is None:
                     decode = _decoder(self._path, schema, channel.message_encoding)
                     self._decoders[channel.id] = decode
-                yield RecordedImage(message.log_time, decode(message.data))
+                yield recorded_image(message.log_time, decode, message.data)
         except (PliantError, GeneratorExit):
             raise
         except Exception as error:  # of a foreign parser on a foreign file

@@ -1,6 +1,6 @@
 """What files of recorded messages have in common: the choice of a topic, its frames, its camera."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +9,13 @@ from typing import Any, Protocol
 from pliant.datasets import image_messages
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.calibration import Calibration
+from pliant.datasets.frame_times import in_order
 from pliant.datasets.image_messages import CALIBRATION_TYPES, IMAGE_TYPES, RecordedImage
+from pliant.datasets.image_sizes import LOOKED_AT, most_frequent
 from pliant.datasets.images import SourceOptions, choose_calibration
 from pliant.datasets.rectifier import decode
 from pliant.errors import CalibrationError, DatasetError
+from pliant.wording import shortened
 
 _TRIED_FOR_SIZE = 20
 
@@ -67,35 +70,46 @@ class MessageImages:
         self.frame_count = self._topic.count if self._topic.count >= 0 else None
 
     def __iter__(self) -> Iterator[SourceFrame]:
+        """Raises DatasetError where the file is damaged or has fewer messages than it announces."""
+        came = 0
         with self._file.open() as opened:
-            last_ns = -1
-            for frame in self._frames(opened):
-                if frame.stamp_ns <= last_ns:
-                    raise DatasetError(
-                        f"{self._where}: the time of image {frame.index} "
-                        f"({frame.stamp_ns / 1e9:.6f} s) does not come after that of the image "
-                        f"before ({last_ns / 1e9:.6f} s); is another recording mixed in?"
-                    )
-                last_ns = frame.stamp_ns
+            for frame in in_order(self._frames(opened), ahead=not self.is_live):
+                came = frame.index + 1
                 yield frame
+        if came < self._topic.count:
+            raise DatasetError(
+                f"{self._where}: holds {came} of the {self._topic.count} images of its index"
+            )
 
     def _frames(self, opened: OpenMessages) -> Iterator[SourceFrame]:
+        """One frame for each message, a broken one where it cannot be understood."""
         for index, image in enumerate(opened.messages(self._topic)):
-            yield image_messages.source_frame(self._topic.kind, image, index, self._where)
+            try:
+                yield image_messages.source_frame(self._topic.kind, image, index)
+            except BrokenFrame as error:
+                yield SourceFrame(
+                    index=index, stamp_ns=image.log_time_ns, encoding="unknown", data=b"",
+                    made_from=str(error),
+                )  # fmt: skip
 
     def _size(self, opened: OpenMessages) -> tuple[int, int]:
-        """(width, height) of the first image that decodes."""
-        tried = 0
-        for frame in self._frames(opened):
-            try:
-                height, width = decode(frame).shape[:2]
-            except BrokenFrame:
-                tried += 1
-                if tried == _TRIED_FOR_SIZE:
+        """(width, height) of most of the first images that decode."""
+        faults, sizes = list[str](), list[tuple[int, int]]()
+        try:
+            for frame in self._frames(opened):
+                try:
+                    height, width = decode(frame).shape[:2]
+                    sizes.append((width, height))
+                except BrokenFrame as error:
+                    faults.append(str(error).removeprefix(f"{frame.called}: "))
+                if len(sizes) == LOOKED_AT or len(faults) == _TRIED_FOR_SIZE:
                     break
-                continue
-            return width, height
-        what = "no messages" if not tried else f"none of the first {tried} images decodes"
+        except DatasetError:
+            if not sizes:  # else it is said where the file is read as a whole
+                raise
+        if sizes:
+            return most_frequent(sizes)
+        what = f"no image decodes ({faults[0]})" if faults else "no messages"
         raise DatasetError(f"{self._where}: {what}; choose another --topic")
 
 
@@ -138,7 +152,7 @@ def _calibration(opened: OpenMessages, images: MessageTopic, where: str) -> Cali
     others = sum(topic.kind in IMAGE_TYPES for topic in opened.topics) > 1
     if len(able) != 1 or (nearest == 0 and others and "/" in able[0].name.strip("/")):
         return None
-    message = next(opened.messages(able[0]), None)
+    message = next((each for each in opened.messages(able[0]) if not each.fault), None)
     if message is None:
         return None
     rectified = any("rect" in part for part in images.name.split("/"))
@@ -148,6 +162,15 @@ def _calibration(opened: OpenMessages, images: MessageTopic, where: str) -> Cali
         raise CalibrationError(
             f"{where}: the calibration in {able[0].name}: {error}; give --calibration FILE"
         ) from None
+
+
+def recorded_image(time_ns: int, decode: Callable[[bytes], Any], data: bytes) -> RecordedImage:
+    """A message as it is decoded; one that does not decode costs itself alone."""
+    try:
+        return RecordedImage(time_ns, decode(data))
+    except Exception as error:  # of a foreign parser on foreign bytes
+        said = shortened(" ".join(str(error).split())) or type(error).__name__
+        return RecordedImage(time_ns, None, fault=f"its message is damaged ({said})")
 
 
 def missing_library(path: Path, library: str) -> DatasetError:

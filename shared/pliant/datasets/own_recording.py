@@ -86,6 +86,7 @@ def recorded_frame(image: SourceImage, depth: bytes = b"") -> SourceFrame:
         width=image.width,
         height=image.height,
         depth=depth,
+        made_from="" if image.data else image.made_from,  # why there is none
         mask=image.mask,
         number=image.source_frame,
     )

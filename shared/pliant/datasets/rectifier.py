@@ -48,7 +48,8 @@ def decode(frame: SourceFrame) -> U8:
     if frame.encoding in RAW_BYTES:
         return _decode_raw(frame)
     if not frame.data:
-        raise BrokenFrame(f"{frame.called}: empty: its file is gone, or the video is damaged")
+        why = frame.made_from or "empty: its file is gone, or the video is damaged"
+        raise BrokenFrame(f"{frame.called}: {why}")
     if not _whole(frame):
         raise BrokenFrame(f"{frame.called}: the {frame.encoding} image is cut off")
     try:

@@ -7,6 +7,7 @@ import importlib
 import warnings
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from pliant.datasets.message_files import (
     MessageTopic,
     damaged,
     missing_library,
+    recorded_image,
 )
 from pliant.errors import PliantError
 
@@ -74,8 +76,12 @@ class _OpenBag:
         chosen = [c for c in self._reader.connections if c.topic == topic.name]
         try:
             for connection, time_ns, data in self._reader.messages(connections=chosen):
-                yield RecordedImage(time_ns, self._reader.deserialize(data, connection.msgtype))
+                decode = partial(self._decoded, connection.msgtype)
+                yield recorded_image(time_ns, decode, data)
         except (PliantError, GeneratorExit):
             raise
         except Exception as error:  # of a foreign parser on a foreign file
             raise damaged(self._path, error, _HINT) from None
+
+    def _decoded(self, kind: str, data: bytes) -> Any:
+        return self._reader.deserialize(data, kind)

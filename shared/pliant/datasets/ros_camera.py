@@ -8,16 +8,17 @@ import queue
 import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from pliant.bus.session import open_session
 from pliant.datasets.base import Dataset
 from pliant.datasets.image_messages import RecordedImage, capture_time, plain_type
 from pliant.datasets.images import SourceOptions
-from pliant.datasets.message_files import MessageImages, MessageTopic
+from pliant.datasets.message_files import MessageImages, MessageTopic, recorded_image
 from pliant.errors import BusError, DatasetError
 from pliant.ros.definitions import RosError, definitions
-from pliant.ros.graph import Node, RosTopic
+from pliant.ros.graph import Node
 
 _PREFIX = "ros:"
 _PORT = 7447
@@ -69,7 +70,7 @@ class _OpenGraph:
         ]
 
     def messages(self, topic: MessageTopic) -> Iterator[RecordedImage]:
-        """The messages of a topic as they come, each later than the one before."""
+        """The messages of a topic as they come."""
         ros = self._published[topic.name]
         waiting: queue.Queue[tuple[int, bytes]] = queue.Queue(_WAITING)
 
@@ -93,17 +94,13 @@ class _OpenGraph:
                     if ros.name not in {there.name for there in self._node.published()}:
                         return
                     continue
-                image = RecordedImage(arrived_ns, self._read(ros, data))
-                if capture_time(image) > last_ns:  # a driver may tell one twice
-                    last_ns = capture_time(image)
+                image = recorded_image(arrived_ns, partial(_decoded, ros.kind), data)
+                if image.fault or capture_time(image) != last_ns:  # a driver may tell one twice
+                    last_ns = last_ns if image.fault else capture_time(image)
                     yield image
         finally:
             subscriber.undeclare()
 
-    def _read(self, topic: RosTopic, data: bytes) -> object:
-        try:
-            return definitions().deserialize_cdr(data, topic.kind)
-        except Exception as error:  # of a foreign parser on foreign bytes
-            raise DatasetError(
-                f"{self._path}: {topic.name}: a message is no {topic.kind} ({type(error).__name__})"
-            ) from None
+
+def _decoded(kind: str, data: bytes) -> object:
+    return definitions().deserialize_cdr(data, kind)

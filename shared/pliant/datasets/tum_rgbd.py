@@ -17,13 +17,13 @@ from pliant.datasets.base import Dataset
 from pliant.datasets.calibration import Calibration, DepthImages
 from pliant.datasets.depth import with_depth
 from pliant.datasets.folder import CALIBRATION_NAME, GROUND_TRUTH_NAME, LIST_NAME
+from pliant.datasets.image_lists import read_list
 from pliant.datasets.images import (
     ImageFiles,
     SourceOptions,
     choose_calibration,
     existing,
     image_size,
-    read_list,
 )
 
 _WIDTH, _HEIGHT = 640, 480
@@ -53,16 +53,17 @@ def is_tum_rgbd(source: str) -> bool:
 def open_tum_rgbd(source: str, options: SourceOptions) -> Dataset:
     """A sequence of the benchmark.  Raises DatasetError and CalibrationError."""
     folder = Path(source)
-    images = read_list(folder / LIST_NAME, folder)
+    listed = read_list(folder / LIST_NAME, folder)
     calibration = choose_calibration(
         options,
-        image_size(images),
+        image_size(listed.images),
         found=tum_calibration(_camera_number(folder) or "1"),
         where=source,
     )
     return ImageFiles(
         name=folder.resolve().name,
-        images=with_depth(images, folder, calibration, options),
+        images=with_depth(listed, folder, calibration, options),
+        notes=listed.notes,
         calibration=calibration,
         ground_truth_path=existing(folder / GROUND_TRUTH_NAME),
     )

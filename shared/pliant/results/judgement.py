@@ -31,29 +31,39 @@ def doubtful_frames(history: MapHistory) -> list[int]:
 
 def judge(
     *, frames: int, in_segments: list[int], doubtful: int, unused: int = 0, broken: int = 0,
-    behind: int = 0, calibration: str = "",
+    absent: int = 0, behind: int = 0, calibration: str = "", failed: bool = False,
 ) -> tuple[str, str]:  # fmt: skip
     """Good, doubtful or bad, and why.
 
     frames: of the sequence that were used.   in_segments: poses in each segment of the map.
     doubtful: poses told as such.   unused: frames that were broken, dropped or passed over.
-    broken: those of them that no frame could be made of, as nobody wanted it.   behind: those that
-    there was no time for.   calibration: why it bends the map; "" where it does not.
+    broken: those of them that do not decode or have a wrong time.   absent: frames of the source
+    that never came.   behind: those that there was no time for.   calibration: why it bends the
+    map; "" where it does not.   failed: the source broke off.
+
+    Broken and absent frames are frames of the source: they count as frames without a pose.
     """
     longest, posed = max(in_segments, default=0), sum(in_segments)
     if not longest:
         return BAD, "there is no map"
-    share = longest / max(frames, 1)
-    which = "frames that were used" if unused else "frames"
+    of_source = max(frames + broken + absent, 1)
+    share = longest / of_source
+    used = "frames that were used" if unused else "frames"
+    which = "frames of the source" if broken or absent else used
     told = f"{share:.0%} of the {which} have a pose in the largest segment"
     if share < _LITTLE:
         return BAD, told
     if doubtful > DOUBTS * posed:
         return DOUBTFUL, f"{doubtful / posed:.0%} of the poses are doubtful: something large moves?"
-    if share < _WHOLE:
-        return DOUBTFUL, told
+    if absent > (1.0 - _WHOLE) * of_source:
+        came = 1.0 - absent / of_source
+        return DOUBTFUL, f"only {came:.0%} of the frames of the source came"
     if broken > (1.0 - _WHOLE) * (frames + broken):
         return DOUBTFUL, f"{broken / (frames + broken):.0%} of the images are broken"
+    if share < _WHOLE:
+        return DOUBTFUL, told
+    if failed:
+        return DOUBTFUL, "the source ended early"
     if behind > (1.0 - _LITTLE) * (frames + behind):
         return DOUBTFUL, (
             f"the computer kept up with {frames / (frames + behind):.0%} of the frames: take "
@@ -61,7 +71,7 @@ def judge(
         )
     if calibration:
         return DOUBTFUL, calibration
-    return GOOD, told if longest < frames else f"all {which} have a pose in one segment"
+    return GOOD, told if longest < frames + absent else f"all {used} have a pose in one segment"
 
 
 def slipping_frames(tracked: Sequence[int], in_view: Sequence[int]) -> list[int]:
@@ -72,7 +82,8 @@ def slipping_frames(tracked: Sequence[int], in_view: Sequence[int]) -> list[int]
 
 def judge_surfels(
     *, frames: int, in_segments: list[int], slipping: int, depth_from: str, unusable: int,
-    together: int = 0, unused: int = 0, broken: int = 0, behind: int = 0,
+    together: int = 0, unused: int = 0, broken: int = 0, absent: int = 0, behind: int = 0,
+    failed: bool = False,
 ) -> tuple[str, str]:  # fmt: skip
     """As ``judge``, of a surface that deforms.
 
@@ -82,7 +93,7 @@ def judge_surfels(
     """
     word, why = judge(
         frames=frames, in_segments=in_segments, doubtful=0, unused=unused, broken=broken,
-        behind=behind,
+        absent=absent, behind=behind, failed=failed,
     )  # fmt: skip
     posed = sum(in_segments)
     if not posed:

@@ -41,6 +41,8 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         frames=frames - unused,
         unused=unused,
         broken=len(broken_images(run.missing)),
+        absent=absent_frames(run, frames),
+        failed=source_failed(run),
         behind=[*run.missing.values()].count(DROPPED) + len(run.passed_over),
         in_segments=[len(members) for members in by_segment.values()],
         doubtful=len(doubtful),
@@ -55,6 +57,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "complete": run.complete,
         "ended_early": ended_early(run, frames),
         "frames": frames,
+        "frames_that_never_came": absent_frames(run, frames),
         "frames_with_pose": len(final),
         "frames_per_second": round(run.frames_per_second, 2),
         "success_rate": len(final) / frames if frames else 0.0,
@@ -108,16 +111,29 @@ def process_figures(run: Run, frames: int) -> dict[str, Any]:
     }
 
 
-def ended_early(run: Run, came: int) -> str:
-    """Why less frames came than the source had said; "" if they did not."""
-    if run.source_failure or run.stream is None:
-        return run.source_failure
-    announced = run.stream.frames
+def absent_frames(run: Run, came: int) -> int:
+    """Frames that the source announced and that never came."""
+    announced = -1 if run.stream is None else run.stream.frames
     # Containers of videos count their frames roughly.
-    if announced - came <= max(2, _ROUGHLY * announced):
+    roughly = 0 if run.source_failure else max(2, _ROUGHLY * announced)
+    return announced - came if announced - came > roughly else 0
+
+
+def source_failed(run: Run) -> bool:
+    """Whether the source broke off.  A live one has no end of its own."""
+    return bool(run.source_failure) and run.stream is not None and run.stream.mode != "live"
+
+
+def ended_early(run: Run, came: int) -> str:
+    """Why fewer frames came than the source had announced; "" if they did not."""
+    absent = absent_frames(run, came)
+    counted = f"{came} of {came + absent} frames came: " if absent else ""
+    if run.source_failure:
+        return counted + run.source_failure
+    if not absent:
         return ""
     why = "the file is cut off or damaged" if run.complete else "the run was stopped or cut off"
-    return f"{came} of {announced} frames came: {why}"
+    return counted + why
 
 
 def _well_observed(run: Run, final: dict[int, Any]) -> int:

@@ -28,7 +28,13 @@ from pliant.results.judgement import judge_surfels, slipping_frames
 from pliant.results.moving_together import MovingTogether
 from pliant.results.page.moved_surface import Surface
 from pliant.results.page.surfel_page import write_surfel_page
-from pliant.results.report import broken_images, ended_early, process_figures
+from pliant.results.report import (
+    absent_frames,
+    broken_images,
+    ended_early,
+    process_figures,
+    source_failed,
+)
 from pliant.results.run import Run, read_run
 from pliant.trajectory import Trajectory
 from pliant.wording import counted
@@ -231,6 +237,8 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         together=len(counts.together.frames) if _stands_still(run.recorded.metadata) else 0,
         unused=len(without_pixels),
         broken=len(broken_images(without_pixels)),
+        absent=absent_frames(run, frames),
+        failed=source_failed(run),
         behind=reasons.count(DROPPED),
     )
     return {
@@ -243,6 +251,7 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
         "complete": run.complete,
         "ended_early": ended_early(run, frames),
         "frames": frames,
+        "frames_that_never_came": absent_frames(run, frames),
         "frames_with_pose": followed,
         "frames_per_second": round((frames - 1) * 1e9 / spent_ns, 2) if spent_ns > 0 else 0.0,
         "success_rate": followed / frames if frames else 0.0,

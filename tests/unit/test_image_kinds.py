@@ -1,0 +1,109 @@
+"""Folders as people have them: depth beside colour, several cameras, odd sizes, foreign files."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pliant.datasets import notes_on, open_source
+from pliant.datasets.base import BrokenFrame
+from pliant.datasets.rectifier import Rectifier
+
+COUNT = 5
+COLOUR = np.full((24, 32, 3), 90, np.uint8)
+GREY = np.full((24, 32), 90, np.uint8)
+DEPTH = np.full((24, 32), 1200, np.uint16)
+
+
+def write(folder: Path, pattern: str, pixels: np.ndarray, count: int = COUNT) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for row in range(count):
+        assert cv2.imwrite(str(folder / pattern.format(row)), pixels)
+
+
+def names(folder: Path) -> tuple[list[str], list[str]]:
+    source = open_source(str(folder), fov_deg=60.0)
+    said = [note for note in notes_on(source) if not note.startswith("times: ")]
+    return [frame.name for frame in source], said
+
+
+@pytest.mark.parametrize(
+    ("used", "other", "pixels"),
+    [
+        ("frame-{:06d}.color.png", "frame-{:06d}.depth.png", DEPTH),
+        ("rgb_{}.png", "depth_{}.png", DEPTH),
+        ("{}.jpg", "{}.png", DEPTH),
+        ("z{}.png", "a{}.png", DEPTH),
+        ("{}.png", "{}_mask.png", GREY),
+        ("left_{}.png", "right_{}.png", COLOUR),
+        ("cam0_{}.png", "cam1_{}.png", COLOUR),
+        ("a_{}.png", "b_{}.png", COLOUR),
+        ("photo{}.jpg", "photo{}.png", COLOUR[::2, ::2]),  # previews
+    ],
+)
+def test_one_kind_is_used_and_a_line_says_which(
+    used: str, other: str, pixels: np.ndarray, tmp_path: Path
+) -> None:
+    write(tmp_path, used, COLOUR)
+    write(tmp_path, other, pixels)
+    found, said = names(tmp_path)
+    assert found == [used.format(row) for row in range(COUNT)]
+    assert len(said) == 1
+    assert "are used; passed over: 5 " in said[0]
+
+
+def test_kinds_of_other_frames_stay_together(tmp_path: Path) -> None:
+    write(tmp_path, "a_{}.png", COLOUR)
+    for row in range(COUNT):
+        cv2.imwrite(str(tmp_path / f"b_{row + COUNT}.png"), COLOUR)
+    found, said = names(tmp_path)
+    assert (len(found), said) == (2 * COUNT, [])
+
+
+def test_a_thumbnail_first_costs_itself(tmp_path: Path) -> None:
+    write(tmp_path, "{}.png", COLOUR)
+    cv2.imwrite(str(tmp_path / "0.png"), COLOUR[::2, ::2])
+    source = open_source(str(tmp_path), fov_deg=60.0)
+    assert (source.calibration.width, source.calibration.height) == (32, 24)
+    rectifier, broken = Rectifier(source.calibration), list[int]()
+    for frame in source:
+        try:
+            rectifier.rectify(frame)
+        except BrokenFrame:
+            broken.append(frame.index)
+    assert broken == [0]
+
+
+def test_images_that_are_turned_by_what_they_say_of_themselves(tmp_path: Path) -> None:
+    write(tmp_path, "{}.jpg", COLOUR)
+    for path in tmp_path.iterdir():  # an EXIF header: orientation 6
+        data = path.read_bytes()
+        exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+        path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2) + exif + data[2:])
+    calibration = open_source(str(tmp_path), fov_deg=60.0).calibration
+    assert (calibration.width, calibration.height) == (24, 32)
+
+
+@pytest.mark.parametrize("inner", ["rgb", "color", "images", "frames", "cam0"])
+def test_images_in_a_usual_folder(inner: str, tmp_path: Path) -> None:
+    write(tmp_path / inner, "{}.png", COLOUR)
+    write(tmp_path / "depth", "{}.png", DEPTH)
+    (tmp_path / "__MACOSX" / inner).mkdir(parents=True)
+    (tmp_path / "__MACOSX" / inner / "._0.png").write_bytes(b"what macOS leaves")
+    (tmp_path / ".DS_Store").write_bytes(b"\0")
+    found, said = names(tmp_path)
+    assert found == [f"{row}.png" for row in range(COUNT)]
+    assert said == [f"the images are those in {inner}/"]
+
+
+def test_files_of_other_formats_are_named(tmp_path: Path) -> None:
+    write(tmp_path, "{}.jpg", COLOUR)
+    for name in ("a.HEIC", "b.heic", "c.DNG", "notes.txt", "._d.heic"):
+        (tmp_path / name).write_bytes(b"x")
+    found, said = names(tmp_path)
+    assert len(found) == COUNT
+    assert said == [
+        f"{tmp_path.name}: 3 files (.dng, .heic) passed over: not a format that is read; convert "
+        "them to JPEG or PNG"
+    ]
