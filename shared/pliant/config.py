@@ -18,6 +18,8 @@ from pliant.algorithms.parameters import Parameters
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.errors import ConfigError, RecordingError
+from pliant.wording import shortened, shown
+from pliant.yaml_text import YamlError, load_yaml
 
 
 class IngestParameters(Parameters):
@@ -197,11 +199,11 @@ def describe(group: BaseModel | None = None, prefix: str = "") -> list[tuple[str
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        content: Any = yaml.safe_load(file.read_text(encoding="utf-8"))
+        content: Any = load_yaml(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{file}: cannot read the configuration: {error.strerror}") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{file}: not YAML: {' '.join(str(error).split())}") from None
+    except ValueError as error:  # no YAML, or no UTF-8
+        raise ConfigError(f"{file}: not YAML: {shortened(str(error), 200)}") from None
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -212,17 +214,18 @@ def _read(file: Path) -> dict[str, Any]:
 def _apply(content: dict[str, Any], override: str) -> None:
     key, separator, text = override.partition("=")
     if not separator or not key:
-        raise ConfigError(f"--set {override}: expected KEY=VALUE, e.g. bus.window=8")
+        raise ConfigError(f"--set {shortened(override)}: expected KEY=VALUE, e.g. bus.window=8")
     try:
-        value: Any = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError):
-        raise ConfigError(f"--set {override}: {text!r} is not a value") from None
+        value: Any = load_yaml(text)
+    except YamlError:
+        raise ConfigError(f"--set {shortened(override)}: {shown(text)} is not a value") from None
     *parents, last = key.split(".")
     level = content
     for parent in parents:
         level = level.setdefault(parent, {})
         if not isinstance(level, dict):
-            raise ConfigError(f"--set {override}: {parent} is a value, not a group of keys")
+            where = f"--set {shortened(override)}: {shortened(parent)}"
+            raise ConfigError(f"{where} is a value, not a group of keys")
     level[last] = value
 
 
@@ -238,10 +241,10 @@ def _over(defaults: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
 
 def _explain(error: ValidationError, file: Path | None) -> str:
     first = error.errors(include_url=False)[0]
-    key = ".".join(str(part) for part in first["loc"])
+    key = shortened(".".join(str(part) for part in first["loc"]), 120)
     where = f"{file}: " if file is not None else ""
     if first["type"] != "extra_forbidden":
-        return f"{where}{key}: {first['msg']} (got {first['input']!r})"
+        return f"{where}{key}: {first['msg']} (got {shown(first['input'])})"
     known = [name for name, _, _ in describe()]
     known += sorted({name.rpartition(".")[0] for name in known} - {""})
     near = difflib.get_close_matches(key, known, n=3)
@@ -256,8 +259,8 @@ def recorded_config(metadata: Mapping[str, Mapping[str, str]], overrides: Sequen
     """
     text = metadata.get("config", {}).get("yaml", "")
     try:
-        content = yaml.safe_load(text) or {}
-    except yaml.YAMLError:
+        content = load_yaml(text) or {}
+    except YamlError:
         raise RecordingError("the configuration in the recording is damaged") from None
     if not isinstance(content, dict):
         raise RecordingError("the configuration in the recording is damaged")

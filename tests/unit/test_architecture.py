@@ -26,6 +26,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "exit_codes": set(),
     "version": set(),
     "wording": set(),
+    "yaml_text": set(),
     "trajectory": {"algorithms"},
     "formats": {"formats", "algorithms", "errors", "trajectory"},
     "pictures": {"pictures", "formats", "algorithms", "errors"},
@@ -49,7 +50,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "offline": {"datasets", "messages", "algorithms", "config", "map_history"},
     "fusion": {"fusion", "algorithms", "errors", "map_history"},
 }
-ANYWHERE = {"exit_codes", "version", "wording"}  # they import nothing; ``pliant`` is of the top
+# They import nothing of ours; ``pliant`` is of the top.
+ANYWHERE = {"exit_codes", "version", "wording", "yaml_text"}
 PURE_FORBIDS = {"time", "datetime", "socket", "logging", "os", "pathlib", "random", "threading"}
 
 

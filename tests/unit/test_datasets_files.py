@@ -254,8 +254,8 @@ def test_nothing_there(tmp_path: Path) -> None:
     for source, says in ((tmp_path / "none", "no such file"), (tmp_path, "is an empty folder")):
         line = refused(source)
         assert says in line
-        for kind in FORMATS.values():
-            assert kind.layout in line
+        assert line.endswith("`pliant run --help` and docs/sources.md say what is read")
+        assert len(line) < len(str(source)) + 100
     (tmp_path / "readme.md").write_text("")
     assert "holds none of the sources" in refused(tmp_path)
     assert "is empty" in refused("")

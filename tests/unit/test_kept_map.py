@@ -282,13 +282,18 @@ def test_a_map_that_cannot_be_is_refused_in_one_line(
     [
         ("T_world_camera", 2.0 * np.eye(4)),
         ("given", np.zeros(6)),
+        ("given", np.array([1e9, 480.0, 500.0, 500.0, 320.0, 240.0])),
+        ("id", 1 << 62),
+        ("segment", 1 << 62),
+        ("session", -1),
+        ("source_frame", 1 << 62),
         ("point_ids", None),
         ("points_world", None),
         ("point_patches", None),
     ],
 )
 def test_values_that_cannot_be_are_refused(
-    kept: list[MapKeyframe], field: str, value: np.ndarray | None
+    kept: list[MapKeyframe], field: str, value: np.ndarray | int | None
 ) -> None:
     good: KeptKeyframe = kept[0]
     assert len(good.point_ids) > 2

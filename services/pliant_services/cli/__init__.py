@@ -13,6 +13,7 @@ import typer
 from pliant import __version__
 from pliant.errors import PliantError, SourceLostError
 from pliant.exit_codes import FAILED, INCOMPLETE, INTERRUPTED, USAGE
+from pliant.wording import shortened
 from pliant_services.cli.groups import GroupedCommands
 from pliant_services.runtime.interruptions import deliver_swallowed_interruptions
 
@@ -122,7 +123,11 @@ def _take_no_more() -> None:
         signal.signal(kind, signal.SIG_IGN)
 
 
+_LONGEST_LINE = 2000
+"""Whatever an error quotes."""
+
+
 def _say(line: str, code: int = FAILED) -> int:
     with suppress(OSError):
-        print(f"pliant: {line}", file=sys.stderr)
+        print(f"pliant: {shortened(line, _LONGEST_LINE)}", file=sys.stderr)
     return code

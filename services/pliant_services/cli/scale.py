@@ -5,12 +5,14 @@ from typing import Annotated
 
 import typer
 
+from pliant.wording import shown
+
 
 def _point(text: str) -> tuple[float, ...]:
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is no point: expected X,Y,Z") from None
+        raise typer.BadParameter(f"{shown(text)} is no point: expected X,Y,Z") from None
     return x, y, z
 
 

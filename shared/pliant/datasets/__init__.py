@@ -33,6 +33,7 @@ from pliant.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from pliant.datasets.video import VideoFile
 from pliant.datasets.working_size import SmallerImages, at_working_size
 from pliant.errors import DatasetError
+from pliant.wording import shown
 
 __all__ = [
     "FORMATS",
@@ -61,12 +62,11 @@ __all__ = [
 class SourceFormat:
     """One kind of source.
 
-    layout: what it looks like, for people.     recognises: whether a source is of this kind.
+    recognises: whether a source is of this kind.
     open: opens it; raises DatasetError and CalibrationError.
     sized: its images have their working size already.
     """
 
-    layout: str
     recognises: Callable[[str], bool]
     open: Callable[[str, SourceOptions], Dataset]
     has_topics: bool = False
@@ -106,32 +106,18 @@ def _open_video(source: str, options: SourceOptions) -> Dataset:
 
 
 FORMATS: dict[str, SourceFormat] = {
-    "built-in": SourceFormat(
-        "built-in:NAME",
-        is_builtin,
-        _open_builtin,
-        has_depth=True,
-    ),
-    "camera": SourceFormat("camera:0", _is_camera, _open_camera),
-    "ros": SourceFormat("ros:HOST (ROS 2 over rmw_zenoh)", _is_ros, _open_ros, has_topics=True),
-    "recording": SourceFormat(
-        "a recording of Pliant's", is_own_recording, open_own_recording, has_depth=True, sized=True
-    ),
-    "mcap": SourceFormat("an MCAP file", is_mcap, open_mcap, has_topics=True),
-    "ros-bag": SourceFormat(
-        "a ROS 1 bag or the folder of a ROS 2 bag", is_ros_bag, open_ros_bag, has_topics=True
-    ),
-    "video": SourceFormat("a video file", lambda source: Path(source).is_file(), _open_video),
-    "euroc": SourceFormat("EuRoC (mav0/cam0/data.csv)", is_euroc, open_euroc),
-    "kitti": SourceFormat("KITTI odometry (image_0/, times.txt, calib.txt)", is_kitti, open_kitti),
-    "tum-rgbd": SourceFormat("TUM RGB-D (rgb.txt)", is_tum_rgbd, open_tum_rgbd, has_depth=True),
-    "folder": SourceFormat(
-        "a folder with rgb.txt and calib.yaml",
-        is_listed_folder,
-        open_listed_folder,
-        has_depth=True,
-    ),
-    "images": SourceFormat("a folder of images", is_bare_folder, open_bare_folder),
+    "built-in": SourceFormat(is_builtin, _open_builtin, has_depth=True),
+    "camera": SourceFormat(_is_camera, _open_camera),
+    "ros": SourceFormat(_is_ros, _open_ros, has_topics=True),
+    "recording": SourceFormat(is_own_recording, open_own_recording, has_depth=True, sized=True),
+    "mcap": SourceFormat(is_mcap, open_mcap, has_topics=True),
+    "ros-bag": SourceFormat(is_ros_bag, open_ros_bag, has_topics=True),
+    "video": SourceFormat(lambda source: Path(source).is_file(), _open_video),
+    "euroc": SourceFormat(is_euroc, open_euroc),
+    "kitti": SourceFormat(is_kitti, open_kitti),
+    "tum-rgbd": SourceFormat(is_tum_rgbd, open_tum_rgbd, has_depth=True),
+    "folder": SourceFormat(is_listed_folder, open_listed_folder, has_depth=True),
+    "images": SourceFormat(is_bare_folder, open_bare_folder),
 }
 """Every kind of source; the first that recognises a source opens it."""
 
@@ -163,7 +149,7 @@ def open_source(
     Raises DatasetError or CalibrationError: one line with what is wrong, where, and what to do.
     """
     if not source or "\0" in source:
-        raise DatasetError(f"source {source!r}: is empty; understood are {understood()}")
+        raise DatasetError(f"source {shown(source)}: is empty; {HELP}")
     first_depth = depth == "first"
     depth = "all" if first_depth and not is_all(part) else depth  # that of its first is elsewhere
     options = SourceOptions(calibration=calibration, fov_deg=fov_deg, topic=topic, depth=depth)
@@ -187,18 +173,18 @@ def open_source(
                     return opened
                 return at_working_size(opened, longest_side_px)
         if not path.exists():
-            raise DatasetError(f"{source}: no such file or folder; understood are {understood()}")
+            raise DatasetError(f"{source}: no such file or folder; {HELP}")
     except OSError as error:  # a name too long, a folder that may not be entered, a broken disk
         raise DatasetError(f"{source}: cannot be read: {error.strerror or error}") from None
     if not path.is_dir():
-        raise DatasetError(f"{source}: neither a file nor a folder; understood are {understood()}")
+        raise DatasetError(f"{source}: neither a file nor a folder; {HELP}")
     if any(_is_clip(each) for each in path.iterdir()):
         raise DatasetError(
             f"{source}: is no source, but holds some: name one of them, or all by "
             f"`pliant batch {source}`"
         )
     what = "holds none of the sources" if any(path.iterdir()) else "is an empty folder"
-    raise DatasetError(f"{source}: {what}; understood are {understood()}")
+    raise DatasetError(f"{source}: {what}; {HELP}")
 
 
 def notes_on(dataset: Dataset) -> list[str]:
@@ -218,6 +204,9 @@ def check_start(dataset: Dataset) -> None:
     if isinstance(whole, Excerpt) and not whole.is_live:
         whole.check_start()
 
+
+HELP = "`pliant run --help` and docs/sources.md say what is read"
+"""Where the sources are listed that are understood."""
 
 _VIDEOS = (
     *(".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts"),
@@ -240,15 +229,10 @@ def sources_in(folder: Path, *, but: Path) -> list[Path]:
     results = (but.resolve(), *but.resolve().parents)
     found = [path for path in paths if path.resolve() not in results and _is_clip(path)]
     if not found:
-        raise DatasetError(f"{folder}: holds none of the sources; understood are {understood()}")
+        raise DatasetError(f"{folder}: holds none of the sources; {HELP}")
     return found
 
 
 def _is_clip(path: Path) -> bool:
     names = [name for name, kind in FORMATS.items() if kind.recognises(str(path))]
     return bool(names) and (names[0] != "video" or path.suffix.lower() in _VIDEOS)
-
-
-def understood() -> str:
-    """The sources that are understood, in one line."""
-    return ", ".join(kind.layout for kind in FORMATS.values())

@@ -38,6 +38,7 @@ from pliant.datasets.sequence_files import Progress
 from pliant.errors import DatasetError
 from pliant.rendering.deforming_scenes import DEFORMING, DeformingOptions
 from pliant.rendering.scenes import SCENES
+from pliant.wording import shown
 
 __all__ = [
     "SequenceOptions",
@@ -80,9 +81,9 @@ def parse_builtin(source: str) -> tuple[str, Options]:
         key, equals, value = item.partition("=")
         if key not in kind.model_fields:
             valid = ", ".join(kind.model_fields)
-            raise DatasetError(f"{source}: unknown option {key!r}; valid options: {valid}")
+            raise DatasetError(f"{source}: unknown option {shown(key)}; valid options: {valid}")
         if not equals:
-            raise DatasetError(f"{source}: option {key!r} has no value; write {key}=VALUE")
+            raise DatasetError(f"{source}: option {shown(key)} has no value; write {key}=VALUE")
         given[key] = tuple(value.split(",")) if key == "distortion" else value
     try:
         options = kind.model_validate(given)

@@ -31,6 +31,8 @@ import yaml
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.rectification import Lens, LensModel, rectified_camera
 from pliant.errors import CalibrationError
+from pliant.wording import shown
+from pliant.yaml_text import YamlError, load_yaml
 
 COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
     "pinhole": (),
@@ -173,9 +175,9 @@ def calibration_from_yaml(text: str) -> Calibration:
     Raises CalibrationError.
     """
     try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise CalibrationError(f"not YAML: {' '.join(str(error).split())}") from None
+        content = load_yaml(text)
+    except YamlError as error:
+        raise CalibrationError(f"not YAML: {error}") from None
     if not isinstance(content, dict):
         raise CalibrationError("expected keys and values: width, height, fx, fy, cx, cy, ...")
     return calibration_from_keys(cast(dict[str, Any], content))
@@ -220,9 +222,9 @@ def number(content: dict[str, Any], key: str) -> float:
     try:
         result = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
-        raise CalibrationError(f"{key} is {value!r}: expected a number") from None
+        raise CalibrationError(f"{key} is {shown(value)}: expected a number") from None
     if not math.isfinite(result):
-        raise CalibrationError(f"{key} is {value}: expected a finite number")
+        raise CalibrationError(f"{key} is {shown(value)}: expected a finite number")
     return result
 
 
@@ -251,7 +253,7 @@ def _model(content: dict[str, Any]) -> LensModel:
             return "pinhole-rational"
         return "pinhole-radtan" if distorted else "pinhole"
     if given not in _MODELS:
-        raise CalibrationError(f"model {given!r} is not understood: use {', '.join(_MODELS)}")
+        raise CalibrationError(f"model {shown(given)} is not understood: use {', '.join(_MODELS)}")
     model = cast(LensModel, given)
     unused = [k for k in distorted if k not in COEFFICIENTS[model]]
     if unused:
@@ -283,7 +285,7 @@ def _depth(
     invalid = content.get("depth_invalid", [0])
     values = invalid if isinstance(invalid, list) else [invalid]
     if not all(isinstance(value, int) for value in values):
-        raise CalibrationError(f"depth_invalid is {invalid!r}: expected whole numbers")
+        raise CalibrationError(f"depth_invalid is {shown(invalid)}: expected whole numbers")
     camera = PinholeCamera(width=width, height=height, **own)
     return DepthImages(
         scale_m=scale,

@@ -13,11 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
-import yaml
-
 from pliant.algorithms.rectification import LensModel
 from pliant.datasets.calibration import COEFFICIENTS, number
 from pliant.errors import CalibrationError
+from pliant.wording import shown
+from pliant.yaml_text import YamlError, load_yaml
 
 Keys: TypeAlias = dict[str, Any]
 """What a file says, by key."""
@@ -72,11 +72,9 @@ def _keys(text: str) -> Keys:
     text = re.sub(r"^%YAML:[\d.]+\s*\n(---\s*\n)?", "", text, count=1, flags=re.MULTILINE)
     text = text.replace("!!opencv-matrix", "")
     try:
-        content = _json(text) or yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise CalibrationError(
-            f"not YAML ({' '.join(str(error).split())}); understood are {UNDERSTOOD}"
-        ) from None
+        content = _json(text) or load_yaml(text)
+    except YamlError as error:
+        raise CalibrationError(f"not YAML ({error}); understood are {UNDERSTOOD}") from None
     if not isinstance(content, dict):
         raise CalibrationError(f"no keys and values; understood are {UNDERSTOOD}")
     return {str(key): value for key, value in cast(Keys, content).items()}
@@ -88,7 +86,7 @@ def _json(text: str) -> Any:
         return None
     try:
         return json.loads(text)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         return None
 
 
@@ -120,7 +118,7 @@ def _own(content: Keys, wanted: Wanted) -> Keys:
 
 def _kalibr(content: Keys, wanted: Wanted) -> Keys:
     if not isinstance(content["cam0"], dict):
-        raise CalibrationError(f"cam0 is {content['cam0']!r}: expected the keys of a camera")
+        raise CalibrationError(f"cam0 is {shown(content['cam0'])}: expected the keys of a camera")
     return flat_from_keys(cast(Keys, content["cam0"]), wanted)
 
 
@@ -128,7 +126,7 @@ def _euroc(content: Keys, wanted: Wanted) -> Keys:
     camera = str(content.get("camera_model", "pinhole")).lower()
     if camera not in ("pinhole", "pinhole-radtan", "fisheye"):
         raise CalibrationError(
-            f"camera_model {camera!r} is not understood: calibrate again with pinhole "
+            f"camera_model {shown(camera)} is not understood: calibrate again with pinhole "
             "(a wide lens: with pinhole-equi)"
         )
     size = _numbers(content, "resolution", 2) if "resolution" in content else None
@@ -163,7 +161,7 @@ def _lens(content: Keys, intrinsics: list[Any], size: list[Any] | None, said: st
     model, coefficients = _DISTORTION.get(said), _numbers(content, key, None)
     if model is None:
         raise CalibrationError(
-            f"distortion_model {said!r} is not understood: calibrate again with radtan or "
+            f"distortion_model {shown(said)} is not understood: calibrate again with radtan or "
             "equidistant"
         )
     names = COEFFICIENTS[model]
@@ -202,7 +200,7 @@ def _numbers(content: Keys, key: str, count: int | None) -> list[Any]:
         value = [number for row in cast(list[list[Any]], rows) for number in row]
     if not isinstance(value, list) or (count is not None and len(cast(list[Any], value)) != count):
         expected = "a list of numbers" if count is None else f"{count} numbers"
-        raise CalibrationError(f"{key} is {content[key]!r}: expected {expected}")
+        raise CalibrationError(f"{key} is {shown(content[key])}: expected {expected}")
     return cast(list[Any], value)
 
 
@@ -226,7 +224,7 @@ def _orb_slam(content: Keys, wanted: Wanted) -> Keys:
     model = _ORB_SLAM.get(said.lower())
     if model is None:
         raise CalibrationError(
-            f"Camera.type {said!r} is not understood: calibrate again with PinHole or "
+            f"Camera.type {shown(said)} is not understood: calibrate again with PinHole or "
             "KannalaBrandt8"
         )
     camera = "Camera1" if "Camera1.fx" in content else "Camera"

@@ -19,6 +19,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I64
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.image.decoding import decoded
 from pliant.algorithms.rectification import rectified_camera
 from pliant.datasets import stereo
 from pliant.datasets.base import BrokenFrame
@@ -120,10 +121,7 @@ class DepthRectifier:
         if self._depth is None:
             raise BrokenFrame(f"frame {frame}: a depth map without depth_scale in the calibration")
         camera = self._depth.camera
-        try:
-            units: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            units = None
+        units: Any = decoded(data, cv2.IMREAD_UNCHANGED)
         if units is None or units.dtype != np.uint16 or units.ndim != 2:
             raise BrokenFrame(f"frame {frame}: its depth map is no 16-bit image of one channel")
         if units.shape != (camera.height, camera.width):

@@ -4,8 +4,8 @@ from collections import Counter
 from collections.abc import Sequence
 
 import cv2
-import numpy as np
 
+from pliant.algorithms.image.decoding import decoded
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.jpeg import jpeg_size
 from pliant.datasets.rectifier import decode
@@ -32,8 +32,5 @@ def size_of(frame: SourceFrame) -> tuple[int, int]:
 
 def _small_shape(data: bytes) -> tuple[int, ...] | None:
     """(height, width) of an eighth of a JPEG, which is quick to decode."""
-    try:
-        small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8)
-    except cv2.error:
-        return None
+    small = decoded(data, cv2.IMREAD_REDUCED_GRAYSCALE_8)
     return None if small is None else small.shape

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import BoolArray
+from pliant.algorithms.image.decoding import decoded
 from pliant.algorithms.image.masks import packed, scaled
 from pliant.datasets.base import Dataset, SourceFrame, encoding_of
 from pliant.datasets.images import ImageFiles, image_files
@@ -118,9 +119,12 @@ def _read(path: Path) -> BoolArray:
     except OSError as error:
         raise DatasetError(f"--mask {path}: cannot be read: {error.strerror}") from None
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    pixels = decoded(data, flags)
     if pixels is None:
-        raise DatasetError(f"--mask {path}: is no image that OpenCV can read: give a PNG")
+        raise DatasetError(
+            f"--mask {path}: is no image that OpenCV can read, or one of more than a gigapixel: "
+            "give a PNG of the images' size"
+        )
     # What is compressed with losses has no exact black.
     least = 128 if encoding_of(data) in _LOSSY else 1
     return np.asarray(pixels) >= least

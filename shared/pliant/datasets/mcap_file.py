@@ -31,6 +31,7 @@ from pliant.datasets.message_files import (
     recorded_image,
 )
 from pliant.errors import DatasetError, PliantError
+from pliant.wording import shortened, shown
 
 MAGIC = b"\x89MCAP0\r\n"
 _HINT = "`mcap recover`"
@@ -113,8 +114,8 @@ def _decoder(path: Path, schema: Schema | None, encoding: str) -> _Decoder:
     if encoding == "json":
         return _from_json
     raise DatasetError(
-        f"{path}: {schema.name} encoded as {encoding!r} is not understood: only cdr, ros1, "
-        "protobuf and json are"
+        f"{path}: {shortened(schema.name)} encoded as {shown(encoding)} is not understood: "
+        "only cdr, ros1, protobuf and json are"
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.image.decoding import decoded
 from pliant.algorithms.image.masks import packed, scaled, unpacked
 from pliant.algorithms.rectification import rectification_maps, rectified_camera, resample
 from pliant.datasets.base import BrokenFrame, SourceFrame
@@ -52,15 +53,11 @@ def decode(frame: SourceFrame) -> U8:
         raise BrokenFrame(f"{frame.called}: {why}")
     if not _whole(frame):
         raise BrokenFrame(f"{frame.called}: the {frame.encoding} image is cut off")
-    try:
-        pixels = cv2.imdecode(np.frombuffer(frame.data, np.uint8), cv2.IMREAD_ANYCOLOR)
-    except cv2.error:
-        pixels = None
+    pixels = decoded(frame.data, cv2.IMREAD_ANYCOLOR)
     if pixels is None:
         kind = "image" if frame.encoding == "unknown" else f"{frame.encoding} image"
         raise BrokenFrame(f"{frame.called}: the {kind} does not decode")
-    decoded = cast(U8, pixels)
-    return _rgb(decoded) if decoded.ndim == 3 else decoded
+    return _rgb(pixels) if pixels.ndim == 3 else pixels
 
 
 class Rectifier:

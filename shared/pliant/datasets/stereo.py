@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, U8
+from pliant.algorithms.image.decoding import decoded
 
 LIST_NAME = "right.txt"
 _BLOCK_PX = 7
@@ -89,5 +90,4 @@ def _match(left: U8, right: U8, search: int) -> F32:
 
 
 def _grey(data: bytes) -> U8 | None:
-    pixels: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    return None if pixels is None else pixels
+    return decoded(data, cv2.IMREAD_GRAYSCALE)

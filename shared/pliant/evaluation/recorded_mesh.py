@@ -5,8 +5,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.errors import ResultError
@@ -17,6 +15,7 @@ from pliant.formats.ply import read_ply
 from pliant.map_history import MapHistory
 from pliant.results.folder import RECORDING_NAME
 from pliant.results.run import read_run
+from pliant.yaml_text import load_yaml
 
 MESHES = {"mesh": "mesh.ply", "mesh_coarse": "mesh_coarse.ply"}
 
@@ -67,7 +66,7 @@ def compare_mesh(
 
 def depth_camera(truth: Path, camera: PinholeCamera) -> PinholeCamera:
     """The camera of the depth maps: ``depth_fx`` and so on, where it is not that of the images."""
-    content = yaml.safe_load((truth / "calib.yaml").read_text(encoding="utf-8"))
+    content = load_yaml((truth / "calib.yaml").read_text(encoding="utf-8"))
     names = {name: content.get(f"depth_{name}") for name in ("fx", "fy", "cx", "cy")}
     if all(isinstance(value, int | float) for value in names.values()):
         return replace(camera, **{name: float(value) for name, value in names.items()})

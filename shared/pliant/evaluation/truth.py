@@ -7,7 +7,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
@@ -21,6 +20,7 @@ from pliant.messages.types import Extrema
 from pliant.recording.reader import Recording
 from pliant.results.folder import RECORDING_NAME
 from pliant.results.run import read_run
+from pliant.yaml_text import load_yaml
 
 Truth = Callable[[int], tuple[F64, F64]]
 
@@ -28,7 +28,7 @@ Truth = Callable[[int], tuple[F64, F64]]
 def true_frames(folder: Path) -> Truth:
     """Depth (H, W) in metres and T_world_camera of a frame of a rendered sequence."""
     try:
-        calibration = yaml.safe_load((folder / "calib.yaml").read_text())
+        calibration = load_yaml((folder / "calib.yaml").read_text())
         scale = float(calibration["depth_scale"])
         invalid = [float(value) for value in calibration.get("depth_invalid", ())]
         depths = [
@@ -36,7 +36,7 @@ def true_frames(folder: Path) -> Truth:
             for line in (folder / "depth.txt").read_text().splitlines()
             if line and not line.startswith("#")
         ]
-    except (OSError, KeyError, IndexError) as error:
+    except (OSError, ValueError, KeyError, IndexError) as error:
         raise ResultError(f"{folder}: no true depth: {error}") from None
     poses = read_tum(folder / "groundtruth.txt").T_world_camera
 

@@ -6,6 +6,7 @@ A metadata record ``map`` stands first: ``version`` of what the fields mean, ``r
 Nothing in it depends on the time or the machine.
 """
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from pliant.recording.reader import Recorded, Recording
 from pliant.recording.scan import Closed, Damage
 from pliant.recording.writer import RecordingWriter
 from pliant.version import __version__
-from pliant.wording import counted
+from pliant.wording import counted, shortened
 
 MAP_NAME = "map.pliant"
 _RECORD = "map"
@@ -53,7 +54,7 @@ class MapFile:
             found = self._recording.metadata().get(_RECORD)
         except RecordingError as error:
             raise MapError(f"{self.path}: no map: {_why(error, self.path)}") from None
-        if found is None or not found.get("version", "").isdigit():
+        if found is None or not re.fullmatch("[0-9]{1,9}", found.get("version", "")):
             raise MapError(f"{self.path}: no map: without its record `{_RECORD}`")
         self.header = MapHeader(
             version=int(found["version"]),
@@ -65,8 +66,8 @@ class MapFile:
         if self.header.version > MAP_VERSION:
             raise MapError(
                 f"{self.path}: a map of version {self.header.version} (pliant "
-                f"{self.header.release}), this pliant reads up to {MAP_VERSION}: install a newer "
-                "one"
+                f"{shortened(self.header.release)}), this pliant reads up to "
+                f"{MAP_VERSION}: install a newer one"
             )
 
     def keyframes(self) -> Iterator[MapKeyframe]:
@@ -138,8 +139,8 @@ def describe(path: Path) -> Iterator[str]:
     count = sum(keyframes for keyframes, _ in segments.values())
     size = file.path.stat().st_size
     header = file.header
-    yield f"{file.path}: version {header.version}, written by pliant {header.release}"
-    yield f"sessions: {len(sessions)}, the last of {header.source}"
+    yield f"{file.path}: version {header.version}, written by pliant {shortened(header.release)}"
+    yield f"sessions: {len(sessions)}, the last of {shortened(header.source, 200)}"
     yield f"scale: {'metres' if header.metric else 'arbitrary'}"
     yield f"cameras: {'; '.join(sorted(cameras))}"
     yield (

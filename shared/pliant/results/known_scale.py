@@ -16,6 +16,7 @@ from pliant.messages.topics import Topic
 from pliant.messages.types import Header
 from pliant.recording.reader import Recorded, Recording
 from pliant.results.folder import SCALE_NAME
+from pliant.yaml_text import load_yaml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +45,7 @@ def read_scale(folder: Path) -> Scale | None:
     """That of a result folder; None without.  Raises ResultError for a file that is none."""
     path = folder / SCALE_NAME
     try:
-        told = yaml.safe_load(path.read_text(encoding="utf-8"))
+        told = load_yaml(path.read_text(encoding="utf-8"))
         found = Scale(
             metres_per_unit=float(told["metres_per_unit"]),
             sigma=float(told["sigma"]),
@@ -52,7 +53,7 @@ def read_scale(folder: Path) -> Scale | None:
         )
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+    except (OSError, ValueError, KeyError, TypeError):
         found = None
     if found is None or not 0.0 < found.metres_per_unit < float("inf"):
         raise ResultError(f"{path}: no scale: remove it, or measure again with `pliant scale`")

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, U8, BoolArray
+from pliant.algorithms.image.decoding import decoded
 
 EDGE_PX = 2
 """So near to what is not used, lens, demosaicing and compression have mixed it in."""
@@ -31,7 +32,7 @@ def packed(used: BoolArray) -> bytes:
 
 def unpacked(data: bytes) -> BoolArray:
     """The mask (H, W) in an image file of one channel.  Raises ValueError where it is none."""
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    pixels = decoded(data, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.ndim != 2:
         raise ValueError("no image that can be read")
     return np.asarray(pixels) > 0

@@ -38,21 +38,28 @@ def view_of(kept: KeptKeyframe) -> CorrectedView:
     return corrected_view(kept.given_camera, tuple(kept.correction.tolist()))
 
 
+_MOST, _MOST_POINTS, _LONGEST_SIDE_PX = 1 << 30, 1 << 62, 32767
+"""What numbers of keyframes, of points and of pixels may be, so that what comes later fits, too."""
+
+
 def check(kept: KeptKeyframe) -> None:
     """Raise ValueError where a keyframe is none that this module has made."""
     check_arrays(kept)
     if kept.point_patches.shape[1:] != (PATCH_SIDE, PATCH_SIDE):
         raise ValueError(f"patches of {kept.point_patches.shape[1]} pixels")
-    if kept.id < 0 or kept.segment < 0 or kept.given[:4].min() <= 0.0:
+    numbers = (kept.id, kept.segment, kept.session, kept.source_frame)
+    if not all(0 <= number < _MOST for number in numbers) or kept.given[:4].min() <= 0.0:
         raise ValueError("numbers or a camera that cannot be")
     real = (kept.given, kept.correction, kept.T_world_camera, kept.motion, kept.points_world)
     if not all(np.isfinite(each).all() for each in (*real, kept.seen_px, kept.corners_px)):
         raise ValueError("values that are not finite")
+    if kept.given[:2].max() > _LONGEST_SIDE_PX:
+        raise ValueError("a camera that cannot be")
     R, last = kept.T_world_camera[:3, :3], kept.T_world_camera[3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or last.tolist() != [0.0, 0.0, 0.0, 1.0]:
         raise ValueError("a pose that is none")
     for ids in (kept.seen_ids, kept.point_ids):
-        if len(ids) and (ids[0] < 0 or (np.diff(ids) <= 0).any()):
+        if len(ids) and (ids[0] < 0 or ids[-1] >= _MOST_POINTS or (np.diff(ids) <= 0).any()):
             raise ValueError("points that are not in order")
 
 
