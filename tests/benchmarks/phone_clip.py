@@ -21,7 +21,7 @@ from benchmarks.colmap import children_s
 from benchmarks.table import markdown_header, markdown_row
 from pliant.datasets import open_source
 from pliant.datasets.rectifier import decode
-from pliant.datasets.video import quiet_opencv
+from pliant.datasets.video_decoder import quiet_opencv
 from pliant.errors import PliantError
 from pliant.evaluation.presentation import metres
 from pliant.evaluation.run_evaluation import evaluate_trajectory

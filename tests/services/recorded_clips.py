@@ -13,7 +13,7 @@ from pliant.config import Config, IngestParameters, load_config
 from pliant.datasets import open_source
 from pliant.datasets.base import Dataset
 from pliant.datasets.recorded_images import RecordedImages
-from pliant.datasets.video import quiet_opencv
+from pliant.datasets.video_decoder import quiet_opencv
 from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import Header, SourceImage

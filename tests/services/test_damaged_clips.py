@@ -24,7 +24,7 @@ from recorded_clips import (
 
 from pliant.datasets.clip import clip_of
 from pliant.datasets.recorded_images import RecordedImages
-from pliant.datasets.video import quiet_opencv
+from pliant.datasets.video_decoder import quiet_opencv
 from pliant.errors import RecordingError
 from pliant.messages import topics
 from pliant.recording.layout import CHUNK_BYTES

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from mp4_patches import spaced, ticks_a_second, turned
+from odd_videos import moving, with_edits, with_track_before, write_video
 from recorded_clips import (
     FRAMES,
     HEIGHT,
@@ -40,6 +41,24 @@ from pliant_services.replay.play import PlayRequest, run_play
 from pliant_services.runtime.monitor import SilentMonitor
 
 PATIENCE_S = 60.0
+
+
+def test_images_of_odd_videos_are_made_again(tmp_path: Path) -> None:
+    """The stream that was read, what its edit list shows, and one field of interlaced frames."""
+    film = write_video(tmp_path / "film.mp4", moving(12))
+    preview = write_video(tmp_path / "preview.mp4", moving(12, 160, 120))
+    odd = with_edits(with_track_before(film, preview), [(0.08, 0.24)])
+    (tmp_path / "odd.mp4").write_bytes(odd)
+    write_video(tmp_path / "tape.avi", moving(12, 720, 576), "dvsd")
+    for name, frames in (("odd.mp4", 6), ("tape.avi", 12)):
+        path = tmp_path / f"{name}.mcap"
+        published = record(opened(tmp_path / name), path)
+        assert len(published) == frames
+        assert all(image.clip_frame >= 0 for image in published)
+        assert_same_images(path, published)
+        images, kept = RecordedImages(Recording(path)), references(path)
+        for number in (frames - 1, 2, frames // 2):  # in any order
+            assert images.whole(kept[number]).data == published[number].data
 
 
 def test_the_recording_of_a_video_is_as_large_as_the_video(clip: Path, tmp_path: Path) -> None:

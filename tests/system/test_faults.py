@@ -23,7 +23,7 @@ from pliant.datasets import open_source
 from pliant.datasets.calibration import calibration_yaml
 from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.rectifier import decode
-from pliant.datasets.video import quiet_opencv
+from pliant.datasets.video_decoder import quiet_opencv
 from pliant.messages import topics
 from pliant.messages.types import ClipPiece, MapUpdate, SourceImage, Status
 from pliant.recording.reader import Recording

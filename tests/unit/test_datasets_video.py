@@ -18,7 +18,7 @@ from pliant.datasets.calibration import UNSAID_SIGMA, calibration_from_yaml, cal
 from pliant.datasets.camera_device import CameraDevice, camera_index
 from pliant.datasets.images import SourceOptions
 from pliant.datasets.rectifier import Rectifier, decode
-from pliant.datasets.video import quiet_opencv
+from pliant.datasets.video_decoder import quiet_opencv
 from pliant.errors import CalibrationError, DatasetError
 
 WIDTH, HEIGHT = 64, 48

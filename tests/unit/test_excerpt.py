@@ -14,7 +14,7 @@ from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration, calibration_from_fov
 from pliant.datasets.excerpt import Excerpt
 from pliant.datasets.rectifier import Rectifier, rectified
-from pliant.datasets.video import quiet_opencv
+from pliant.datasets.video_decoder import quiet_opencv
 from pliant.errors import DatasetError
 
 START_NS = 5_000_000_000

@@ -116,15 +116,18 @@ class Calibration:
         )
 
 
-def calibration_from_fov(width: int, height: int, fov_deg: float | None = None) -> Calibration:
+def calibration_from_fov(
+    width: int, height: int, fov_deg: float | None = None, *, pixel_aspect: float = 1.0
+) -> Calibration:
     """A first guess: a pinhole camera with this horizontal field of view, looking straight ahead.
 
     fov_deg: None where nobody says it: a lens sees as much, whichever way it is held.
+    pixel_aspect: width over height of a pixel, which is fy over fx.
 
     Raises CalibrationError for a field of view that a pinhole camera cannot have.
     """
     said = fov_deg is not None
-    side = width if said else max(width, height)
+    side = width if said else max(width, height / pixel_aspect)
     fov_deg = fov_deg if said else UNSAID_FOV_DEG
     if not 1.0 <= fov_deg <= 170.0:  # also refuses NaN
         raise CalibrationError(
@@ -137,7 +140,7 @@ def calibration_from_fov(width: int, height: int, fov_deg: float | None = None) 
         width=width,
         height=height,
         fx=focal,
-        fy=focal,
+        fy=focal * pixel_aspect,
         cx=0.5 * (width - 1),
         cy=0.5 * (height - 1),
         focal_sigma=SAID_SIGMA if said else UNSAID_SIGMA,

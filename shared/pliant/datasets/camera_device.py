@@ -17,7 +17,8 @@ from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.images import SourceOptions, choose_calibration
-from pliant.datasets.video import quiet_opencv, raw_frame
+from pliant.datasets.video import raw_frame
+from pliant.datasets.video_decoder import quiet_opencv
 from pliant.errors import DatasetError
 
 _INDEX = re.compile(r"(?:camera:)?([0-9]{1,3})")

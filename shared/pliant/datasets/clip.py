@@ -10,7 +10,8 @@ from pliant.datasets.base import Dataset
 from pliant.datasets.excerpt import Excerpt, Part
 from pliant.datasets.masks import Masked
 from pliant.datasets.static_mask import StaticallyMasked
-from pliant.datasets.video import VideoFile, file_version
+from pliant.datasets.video import VideoFile
+from pliant.datasets.video_decoder import file_version
 from pliant.datasets.working_size import SmallerImages
 from pliant.errors import DatasetError
 from pliant.messages.types import ClipPiece

@@ -146,13 +146,15 @@ def choose_calibration(
     found: Path | Calibration | None,
     where: str,
     kitti_camera: int = 0,
+    pixel_aspect: float = 1.0,
 ) -> Calibration:
     """The user's calibration or field of view, else what was found with the source.
 
-    Where there is none, a guess.  Raises CalibrationError where it is broken, or for other images.
+    Where there is none, a guess.  pixel_aspect: width over height of a pixel.
+    Raises CalibrationError where it is broken, or for other images.
     """
     if options.fov_deg is not None:
-        return calibration_from_fov(*size, options.fov_deg)
+        return calibration_from_fov(*size, options.fov_deg, pixel_aspect=pixel_aspect)
     if options.calibration is not None:
         return read_calibration(options.calibration, size, kitti_camera=kitti_camera)
     if isinstance(found, Calibration):
@@ -160,7 +162,7 @@ def choose_calibration(
         return found
     if found is not None and found.is_file():
         return read_calibration(found, size, kitti_camera=kitti_camera)
-    return calibration_from_fov(*size)
+    return calibration_from_fov(*size, pixel_aspect=pixel_aspect)
 
 
 def existing(*candidates: Path) -> Path | None:

@@ -13,13 +13,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, cast
+from typing import IO
 
 import cv2
 
-from pliant.algorithms.arrays import U8
 from pliant.datasets.rectifier import decode
-from pliant.datasets.video import GIVE_UP, opened, rate_hz, raw_frame
+from pliant.datasets.video import GIVE_UP, raw_frame
+from pliant.datasets.video_decoder import opened
 from pliant.datasets.working_size import smaller
 from pliant.errors import DatasetError, RecordingError
 from pliant.messages import topics
@@ -77,7 +77,7 @@ class _RecordedClip:
     def pixels(self, image: SourceImage) -> bytes:
         """The bytes of an image.  Raises RecordingError where they cannot be made again."""
         ahead = image.clip_frame - self._next
-        near = round(_NEAR_S * self._rate_hz)
+        near = round(_NEAR_S * self._video.rate_hz)
         found = self._following(image) if 0 <= ahead <= near else self._sought(image, near)
         if found is None:  # counted from the beginning, then
             self._begin()
@@ -95,7 +95,7 @@ class _RecordedClip:
         """An image further on, by counting; None where its number has other pixels."""
         failed = 0
         while self._next < image.clip_frame and failed <= GIVE_UP:
-            failed = 0 if self._capture.grab() else failed + 1
+            failed = 0 if self._video.grab() else failed + 1
             self._next += 1
         return self._read(image)
 
@@ -105,7 +105,7 @@ class _RecordedClip:
         What a container says of its frames is no promise: the checksum alone tells.
         """
         for start, count in ((image.clip_frame, 1), (image.clip_frame - near // 2, near)):
-            if start <= 0 or not self._capture.set(cv2.CAP_PROP_POS_FRAMES, start):
+            if start <= 0 or not self._video.seek_frame(start):
                 continue
             for _ in range(count):
                 found = self._read(image)
@@ -116,11 +116,11 @@ class _RecordedClip:
 
     def _read(self, image: SourceImage) -> bytes | None:
         """The next frame as it was published, if it is this image."""
-        read, pixels = self._capture.read()
+        pixels = self._video.read()
         self._next += 1
-        if not read:
+        if pixels is None:
             return None
-        frame = raw_frame(cast(U8, pixels), image.frame, image.stamp_ns)
+        frame = raw_frame(pixels, image.frame, image.stamp_ns)
         if (frame.width, frame.height) != (image.width, image.height):
             frame = smaller(frame, decode(frame), max(image.width, image.height))
         return frame.data if zlib.crc32(frame.data) == image.checksum else None
@@ -129,12 +129,11 @@ class _RecordedClip:
         """At the first frame, in a decoder that has seen no other."""
         self._decoder.close()
         try:
-            self._capture = self._decoder.enter_context(opened(self._file))
+            self._video = self._decoder.enter_context(opened(self._file))
         except DatasetError:
             raise RecordingError(
                 f"{self._path}: OpenCV {cv2.__version__} cannot read the clip in it{self._missing}"
             ) from None
-        self._rate_hz = rate_hz(self._capture)
         self._next = 0
 
     def _unpacked(self, recording: Recording) -> IO[bytes]:

@@ -23,7 +23,9 @@ from pliant.algorithms.image.sharpness import (
 from pliant.datasets.base import BrokenFrame, Dataset, SourceFrame
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.rectifier import decode
+from pliant.errors import DatasetError
 
+_LEAST_SHORTER_SIDE_PX = 16
 _LOOKED_AT, _STEP = 7, 5
 """Frames that say how sharp a source is, and how far they lie apart: cameras begin out of focus."""
 
@@ -81,9 +83,16 @@ def at_working_size(source: Dataset, longest_side_px: int = 0) -> Dataset:
     """The source itself, or its images made smaller.  longest_side_px: 0 lets them say it.
 
     A camera's first images say little, and it would give others after a restart: of those it is
-    the limit alone that counts.
+    the limit alone that counts.     Raises DatasetError for images that are too narrow.
     """
-    longer = max(source.calibration.width, source.calibration.height)
+    width, height = source.calibration.width, source.calibration.height
+    longer = max(width, height)
+    shorter = min(width, height, round(min(width, height) * LONGEST_SIDE_PX / longer))
+    if shorter < _LEAST_SHORTER_SIDE_PX:
+        raise DatasetError(
+            f"{source.name}: images of {width}x{height} px are too narrow to track in: the shorter "
+            f"side needs {_LEAST_SHORTER_SIDE_PX} px where the longer one has {LONGEST_SIDE_PX}"
+        )
     side = longest_side_px or _side_of(source, longer)
     return SmallerImages(source, side) if side < longer else source
 

@@ -1,0 +1,227 @@
+"""The video tracks of an MP4 or QuickTime file: its boxes, as ISO/IEC 14496-12 says.
+
+Read are the sizes, which tracks are pictures, the times of the samples, and the edit lists.  With
+an edit list a file keeps more samples than it shows (a lossless trim).  FFmpeg passes over some of
+these, and then nobody knows how many frames should come.  So where an edit list leaves something
+out it is hidden, all samples are decoded, and the source passes over what is not shown.
+"""
+
+from collections.abc import Iterator
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from pliant.algorithms.arrays import I64, BoolArray
+from pliant.datasets.video_streams import Container, Patch, VideoStream
+
+MAGIC_BYTES = 8
+_BEGINNINGS = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
+_FREE = b"free"
+_SIZED = (b"avc1", b"hvc1")
+"""Descriptions of H.264 and HEVC whose parameters are not among the samples."""
+_MOST_BOXES = 100_000
+_MOST_EDITS = 1_000
+_MOST_TABLE_BYTES = 1 << 28
+_NS = 10**9
+
+
+class _Box(NamedTuple):
+    kind: bytes
+    at: int
+    start: int
+    end: int
+
+
+def recognises(head: bytes) -> bool:
+    """Whether a file begins as one of these."""
+    return head[4:8] in _BEGINNINGS
+
+
+def video_streams(file: BinaryIO, size: int) -> Container:
+    """Its video tracks.  Raises OSError."""
+    moov = next((box for box in _boxes(file, 0, size) if box.kind == b"moov"), None)
+    if moov is None:
+        return Container()
+    tracks = [_Track(file, box) for box in _boxes(file, moov.start, moov.end, b"trak")]
+    chapters = {number for track in tracks for number in track.chapters()}
+    fragments = any(True for _ in _boxes(file, moov.start, moov.end, b"mvex"))
+    time_scale = _time_scale(file, moov, b"mvhd")
+    streams: list[VideoStream] = []
+    patches = list(_covers(file, moov))
+    for track in tracks:
+        if not track.is_video():
+            continue
+        times = np.zeros(0, np.int64) if fragments else track.stamps_ns()
+        shown = track.shown_ns(time_scale) if len(times) else ()
+        inside = _inside(times, shown)
+        if shown and not (len(shown) == 1 and inside.all()):
+            patches += [Patch(box.at + 4, _FREE) for box in track.boxes(b"edts")]
+        if inside.all() or not inside.any():  # what would show nothing is none to follow
+            shown = ()
+        hide = [Patch(track.box.at + 4, _FREE)]
+        hide += _parts_in_fragments(file, size, track.number) if fragments else []
+        width, height = track.size()
+        streams.append(
+            VideoStream(
+                width=width,
+                height=height,
+                is_default=track.is_enabled(),
+                is_still=track.number in chapters or track.samples() == 1,
+                stamps_ns=times.tolist(),
+                shown_ns=shown,
+                may_change=not track.keeps_size(),
+                hide=tuple(hide),
+            )
+        )
+    return Container(streams=tuple(streams), patches=tuple(patches))
+
+
+class _Track:
+    """A ``trak`` box."""
+
+    def __init__(self, file: BinaryIO, box: _Box) -> None:
+        self._file = file
+        self.box = box
+        header = self._body(b"tkhd")
+        version = header[:1] == b"\1"
+        self._flags = int.from_bytes(header[1:4])
+        self.number = int.from_bytes(header[20:24] if version else header[12:16])
+
+    def boxes(self, *path: bytes) -> list[_Box]:
+        """The boxes at a path below it."""
+        found = [self.box]
+        for kind in path:
+            found = [b for each in found for b in _boxes(self._file, each.start, each.end, kind)]
+        return found
+
+    def is_video(self) -> bool:
+        return self._body(b"mdia", b"hdlr")[8:12] == b"vide" and bool(self._entry())
+
+    def is_enabled(self) -> bool:
+        return bool(self._flags & 1)
+
+    def chapters(self) -> list[int]:
+        """The tracks that hold titles and pictures of its chapters."""
+        data = self._body(b"tref", b"chap")
+        return [int.from_bytes(data[i : i + 4]) for i in range(0, len(data), 4)]
+
+    def size(self) -> tuple[int, int]:
+        entry = self._entry()
+        return int.from_bytes(entry[32:34]), int.from_bytes(entry[34:36])
+
+    def keeps_size(self) -> bool:
+        """Whether all samples have one description, and it has their size."""
+        data = self._body(b"mdia", b"minf", b"stbl", b"stsd", limit=16)
+        return int.from_bytes(data[4:8]) == 1 and data[12:16] in _SIZED
+
+    def samples(self) -> int:
+        """0 where fragments have them."""
+        for kind in (b"stsz", b"stz2"):
+            data = self._body(b"mdia", b"minf", b"stbl", kind, limit=12)
+            if data:
+                return int.from_bytes(data[8:12])
+        return 0
+
+    def stamps_ns(self) -> I64:
+        """When its samples are shown, sorted; media time."""
+        scale = _time_scale(self._file, self.boxes(b"mdia")[0], b"mdhd")
+        steps = self._runs(b"stts")
+        count = min(self.samples(), sum(max(0, each) for each, _ in steps.tolist()))
+        if not scale or not count or count * 8 > _MOST_TABLE_BYTES:
+            return np.zeros(0, np.int64)
+        ticks = np.cumsum(np.repeat(steps[:, 1], np.maximum(steps[:, 0], 0)))[:count]
+        ticks = np.concatenate(([0], ticks[:-1]))
+        later = self._runs(b"ctts")
+        if int(np.maximum(later[:, 0], 0).sum()) >= count:
+            ticks = ticks + np.repeat(later[:, 1], np.maximum(later[:, 0], 0))[:count]
+        ticks = np.sort(ticks)
+        return ticks // scale * _NS + ticks % scale * _NS // scale
+
+    def shown_ns(self, movie_scale: int) -> tuple[tuple[int, int], ...]:
+        """The intervals of media time in its edit list, without empty ones."""
+        data = self._body(b"edts", b"elst", limit=8 + 20 * _MOST_EDITS)
+        scale = _time_scale(self._file, self.boxes(b"mdia")[0], b"mdhd")
+        wide, found = data[:1] == b"\1", list[tuple[int, int]]()
+        step, half = (20, 8) if wide else (12, 4)
+        if not scale or not movie_scale:
+            return ()
+        for at in range(8, min(len(data), 8 + step * int.from_bytes(data[4:8])) - step + 1, step):
+            length = int.from_bytes(data[at : at + half])
+            begin = int.from_bytes(data[at + half : at + 2 * half], signed=True)
+            if begin >= 0:
+                start = begin * _NS // scale
+                end = start + length * _NS // movie_scale if length else 1 << 62
+                found.append((start, end))
+        return tuple(found)
+
+    def _entry(self) -> bytes:
+        """The first description of its samples."""
+        return self._body(b"mdia", b"minf", b"stbl", b"stsd", limit=8 + 86)[8:]
+
+    def _runs(self, kind: bytes) -> I64:
+        """(N, 2) rows of a table of runs: how many samples, and their value."""
+        data = self._body(b"mdia", b"minf", b"stbl", kind, limit=_MOST_TABLE_BYTES)
+        count = min(int.from_bytes(data[4:8]), max(0, len(data) - 8) // 8)
+        return np.frombuffer(data, ">i4", 2 * count, 8 if count else 0).reshape(-1, 2).astype(int)
+
+    def _body(self, *path: bytes, limit: int = 1 << 16) -> bytes:
+        box = next(iter(self.boxes(*path)), None)
+        return _read(self._file, box, limit) if box is not None else b""
+
+
+def _inside(stamps_ns: I64, shown_ns: tuple[tuple[int, int], ...]) -> BoolArray:
+    """Which samples some interval shows."""
+    inside = np.zeros(len(stamps_ns), np.bool_)
+    for start, end in shown_ns:
+        inside |= (stamps_ns >= start) & (stamps_ns < end)
+    return inside
+
+
+def _time_scale(file: BinaryIO, parent: _Box, kind: bytes) -> int:
+    """Ticks a second of a header."""
+    box = next(_boxes(file, parent.start, parent.end, kind), None)
+    data = _read(file, box, 24) if box is not None else b""
+    return int.from_bytes(data[20:24] if data[:1] == b"\1" else data[12:16])
+
+
+def _covers(file: BinaryIO, moov: _Box) -> Iterator[Patch]:
+    """What hides cover pictures, which FFmpeg makes video streams of."""
+    for udta in _boxes(file, moov.start, moov.end, b"udta"):
+        for meta in _boxes(file, udta.start, udta.end, b"meta"):
+            for skipped in (4, 0):  # QuickTime's has no version
+                for ilst in _boxes(file, meta.start + skipped, meta.end, b"ilst"):
+                    for cover in _boxes(file, ilst.start, ilst.end, b"covr"):
+                        yield Patch(cover.at + 4, _FREE)
+
+
+def _parts_in_fragments(file: BinaryIO, size: int, number: int) -> Iterator[Patch]:
+    """What hides a track in the fragments."""
+    for moof in _boxes(file, 0, size, b"moof"):
+        for part in _boxes(file, moof.start, moof.end, b"traf"):
+            header = next(_boxes(file, part.start, part.end, b"tfhd"), None)
+            if header is not None and int.from_bytes(_read(file, header, 8)[4:8]) == number:
+                yield Patch(part.at + 4, _FREE)
+
+
+def _boxes(file: BinaryIO, start: int, end: int, kind: bytes = b"") -> Iterator[_Box]:
+    """The boxes of a kind, or all, between two places, as far as they make sense."""
+    at = start
+    for _ in range(_MOST_BOXES):
+        if at + 8 > end:
+            return
+        file.seek(at)
+        head = file.read(16)
+        length, found, body = int.from_bytes(head[:4]), head[4:8], at + 8
+        if length == 1:
+            length, body = int.from_bytes(head[8:16]), at + 16
+        stop = end if length == 0 else at + length
+        if stop < body:
+            return
+        if not kind or found == kind:
+            yield _Box(found, at, body, min(stop, end))
+        at = stop
+
+
+def _read(file: BinaryIO, box: _Box, limit: int) -> bytes:
+    file.seek(box.start)
+    return file.read(min(limit, box.end - box.start))

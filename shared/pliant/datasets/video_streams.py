@@ -1,0 +1,146 @@
+"""The video streams of a container: what each is, which one is meant, and how to hide the others.
+
+OpenCV decodes the first video stream of a file, be it a preview or a cover picture.  So the others
+are hidden from it: a few bytes of the header are replaced while it reads (``PatchedFile``).
+"""
+
+import io
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Bytes that stand in for those of a file from ``offset`` on."""
+
+    offset: int
+    data: bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoStream:
+    """One video stream, as its container describes it.
+
+    width, height: of the stored images, pixels.
+    is_default: not marked as one to be passed over.
+    is_still: a cover picture or thumbnails, no film.
+    stamps_ns: when frames are shown, sorted, in media time; () where only reading tells.
+    shown_ns: intervals of media time that are to be shown; () for all.
+    may_change: whether the size of its images may change on the way.
+    hide: what makes a reader pass over this stream.
+    """
+
+    width: int
+    height: int
+    is_default: bool = True
+    is_still: bool = False
+    stamps_ns: Sequence[int] = ()
+    shown_ns: tuple[tuple[int, int], ...] = ()
+    may_change: bool = True
+    hide: tuple[Patch, ...] = ()
+
+    def shows(self, media_ns: int) -> bool:
+        """Whether the edit list shows what was taken at this media time."""
+        times = self.shown_ns
+        return not times or any(start <= media_ns < end for start, end in times)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Container:
+    """The video streams in the order of the file.  patches: needed whichever stream is read."""
+
+    streams: tuple[VideoStream, ...] = ()
+    patches: tuple[Patch, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChosenStream:
+    """What is decoded of a file.  stream: None where the container is not understood."""
+
+    stream: VideoStream | None = None
+    patches: tuple[Patch, ...] = ()
+    note: str = ""
+
+
+def choose(container: Container) -> ChosenStream:
+    """The largest film among the streams that are marked as default, or among all."""
+    streams = container.streams
+    if not streams:
+        return ChosenStream(patches=container.patches)
+    wanted = [each for each in streams if not each.is_still] or list(streams)
+    wanted = [each for each in wanted if each.is_default] or wanted
+    chosen = max(wanted, key=lambda each: each.width * each.height)
+    others = [each for each in streams if each is not chosen]
+    patches = [*container.patches, *(patch for each in others for patch in each.hide)]
+    return ChosenStream(stream=chosen, patches=tuple(patches), note=_note(streams, chosen))
+
+
+def _note(streams: Sequence[VideoStream], chosen: VideoStream) -> str:
+    if len(streams) == 1:
+        return ""
+    listed = ", ".join(
+        f"{each.width}x{each.height}{' (picture)' if each.is_still else ''}" for each in streams
+    )
+    number = next(i for i, each in enumerate(streams, start=1) if each is chosen)
+    return f"{len(streams)} video streams ({listed}): stream {number} is read"
+
+
+def streams_of(file: Path) -> Container:
+    """The video streams of an MP4, MOV, Matroska or WebM file; none of any other.
+
+    Raises OSError where the file cannot be read.
+    """
+    from pliant.datasets import matroska, mp4_boxes
+
+    with file.open("rb") as source:
+        size = source.seek(0, os.SEEK_END)
+        for kind in (mp4_boxes, matroska):
+            source.seek(0)
+            if kind.recognises(source.read(kind.MAGIC_BYTES)):
+                return kind.video_streams(source, size)
+    return Container()
+
+
+class PatchedFile(io.BufferedIOBase):
+    """A file of which some bytes read otherwise; how OpenCV reads what has no name for it."""
+
+    def __init__(self, file: Path, patches: Sequence[Patch] = ()) -> None:
+        """Raises OSError."""
+        self._file: BinaryIO = file.open("rb")
+        self._patches = tuple(patches)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """The next bytes."""
+        start = self._file.tell()
+        data = self._file.read(-1 if size is None else size)
+        for patch in self._patches:
+            first = patch.offset - start
+            if -len(patch.data) < first < len(data):
+                skip, at = max(0, -first), max(0, first)
+                there = patch.data[skip : skip + len(data) - at]
+                data = data[:at] + there + data[at + len(there) :]
+        return data
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        """Go to a position; returns it."""
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        """The position."""
+        return self._file.tell()
+
+    def readable(self) -> bool:
+        """Always."""
+        return True
+
+    def seekable(self) -> bool:
+        """Always."""
+        return True
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+        super().close()
