@@ -112,6 +112,7 @@ def read_run(path: Path, scale: Scale | None = None) -> Run:
     """
     recording = MetricRecording(path, scale)
     run = Run(scale=recording.scale)
+    run.recorded.metadata = recording.metadata()
     for keyframe in known_keyframes(recording):
         run.history.know(keyframe)
         run.known_segments.add(keyframe.segment)

@@ -211,6 +211,9 @@ def is_metric(metadata: Mapping[str, Mapping[str, str]]) -> bool:
 
 
 def _depth_from(metadata: Mapping[str, Mapping[str, str]]) -> str:
+    """Empty where the recording has no configuration: nothing is in metres by default then."""
+    if "config" not in metadata:
+        return ""
     return recorded_config(metadata, []).surfels.depth_from
 
 
