@@ -23,9 +23,8 @@ FRAMES = 5
 def test_depth_that_was_made_up_is_doubtful_and_not_in_metres(
     depth_from: str, verdict: str, is_metric: bool, tmp_path: Path
 ) -> None:
-    config = load_config(
-        None, ["surfels.max_surfels=60", f"surfels.depth_from={depth_from}", "surfels.camera=moving"]
-    )
+    settings = ["surfels.max_surfels=60", "surfels.camera=moving"]
+    config = load_config(None, [*settings, f"surfels.depth_from={depth_from}"])
     source = ReplayBus({})
     depth = "all" if depth_from == "sensor" else "none"
     dataset = open_source(f"built-in:tiny?frames={FRAMES}", depth=depth)

@@ -32,12 +32,9 @@ from pliant.results.folder import RECORDING_NAME, STATE_FOLDER, prepare
 from pliant.results.write import write_results
 from pliant_services.profiles import PROFILES
 from pliant_services.replay.command import SAME, ReplayRequest, run_replay
-from pliant_services.run.command import (
-    RunRequest,
-    resumed_config,
-    resumed_map,
-    service_arguments,
-)
+from pliant_services.run.command import service_arguments
+from pliant_services.run.request import RunRequest
+from pliant_services.run.resume import resumed_config, resumed_map
 from pliant_services.runtime import launcher
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 

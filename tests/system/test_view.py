@@ -77,6 +77,17 @@ def test_wrong_requests_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert not (tmp_path / "x.rrd").exists()
 
 
+def test_a_view_of_nothing_leaves_what_was_saved_before(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    there = tmp_path / "there.rrd"
+    there.write_text("mine")
+    for source in (("--connect", free_endpoint(), "--session", "none"), (tmp_path / "nothing",)):
+        done = in_this_process("view", *source, "--save", there, "--force")
+        assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["there.rrd"]
+    assert there.read_text() == "mine"
+
+
 def test_a_viewer_that_cannot_start_leaves_an_earlier_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,8 @@ from pliant.datasets import sources_in
 from pliant.errors import DatasetError, ResultError
 from pliant.results.folder import folder_name
 from pliant_services.batch.command import run_batch
-from pliant_services.run.command import RunRequest, resumed_config
+from pliant_services.run.request import RunRequest
+from pliant_services.run.resume import resumed_config
 
 
 def folder_of_images(path: Path) -> Path:

@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 
 from pliant.algorithms.tracks import FrameTracks
 from pliant.errors import RecordingError
+from pliant.files import create
 from pliant.messages import codec, topics
 from pliant.messages.types import Extrema, Header, SourceImage, StreamEnd
 from pliant.recording.reader import Recorded, Recording
@@ -163,10 +164,12 @@ def test_memory_holds_a_message_and_never_what_a_length_claims(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-def test_a_full_disk_is_one_line_and_leaves_nothing(whole: bytes, tmp_path: Path) -> None:
+def test_a_full_disk_is_one_line_and_leaves_nothing(
+    whole: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(whole)
-    (tmp_path / "b.mcap.partial").symlink_to("/dev/full")
+    monkeypatch.setattr("pliant.recording.writer.create", lambda _: create(Path("/dev/full")))
     with pytest.raises(RecordingError, match="disk is full"):
         recover(path, tmp_path / "b.mcap")
     assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]

@@ -20,6 +20,7 @@ from typing import Any
 from pliant import __version__
 from pliant.errors import PliantError
 from pliant.exit_codes import DONE, FAILED, INCOMPLETE
+from pliant.files import create
 from pliant.results.folder import REPORT_NAME, STATE_FOLDER, is_being_written, settle_killed
 from pliant.results.verdict import grade
 
@@ -74,7 +75,7 @@ def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
     resumes = (result / STATE_FOLDER).is_dir()
     if report is not None and not resumes:
         return Outcome(exit_code=grade(report), told=_told(report))
-    arguments = [errand.source, "--output", errand.result]
+    arguments = ["--output", errand.result]
     if "--on-crash" not in errand.options:
         arguments += ["--on-crash", "restart"]  # it can be taken up again
     if resumes:
@@ -82,7 +83,7 @@ def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
     elif begun or errand.state != "waiting":
         arguments += ["--force"]
     began = time.monotonic()
-    run = OneRun([*arguments, *errand.options], log, here)
+    run = OneRun([*arguments, *errand.options, "--", errand.source], log, here)
     code = run.wait(stopped)
     seconds = time.monotonic() - began
     if code in (DONE, INCOMPLETE):
@@ -126,7 +127,7 @@ class OneRun:
     def __init__(self, arguments: list[str], log: Path, folder: Path) -> None:
         """arguments: of ``pliant run``.  Raises OSError where the log cannot be written."""
         command = [sys.executable, "-m", "pliant_services.cli", "run", *arguments]
-        with log.open("w", encoding="utf-8") as file:
+        with create(log) as file:
             self._process = subprocess.Popen(
                 command,
                 cwd=folder,

@@ -37,7 +37,7 @@ def session_at(
     Raises ResultError where no run does, and without either.
     """
     from pliant.errors import ResultError
-    from pliant.results.folder import running_session
+    from pliant_services.runtime.announced import running_session
 
     if result is None:
         if not connect:

@@ -4,11 +4,9 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 from pliant.config import Config, config_yaml, load_config
 from pliant.datasets import check_start, notes_on, open_source
@@ -23,13 +21,11 @@ from pliant.fusion.memory import check_voxel_sizes
 from pliant.messages.types import Status
 from pliant.recording import parts
 from pliant.recording.map_file import MapFile
-from pliant.recording.recover import mend
 from pliant.results import earlier
 from pliant.results.folder import (
     CONFIG_NAME,
     PAGE_NAME,
     RECORDING_NAME,
-    REPORT_NAME,
     STATE_FOLDER,
     discard,
     files_of,
@@ -42,42 +38,27 @@ from pliant.results.folder import (
     settle_killed,
     written,
 )
+from pliant.results.locking import Held
 from pliant.wording import counted
 from pliant_services.nodes.ingest import plays_live
-from pliant_services.processes import BY_NAME, deformable_fleet, inputs_of, reads_depth
+from pliant_services.processes import BY_NAME, deformable_fleet, reads_depth
 from pliant_services.profiles import PROFILES
 from pliant_services.run.progress import Progress
-from pliant_services.run.spectators import Viewer, announced, check_viewer, has_viewer
+from pliant_services.run.request import RunRequest
+from pliant_services.run.resume import (
+    KNOWN_MAP,
+    check_ended,
+    has_ended,
+    resumed_config,
+    resumed_map,
+)
+from pliant_services.run.spectators import Viewer, check_viewer, has_viewer
 from pliant_services.runtime import kernels as warm_up
+from pliant_services.runtime.announced import announced
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 
 _DEFORMABLE = "deformable"
-_KNOWN_MAP = "known_map"
-"""In the folder of checkpoints: where the map is in which a run goes on."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunRequest:
-    """What the user asked for."""
-
-    source: str
-    profile: str = "rigid"
-    output: Path | None = None
-    force: bool = False
-    config_file: Path | None = None
-    overrides: Sequence[str] = ()
-    seed: int | None = None
-    calibration: Path | None = None
-    fov_deg: float | None = None
-    mask: Path | None = None
-    known: Path | None = None
-    topic: str = ""
-    port: int | None = None
-    view: Literal["window", "web"] | None = None
-    save: Path | None = None
-    poses: bool = False
-    on_crash: Literal["stop", "restart"] = "stop"
-    resume: bool = False
+_WRITTEN_AGAIN = "the run had come to its end already: its results are written again"
 
 
 def run_pipeline(request: RunRequest) -> int:
@@ -104,14 +85,19 @@ def run_pipeline(request: RunRequest) -> int:
         if known is not None:
             for _ in known.keyframes():  # said before anything is touched
                 pass
-        with written(output, force=request.force or request.resume):
-            code = _run_into(output, request, viewer)
+        with written(output, force=request.force or request.resume) as held:
+            if request.resume and not (output / STATE_FOLDER).is_dir():
+                check_ended(output, resumed_config(output, request))
+                print(_WRITTEN_AGAIN, file=sys.stderr, flush=True)
+                code = _finish(output, interrupted=False, failure=None, resumed=True)
+            else:
+                code = _run_into(output, request, viewer, held)
         if viewer is not None and code != INTERRUPTED:
             viewer.stay()  # the results are there
         return code
 
 
-def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
+def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: Held) -> int:
     config = load_config(request.config_file, request.overrides, seed=request.seed)
     profile = request.profile
     state = output / STATE_FOLDER if request.on_crash == "restart" or request.resume else None
@@ -150,8 +136,8 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
             check_voxel_sizes(Rectifier(dataset.calibration).camera, config.meshing.tsdf)
     mesh_afterwards = state is not None and profile == "rigid"
     services = PROFILES["points" if mesh_afterwards else profile]
-    if request.resume and _has_ended(output, services, config):
-        progress.say("the run had come to its end already: what follows from it is written again")
+    if request.resume and has_ended(output, services, config):
+        progress.say(_WRITTEN_AGAIN)
         interrupted, failure = False, None
     else:
         if request.resume and plays_live(dataset, config):
@@ -167,6 +153,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
             state=state,
         )
         interrupted, failure = _go_through(request, config, output, fleet, progress, viewer)
+        output = _where_now(output, held, failure, progress)
     if failure is None and mesh_afterwards and parts.exists(output / RECORDING_NAME):
         progress.say("meshing what was recorded ...")
         from pliant_services.mesh.afterwards import add_mesh  # it loads what else replays
@@ -177,9 +164,21 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None) -> int:
             interrupted = True
         except PliantError as error:
             failure = error
-    if failure is None and not interrupted:
+    code = _finish(output, interrupted=interrupted, failure=failure, resumed=request.resume)
+    if not interrupted:  # the results are on the disk: nothing is left to resume
         shutil.rmtree(output / STATE_FOLDER, ignore_errors=True)
-    return _finish(output, interrupted=interrupted, failure=failure, resumed=request.resume)
+    return code
+
+
+def _where_now(output: Path, held: Held, failure: PliantError | None, progress: Progress) -> Path:
+    """Where the result folder is, which somebody may have renamed.  Raises ResultError, or why the
+    run failed, where it was deleted."""
+    now = held.path
+    if now is None:
+        raise failure or ResultError(f"{output} was deleted during the run: nothing of it is left")
+    if now != output:
+        progress.say(f"{output} was renamed during the run: the results go to {now}")
+    return now
 
 
 class _Followed:
@@ -221,7 +220,7 @@ def _go_through(
             if request.on_crash == "restart" and request.known is not None:
                 make_folder(output / STATE_FOLDER)
                 map_file = MapFile(request.known).path.resolve()
-                write_whole(output / STATE_FOLDER / _KNOWN_MAP, str(map_file))
+                write_whole(output / STATE_FOLDER / KNOWN_MAP, str(map_file))
         try:
             with announced(output, fleet.endpoint, fleet.session), progress:
                 if viewer is not None:
@@ -248,50 +247,6 @@ def _told_poses(request: RunRequest, fleet: Fleet) -> AbstractContextManager[Non
 
     known = None if request.known is None else MapFile(request.known)
     return told_poses(fleet, known, deformable=request.profile == _DEFORMABLE)
-
-
-def resumed_config(output: Path, request: RunRequest) -> Config:
-    """The configuration of the run that is taken up again.  Raises ResultError, ConfigError."""
-    if not (output / STATE_FOLDER).is_dir():
-        raise ResultError(f"{output}: {_why_not_resumed(output)}")
-    kept = load_config(output / CONFIG_NAME)
-    said = request.overrides or request.config_file or request.seed is not None
-    if said and kept != load_config(request.config_file, request.overrides, seed=request.seed):
-        raise ResultError(
-            "--resume takes the configuration of its run, and this is another one: leave --config, "
-            "--set, --seed and what else changes it"
-        )
-    return kept
-
-
-def _why_not_resumed(output: Path) -> str:
-    if not parts.exists(output / RECORDING_NAME):
-        return "there is no run to resume: leave --resume"
-    if (output / REPORT_NAME).exists():
-        return "its run came to its end, and nothing is left to resume: --force begins anew"
-    return (
-        "its run was begun without --on-crash restart, and cannot go on: `pliant recover` keeps "
-        "what was recorded, --force begins anew"
-    )
-
-
-def resumed_map(output: Path, request: RunRequest) -> Path | None:
-    """The map in which the run goes on that is taken up again.  Raises ResultError for another."""
-    note = output / STATE_FOLDER / _KNOWN_MAP
-    begun_in = Path(note.read_text()) if note.is_file() else None
-    if request.known is not None and MapFile(request.known).path.resolve() != begun_in:
-        raise ResultError(
-            f"--resume goes on in the map of its run, {begun_in or 'which has none'}, and "
-            f"{request.known} is another one: leave --map"
-        )
-    return begun_in
-
-
-def _has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
-    """Whether all that the services had to say was recorded, and nobody is to be started again."""
-    _, ended = mend(output / RECORDING_NAME)
-    recorded = inputs_of("recorder", services, images=config.recorder.images)
-    return ended >= {topic.key for topic in recorded}
 
 
 def _wait(fleet: Fleet, progress: Progress, up: str) -> bool:

@@ -1,32 +1,17 @@
-"""How a run lets others look on: it says where it is, and starts a viewer where asked to."""
+"""The viewer that a run starts where asked to."""
 
-import json
 import subprocess
 import sys
-from collections.abc import Generator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
 from pliant.errors import ResultError
-from pliant.results.folder import SESSION_NAME
 from pliant_services.runtime.launcher import Fleet
 
 _WAIT_S = 120.0  # services compile before they are up; a viewer imports Rerun on a busy machine
 _LAST_WORDS_S = 20.0
 _LEAVE_S = 5.0
-
-
-@contextmanager
-def announced(output: Path, endpoint: str, session: str) -> Generator[None]:
-    """Leave ``session.json`` in the result folder while the run goes on."""
-    file = output / SESSION_NAME
-    with suppress(OSError):  # a full disk has a line of its own
-        file.write_text(json.dumps({"endpoint": endpoint, "session": session}), encoding="utf-8")
-    try:
-        yield
-    finally:
-        file.unlink(missing_ok=True)
 
 
 def has_viewer() -> bool:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pliant.exit_codes import DONE, INCOMPLETE
+from pliant.files import append
 
 _LAST_WORDS = 12  # lines of a service's log that are shown when it dies
 _POLL_S = 0.05
@@ -58,7 +59,7 @@ class Child:
     def _read(self) -> None:
         assert self.process.stdout is not None
         try:
-            log = self.log.open("ab", buffering=0)
+            log = append(self.log)
         except OSError:
             log = None
         for line in self.process.stdout:

@@ -15,7 +15,7 @@ from pliant.bus.session import open_session
 from pliant.config import Config, config_yaml
 from pliant.errors import ResultError, SessionOverError, SourceLostError
 from pliant.exit_codes import DONE
-from pliant.files import make_folder, put_in_place, write_whole
+from pliant.files import make_folder, mark, put_in_place, write_whole
 from pliant.recording import parts
 from pliant.results.folder import (
     CONFIG_NAME,
@@ -64,7 +64,7 @@ def run_alone(name: str, config: Config, options: ServiceOptions, *, results: bo
     return code
 
 
-def _held(output: Path | None, *, results: bool) -> AbstractContextManager[None]:
+def _held(output: Path | None, *, results: bool) -> AbstractContextManager[object]:
     """The folder that a recorder writes to, so that nobody replaces what is there."""
     if output is None:
         return nullcontext()
@@ -112,8 +112,8 @@ def _leave(state: Path | None, name: str) -> None:
     if state is None:
         return
     folder = state / name
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / _MARK).touch()
+    make_folder(folder)
+    mark(folder / _MARK)
     for checkpoint in folder.glob("*.state"):
         checkpoint.unlink(missing_ok=True)
 

@@ -1,7 +1,6 @@
 """An authority of our own and a certificate for everybody in a session: ``pliant certs``."""
 
 import ipaddress
-import os
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from importlib import import_module
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pliant.errors import PliantError, ResultError
+from pliant.files import write_whole
 
 ROUTER = "router"
 _AUTHORITY = "pliant"
@@ -42,7 +42,7 @@ def make_certificates(
         signing = _load_key(authority / "ca.key")
         issuer = (authority / "ca.pem").read_bytes()
         x509.load_pem_x509_certificate(issuer)  # a broken one is noticed before keys are made
-        (folder / "ca.pem").write_bytes(issuer)
+        write_whole(folder / "ca.pem", issuer)
         for name in names:
             if (folder / f"{name}.key").exists():
                 continue
@@ -145,8 +145,6 @@ def _load_key(path: Path) -> Any:
 
 def _write(folder: Path, name: str, key: Any, certificate: Any) -> None:
     forms = _module("hazmat.primitives.serialization")
-    (folder / f"{name}.pem").write_bytes(certificate.public_bytes(forms.Encoding.PEM))
+    write_whole(folder / f"{name}.pem", certificate.public_bytes(forms.Encoding.PEM))
     secret = key.private_bytes(forms.Encoding.PEM, forms.PrivateFormat.PKCS8, forms.NoEncryption())
-    descriptor = os.open(folder / f"{name}.key", os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(secret)
+    write_whole(folder / f"{name}.key", secret, mode=0o600)

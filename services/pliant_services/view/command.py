@@ -22,10 +22,12 @@ from pliant.messages import codec, topics
 from pliant.messages.topics import Topic, by_key
 from pliant.recording import parts
 from pliant.recording.reader import Recording
-from pliant.results.folder import RECORDING_NAME, files_read, keep_apart, running_session
+from pliant.results.folder import RECORDING_NAME, files_read, keep_apart
+from pliant.staging import put_tree_in_place, staging
 from pliant.viewers.canvas import Canvas
 from pliant.viewers.drawn_scene import Scene
 from pliant.viewers.rerun import RerunCanvas, Where
+from pliant_services.runtime.announced import running_session
 
 _WAITING = 512  # messages between the network and the drawing; the oldest give way
 _WAITING_BYTES = 256 << 20
@@ -60,8 +62,30 @@ class ViewRequest:
 def run_view(request: ViewRequest) -> None:
     """Show it.  Raises PliantError."""
     where = place(web=request.web, save=request.save, force=request.force)
-    if request.save is not None and request.source is not None:
-        keep_apart(request.save, files_read(request.source), option="--save")
+    if not isinstance(where, Path):
+        _show(request, where)
+        return
+    if request.source is not None:
+        keep_apart(where, files_read(request.source), option="--save")
+    try:
+        with staging(where.parent) as partial:
+            made = partial / where.name
+            try:
+                _show(request, made)
+            except PliantError:  # nothing came to be seen
+                raise
+            except BaseException:  # of an interruption: what came so far
+                if made.exists():
+                    put_tree_in_place(made, where)
+                raise
+            put_tree_in_place(made, where)
+    except OSError as error:
+        raise ResultError(f"{where}: cannot be written ({error.strerror})") from None
+    print(where)
+
+
+def _show(request: ViewRequest, where: Where) -> None:
+    """Draw it there.  Raises PliantError."""
     endpoints, session = request.endpoints, request.session
     if not endpoints and request.source is not None and request.source.is_dir():
         endpoints, session = running_session(request.source)
@@ -82,16 +106,10 @@ def run_view(request: ViewRequest) -> None:
         if request.web:
             canvas.send()
             _stay()
-    except PliantError:
-        if request.save is not None:  # nothing came to be seen: the next try shall find no file
-            request.save.unlink(missing_ok=True)
-        raise
     finally:
         if not canvas.is_watched:
             print("the window of Rerun is closed, or could not open", file=sys.stderr)
         canvas.close()
-    if request.save is not None:
-        print(request.save)
 
 
 def follow(

@@ -79,12 +79,13 @@ def run(
         "camera": camera, "depth": depth, "depth-frames": depth_frames, "no-images": not images,
         "seed": seed, "poses": on_frame is not None,
     }  # fmt: skip
-    command = [sys.executable, "-m", "pliant_services.cli", "run", str(source)]
+    command = [sys.executable, "-m", "pliant_services.cli", "run"]
     for name, value in options.items():
         if value is not None and value is not False:
             command += [f"--{name}"] if value is True else [f"--{name}", str(value)]
     for setting in settings_of(settings or {}):
         command += ["--set", setting]
+    command += ["--", str(source)]  # its name may begin with a dash
     said = ""
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,

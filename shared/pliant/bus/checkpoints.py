@@ -5,6 +5,7 @@ will not make those again.  So some are kept, until an older one can never be ne
 whose outputs every reader has safe.
 """
 
+import io
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -15,7 +16,7 @@ from typing import Any
 import msgpack
 
 from pliant.errors import BusError, StateError
-from pliant.files import make_folder, put_in_place
+from pliant.files import create, make_folder, put_in_place
 
 _VERSION = 1
 
@@ -122,7 +123,7 @@ class Checkpoints:
 
 def _write_whole(path: Path, parts: tuple[Any, ...]) -> None:
     part = path.with_suffix(".part")
-    with part.open("wb") as file:
+    with io.BufferedWriter(create(part)) as file:
         for data in parts:
             file.write(data)
     put_in_place(part, path)

@@ -1,8 +1,6 @@
 """Behind ``pliant export``: what a result folder becomes for other programs and for the eye."""
 
-import shutil
 from collections.abc import Callable, Container, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +9,7 @@ import numpy as np
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
-from pliant.errors import ResultError
+from pliant.errors import PliantError, ResultError
 from pliant.export.colmap import colmap
 from pliant.export.depth import depth
 from pliant.export.images import camera_of, images, rectified_images
@@ -29,6 +27,7 @@ from pliant.export.overview import (
 )
 from pliant.export.surface_meshes import overlay_pictures, surfaces
 from pliant.export.textured import glb, obj
+from pliant.files import is_stream, make_folder
 from pliant.formats.euroc import write_euroc
 from pliant.formats.kitti import write_kitti
 from pliant.formats.tum import write_tum
@@ -46,6 +45,7 @@ from pliant.results.known_scale import MetricRecording
 from pliant.results.mesh_files import mesh_of
 from pliant.results.run import Run, read_run
 from pliant.results.surfels import has_surfels, surfel_trajectory
+from pliant.staging import put_tree_in_place, staging
 from pliant.trajectory import Trajectory
 
 _QUALITY = 60
@@ -101,13 +101,22 @@ def export_result(
     if path.exists() and not force:
         raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
     check_free(path, path.parent)
-    fresh = not path.exists()
-    try:
+    if is_stream(path):
         write(recording, path, folder, **given)
-    except BaseException:  # Ctrl-C, too: half an export is none
-        if fresh:
-            _remove(path)
-        raise
+        return path
+    try:
+        if not Path(name).suffix:
+            make_folder(path.parent)
+        with staging(path.parent) as partial:
+            made = partial / path.name
+            try:
+                write(recording, made, folder, **given)
+            except PliantError as error:
+                error.args = (str(error).replace(f"{made}", f"{path}"),)
+                raise
+            put_tree_in_place(made, path)
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be written ({error.strerror})") from None
     return path
 
 
@@ -145,14 +154,6 @@ class _Followed(MetricRecording):
             if self._progress is not None and recorded.topic == topics.SOURCE:
                 self._progress(recorded.sequence + 1, frames)
             yield recorded
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        with suppress(OSError):
-            path.unlink()
 
 
 def _beside(recording: Path, name: str) -> Path:

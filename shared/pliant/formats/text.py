@@ -8,6 +8,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.errors import ResultError
+from pliant.files import write_whole
 from pliant.trajectory import Trajectory
 
 QUATERNION_TOLERANCE = 0.01
@@ -127,8 +128,8 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a whole file; a failing disk is one clear line (ResultError)."""
+    """Write a file, whole or not at all; a failing disk is one clear line (ResultError)."""
     try:
-        path.write_bytes(data)
+        write_whole(path, data, synced=False)
     except OSError as error:
         raise ResultError(f"{path}: cannot be written ({error.strerror})") from None

@@ -20,7 +20,7 @@ from mcap.records import (
 )
 
 from pliant.errors import RecordingError
-from pliant.files import sync
+from pliant.files import create, sync
 from pliant.messages import codec
 from pliant.messages.planes import in_planes
 from pliant.messages.topics import Topic
@@ -58,7 +58,7 @@ class RecordingWriter:
         self._metadata: list[MetadataIndex] = []
         self._broken = False
         try:
-            self._file = path.open("wb" if replace else "xb", buffering=0)
+            self._file = create(path) if replace else path.open("xb", buffering=0)
         except FileExistsError:
             raise RecordingError(f"{path} exists already: move it elsewhere") from None
         except OSError as error:

@@ -8,7 +8,6 @@ import platform
 import re
 import subprocess
 import sys
-import tempfile
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
@@ -17,13 +16,15 @@ from typing import Any
 
 from pliant.arithmetic import target
 from pliant.errors import PliantError, ResultError
-from pliant.files import make_folder, move_all, sync, write_whole
+from pliant.files import is_folder, make_folder, move_all, sync, sync_all, write_whole
 from pliant.messages import topics
 from pliant.recording import parts
 from pliant.recording.map_file import MAP_NAME
 from pliant.recording.reader import Recorded, Recording
 from pliant.recording.scan import NothingReadableError
 from pliant.results import earlier
+from pliant.results.locking import LOCK_NAME, Held, held, holder_of
+from pliant.staging import clear_staging, staging
 from pliant.version import __version__
 
 RECORDING_NAME = "recording.mcap"
@@ -51,7 +52,8 @@ SCALE_NAME = "scale.yaml"
 SOMETIMES = (MAP_NAME, SCALE_NAME)
 """Of a map that came to its end, and of one whose scale is known."""
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
-_LOCK_NAME = ".lock"
+_SWITCHING = ".results-whole"
+"""Results that are whole, and on their way to their places."""
 _LOGS, _METADATA = "logs", "metadata.json"
 _OF_SEGMENT = re.compile(r"_segment_\d+(?=\.\w+$)")
 _OF_FRAMES = (topics.SOURCE, topics.EXTREMA, topics.SURFELS)
@@ -95,41 +97,62 @@ def all_or_none(output: Path) -> Generator[Path]:
     Raises ResultError.
     """
     try:
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=output) as folder:
-            yield Path(folder)
-            move_all(Path(folder), output)
+        with staging(output) as folder:
+            made = folder / "results"
+            made.mkdir()
+            yield made
+            _switch(made, output)
     except OSError as error:
         raise ResultError(
             f"{output}: cannot write the results ({error.strerror}); the recording is kept"
         ) from None
 
 
+def _switch(made: Path, output: Path) -> None:
+    """Put files in place, from one moment on all of them: who is killed in between has it done by
+    the next one who takes the folder.  Raises OSError."""
+    for path in made.iterdir():
+        if is_folder(output / path.name):
+            raise IsADirectoryError(errno.EISDIR, f"{path.name} is a folder")
+    sync_all(made)
+    made.rename(output / _SWITCHING)
+    sync(output)
+    _finish_switch(output)
+
+
+def _finish_switch(output: Path) -> None:
+    """Raises OSError."""
+    if is_folder(output / _SWITCHING):
+        move_all(output / _SWITCHING, output)
+        (output / _SWITCHING).rmdir()
+
+
 @contextmanager
-def written(output: Path, *, force: bool) -> Generator[None]:
+def written(output: Path, *, force: bool) -> Generator[Held]:
     """Hold a result folder while results are written to it; made here, it goes if it stays empty.
 
-    The lock is the system's, so that of a process that died holds nobody up.  Raises ResultError
-    where the results cannot go there, or another process is writing them.
+    Raises ResultError where the results cannot go there, or another process is writing them.
     """
     check_output(output, force=force)
     missing = [folder for folder in (output, *output.parents) if not folder.exists()]
     try:
         try:
             make_folder(output)
-            lock = _locked(output)
+            held_folder = Held(output)
         except OSError as error:
             raise _unwritable(output, error) from None
         try:
             check_output(output, force=force)  # another one may have been here meanwhile
             _settle(output)
-            yield
+            yield held_folder
         finally:
             try:
                 with suppress(PliantError):  # the next one who writes here tells of it
-                    _settle(output)
+                    now = held_folder.path  # perhaps it has another name now
+                    if now is not None:
+                        _settle(now)
             finally:
-                (output / _LOCK_NAME).unlink(missing_ok=True)
-                os.close(lock)
+                held_folder.release()
     finally:
         for folder in missing:
             with suppress(OSError):
@@ -145,43 +168,18 @@ def recorded_into(folder: Path) -> Generator[None]:
     settle_killed(folder)
     try:
         make_folder(folder)
-        lock = _locked(folder, fcntl.LOCK_SH)
+        held_folder = Held(folder, fcntl.LOCK_SH)
     except OSError as error:
         raise _unwritable(folder, error) from None
     try:
         yield
     finally:
-        with suppress(OSError):  # another one still records
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            (folder / _LOCK_NAME).unlink(missing_ok=True)
-        os.close(lock)
-
-
-def _locked(output: Path, kind: int = fcntl.LOCK_EX) -> int:
-    """The descriptor of a lock file with our number in it."""
-    path = output / _LOCK_NAME
-    while True:
-        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(lock, kind | fcntl.LOCK_NB)
-            if os.path.exists(path) and os.path.samestat(os.fstat(lock), os.stat(path)):
-                os.truncate(lock, 0)
-                os.write(lock, f"{os.getpid()}\n".encode())
-                return lock
-        except OSError as error:
-            if error.errno in (errno.ENOLCK, errno.ENOTSUP):  # a file system without locks
-                return lock
-            if error.errno not in (errno.EACCES, errno.EAGAIN):
-                raise
-            holder = os.read(lock, 20).decode().strip()
-            os.close(lock)
-            raise _held(output, holder) from None
-        os.close(lock)  # its holder left between our two looks, and took the file away
+        held_folder.release()
 
 
 def is_being_written(output: Path) -> bool:
     """Whether another process holds a result folder, perhaps on another machine."""
-    return _holder(output) is not None
+    return holder_of(output) is not None
 
 
 def check_free(*folders: Path, elsewhere: bool = True) -> None:
@@ -190,41 +188,11 @@ def check_free(*folders: Path, elsewhere: bool = True) -> None:
     elsewhere: whether the command has an --output that can name another one.
     """
     for folder in folders:
-        holder = _holder(folder)
+        holder = holder_of(folder)
         if holder is not None:
-            raise _held(folder, holder, elsewhere=elsewhere)
-
-
-def _holder(output: Path) -> str | None:
-    """The number of the process that holds a folder, "" where nobody knows; None: nobody does."""
-    try:
-        lock = os.open(output / _LOCK_NAME, os.O_RDWR)
-    except OSError:
-        return None
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in (errno.EACCES, errno.EAGAIN):
-            return os.read(lock, 20).decode().strip()
-    finally:
-        os.close(lock)
-    return None
-
-
-def _held(output: Path, holder: str, *, elsewhere: bool = True) -> ResultError:
-    return ResultError(
-        f"{output} is being written by process {holder or '?'}: wait for its end"
-        + ", or choose another --output" * elsewhere
-    )
-
-
-def running_session(result: Path) -> tuple[list[str], str]:
-    """The endpoint and name of the run that is writing this result; ([], "") if none is."""
-    try:
-        content = json.loads((result / SESSION_NAME).read_text(encoding="utf-8"))
-        return [str(content["endpoint"])], str(content["session"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return [], ""
+            raise held(folder, holder, elsewhere=elsewhere)
+        if is_folder(folder / _SWITCHING):
+            settle_killed(folder)
 
 
 def check_output(output: Path, *, force: bool) -> None:
@@ -233,7 +201,7 @@ def check_output(output: Path, *, force: bool) -> None:
         if output.exists() and not output.is_dir():
             raise ResultError(f"{output} is a file: choose another --output")
         there = {each.name for each in output.iterdir()} if output.is_dir() else set[str]()
-        if there - {_LOCK_NAME} and not force:
+        if there - {LOCK_NAME} and not force:
             raise ResultError(
                 f"{output} exists: choose another --output, or --force to overwrite it"
             )
@@ -256,6 +224,8 @@ def prepare(output: Path, config: str) -> None:
     if folder.is_symlink() and parts.parts_in(folder):
         raise ResultError(f"{folder} is a link, and a recording is there: move it, or the link")
     try:
+        if (output / _LOGS).is_symlink():  # what it points to is not ours
+            (output / _LOGS).unlink()
         make_folder(output / _LOGS)
         earlier.set_aside(output, _result_in(output))
         write_whole(output / CONFIG_NAME, config)
@@ -265,11 +235,11 @@ def prepare(output: Path, config: str) -> None:
 
 
 def settle_killed(output: Path) -> None:
-    """Settle which result a folder keeps, where the run that was to replace it was killed.
+    """Settle which result a folder keeps, where who was to replace it was killed.
 
     Raises PliantError.
     """
-    if earlier.is_aside(output) or earlier.is_moving(output):
+    if earlier.is_aside(output) or earlier.is_moving(output) or is_folder(output / _SWITCHING):
         with written(output, force=True):
             pass
 
@@ -290,9 +260,13 @@ def let_go(output: Path) -> None:
 def _settle(output: Path) -> None:
     """Where an earlier result is set aside: let it go if the new one has frames, else put it back.
 
-    Logs are those of the last run in any case.  Raises PliantError, and has deleted nothing then.
+    Logs are those of the last run in any case.  Who holds the folder alone calls it: what killed
+    processes have left goes.  Raises PliantError, and has deleted nothing then.
     """
     try:
+        clear_staging(output)
+        _finish_switch(output)
+        (output / SESSION_NAME).unlink(missing_ok=True)
         if earlier.is_moving(output):
             earlier.move_back(output)
         if earlier.is_aside(output):

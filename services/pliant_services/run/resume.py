@@ -1,0 +1,75 @@
+"""A run that was cut off, and is taken up again: what it was begun with, and how far it came."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pliant.config import Config, load_config
+from pliant.errors import ResultError
+from pliant.recording import parts
+from pliant.recording.map_file import MapFile
+from pliant.recording.recover import mend
+from pliant.recording.summary import summarise
+from pliant.results.folder import CONFIG_NAME, RECORDING_NAME, REPORT_NAME, STATE_FOLDER
+from pliant_services.processes import deformable_fleet, inputs_of
+from pliant_services.profiles import PROFILES
+from pliant_services.run.request import RunRequest
+
+KNOWN_MAP = "known_map"
+"""In the folder of checkpoints: where the map is in which a run goes on."""
+_NONE = "there is no run to resume: leave --resume"
+_OVER = "its run came to its end, and nothing is left to resume: --force begins anew"
+_CUT_OFF = (
+    "its run was begun without --on-crash restart, and cannot go on: `pliant recover` keeps what "
+    "was recorded, --force begins anew"
+)
+
+
+def resumed_config(output: Path, request: RunRequest) -> Config:
+    """The configuration of the run that is taken up again.  Raises ResultError, ConfigError."""
+    begun = parts.exists(output / RECORDING_NAME)
+    if not (output / STATE_FOLDER).is_dir() and (not begun or (output / REPORT_NAME).exists()):
+        raise ResultError(f"{output}: {_OVER if begun else _NONE}")
+    kept = load_config(output / CONFIG_NAME)
+    said = request.overrides or request.config_file or request.seed is not None
+    if said and kept != load_config(request.config_file, request.overrides, seed=request.seed):
+        raise ResultError(
+            "--resume takes the configuration of its run, and this is another one: leave --config, "
+            "--set, --seed and what else changes it"
+        )
+    return kept
+
+
+def resumed_map(output: Path, request: RunRequest) -> Path | None:
+    """The map in which the run goes on that is taken up again.  Raises ResultError for another."""
+    if not (output / STATE_FOLDER).is_dir():  # at most results are left to write
+        return request.known
+    note = output / STATE_FOLDER / KNOWN_MAP
+    begun_in = Path(note.read_text()) if note.is_file() else None
+    if request.known is not None and MapFile(request.known).path.resolve() != begun_in:
+        raise ResultError(
+            f"--resume goes on in the map of its run, {begun_in or 'which has none'}, and "
+            f"{request.known} is another one: leave --map"
+        )
+    return begun_in
+
+
+def has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
+    """Whether all that the services had to say was recorded, and nobody is to be started again."""
+    path = output / RECORDING_NAME
+    if path.is_file():
+        ended = {key for key, topic in summarise(path).topics.items() if topic.end is not None}
+    else:
+        _, ended = mend(path)
+    recorded = inputs_of("recorder", services, images=config.recorder.images)
+    return ended >= {topic.key for topic in recorded}
+
+
+def check_ended(output: Path, config: Config) -> None:
+    """Raise ResultError where a run without checkpoints was not recorded to its end."""
+    from pliant.results.surfels import has_surfels  # it loads what a launcher has no use for
+
+    deformable = has_surfels(output / RECORDING_NAME)
+    rigid = "rigid" if config.meshing.enabled else "points"
+    services = PROFILES[deformable_fleet(config) if deformable else rigid]
+    if not has_ended(output, services, config):
+        raise ResultError(f"{output}: {_CUT_OFF}")
