@@ -7,6 +7,9 @@ import pytest
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import config_yaml, load_config
 from pliant.datasets import open_source
+from pliant.errors import ResultError
+from pliant.export.export import export_result
+from pliant.export.kinds import OF_STILL_SCENES
 from pliant.messages import codec, topics
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import RECORDING_NAME, run_metadata
@@ -42,3 +45,6 @@ def test_depth_that_was_made_up_is_doubtful_and_not_in_metres(
                 writer.write(topic, data, sequence=n, log_time_ns=n, publish_time_ns=n)
     report = write_results(tmp_path)
     assert (report["verdict"], report["scale_is_metric"]) == (verdict, is_metric)
+    for kind in OF_STILL_SCENES:
+        with pytest.raises(ResultError, match=f"^--to {kind} needs the map .* --to surface writes"):
+            export_result(tmp_path, kind, None, force=False)

@@ -77,6 +77,8 @@ def test_lists_of_exports_are_whole() -> None:
         (rows,) = re.findall(r"^\| `--to` \|.*?\n\n", text, re.MULTILINE | re.DOTALL)
         return "".join(line.split("|")[1] for line in rows.strip().splitlines())
 
+    (kinds,) = (p for p in PROGRAMS["pliant"].commands["export"].params if p.name == "to")
+    assert kinds.help == f"{', '.join(EXPORTS)}."
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert set(EXPORTS) <= told(readme)
     assert told(table("outputs.md")) == told(table("viewing.md")) == set(EXPORTS)

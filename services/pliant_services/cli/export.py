@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from pliant.export.kinds import KINDS
+
 
 def export(
     result: Annotated[Path, typer.Argument(help="A result folder or a recording.")],
@@ -12,8 +14,7 @@ def export(
         str,
         typer.Option(
             "--to",
-            help="foxglove, rerun, tum, kitti, euroc, ply, colmap, nerfstudio, depth, images, glb, "
-            "obj, surface, overlay, picture or overview.",
+            help=f"{', '.join(KINDS)}.",
         ),
     ],
     output: Annotated[

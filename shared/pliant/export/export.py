@@ -13,6 +13,7 @@ from pliant.errors import PliantError, ResultError
 from pliant.export.colmap import colmap
 from pliant.export.depth import depth
 from pliant.export.images import camera_of, images, rectified_images
+from pliant.export.kinds import KINDS, OF_STILL_SCENES, OPTIONS
 from pliant.export.models import foxglove, ply, rerun
 from pliant.export.nerfstudio import nerfstudio
 from pliant.export.overview import (
@@ -87,8 +88,8 @@ def export_result(
     options = {"every": every, "triangles": triangles}
     given = {name: value for name, value in options.items() if value is not None}
     for option in given:
-        if to not in _OPTIONS[option]:
-            has = " and ".join(_OPTIONS[option])
+        if to not in OPTIONS[option]:
+            has = " and ".join(OPTIONS[option])
             raise ResultError(f"--{option}: {to} has no such option, only {has}")
     if not result.exists():
         raise ResultError(f"{result}: no such result folder or recording")
@@ -112,6 +113,11 @@ def export_result(
             try:
                 write(recording, made, folder, **given)
             except PliantError as error:
+                if to in OF_STILL_SCENES and has_surfels(recording.path):
+                    raise ResultError(
+                        f"--to {to} needs the map or mesh of a rigid scene, and {result} deforms: "
+                        "--to surface writes its meshes"
+                    ) from None
                 error.args = (str(error).replace(f"{made}", f"{path}"),)
                 raise
             put_tree_in_place(made, path)
@@ -284,26 +290,25 @@ def _frames_per_second(recording: Recording, topic: Topic = topics.EXTREMA) -> f
     return float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else 30.0
 
 
-EXPORTS: dict[str, tuple[str, Export]] = {
-    "foxglove": ("foxglove.mcap", foxglove),
-    "rerun": ("rerun.rrd", rerun),
-    "tum": ("trajectory_tum.txt", _poses(write_tum)),
-    "kitti": ("trajectory_kitti.txt", _poses(write_kitti)),
-    "euroc": ("trajectory_euroc.csv", _poses(write_euroc)),
-    "ply": ("points_longest.ply", ply),
-    "colmap": ("colmap", colmap),
-    "nerfstudio": ("nerfstudio", nerfstudio),
-    "depth": ("depth", depth),
-    "images": ("images", images),
-    "glb": ("mesh.glb", glb),
-    "obj": ("obj", obj),
-    "surface": ("surface", surfaces),
-    "overlay": ("overlay.mp4", _overlay),
-    "picture": ("picture.png", _picture),
-    "overview": ("overview.webp", _overview),
+_WRITERS: dict[str, Export] = {
+    "foxglove": foxglove,
+    "rerun": rerun,
+    "tum": _poses(write_tum),
+    "kitti": _poses(write_kitti),
+    "euroc": _poses(write_euroc),
+    "ply": ply,
+    "colmap": colmap,
+    "nerfstudio": nerfstudio,
+    "depth": depth,
+    "images": images,
+    "glb": glb,
+    "obj": obj,
+    "surface": surfaces,
+    "overlay": _overlay,
+    "picture": _picture,
+    "overview": _overview,
 }
+EXPORTS = {kind: (name, _WRITERS[kind]) for kind, name in KINDS.items()}
 """Kind of export: its default name, and who writes it."""
 _NAMED = ("foxglove", "rerun", "ply", "glb")
 """Kinds that other programs know by the ending; trajectories are text under any."""
-_OPTIONS = {"every": ("surface",), "triangles": ("glb", "obj")}
-"""Which kinds have an option."""

@@ -1,0 +1,26 @@
+"""The kinds of export by name, without what makes them: help pages list them."""
+
+KINDS = {
+    "foxglove": "foxglove.mcap",
+    "rerun": "rerun.rrd",
+    "tum": "trajectory_tum.txt",
+    "kitti": "trajectory_kitti.txt",
+    "euroc": "trajectory_euroc.csv",
+    "ply": "points_longest.ply",
+    "colmap": "colmap",
+    "nerfstudio": "nerfstudio",
+    "depth": "depth",
+    "images": "images",
+    "glb": "mesh.glb",
+    "obj": "obj",
+    "surface": "surface",
+    "overlay": "overlay.mp4",
+    "picture": "picture.png",
+    "overview": "overview.webp",
+}
+"""Kind of export: its default name."""
+
+OF_STILL_SCENES = ("ply", "colmap", "nerfstudio", "depth", "glb", "obj", "picture", "overview")
+"""Kinds that are made of a map or mesh, which a run of the deformable profile has not."""
+OPTIONS = {"every": ("surface",), "triangles": ("glb", "obj")}
+"""Which kinds have an option."""
