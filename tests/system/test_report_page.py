@@ -20,6 +20,7 @@ from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.messages import topics
 from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
+from pliant.results.calibration import FOUND
 from pliant.results.folder import RECORDING_NAME
 from pliant.results.page.advice import advice
 from pliant.results.page.scene import make_scene
@@ -288,6 +289,7 @@ def test_of_a_good_run_there_is_nothing_to_say() -> None:
     assert advice(report(), STAMPS) == []
     # A clip so short that all of its frames waited for the map to begin.
     assert advice(report(median_inliers_per_frame=0.0), STAMPS) == []
+    assert advice(report(calibration_verdict=f"{FOUND} (60.0 degrees)"), STAMPS) == []
 
 
 def test_what_the_verdict_says_of_the_lens_is_not_said_again() -> None:

@@ -133,6 +133,12 @@ def test_a_run_whose_calibration_bends_the_map_is_doubtful() -> None:
     assert judge(frames=100, in_segments=[20], doubtful=0, calibration=known)[0] == BAD
 
 
+def test_where_much_of_the_scene_moves_the_profile_for_it_is_named() -> None:
+    word, why = judge(frames=100, in_segments=[100], doubtful=44)
+    assert word == DOUBTFUL
+    assert "--profile deformable" in why
+
+
 def test_a_run_of_which_many_images_are_broken_is_doubtful() -> None:
     few = judge(frames=95, in_segments=[95], doubtful=0, unused=5, broken=5)
     many = judge(frames=60, in_segments=[60], doubtful=0, unused=40, broken=40)

@@ -16,6 +16,9 @@ from pliant.datasets.working_size import at_size
 from pliant.errors import CalibrationError
 from pliant.results.run import Run
 
+FOUND = "the focal length was found"
+"""What a verdict begins with that asks nothing of the user."""
+
 _GRID = 24
 """Points across the image to which a lens is fitted."""
 
@@ -121,7 +124,7 @@ def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
     if run.stream.focal_sigma > 0.0:
         if sigmas[0] > _KNOWN:
             return f"the focal length stays unknown ({known}){_why(final)}: give --calibration"
-        return f"the focal length was found ({known}): calibration.yaml is for the next run"
+        return f"{FOUND} ({known}): calibration.yaml is for the next run"
     if not _is_contradicted(run):
         return ""
     return (

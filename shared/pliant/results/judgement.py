@@ -54,7 +54,10 @@ def judge(
     if share < _LITTLE:
         return BAD, told
     if doubtful > DOUBTS * posed:
-        return DOUBTFUL, f"{doubtful / posed:.0%} of the poses are doubtful: something large moves?"
+        return DOUBTFUL, (
+            f"{doubtful / posed:.0%} of the poses are doubtful: something large moves, or the "
+            "scene deforms (--profile deformable)?"
+        )
     if absent > (1.0 - _WHOLE) * of_source:
         came = 1.0 - absent / of_source
         return DOUBTFUL, f"only {came:.0%} of the frames of the source came"

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pliant.messages.types import DROPPED
+from pliant.results.calibration import FOUND
 from pliant.results.judgement import DOUBTS
 from pliant.results.report import broken_images
 from pliant.wording import counted
@@ -62,12 +63,13 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
     if len(report["doubtful_frames"]) > DOUBTS * posed:
         told.append(
             f"{len(report['doubtful_frames'])} poses rest on a small part of the image: something "
-            "large moves in front of the camera, or most of what it sees is blank."
+            "large moves in front of the camera, or most of what it sees is blank. For a scene that "
+            "deforms use --profile deformable."
         )
-    if report["calibration_verdict"] and report["calibration_verdict"] != report["verdict_reason"]:
-        told.append(
-            f"{report['calibration_verdict'][:1].upper()}{report['calibration_verdict'][1:]}."
-        )
+    calibration = report["calibration_verdict"]
+    said = calibration == report["verdict_reason"] or calibration.startswith(FOUND)
+    if calibration and not said:
+        told.append(f"{calibration[:1].upper()}{calibration[1:]}.")
     if report["frames_passed_over"] or any(
         why == DROPPED for why in report["frames_without_pixels"].values()
     ):

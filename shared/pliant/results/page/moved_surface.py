@@ -49,7 +49,7 @@ class Surface:
             colours=np.tile(colours, (2, 1)),
             triangles=both,
         )
-        return make_scene(positions, colours, np.array(self._path), mesh)
+        return make_scene(positions, colours, np.array(self._path), mesh, frame_path=False)
 
     def _colours(self, positions: F64, ids: list[int]) -> U8:
         """(N, 3) RGB."""

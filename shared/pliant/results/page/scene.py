@@ -37,10 +37,13 @@ def make_scene(
     T_world_camera: F64,
     mesh: TriangleMesh | None,
     places: F64 | None = None,
+    *,
+    frame_path: bool = True,
 ) -> Scene:
     """Points (P, 3), the camera's path (N, 4, 4), N >= 1, and the mesh, as many as a page carries.
 
-    places: (L, 2, 3) lines between what shows one place.
+    places: (L, 2, 3) lines between what shows one place.    frame_path: whether the path is in view
+    at first, or the surface alone, which fills the canvas then.
 
     Places are 16-bit shares of the box that holds all but stray points.
     """
@@ -65,7 +68,7 @@ def make_scene(
         tints = np.tile(np.array(PLACES_COLOUR, np.uint8), (2 * len(places), 1))
         block.add("places", places.reshape(-1, 3), tints, line=True, pairs=True)
     view = choose_view(points, T_world_camera)
-    target, distance = _framed(shown, path, view)
+    target, distance = _framed(shown, path if frame_path else path[:0], view)
     direction = view.T_world_view[:3, 2]
     up = view.up / np.linalg.norm(view.up)
     level = direction - (direction @ up) * up
@@ -87,6 +90,10 @@ def _framed(places: F64 | F32, path: F64, view: MapView) -> tuple[F64, float]:
     (N, 3), but for stray ones, and by the path (M, 3)."""
     R, target = view.T_world_view[:3, :3], view.centre
     distance = float(np.linalg.norm(view.T_world_view[:3, 3] - target))
+    if not len(path):  # the view was chosen with it, and may look past what is to be seen
+        low, high = np.quantile(places, (_RIM, 1.0 - _RIM), axis=0)
+        target = 0.5 * (low + high)
+        distance = 2.0 * max(float(np.linalg.norm(high - low)), 1e-9)
     for _ in range(8):
         seen: list[F64] = []
         for some, rim in ((places, _RIM), (path, 0.0)):
