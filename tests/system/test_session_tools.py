@@ -16,6 +16,7 @@ from running import AS_FROM_A_SHELL, NO_MESH, command, in_this_process, pliant
 from pliant import arithmetic
 from pliant.bus.session import free_endpoint
 from pliant.datasets.builtin import builtin_folder
+from pliant.results.folder import has_frames
 from pliant_services.profiles import PROFILES
 
 pytestmark = pytest.mark.system
@@ -107,7 +108,7 @@ def test_a_run_is_found_by_its_result_folder(tmp_path: Path) -> None:
     result = tmp_path / "long"
     with start("run", long_source(tmp_path), *NO_MESH, "--output", str(result)) as run:
         rows: set[str] = set()
-        while not {"ingest", "recorder"} <= rows:
+        while not ({"ingest", "recorder"} <= rows and has_frames(result)):
             shown = pliant("status", str(result), "--seconds", "1.5")
             rows = {line.split()[1] for line in shown.stdout.splitlines()[1:]}
             assert run.poll() is None

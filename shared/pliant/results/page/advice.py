@@ -63,8 +63,8 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
     if len(report["doubtful_frames"]) > DOUBTS * posed:
         told.append(
             f"{len(report['doubtful_frames'])} poses rest on a small part of the image: something "
-            "large moves in front of the camera, or most of what it sees is blank. For a scene that "
-            "deforms use --profile deformable."
+            "large moves in front of the camera, or most of what it sees is blank. If the scene "
+            "deforms, use --profile deformable."
         )
     calibration = report["calibration_verdict"]
     said = calibration == report["verdict_reason"] or calibration.startswith(FOUND)
