@@ -20,7 +20,7 @@ class SourceFrame:
     index: from 0, without gaps.     stamp_ns: capture time, increasing.
     encoding: how ``data`` is read: a file format ("jpeg", "png", "bmp", "tiff", "webp", "pnm", or
     "unknown", left to the decoder) or raw rows without padding ("mono8", "bgr8", "rgb8" and
-    the others of ``rectifier.RAW_BYTES``).
+    the others of ``raw_pixels.RAW_BYTES``).
     data: bytes as they are in the file, or the raw pixels.
     width, height: of raw pixels; 0 for file formats, which say it themselves.
     made_from: "" as it came; else what it was before, for people; of a frame without data, why it

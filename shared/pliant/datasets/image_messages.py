@@ -14,7 +14,7 @@ import numpy as np
 from pliant.datasets.base import BrokenFrame, SourceFrame, encoding_of
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_files import calibration_from_camera_info
-from pliant.datasets.rectifier import RAW_BYTES
+from pliant.datasets.raw_pixels import OTHER_NAMES, RAW_BYTES, is_deep, raw_rows
 from pliant.errors import CalibrationError
 from pliant.wording import shown
 
@@ -26,9 +26,6 @@ IMAGE_TYPES = (
 )
 CALIBRATION_TYPES = ("sensor_msgs/CameraInfo", "foxglove/CameraCalibration")
 _RAW_TYPES = (IMAGE_TYPES[0], IMAGE_TYPES[2])
-
-_ENCODINGS = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16"}
-"""OpenCV's names of pixels, which ROS also takes."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,7 @@ def source_frame(kind: str, image: RecordedImage, index: int) -> SourceFrame:
     if kind not in _RAW_TYPES:
         data = bytes(message.data)
         return SourceFrame(index=index, stamp_ns=stamp_ns, encoding=encoding_of(data), data=data)
-    encoding = _ENCODINGS.get(message.encoding, message.encoding)
+    encoding = OTHER_NAMES.get(message.encoding, message.encoding)
     if encoding not in RAW_BYTES:
         raise BrokenFrame(
             f"images with encoding {shown(message.encoding)} are not understood; convert them "
@@ -94,12 +91,13 @@ def source_frame(kind: str, image: RecordedImage, index: int) -> SourceFrame:
 def _rows(message: Any, encoding: str) -> bytes:
     """The pixels without padding, little-endian.  As they are where they do not fit the size: the
     frame is then counted as broken."""
-    width, height, step = int(message.width), int(message.height), int(message.step)
+    width, step = int(message.width), int(message.step)
+    rows = raw_rows(encoding, int(message.height))
     row = width * RAW_BYTES[encoding]
     pixels = np.frombuffer(bytes(message.data), np.uint8)
-    if pixels.size == height * step and step > row:
-        pixels = pixels.reshape(height, step)[:, :row]
-    if encoding == "mono16" and getattr(message, "is_bigendian", False) and pixels.size % 2 == 0:
+    if pixels.size == rows * step and step > row:
+        pixels = pixels.reshape(rows, step)[:, :row]
+    if is_deep(encoding) and getattr(message, "is_bigendian", False) and pixels.size % 2 == 0:
         pixels = np.ascontiguousarray(pixels).reshape(-1).view(">u2").astype("<u2").view(np.uint8)
     return pixels.tobytes()
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from pliant.datasets.base import BrokenFrame, SourceFrame, encoding_of
+from pliant.datasets.bit_depth import bits_used, eight_bits, note_on
 from pliant.datasets.calibration import Calibration, calibration_from_fov
 from pliant.datasets.calibration_files import check_size, read_calibration
 from pliant.datasets.image_sizes import LOOKED_AT, most_frequent, size_of
@@ -68,6 +69,8 @@ class ImageFiles:
         self.calibration = calibration
         self.ground_truth_path = ground_truth_path
         self._images = images
+        self._bits = bits_used(_read(row, images[row]) for row in _spread(len(images)))
+        self.notes += note_on(self._bits)
 
     @property
     def frame_count(self) -> int | None:
@@ -89,7 +92,7 @@ class ImageFiles:
 
     def __iter__(self) -> Iterator[SourceFrame]:
         for index, image in enumerate(self._images):
-            yield _read(index, image)
+            yield eight_bits(_read(index, image), self._bits)
 
 
 def _read(index: int, image: ListedImage) -> SourceFrame:
@@ -122,10 +125,9 @@ def image_size(images: Sequence[ListedImage]) -> tuple[int, int]:
 
     Raises DatasetError where none of the first twenty, nor of these, decodes.
     """
-    count = len(images)
-    spread = {round(i * (count - 1) / max(1, LOOKED_AT - 1)) for i in range(LOOKED_AT)}
+    count, spread = len(images), _spread(len(images))
     sizes: list[tuple[int, int]] = []
-    for index in [*sorted(spread), *range(min(count, _TRIED_FOR_SIZE))]:
+    for index in [*spread, *range(min(count, _TRIED_FOR_SIZE))]:
         if len(sizes) >= len(spread) or (sizes and index not in spread):
             break
         try:
@@ -137,6 +139,12 @@ def image_size(images: Sequence[ListedImage]) -> tuple[int, int]:
     tried = min(count, _TRIED_FOR_SIZE)
     which = "the only image does not" if tried == 1 else f"none of the first {tried} images does"
     raise DatasetError(f"{images[0].path}: {which} decode; are these image files?")
+
+
+def _spread(count: int) -> list[int]:
+    """Some images from the first to the last."""
+    last = max(1, LOOKED_AT - 1)
+    return sorted({round(i * (count - 1) / last) for i in range(LOOKED_AT)}) if count else []
 
 
 def choose_calibration(

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from pliant.datasets import image_messages
 from pliant.datasets.base import BrokenFrame, SourceFrame
+from pliant.datasets.bit_depth import bits_used, eight_bits, note_on
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.frame_times import in_order
 from pliant.datasets.image_messages import CALIBRATION_TYPES, IMAGE_TYPES, RecordedImage
@@ -58,11 +59,13 @@ class MessageImages:
     def __init__(self, file: MessageFile, options: SourceOptions) -> None:
         """Raises DatasetError, which lists the topics where the choice is not clear."""
         self.name = file.path.resolve().stem
+        self.notes: list[str] = []
+        self._bits = 16
         self._file = file
         with file.open() as opened:
             self._topic = _choose(opened.topics, options.topic, file.path)
             self._where = f"{file.path}: {self._topic.name}"
-            size = self._size(opened)
+            size = self._look(opened)
             found = None
             if options.calibration is None and options.fov_deg is None:
                 found = _calibration(opened, self._topic, self._where)
@@ -85,32 +88,37 @@ class MessageImages:
         """One frame for each message, a broken one where it cannot be understood."""
         for index, image in enumerate(opened.messages(self._topic)):
             try:
-                yield image_messages.source_frame(self._topic.kind, image, index)
+                frame = image_messages.source_frame(self._topic.kind, image, index)
+                yield eight_bits(frame, self._bits)
             except BrokenFrame as error:
                 yield SourceFrame(
                     index=index, stamp_ns=image.log_time_ns, encoding="unknown", data=b"",
                     made_from=str(error),
                 )  # fmt: skip
 
-    def _size(self, opened: OpenMessages) -> tuple[int, int]:
-        """(width, height) of most of the first images that decode."""
-        faults, sizes = list[str](), list[tuple[int, int]]()
+    def _look(self, opened: OpenMessages) -> tuple[int, int]:
+        """(width, height) of most of the first images that decode, and the bits that they use."""
+        faults, sizes, frames = list[str](), list[tuple[int, int]](), list[SourceFrame]()
         try:
             for frame in self._frames(opened):
                 try:
                     height, width = decode(frame).shape[:2]
                     sizes.append((width, height))
+                    frames.append(frame)
                 except BrokenFrame as error:
                     faults.append(str(error).removeprefix(f"{frame.called}: "))
-                if len(sizes) == LOOKED_AT or len(faults) == _TRIED_FOR_SIZE:
+                enough = 1 if self.is_live else LOOKED_AT
+                if len(sizes) == enough or len(faults) == _TRIED_FOR_SIZE:
                     break
         except DatasetError:
             if not sizes:  # else it is said where the file is read as a whole
                 raise
-        if sizes:
-            return most_frequent(sizes)
-        what = f"no image decodes ({faults[0]})" if faults else "no messages"
-        raise DatasetError(f"{self._where}: {what}; choose another --topic")
+        if not sizes:
+            what = f"no image decodes ({faults[0]})" if faults else "no messages"
+            raise DatasetError(f"{self._where}: {what}; choose another --topic")
+        self._bits = bits_used(frames)
+        self.notes += note_on(self._bits)
+        return most_frequent(sizes)
 
 
 def _choose(topics: list[MessageTopic], wanted: str, path: Path) -> MessageTopic:

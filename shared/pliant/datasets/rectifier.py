@@ -16,24 +16,8 @@ from pliant.algorithms.image.masks import packed, scaled, unpacked
 from pliant.algorithms.rectification import rectification_maps, rectified_camera, resample
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.calibration import Calibration
+from pliant.datasets.raw_pixels import RAW_BYTES, colours, is_deep, raw_rows
 from pliant.messages.types import BROKEN, CAMERA_FRAME_ID, DROPPED, MASKED, Image
-
-_BAYER = {
-    "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
-    "bayer_bggr8": cv2.COLOR_BayerBGGR2RGB,
-    "bayer_gbrg8": cv2.COLOR_BayerGBRG2RGB,
-    "bayer_grbg8": cv2.COLOR_BayerGRBG2RGB,
-}
-RAW_BYTES = {
-    "mono8": 1,
-    "mono16": 2,
-    "bgr8": 3,
-    "rgb8": 3,
-    "bgra8": 4,
-    "rgba8": 4,
-    **dict.fromkeys(_BAYER, 1),
-}
-"""Bytes of a pixel of each raw encoding; mono16 is little-endian."""
 
 
 def decode(frame: SourceFrame) -> U8:
@@ -131,28 +115,17 @@ class Rectifier:
 
 
 def _decode_raw(frame: SourceFrame) -> U8:
-    size = RAW_BYTES[frame.encoding]
-    if min(frame.width, frame.height) <= 0 or len(frame.data) != frame.width * frame.height * size:
-        raise BrokenFrame(
-            f"{frame.called}: {len(frame.data)} bytes are no {frame.encoding} image of "
-            f"{frame.width}x{frame.height} px"
-        )
-    pixels = np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width, size)
-    match frame.encoding:
-        case "mono8":
-            return pixels[:, :, 0]
-        case "mono16":
-            return np.ascontiguousarray(pixels[:, :, 1])  # the upper byte
-        case "rgb8":
-            return pixels
-        case "bgr8":
-            return _rgb(pixels)
-        case "rgba8":
-            return np.ascontiguousarray(pixels[:, :, :3])
-        case "bgra8":
-            return np.ascontiguousarray(pixels[:, :, 2::-1])
-        case bayer:
-            return cast(U8, cv2.cvtColor(pixels[:, :, 0], _BAYER[bayer]))
+    size, rows = RAW_BYTES[frame.encoding], raw_rows(frame.encoding, frame.height)
+    what = f"no {frame.encoding} image of {frame.width}x{frame.height} px"
+    if min(frame.width, frame.height) <= 0 or len(frame.data) != frame.width * rows * size:
+        raise BrokenFrame(f"{frame.called}: {len(frame.data)} bytes are {what}")
+    pixels = np.frombuffer(frame.data, np.uint8).reshape(rows, frame.width, size)
+    if is_deep(frame.encoding):
+        pixels = np.ascontiguousarray(pixels[:, :, 1::2])  # the upper bytes
+    try:
+        return colours(frame.encoding, pixels)
+    except ValueError as error:
+        raise BrokenFrame(f"{frame.called}: is {what}: it {error}") from None
 
 
 def _rgb(bgr: U8) -> U8:
