@@ -77,9 +77,9 @@ class Pipeline:
         self._last = image.frame
         return Frame(image, tracks, delta)
 
-    def finish(self) -> MapDelta:
+    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
-        delta = self._mapper.finish()
+        delta = self._mapper.finish(timer)
         self.history.apply(delta, frame=self._last, stamp_ns=0, final=True)
         return delta
 

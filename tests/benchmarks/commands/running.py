@@ -220,3 +220,22 @@ def ablation(
     from benchmarks.ablation import measure
 
     show(measure(sources, only=only or [], seeds=seeds))
+
+
+@app.command()
+def growth(
+    source: Annotated[str, typer.Argument(help="A hard clip; none: a built-in one.")] = "",
+    calibration: Annotated[Path | None, typer.Option(help="Of its camera.")] = None,
+    frames: Annotated[
+        list[int] | None, typer.Option(min=10, help="Of a run; can be repeated.")
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """What a clip costs by its length: CPU a frame by stage, the end, keyframes, memory.
+
+    scripts/bench growth path/to/video.mp4 --calibration calib.yaml --frames 500 --frames 1000
+    """
+    from benchmarks.growth import Source as Clip
+    from benchmarks.growth import measure
+
+    show(measure(Clip(source, calibration), frames or [500, 1000, 2000, 4000], overrides or []))

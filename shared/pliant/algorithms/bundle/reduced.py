@@ -187,12 +187,23 @@ def solve_reduced(pattern: Pattern, S: F64, b: F64, damping: F64) -> F64 | None:
     overwritten.     b, damping: (N, 6).
     An unknown without observations has an empty row: the identity keeps it where it is.
     """
+    return substitute_reduced(pattern, S, b) if factor_reduced(pattern, S, damping) else None
+
+
+def factor_reduced(pattern: Pattern, S: F64, damping: F64) -> bool:
+    """Overwrite S with the L of ``S + diag(damping)``; False where that is not positive definite.
+
+    As of ``solve_reduced``.
+    """
     at = pattern.start[:-1, None], DIAGONAL
     S[at] += np.where(S[at] == 0.0, 1.0, damping)
-    if not _factor(pattern.start, pattern.row, pattern.block, S):
-        return None
+    return bool(_factor(pattern.start, pattern.row, pattern.block, S))
+
+
+def substitute_reduced(pattern: Pattern, L: F64, b: F64) -> F64 | None:
+    """Solve ``L L^T x = b``: (N, 6), None where that is not finite."""
     x = b.copy()
-    _substitute(pattern.start, pattern.row, S, x)
+    _substitute(pattern.start, pattern.row, L, x)
     return x if np.isfinite(x).all() else None
 
 

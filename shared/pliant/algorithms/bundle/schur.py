@@ -40,7 +40,12 @@ from pliant.algorithms.bundle.problem import (
 )
 from pliant.algorithms.bundle.projection import Cameras, limits_of, move_cameras
 from pliant.algorithms.bundle.reduced import LOWER as LOWER6
-from pliant.algorithms.bundle.reduced import find_pattern, solve_reduced
+from pliant.algorithms.bundle.reduced import (
+    factor_reduced,
+    find_pattern,
+    solve_reduced,
+    substitute_reduced,
+)
 from pliant.compiler.kernel import kernel
 
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e8
@@ -241,10 +246,11 @@ class SchurSystem:
             return covariance
         self.linearise(state)
         S, b, diagonal = self._reduced_system(state, _GAUGE_DAMPING)
+        factored = factor_reduced(self.pattern, S, _GAUGE_DAMPING * diagonal)
         for k in np.flatnonzero(self.calibration.unknown):
             b[:] = 0.0
             b[-1, k] = 1.0
-            solution = solve_reduced(self.pattern, S.copy(), b, _GAUGE_DAMPING * diagonal)
+            solution = substitute_reduced(self.pattern, S, b) if factored else None
             covariance[:, k] = np.inf if solution is None else solution[-1, :SHARED]
         return covariance
 

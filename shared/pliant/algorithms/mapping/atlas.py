@@ -28,6 +28,7 @@ from pliant.algorithms.mapping.segment import Moved, Segment, see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_guess
 from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held
 from pliant.algorithms.places import describe
+from pliant.algorithms.stages import StageTimer, no_stages
 
 
 class Atlas:
@@ -287,20 +288,34 @@ class Atlas:
         """Forget what is about to move the map: nobody has it yet."""
         self.whole_map, self.places.meetings = WholeMap(), Meetings()
 
-    def finish(self) -> list[Moved]:
+    def finish(self, timer: StageTimer = no_stages) -> list[Moved]:
         """What is still to be corrected at the end of the stream."""
-        moved = self._join_met(0)
+        with timer("merging"):
+            moved = self._join_met(0)
         active = self.active
         if self._adjusts:
-            moves = self._earlier.adjust(self._parameters)
+            with timer("final adjustment"):
+                moves = self._earlier.adjust(self._parameters)
             moved += [Moved(np.eye(4), held(each, self._spans, of)) for of, each in moves]
         if active is None:
             return moved
+        with timer("merging"):
+            moved += self._close_at_last(active)
+        with timer("final adjustment"):
+            return [*moved, *self._adjust_at_last(active)]
+
+    def _close_at_last(self, active: ActiveMap) -> list[Moved]:
+        """Close the loops that are still open."""
         self.whole_map.withdraw()  # the final adjustment does what was asked for
-        if self.whole_map.loops:
-            self._ask(0, active)
-            if (answer := self.whole_map.settle()) is not None:
-                moved += self.take_over(answer)
+        if not self.whole_map.loops:
+            return []
+        self._ask(0, active)
+        answer = self.whole_map.settle()
+        return [] if answer is None else self.take_over(answer)
+
+    def _adjust_at_last(self, active: ActiveMap) -> list[Moved]:
+        """Adjust the segment that the camera was in last, in the frame of its beginning."""
+        moved: list[Moved] = []
         if self._adjusts:
             back = active.segment.back()
             if back is not None:

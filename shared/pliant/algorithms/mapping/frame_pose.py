@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
-from pliant.algorithms.camera import PinholeCamera, size_unit
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.directions import (
@@ -33,7 +33,7 @@ from pliant.algorithms.mapping.localisation import (
     recover,
     refine,
 )
-from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, UNLINKED, Observations
+from pliant.algorithms.mapping.map_store import MAPPED, UNLINKED, Observations
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -326,25 +326,6 @@ def limits_of_points(inliers: int, parameters: MappingParameters) -> PointParame
     if inliers >= parameters.start.min_points:
         return parameters.point
     return parameters.point.model_copy(update={"min_observations": 2})
-
-
-def keyframe_is_due(active: ActiveMap, age_s: float, interval_s: float) -> bool:
-    """Whether the frame is to become a keyframe.
-
-    age_s: since the last keyframe.   interval_s: since the last frame, so that the next one may be
-    expected as long after this one.
-    """
-    if active.segment.resumes:
-        return True  # the camera has been recognised
-    limits = active.parameters.keyframe
-    least = CANDIDATE if len(directions_of(active)) else MAPPED
-    share, flow = active.window.flow_since_keyframe(least)
-    unit = size_unit(active.camera.width, active.camera.height)
-    # Points go from view at a constant rate, whether frames come often or not.
-    share_of_next = share ** (1.0 + interval_s / age_s)
-    if share_of_next < limits.min_shared_share or flow > limits.max_flow_px * unit:
-        return True
-    return age_s > limits.max_s and flow > limits.min_flow_px * unit
 
 
 def support_of(

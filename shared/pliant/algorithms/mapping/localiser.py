@@ -135,7 +135,7 @@ class Localiser:
         """Nothing: the map is as it was."""
         return []
 
-    def finish(self) -> MapDelta:
+    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """As ``Mapper.finish``."""
         return self._publish(WAITING if self._map is None else TRACKING, "", 0)
 

@@ -24,13 +24,13 @@ from pliant.algorithms.mapping.frame_pose import (
     at_once,
     doubt,
     image_of_tracks,
-    keyframe_is_due,
     limits_of_points,
     localise,
     reacquire_points,
     stand,
 )
 from pliant.algorithms.mapping.kept_map import known_camera
+from pliant.algorithms.mapping.keyframes import keyframe_is_due
 from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -217,13 +217,14 @@ class Mapper:
         state = LOST if self._lost_frames else TRACKING
         return self._publish(WAITING if self.atlas.active is None else state, reason, 0)
 
-    def finish(self) -> MapDelta:
+    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
         self.start_at_last()
-        self.follow(self.atlas.finish())
-        for segment, seen_by in self.atlas.everything():
-            frames = segment.passed.take_all()
-            self._correct(refined_poses(frames, segment.points, seen_by, self._parameters))
+        self.follow(self.atlas.finish(timer))
+        with timer("skipped frames"):
+            for segment, seen_by in self.atlas.everything():
+                frames = segment.passed.take_all()
+                self._correct(refined_poses(frames, segment.points, seen_by, self._parameters))
         if self.atlas.active is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         self._keyframe_changes.settle(self.atlas.active.keyframes)

@@ -115,11 +115,11 @@ class TrialMapper:
         """As ``Mapper.counters``."""
         return {} if self._on_trial else self._mapper.counters
 
-    def finish(self) -> MapDelta:
+    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """As ``Mapper.finish``; a trial that lasts until then ends with it."""
         begins = self._on_trial and (self._first is not None or self._mapper.start_at_last())
         begun = self._begin(no_stages) if begins else None
-        final = self._mapper.finish()
+        final = self._mapper.finish(timer)
         return final if begun is None else _joined([begun, final])
 
     def kept(self) -> Iterator[KeptKeyframe]:

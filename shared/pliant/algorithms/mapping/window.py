@@ -152,8 +152,9 @@ class Window:
         )
         return inverse_distance
 
-    def flow_since_keyframe(self, least: int) -> tuple[float, float]:
-        """Share of the newest keyframe's points still seen, and their median flow, px.
+    def flow_since_keyframe(self, least: int) -> tuple[int, int, float]:
+        """How many of the newest keyframe's points are still seen, of how many, and their median
+        flow, px.
 
         least: state of the points.   The flow is what the turn of the camera leaves of it.
         """
@@ -162,9 +163,7 @@ class Window:
         turn = self.T_world_camera[-1, :3, :3].T @ self.T_world_camera[-2, :3, :3]
         H = K @ turn @ np.linalg.inv(K)
         before, moved = flows(self.rows, self.points.state, least, self.u, self.v, self.seen, H)
-        if len(moved) == 0:
-            return 0.0, 0.0
-        return len(moved) / before, float(np.median(moved))
+        return len(moved), before, float(np.median(moved)) if len(moved) else 0.0
 
     def triangulate(self, limits: PointParameters) -> None:
         """Make points of the candidates whose rays now meet under enough parallax."""

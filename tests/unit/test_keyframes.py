@@ -1,0 +1,60 @@
+"""When a frame becomes a keyframe: the last one before too little is shared, or too much moved."""
+
+import numpy as np
+import pytest
+from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
+
+from pliant.algorithms.mapping import keyframes
+from pliant.algorithms.mapping.keyframes import Overlap, is_due
+from pliant.algorithms.mapping.map_store import MAPPED
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.parameters import KeyframeParameters, MappingParameters
+
+LIMITS = KeyframeParameters()
+
+
+def first_due(interval_s, share_after, flow=0.0):
+    """How many frames after the last keyframe the next one is.   share_after(s): of its points."""
+    for n in range(1, 1000):
+        overlap = Overlap(share_after(n * interval_s), flow, n * interval_s, interval_s)
+        if is_due(overlap, LIMITS):
+            return n
+    return None
+
+
+@pytest.mark.parametrize("interval_s", [1 / 60, 1 / 10, 1 / 3])
+@pytest.mark.parametrize("half_life_s", [0.1, 0.5, 3.0])
+def test_keyframes_share_enough_at_any_rate(interval_s, half_life_s):
+    def share(s):
+        return 0.5 ** (s / half_life_s)
+
+    n = first_due(interval_s, share)
+    assert share((n + 1) * interval_s) < LIMITS.min_shared_share
+    assert n == 1 or share(n * interval_s) >= LIMITS.min_shared_share
+
+
+def test_what_moves_far_needs_one_and_what_stays_none():
+    for flow, due in ((1.01 * LIMITS.max_flow_px, 1), (LIMITS.min_flow_px, None)):
+        assert first_due(1 / 30, lambda s: 1.0, flow) == due
+
+
+def test_what_moves_a_little_needs_one_after_some_time():
+    n = first_due(1 / 30, lambda s: 1.0, 2.0 * LIMITS.min_flow_px)
+    assert n == int(30 * LIMITS.max_s) + 1
+
+
+@pytest.mark.parametrize(("mapped", "due"), [(900, False), (60, True)])
+def test_tracks_of_noise_make_no_keyframes(monkeypatch, mapped, due):
+    """Where most candidates end at once and points stay; few points are no measure."""
+    mapper = Mapper(CAMERA, MappingParameters(), 0)
+    for frame, tracks in enumerate(Scene.box().frames(sideways(30))):
+        mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+    active = mapper.atlas.active
+    assert active is not None
+
+    def shared(least):
+        return (mapped, mapped, 0.0) if least == MAPPED else (2000, 5000, 0.0)
+
+    monkeypatch.setattr(active.window, "flow_since_keyframe", shared)
+    monkeypatch.setattr(keyframes, "directions_of", lambda active: np.arange(4000))
+    assert keyframes.keyframe_is_due(active, 0.1, 0.01) == due
