@@ -24,6 +24,7 @@ from pliant.algorithms.mapping.point_patches import look_alike
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
 from pliant.algorithms.mapping.relocalisation import Place, corners_in_map, repeats
 from pliant.algorithms.places import match
+from pliant.compiler.kernel import kernel
 
 _ROUNDS = 10
 _MOST = 1.0
@@ -72,8 +73,7 @@ def similarity_by_ransac(
     S = _closed_form(pairs.xyz_b[triples], pairs.xyz_a[triples])
     if not len(S):
         return None
-    costs = np.minimum(_squared(S, pairs), gate * gate).sum(axis=1)
-    best = S[int(np.argmin(costs))]
+    best = S[_least_cost(S, pairs.xyz_a, pairs.xyz_b, pairs.seen_a, pairs.seen_b, gate * gate)]
     for _ in range(2):  # with those that agree after the first round
         agreeing = _squared(best, pairs) < gate * gate
         if agreeing.sum() < 4:
@@ -150,15 +150,55 @@ def _slope(X: F64) -> F64:
 
 
 def _squared(S_a_b: F64, pairs: Pairs) -> F64:
-    """(..., N) the larger squared error of each pair in the two images under similarities
-    (..., 4, 4); infinite behind a camera."""
-    A, t = np.swapaxes(S_a_b[..., :3, :3], -1, -2), S_a_b[..., None, :3, 3]
+    """(N,) the larger squared error of each pair in the two images under a similarity (4, 4);
+    infinite behind a camera."""
+    A, t = S_a_b[:3, :3].T, S_a_b[None, :3, 3]
     Y = pairs.xyz_b @ A + t
     Z = (pairs.xyz_a - t) @ np.linalg.inv(A)
     a = ((_project(Y) - pairs.seen_a) ** 2).sum(axis=-1)
     b = ((_project(Z) - pairs.seen_b) ** 2).sum(axis=-1)
     front = (Y[..., 2] > 0.0) & (Z[..., 2] > 0.0)
     return np.where(front, np.maximum(a, b), np.inf)
+
+
+@kernel
+def _least_cost(S: F64, xyz_a: F64, xyz_b: F64, seen_a: F64, seen_b: F64, most: float) -> int:
+    """Which of the similarities (n, 4, 4) has the least sum of squared errors as of ``_squared``, of
+    each pair at most so much: each is given up as soon as its sum is no less than the least."""
+    best, least = 0, np.inf
+    for s in range(len(S)):
+        A, t = S[s, :3, :3], S[s, :3, 3]
+        back = 1.0 / (A[0, 0] ** 2 + A[0, 1] ** 2 + A[0, 2] ** 2)  # A^-1 = A^T / scale^2
+        cost = 0.0
+        for n in range(len(xyz_a)):
+            there = _error(
+                A[0, 0] * xyz_b[n, 0] + A[0, 1] * xyz_b[n, 1] + A[0, 2] * xyz_b[n, 2] + t[0],
+                A[1, 0] * xyz_b[n, 0] + A[1, 1] * xyz_b[n, 1] + A[1, 2] * xyz_b[n, 2] + t[1],
+                A[2, 0] * xyz_b[n, 0] + A[2, 1] * xyz_b[n, 1] + A[2, 2] * xyz_b[n, 2] + t[2],
+                seen_a[n],
+            )  # fmt: skip
+            x, y, z = xyz_a[n, 0] - t[0], xyz_a[n, 1] - t[1], xyz_a[n, 2] - t[2]
+            here = _error(
+                back * (A[0, 0] * x + A[1, 0] * y + A[2, 0] * z),
+                back * (A[0, 1] * x + A[1, 1] * y + A[2, 1] * z),
+                back * (A[0, 2] * x + A[1, 2] * y + A[2, 2] * z),
+                seen_b[n],
+            )
+            cost += min(max(there, here), most)
+            if cost >= least:
+                break
+        if cost < least:
+            best, least = s, cost
+    return best
+
+
+@kernel
+def _error(x: float, y: float, z: float, seen: F64) -> float:
+    """Squared, of a point before a camera where it saw it; infinite behind."""
+    if z <= 0.0:
+        return np.inf
+    z = max(z, _MIN_DEPTH)
+    return (x / z - seen[0]) ** 2 + (y / z - seen[1]) ** 2
 
 
 def _closed_form(source: F64, target: F64) -> F64:
