@@ -163,8 +163,8 @@ def _squared(S_a_b: F64, pairs: Pairs) -> F64:
 
 @kernel
 def _least_cost(S: F64, xyz_a: F64, xyz_b: F64, seen_a: F64, seen_b: F64, most: float) -> int:
-    """Which of the similarities (n, 4, 4) has the least sum of squared errors as of ``_squared``, of
-    each pair at most so much: each is given up as soon as its sum is no less than the least."""
+    """Which of the similarities (n, 4, 4) has the least sum of the errors of ``_squared``, each at
+    most so much.  A similarity is given up once its sum is no less than the least."""
     best, least = 0, np.inf
     for s in range(len(S)):
         A, t = S[s, :3, :3], S[s, :3, 3]
