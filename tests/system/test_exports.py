@@ -12,7 +12,9 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from running import assert_one_line, in_this_process
 
+from pliant import open3d_library
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.bus.replay_bus import ReplayBus
@@ -424,6 +426,44 @@ def test_a_textured_mesh_has_the_colours_that_its_keyframes_show(
         off = np.abs(drawn.astype(float) - image)[inside]
         contrast = np.abs(image - np.median(image)).mean()
         assert np.median(off) < 0.3 * contrast
+
+
+def test_a_solid_is_closed_and_small_pieces_are_left_out(result: Path, tmp_path: Path) -> None:
+    try:
+        import_module("open3d")
+    except (ImportError, OSError) as error:
+        pytest.skip(f"open3d is installed but cannot be loaded ({error})")
+    solid = read_ply(export_result(result, "watertight", tmp_path / "solid.ply"))
+    assert solid.faces is not None
+    edges = np.concatenate([solid.faces[:, k] for k in ([0, 1], [1, 2], [2, 0])])
+    _, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    assert (counts == 2).all()
+    whole, clean = (
+        textured_mesh(Recording(result / "recording.mcap"), 8000, clean=clean)
+        for clean in (False, True)
+    )
+    assert 0.5 * len(whole.triangles) < len(clean.triangles) <= 8000
+    with pytest.raises(ResultError, match="--clean: tum has no such option"):
+        export_result(result, "tum", tmp_path / "poses.txt", clean=True)
+
+
+@pytest.mark.parametrize(
+    "command", [("export", "--to", "watertight"), ("export", "--to", "glb", "--clean"),
+    ("mesh", "--watertight"), ("mesh", "--clean")]
+)  # fmt: skip
+def test_without_open3d_s_libraries_one_line_says_what_to_install(
+    result: Path, command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(name: str) -> None:
+        raise ImportError("libGL.so.1: cannot open shared object file")
+
+    monkeypatch.setattr(open3d_library, "import_module", refuse)
+    name, *options = command
+    done = in_this_process(name, result, *options, "--output", tmp_path / "out.glb"
+        if "glb" in options else tmp_path / ("out.ply" if name == "export" else "out"))  # fmt: skip
+    assert_one_line(done, "libGL.so.1")
+    assert "apt install libegl1" in done.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_triangles_are_for_textured_meshes(result: Path, tmp_path: Path) -> None:

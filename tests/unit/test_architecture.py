@@ -21,6 +21,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "algorithms": {"algorithms", "compiler"},
     "errors": set(),
     "open3d_library": {"errors"},
+    "open3d_geometry": {"open3d_library", "algorithms"},
     "cache": set(),
     "files": set(),
     "staging": {"files"},

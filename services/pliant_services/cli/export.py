@@ -27,6 +27,10 @@ def export(
     triangles: Annotated[
         int | None, typer.Option(min=100, help="glb, obj: most triangles of the mesh [40000].")
     ] = None,
+    clean: Annotated[
+        bool,
+        typer.Option("--clean", help="glb, obj: leave out pieces below 1 % of the largest one."),
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
 ) -> None:
     """Write a run for other programs: viewers, trajectories, reconstructions, videos.
@@ -51,7 +55,7 @@ def export(
     from pliant_services.cli.counting import tell_progress
 
     written = export_result(
-        result, to, output, force=force, every=every, triangles=triangles,
+        result, to, output, force=force, every=every, triangles=triangles, clean=clean,
         progress=partial(tell_progress, f"{to}: image"),
     )  # fmt: skip
     typer.echo(str(written))

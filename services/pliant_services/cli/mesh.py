@@ -18,6 +18,13 @@ def mesh(
             "--when-over", help="Wait for the end of the session that writes there; once only."
         ),
     ] = False,
+    clean: Annotated[
+        bool, typer.Option("--clean", help="Leave out pieces below 1 % of the largest one's area.")
+    ] = False,
+    watertight: Annotated[
+        bool,
+        typer.Option("--watertight", help="Write mesh_watertight.ply, too: a solid for printers."),
+    ] = False,
     overrides: Annotated[
         list[str] | None,
         typer.Option("--set", help="KEY=VALUE over the recorded configuration; may be repeated."),
@@ -28,6 +35,8 @@ def mesh(
     pliant mesh results/room --set meshing.tsdf.fine_voxel=0.005
 
     pliant mesh results/room --set meshing.surface.smoothing=none --output results/raw
+
+    pliant mesh results/room --watertight --clean
     """
     from pliant_services.cli.info import recording_file
     from pliant_services.mesh.command import is_meshed, run_mesh
@@ -44,5 +53,7 @@ def mesh(
         output=output,
         force=force or when_over,
         overrides=overrides or [],
+        clean=clean,
+        close=watertight,
     ):
         typer.echo(line)

@@ -10,17 +10,19 @@ import numpy as np
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.config import Config, recorded_config
 from pliant.errors import RecordingError
+from pliant.export.watertight import WATERTIGHT_NAME, cleaned, watertight
 from pliant.files import write_whole
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Header, MeshPiece, Status
+from pliant.open3d_library import load_open3d
 from pliant.recording.parts import parts_of
 from pliant.recording.summary import summarise
 from pliant.results.folder import keep_apart, written
 from pliant.results.known_scale import MetricRecording
-from pliant.results.mesh_files import mesh_report, meshes_of, write_meshes
+from pliant.results.mesh_files import mesh_of, mesh_report, meshes_of, write_mesh, write_meshes
 from pliant.results.run import folded_map
 from pliant.wording import counted
 from pliant_services.processes import BY_NAME
@@ -71,16 +73,22 @@ def mesh_recording(recording: Path, config: Config) -> Meshing:
 
 
 def run_mesh(
-    recording: Path, *, output: Path | None, force: bool, overrides: Sequence[str]
-) -> Iterator[str]:
-    """Mesh, write the files, and say what came of it.  Raises PliantError."""
+    recording: Path, *, output: Path | None, force: bool, overrides: Sequence[str],
+    clean: bool = False, close: bool = False,
+) -> Iterator[str]:  # fmt: skip
+    """Mesh, write the files, and say what came of it.  Raises PliantError.
+
+    clean: leave out small pieces.    close: write a watertight mesh, too.
+    """
+    if clean or close:
+        load_open3d()  # said before the work
     output = output or _beside(recording.resolve().parent)
     keep_apart(output, [recording, *parts_of(recording)])
     config = recorded_config(summarise(recording).metadata, overrides)
     with written(output, force=force):
         found = mesh_recording(recording, config)
         yield from dict.fromkeys(found.notes)
-        write_all(output, found, folded_map(recording))
+        write_all(output, found, folded_map(recording), clean=clean)
         report = {
             "mesh": mesh_report(found.pieces),
             "seconds": found.seconds,
@@ -89,6 +97,8 @@ def run_mesh(
             "config": config.meshing.model_dump(mode="json"),
         }
         write_whole(output / REPORT_NAME, json.dumps(report, indent=1) + "\n")
+        if close:
+            yield from write_watertight(output, found, folded_map(recording).longest_segment())
     for mesh in mesh_report(found.pieces):
         yield (
             f"segment {mesh['segment']}, {mesh['level']}: "
@@ -110,11 +120,21 @@ def _beside(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}_mesh")
 
 
-def write_all(output: Path, found: Meshing, history: MapHistory) -> None:
+def write_watertight(output: Path, found: Meshing, segment: int) -> Iterator[str]:
+    """The fine mesh of a segment, closed.  Raises ResultError where it does not close."""
+    mesh = mesh_of(found.pieces, segment)
+    if mesh is not None and len(mesh.triangles):
+        closed = watertight(mesh)
+        write_mesh(output / WATERTIGHT_NAME, closed)
+        yield f"{WATERTIGHT_NAME}: {counted(len(closed.triangles), 'triangle')}"
+
+
+def write_all(output: Path, found: Meshing, history: MapHistory, *, clean: bool = False) -> None:
     """The meshes and pictures of every segment, as the results of a run have them."""
     longest = history.longest_segment()
     for segment in sorted({segment for segment, _ in meshes_of(found.pieces)}):
         poses = [pose for of, pose in history.keyframe_poses().values() if of == segment]
         suffix = "" if segment == longest else f"_segment_{segment}"
         T_world_camera = pose_to_matrix(np.array(poses, np.float64).reshape(-1, 7))
-        write_meshes(output, found.pieces, segment, suffix, T_world_camera)
+        changed = cleaned if clean else None
+        write_meshes(output, found.pieces, segment, suffix, T_world_camera, changed)

@@ -14,7 +14,7 @@ from pliant.export.colmap import colmap
 from pliant.export.depth import depth
 from pliant.export.images import camera_of, images, rectified_images
 from pliant.export.kinds import KINDS, OF_STILL_SCENES, OPTIONS
-from pliant.export.models import foxglove, ply, rerun
+from pliant.export.models import foxglove, ply, rerun, solid
 from pliant.export.nerfstudio import nerfstudio
 from pliant.export.overview import (
     FPS,
@@ -74,18 +74,20 @@ class RecordedFrame:
 
 def export_result(
     result: Path, to: str, output: Path | None, *, force: bool = False,
-    every: int | None = None, triangles: int | None = None, progress: Progress | None = None,
+    every: int | None = None, triangles: int | None = None, clean: bool = False,
+    progress: Progress | None = None,
 ) -> Path:  # fmt: skip
     """Write one export of a result folder or a recording and return where.
 
     every: of surfaces, which frames.    triangles: most of a textured mesh.
+    clean: leave out its small pieces.
     progress: is told how many images have been read, and of how many.
 
     Raises ResultError for an unknown kind, and for what is there already unless ``force``.
     """
     if to not in EXPORTS:
         raise ResultError(f"--to {to}: choose {', '.join(EXPORTS)}")
-    options = {"every": every, "triangles": triangles}
+    options = {"every": every, "triangles": triangles, "clean": clean or None}
     given = {name: value for name, value in options.items() if value is not None}
     for option in given:
         if to not in OPTIONS[option]:
@@ -303,6 +305,7 @@ _WRITERS: dict[str, Export] = {
     "images": images,
     "glb": glb,
     "obj": obj,
+    "watertight": solid,
     "surface": surfaces,
     "overlay": _overlay,
     "picture": _picture,
@@ -310,5 +313,5 @@ _WRITERS: dict[str, Export] = {
 }
 EXPORTS = {kind: (name, _WRITERS[kind]) for kind, name in KINDS.items()}
 """Kind of export: its default name, and who writes it."""
-_NAMED = ("foxglove", "rerun", "ply", "glb")
+_NAMED = ("foxglove", "rerun", "ply", "glb", "watertight")
 """Kinds that other programs know by the ending; trajectories are text under any."""

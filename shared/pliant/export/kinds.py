@@ -13,6 +13,7 @@ KINDS = {
     "images": "images",
     "glb": "mesh.glb",
     "obj": "obj",
+    "watertight": "mesh_watertight.ply",
     "surface": "surface",
     "overlay": "overlay.mp4",
     "picture": "picture.png",
@@ -20,7 +21,17 @@ KINDS = {
 }
 """Kind of export: its default name."""
 
-OF_STILL_SCENES = ("ply", "colmap", "nerfstudio", "depth", "glb", "obj", "picture", "overview")
+OF_STILL_SCENES = (
+    "ply",
+    "colmap",
+    "nerfstudio",
+    "depth",
+    "glb",
+    "obj",
+    "watertight",
+    "picture",
+    "overview",
+)
 """Kinds that are made of a map or mesh, which a run of the deformable profile has not."""
-OPTIONS = {"every": ("surface",), "triangles": ("glb", "obj")}
+OPTIONS = {"every": ("surface",), "triangles": ("glb", "obj"), "clean": ("glb", "obj")}
 """Which kinds have an option."""

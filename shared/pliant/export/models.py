@@ -8,11 +8,14 @@ from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.datasets.recorded_images import RecordedImages
 from pliant.errors import ResultError
 from pliant.export.images import camera_of
+from pliant.export.watertight import watertight
 from pliant.formats.ply import read_ply, write_ply
 from pliant.map_history import Points
 from pliant.messages import topics
 from pliant.messages.types import SourceImage
+from pliant.open3d_library import load_open3d
 from pliant.recording.reader import Recording
+from pliant.results.mesh_files import mesh_of, write_mesh
 from pliant.results.run import read_run
 from pliant.viewers.canvas import Canvas
 from pliant.viewers.drawn_scene import Scene
@@ -75,6 +78,16 @@ def ply(recording: Recording, path: Path, folder: Path | None) -> None:
     if not len(points):
         raise ResultError(f"{recording.path}: the run has no map to export")
     write_points(path, points)
+
+
+def solid(recording: Recording, path: Path, folder: Path | None) -> None:
+    """The fine mesh of the longest segment, closed to a solid."""
+    load_open3d()  # said before the work
+    run = read_run(recording.path)
+    mesh = mesh_of(run.mesh, run.history.longest_segment())
+    if mesh is None or not len(mesh.triangles):
+        raise ResultError(f"{recording.path}: there is no mesh in it: run its source again")
+    write_mesh(path, watertight(mesh))
 
 
 def write_points(path: Path, points: Points) -> None:

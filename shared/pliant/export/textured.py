@@ -20,6 +20,7 @@ from pliant.algorithms.meshing.texturing import (
 )
 from pliant.errors import ResultError
 from pliant.export.images import make_folder, mask_image
+from pliant.export.watertight import cleaned
 from pliant.formats.textured import TexturedMesh, write_glb, write_obj
 from pliant.messages import topics
 from pliant.messages.types import Keyframe, MeshPiece
@@ -33,23 +34,27 @@ _TEXELS = 2048
 
 
 def glb(
-    recording: Recording, path: Path, folder: Path | None, triangles: int | None = None
-) -> None:
+    recording: Recording, path: Path, folder: Path | None, triangles: int = TRIANGLES,
+    clean: bool = False,
+) -> None:  # fmt: skip
     """Binary glTF with the texture inside."""
-    write_glb(path, textured_mesh(recording, triangles or TRIANGLES))
+    write_glb(path, textured_mesh(recording, triangles, clean=clean))
 
 
 def obj(
-    recording: Recording, path: Path, folder: Path | None, triangles: int | None = None
-) -> None:
+    recording: Recording, path: Path, folder: Path | None, triangles: int = TRIANGLES,
+    clean: bool = False,
+) -> None:  # fmt: skip
     """A folder with ``mesh.obj``, ``mesh.mtl`` and ``mesh.png``."""
-    mesh = textured_mesh(recording, triangles or TRIANGLES)
+    mesh = textured_mesh(recording, triangles, clean=clean)
     make_folder(path)
     write_obj(path, mesh)
 
 
-def textured_mesh(recording: Recording, triangles: int) -> TexturedMesh:
+def textured_mesh(recording: Recording, triangles: int, *, clean: bool = False) -> TexturedMesh:
     """The fine mesh of the longest segment, of at most so many triangles.
+
+    clean: without small pieces.
 
     Raises ResultError where there is none.
     """
@@ -59,6 +64,7 @@ def textured_mesh(recording: Recording, triangles: int) -> TexturedMesh:
     fine = mesh_of(pieces, segment)
     if run.stream is None or fine is None or not len(fine.triangles):
         raise ResultError(f"{recording.path}: there is no mesh in it: run its source again")
+    fine = cleaned(fine) if clean else fine
     points, tints, faces = decimated(fine.positions, fine.colours, fine.triangles, triangles)
     cut, _ = cut_apart(faces, patches(points[faces]))
     uvs = make_atlas(points[faces], cut, _TEXELS)

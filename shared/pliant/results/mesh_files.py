@@ -1,6 +1,6 @@
 """The meshes of a recording as the files that a user opens."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +30,26 @@ def mesh_of(pieces: Sequence[MeshPiece], segment: int, level: str = "fine") -> T
 
 
 def write_meshes(
-    folder: Path, pieces: Sequence[MeshPiece], segment: int, suffix: str, T_world_camera: F64
-) -> None:
-    """Write the meshes of a segment, and pictures of the fine one from over the camera's path."""
+    folder: Path, pieces: Sequence[MeshPiece], segment: int, suffix: str, T_world_camera: F64,
+    changed: Callable[[TriangleMesh], TriangleMesh] | None = None,
+) -> None:  # fmt: skip
+    """Write the meshes of a segment, and pictures of the fine one from over the camera's path.
+
+    changed: what is done to each mesh before.
+    """
     for (of, level), some in meshes_of(pieces).items():
         if of != segment or level not in _NAMES:
             continue
-        mesh = joined(some)
+        mesh = joined(some) if changed is None else changed(joined(some))
         path = folder / f"{_NAMES[level]}{suffix}.ply"
-        write_ply(path, mesh.positions, mesh.colours, normals=mesh.normals, faces=mesh.triangles)
+        write_mesh(path, mesh)
         if level == "fine" and len(mesh.triangles) and len(T_world_camera):
             write_pictures(folder, mesh, T_world_camera, suffix)
+
+
+def write_mesh(path: Path, mesh: TriangleMesh) -> None:
+    """A PLY file."""
+    write_ply(path, mesh.positions, mesh.colours, normals=mesh.normals, faces=mesh.triangles)
 
 
 def write_pictures(folder: Path, mesh: TriangleMesh, T_world_camera: F64, suffix: str = "") -> None:
