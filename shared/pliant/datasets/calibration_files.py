@@ -1,5 +1,6 @@
 """Calibration files: read and checked, whichever of the ``calibration_formats`` they have."""
 
+import re
 from pathlib import Path
 
 from pliant.datasets.calibration import Calibration, calibration_from_keys
@@ -10,27 +11,41 @@ from pliant.datasets.calibration_formats import (
     flat_from_keys,
     flat_keys,
 )
+from pliant.datasets.calibration_text import calibration_text
 from pliant.errors import CalibrationError
 
-_MAX_BYTES = 1 << 20
-_MAX_JSON_BYTES = 1 << 26
-"""A transforms.json has the pose of every image."""
+_CAMERA = re.compile(r"(.+):((?:cam)?[0-9]+)")
+NAMES = (
+    *("calib.yaml", "calibration.yaml", "cameras.txt", "cameras.bin", "calibration.txt"),
+    *("sparse/0/cameras.txt", "sparse/0/cameras.bin", "intrinsic/intrinsic_color.txt"),
+)
+"""Calibrations that are found beside images."""
 
 
 def read_calibration(
-    file: Path, image_size: tuple[int, int] | None = None, *, kitti_camera: int = 0
+    file: Path,
+    image_size: tuple[int, int] | None = None,
+    *,
+    kitti_camera: int = 0,
+    source: str = "",
 ) -> Calibration:
     """Read a calibration file of any kind that is understood.
 
+    file: or the folder that it is in; ``FILE:cam1`` where it has several cameras.
     image_size: (width, height) of the images, if known: must agree with the file.
-    kitti_camera: which projection matrix of a KITTI file is meant.
+    kitti_camera: which projection matrix of a KITTI file is meant.   source: topic or folder of
+    the images, which may tell the camera.
 
     Raises CalibrationError: one line with the file, what is wrong and what to do.
     """
+    named, camera = _CAMERA.fullmatch(str(file)), ""
+    if named is not None and not file.exists() and Path(named[1]).exists():
+        file, camera = Path(named[1]), named[2]
+    file = next((file / name for name in NAMES if (file / name).is_file()), file)
     text = _read(file)
+    wanted = Wanted(image_size=image_size, kitti_camera=kitti_camera, camera=camera, source=source)
     try:
-        keys = flat_keys(text, Wanted(image_size=image_size, kitti_camera=kitti_camera))
-        calibration = calibration_from_keys(keys, image_size)
+        calibration = calibration_from_keys(flat_keys(text, wanted), image_size)
     except CalibrationError as error:
         raise CalibrationError(f"{file}: {error}") from None
     check_size(calibration, image_size, str(file))
@@ -57,17 +72,12 @@ def check_size(calibration: Calibration, image_size: tuple[int, int] | None, whe
 
 def _read(file: Path) -> str:
     try:
-        limit = _MAX_JSON_BYTES if file.suffix == ".json" else _MAX_BYTES
-        if file.is_file() and file.stat().st_size > limit:
-            raise CalibrationError(
-                f"{file}: too large for a calibration file; is it the right one?"
-            )
-        return file.read_text(encoding="utf-8-sig")
+        return calibration_text(file)
     except FileNotFoundError:
         raise CalibrationError(
             f"{file}: no such calibration file; write one with {UNDERSTOOD}"
         ) from None
-    except UnicodeDecodeError:
-        raise CalibrationError(f"{file}: not a text file; understood are {UNDERSTOOD}") from None
+    except IsADirectoryError:
+        raise CalibrationError(f"{file}: a folder without a calibration file: name it") from None
     except OSError as error:
         raise CalibrationError(f"{file}: cannot be read: {error.strerror}") from None

@@ -7,31 +7,19 @@ here.  Pixels have (0, 0) at the centre of the top-left one; COLMAP's and nerfst
 """
 
 import json
-import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias, cast
+from typing import Any, cast
 
 from pliant.algorithms.rectification import LensModel
-from pliant.datasets.calibration import COEFFICIENTS, number
+from pliant.datasets.calibration import COEFFICIENTS
+from pliant.datasets.calibration_colmap import COLMAP_LINE, colmap, nerfstudio
+from pliant.datasets.calibration_keys import Keys, Wanted
+from pliant.datasets.opencv_xml import is_xml, keys_of_xml
 from pliant.errors import CalibrationError
 from pliant.wording import shown
 from pliant.yaml_text import YamlError, load_yaml
-
-Keys: TypeAlias = dict[str, Any]
-"""What a file says, by key."""
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """Which camera of a file is meant.
-
-    image_size: (width, height) of its images, if known.    kitti_camera: number of KITTI's.
-    """
-
-    image_size: tuple[int, int] | None = None
-    kitti_camera: int = 0
 
 
 @dataclass(frozen=True)
@@ -56,7 +44,7 @@ def flat_keys(text: str, wanted: Wanted) -> Keys:
     for kind in FORMATS:
         if isinstance(kind.mark, re.Pattern) and kind.mark.search(text):
             return kind.flat(text, wanted)
-    return flat_from_keys(_keys(text), wanted)
+    return flat_from_keys(keys_of_xml(text) if is_xml(text) else _keys(text), wanted)
 
 
 def flat_from_keys(content: Keys, wanted: Wanted) -> Keys:
@@ -70,7 +58,7 @@ def flat_from_keys(content: Keys, wanted: Wanted) -> Keys:
 def _keys(text: str) -> Keys:
     # OpenCV's writer begins with a directive that is not YAML's, and has a tag of its own.
     text = re.sub(r"^%YAML:[\d.]+\s*\n(---\s*\n)?", "", text, count=1, flags=re.MULTILINE)
-    text = text.replace("!!opencv-matrix", "")
+    text = text.replace("!!opencv-matrix", "").replace("\t", "  ")  # which YAML has no room for
     try:
         content = _json(text) or load_yaml(text)
     except YamlError as error:
@@ -106,6 +94,7 @@ _DISTORTION: dict[str, LensModel] = {
 }
 """What others call the models."""
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "camera_Matrix")
+_SIZE = (("image_width", "image_Width"), ("image_height", "image_Height"))
 _COEFFICIENTS = (
     *("distortion_coefficients", "distortion_coeffs", "Distortion_Coefficients"),
     *("dist_coeffs", "dist_coeff", "distCoeffs", "distortionCoefficients"),
@@ -116,10 +105,46 @@ def _own(content: Keys, wanted: Wanted) -> Keys:
     return content
 
 
+_CHAINED = re.compile(r"cam([0-9]+)")
+
+
 def _kalibr(content: Keys, wanted: Wanted) -> Keys:
-    if not isinstance(content["cam0"], dict):
-        raise CalibrationError(f"cam0 is {shown(content['cam0'])}: expected the keys of a camera")
-    return flat_from_keys(cast(Keys, content["cam0"]), wanted)
+    name = _of_chain(
+        {key: value for key, value in content.items() if _CHAINED.fullmatch(key)}, wanted
+    )
+    if not isinstance(content[name], dict):
+        raise CalibrationError(f"{name} is {shown(content[name])}: expected the keys of a camera")
+    return flat_from_keys(cast(Keys, content[name]), wanted)
+
+
+def _of_chain(cameras: Keys, wanted: Wanted) -> str:
+    """Which camera of a chain took the images: that which the user says, or their topic or folder,
+    or their size.  Raises CalibrationError where none of them does."""
+    names = list(cameras)
+    if wanted.camera:
+        named = [
+            name for name in names if name.removeprefix("cam") == wanted.camera.removeprefix("cam")
+        ]
+        if not named:
+            raise CalibrationError(f"no {shown(wanted.camera)}: it has {', '.join(names)}")
+        return named[0]
+    places = wanted.source.strip("/").split("/")
+    size = None if wanted.image_size is None else list(wanted.image_size)
+    keys = {
+        name: cast(Keys, each) if isinstance(each, dict) else {} for name, each in cameras.items()
+    }
+    for chosen in (
+        names if len(names) == 1 else [],
+        [n for n in names if str(keys[n].get("rostopic", "")).strip("/") == "/".join(places)],
+        [n for n in names if {n, n.replace("cam", "cam_"), n.replace("cam", "camera")} & {*places}],
+        [n for n in names if size is not None and keys[n].get("resolution") == size],
+    ):
+        if len(chosen) == 1:
+            return chosen[0]
+    raise CalibrationError(
+        f"holds {len(names)} cameras ({', '.join(names)}): say which took the images, as in "
+        f"--calibration FILE:{names[-1]}"
+    )
 
 
 def _euroc(content: Keys, wanted: Wanted) -> Keys:
@@ -136,7 +161,7 @@ def _euroc(content: Keys, wanted: Wanted) -> Keys:
 def _opencv(content: Keys, wanted: Wanted) -> Keys:
     """Its samples name no model: the count of the coefficients, or ``fisheye_model``, tells."""
     K = _numbers(content, _first(content, _MATRIX), 9)
-    width, height = content.get("image_width"), content.get("image_height")
+    width, height = (content.get(_first(content, names)) for names in _SIZE)
     model = _said_model(content)
     if not model:
         model = "fisheye" if content.get("fisheye_model") else "rational_polynomial"
@@ -238,107 +263,15 @@ def _orb_slam(content: Keys, wanted: Wanted) -> Keys:
     return flat
 
 
-# --- COLMAP and nerfstudio ----------------------------------------------------------------------
-
-_COLMAP: dict[str, tuple[LensModel, str]] = {
-    "SIMPLE_PINHOLE": ("pinhole", "f cx cy"),
-    "PINHOLE": ("pinhole", "fx fy cx cy"),
-    "SIMPLE_RADIAL": ("pinhole-radtan", "f cx cy k1"),
-    "RADIAL": ("pinhole-radtan", "f cx cy k1 k2"),
-    "OPENCV": ("pinhole-radtan", "fx fy cx cy k1 k2 p1 p2"),
-    "FULL_OPENCV": ("pinhole-rational", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
-    "SIMPLE_FISHEYE": ("fisheye", "f cx cy"),
-    "FISHEYE": ("fisheye", "fx fy cx cy"),
-    "SIMPLE_RADIAL_FISHEYE": ("fisheye", "f cx cy k1"),
-    "RADIAL_FISHEYE": ("fisheye", "f cx cy k1 k2"),
-    "OPENCV_FISHEYE": ("fisheye", "fx fy cx cy k1 k2 k3 k4"),
-}
-"""COLMAP's models that are ours, with their parameters in order (src/colmap/sensor/models.h)."""
-_COLMAP_LINE = re.compile(
-    r"^[ \t]*\d+[ \t]+[A-Z][A-Z0-9_]+[ \t]+\d+[ \t]+\d+[ \t]+\S", re.MULTILINE
-)
-
-
-def _colmap(text: str, wanted: Wanted) -> Keys:
-    """``CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]``: one camera, or the one of that size."""
-    lines = [line.split() for line in text.splitlines() if _COLMAP_LINE.match(line)]
-    cameras = list(dict.fromkeys(tuple(row[1:]) for row in lines))
-    if wanted.image_size is not None and len(cameras) > 1:
-        size = tuple(map(str, wanted.image_size))
-        cameras = [row for row in cameras if row[1:3] == size] or cameras
-    if len(cameras) > 1:
-        raise CalibrationError(
-            f"holds {len(cameras)} cameras: leave the line of the one that took the images"
-        )
-    name, width, height, *values = cameras[0]
-    model, parameters = _known_colmap(name)
-    names = parameters.split()
-    if len(values) != len(names):
-        raise CalibrationError(
-            f"{name} has {len(values)} parameters: expected {len(names)} ({parameters})"
-        )
-    flat: Keys = {"model": model, "width": width, "height": height}
-    flat.update(dict.fromkeys(COEFFICIENTS[model], 0.0))
-    flat.update(zip(names, values, strict=True))
-    if "f" in flat:
-        flat["fx"] = flat["fy"] = flat.pop("f")
-    return _half_a_pixel_back(flat)
-
-
-def _nerfstudio(content: Keys, wanted: Wanted) -> Keys:
-    """The camera of all images; a file that gives each its own is read where all are the same."""
-    said = content.get("camera_model", "OPENCV_FISHEYE" if content.get("is_fisheye") else "OPENCV")
-    model, _ = _known_colmap(str(said))
-    content = {**_of_all_frames(content), **content}
-    flat: Keys = {"model": model, **dict.fromkeys(COEFFICIENTS[model], 0.0)}
-    names = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
-    names |= {k: k for k in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
-    flat.update({own: content[key] for key, own in names.items() if content.get(key) is not None})
-    if "fx" not in flat and "camera_angle_x" in content and "width" in flat:
-        angle = min(max(number(content, "camera_angle_x"), 1e-3), math.pi - 1e-3)
-        flat["fx"] = 0.5 * number(flat, "width") / math.tan(0.5 * angle)
-    if "fx" in flat:
-        flat.setdefault("fy", flat["fx"])
-    return _half_a_pixel_back(flat)
-
-
-def _of_all_frames(content: Keys) -> Keys:
-    frames = content.get("frames")
-    if "fl_x" in content or "camera_angle_x" in content or not isinstance(frames, list):
-        return {}
-    names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
-    each = [
-        {key: frame[key] for key in names if key in frame}
-        for frame in cast(list[Any], frames)
-        if isinstance(frame, dict)
-    ]
-    if any(camera != each[0] for camera in each):
-        raise CalibrationError("gives images cameras that differ: give the calibration of one")
-    return each[0] if each else {}
-
-
-def _known_colmap(name: str) -> tuple[LensModel, str]:
-    if name not in _COLMAP:
-        raise CalibrationError(
-            f"camera model {name} is not understood: calibrate again with OPENCV "
-            "(a wide lens: with OPENCV_FISHEYE)"
-        )
-    return _COLMAP[name]
-
-
-def _half_a_pixel_back(flat: Keys) -> Keys:
-    return {**flat, **{k: number(flat, k) - 0.5 for k in ("cx", "cy") if k in flat}}
-
-
 # --- KITTI --------------------------------------------------------------------------------------
 
-_KITTI_LINE = re.compile(r"^P\d+:", re.MULTILINE)
+_KITTI_LINE = re.compile(r"^P(?:_rect_0)?\d+:", re.MULTILINE)
 
 
 def _kitti(text: str, wanted: Wanted) -> Keys:
     """From the row ``P<camera>:`` with the 3x4 projection matrix; those images are rectified."""
     camera = wanted.kitti_camera
-    match = re.search(rf"^P{camera}:(.*)$", text, re.MULTILINE)
+    match = re.search(rf"^P(?:_rect_0)?{camera}:(.*)$", text, re.MULTILINE)
     if match is None:
         raise CalibrationError(f"no row P{camera}: add the projection matrix of this camera")
     row = match.group(1).split()
@@ -349,15 +282,36 @@ def _kitti(text: str, wanted: Wanted) -> Keys:
     return {"model": "pinhole", "fx": row[0], "fy": row[5], "cx": row[2], "cy": row[6]}
 
 
+# --- numbers alone: ETH3D, ScanNet, and a matrix saved by numpy ----------------------------------
+
+_NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
+_NUMBERS_ALONE = re.compile(
+    rf"\A(?:\s*#[^\n]*\n)*\s*(?:{_NUMBER}[\s,;]+){{3,15}}{_NUMBER}[\s,;]*\Z"
+)
+
+
+def _alone(text: str, wanted: Wanted) -> Keys:
+    """``fx fy cx cy``, or a matrix of 3 or 4 rows; of images without distortion."""
+    lines = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
+    numbers = re.split(r"[\s,;]+", "\n".join(lines).strip(" \n\t,;"))
+    side = {9: 3, 16: 4, 12: 4}.get(len(numbers))
+    if side is None and len(numbers) != 4:
+        raise CalibrationError(f"{len(numbers)} numbers: expected fx fy cx cy, or a matrix")
+    if side is not None:
+        numbers = [numbers[0], numbers[side + 1], numbers[2], numbers[side + 2]]
+    return {"model": "pinhole", **dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))}
+
+
 FORMATS = (
     CalibrationFormat("KITTI's calib.txt", _KITTI_LINE, _kitti),
-    CalibrationFormat("COLMAP's cameras.txt", _COLMAP_LINE, _colmap),
-    CalibrationFormat("Kalibr's camchain.yaml", ("cam0",), _kalibr),
+    CalibrationFormat("COLMAP's cameras.txt or .bin", COLMAP_LINE, colmap),
+    CalibrationFormat("fx fy cx cy or a matrix alone", _NUMBERS_ALONE, _alone),
+    CalibrationFormat("Kalibr's camchain.yaml", ("cam0", "cam1"), _kalibr),
     CalibrationFormat("EuRoC's sensor.yaml", ("intrinsics",), _euroc),
     CalibrationFormat("OpenCV's and ROS's camera_matrix", _MATRIX, _opencv),
     CalibrationFormat("ORB-SLAM's settings", ("Camera1.fx", "Camera.fx"), _orb_slam),
     CalibrationFormat(
-        "nerfstudio's transforms.json", ("fl_x", "camera_angle_x", "frames"), _nerfstudio
+        "nerfstudio's transforms.json", ("fl_x", "camera_angle_x", "frames"), nerfstudio
     ),
     CalibrationFormat("our own calib.yaml", ("fx", "fy", "cx", "cy"), _own),
 )

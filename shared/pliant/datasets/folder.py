@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pliant.datasets.base import Dataset
+from pliant.datasets.calibration_files import NAMES
 from pliant.datasets.depth import with_depth
 from pliant.datasets.image_kinds import folder_of_images, images_of_one_kind
 from pliant.datasets.image_lists import read_list
@@ -101,8 +102,7 @@ def open_bare_folder(source: str, options: SourceOptions) -> Dataset:
 
 def calibration_in(*folders: Path) -> Path | None:
     """The calibration that lies beside the images."""
-    names = (CALIBRATION_NAME, "calibration.yaml", "cameras.txt", "cameras.bin")
-    return existing(*(folder / name for folder in folders for name in names))
+    return existing(*(folder / name for folder in folders for name in NAMES))
 
 
 def _timed(paths: Sequence[Path], fps: float | None) -> tuple[list[ListedImage], list[str]]:

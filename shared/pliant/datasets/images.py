@@ -163,13 +163,14 @@ def choose_calibration(
     """
     if options.fov_deg is not None:
         return calibration_from_fov(*size, options.fov_deg, pixel_aspect=pixel_aspect)
+    source = where.rpartition(": ")[2] if ": /" in where else Path(where).name
     if options.calibration is not None:
-        return read_calibration(options.calibration, size, kitti_camera=kitti_camera)
+        return read_calibration(options.calibration, size, kitti_camera=kitti_camera, source=source)
     if isinstance(found, Calibration):
         check_size(found, size, f"{where}: its known calibration")
         return found
     if found is not None and found.is_file():
-        return read_calibration(found, size, kitti_camera=kitti_camera)
+        return read_calibration(found, size, kitti_camera=kitti_camera, source=source)
     return calibration_from_fov(*size, pixel_aspect=pixel_aspect)
 
 
