@@ -92,7 +92,7 @@ def write_whole(path: Path, data: str | bytes, *, mode: int = 0o666, synced: boo
 
     synced: whether that also holds for a power cut.
     """
-    content = data.encode() if isinstance(data, str) else data
+    content = data.encode(errors="surrogateescape") if isinstance(data, str) else data
     if is_stream(path):
         with path.open("wb") as file:
             file.write(content)

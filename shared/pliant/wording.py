@@ -13,6 +13,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def encodable(text: str) -> str:
+    """A text with a mark for what is not UTF-8 in it, as names of files may have."""
+    return text.encode(errors="surrogateescape").decode(errors="replace")
+
+
 def shown(value: object) -> str:
     """``repr`` of what a user gave, of a file or of the network, shortened to a part of a line."""
     return shortened(_REPR.repr(value), 2 * _LONGEST)

@@ -1,5 +1,6 @@
 """A recording of a video holds the video: its images are those that the run had, or none."""
 
+import os
 import random
 import threading
 from collections.abc import Collection
@@ -41,6 +42,13 @@ from pliant_services.replay.play import PlayRequest, run_play
 from pliant_services.runtime.monitor import SilentMonitor
 
 PATIENCE_S = 60.0
+
+
+def test_a_video_whose_name_is_not_utf_8_is_recorded(clip: Path, tmp_path: Path) -> None:
+    own, path = tmp_path / os.fsdecode(b"caf\xe9.mp4"), tmp_path / "recording.mcap"
+    own.write_bytes(clip.read_bytes())
+    assert_same_images(path, record(opened(own), path))
+    assert "frames of caf?.mp4" in "\n".join(describe(summarise(path)))
 
 
 def test_images_of_odd_videos_are_made_again(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """What is written is read back; what was cut off is read up to the cut."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,13 @@ def test_round_trip(tmp_path: Path) -> None:
     ]
     assert recording.metadata()["config"] == {"yaml": "a: 1"}
     assert not list(recording.messages(topics.IMAGE))
+
+
+def test_metadata_of_a_command_line_that_is_not_utf_8(tmp_path: Path) -> None:
+    named = {"pliant": {"command": os.fsdecode(b"pliant run caf\xe9.mp4")}}
+    RecordingWriter(tmp_path / "a.mcap", named).close()
+    kept = Recording(tmp_path / "a.mcap").metadata()["pliant"]["command"]
+    assert kept == "pliant run caf\ufffd.mp4"
 
 
 def test_every_cut_leaves_the_complete_chunks(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import errno
 import importlib
+import io
 import os
 import signal
 import sys
@@ -65,6 +66,8 @@ def main(application: typer.Typer | None = None) -> None:
         if signal.getsignal(kind) == signal.SIG_DFL:  # not under nohup
             signal.signal(kind, signal.default_int_handler)
     deliver_swallowed_interruptions()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # names of files are bytes
     try:
         run_and_exit(application or app)
     except KeyboardInterrupt:  # one more, just before it was ignored

@@ -44,7 +44,7 @@ def resumed_map(output: Path, request: RunRequest) -> Path | None:
     if not (output / STATE_FOLDER).is_dir():  # at most results are left to write
         return request.known
     note = output / STATE_FOLDER / KNOWN_MAP
-    begun_in = Path(note.read_text()) if note.is_file() else None
+    begun_in = Path(note.read_text("utf-8", "surrogateescape")) if note.is_file() else None
     if request.known is not None and MapFile(request.known).path.resolve() != begun_in:
         raise ResultError(
             f"--resume goes on in the map of its run, {begun_in or 'which has none'}, and "

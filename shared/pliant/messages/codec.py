@@ -82,7 +82,7 @@ def encode(message: Header, *, packed: bool = False) -> bytes:
         values[spec.name] = [list(array.shape), raw]
         room += array.nbytes + 64
     # Room for the whole message: a growing buffer would copy an image several times.
-    packer = msgpack.Packer(use_bin_type=True, buf_size=room)
+    packer = msgpack.Packer(use_bin_type=True, buf_size=room, unicode_errors="replace")
     packed = packer.pack(values)
     assert isinstance(packed, bytes)
     return packed

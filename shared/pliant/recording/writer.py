@@ -28,6 +28,7 @@ from pliant.recording import layout
 from pliant.recording.layout import CHUNK_BYTES
 from pliant.recording.sections import ChunkIndexes, OpenChunk, as_bytes, closing
 from pliant.version import __version__
+from pliant.wording import encodable
 
 _AT_ONCE = 1024
 """Parts that the system takes in one call (IOV_MAX)."""
@@ -68,7 +69,8 @@ class RecordingWriter:
             header = Header(profile="pliant", library=f"pliant {__version__}")
             self._put(layout.MAGIC, as_bytes(header))
             for name, content in metadata.items():
-                record = as_bytes(Metadata(name=name, metadata=dict(content)))
+                content = {key: encodable(value) for key, value in content.items()}
+                record = as_bytes(Metadata(name=name, metadata=content))
                 index = MetadataIndex(offset=self._size, length=len(record), name=name)
                 self._put(record)
                 self._metadata.append(index)

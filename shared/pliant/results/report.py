@@ -1,13 +1,14 @@
 """What report.json says of a run, the same in a few lines, and the exit code that follows."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 
 from pliant.algorithms.corrected_view import parts_of
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.image.exposure import FLAWS
 from pliant.algorithms.map_density import count_distinct, well_observed
 from pliant.messages.types import DROPPED, MASKED
 from pliant.results.calibration import calibration_doubt, calibration_verdict
@@ -63,7 +64,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "success_rate": len(final) / frames if frames else 0.0,
         "initialisation_retries": max(0, len(segments) - 1),
         "segments": segments,
-        "last_reason": telling[-1] if telling else "",
+        "last_reason": last_reason(telling),
         "frames_without_pixels": {str(f): why for f, why in sorted(run.missing.items())},
         "frames_passed_over": run.passed_over,
         "keyframes": len(history.keyframe_poses()),
@@ -81,6 +82,15 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "map_points_per_frame": [run.map_points[f] for f in sorted(run.map_points)],
         "scale_is_metric": run.scale_is_metric,
     }
+
+
+def last_reason(reasons: Sequence[str]) -> str:
+    """The last of the reasons why frames have no pose, or what most images look like."""
+    for flaw in FLAWS:
+        count = reasons.count(flaw)
+        if 2 * count > len(reasons):
+            return f"{count} of {len(reasons)} {flaw.replace('the frame is', 'frames are')}"
+    return reasons[-1] if reasons else ""
 
 
 def broken_images(missing: Mapping[_Frame, str]) -> dict[_Frame, str]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.image.exposure import flaw_of
 from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
@@ -259,8 +260,13 @@ class Mapper:
         with self._timer("start"):
             begun = self._begin_where_possible(self._parameters)
         if isinstance(begun, str):
-            return self._publish(WAITING, begun, 0)
+            return self._publish(WAITING, self._flaw(tracks) or begun, 0)
         return self._publish(TRACKING, "", begun)
+
+    def _flaw(self, tracks: FrameExtrema) -> str:
+        """Why the newest image has fewer tracks than a map starts with, if that shows."""
+        grey, few = self._images[0], len(tracks.ids) < self._parameters.start.min_tracks
+        return flaw_of(grey) if grey is not None and few else ""
 
     def start_at_last(self) -> bool:
         """Begin a map with what there is, since nothing more comes.  Whether there is a map."""
@@ -376,7 +382,7 @@ class Mapper:
         reason = f"lost: the pose of frame {frame} is not supported, {seen} mapped tracks"
         self._lost_frames += 1
         self._waiting = self._waiting.then(frame, stamp_ns, tracks, self._camera, self._parameters)
-        delta = self._publish(LOST, reason, 0)
+        delta = self._publish(LOST, self._flaw(tracks) or reason, 0)
         long = self._motion.lost_s(stamp_ns) > self._parameters.localisation.max_lost_s
         if long and self._lost_frames >= _LEAST_LOST:
             self._keyframe_changes.settle(active.keyframes)

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Mapping
 from typing import Any
 
+from pliant.algorithms.image.exposure import FLAWS
 from pliant.messages.types import DROPPED
 from pliant.results.calibration import FOUND
 from pliant.results.judgement import DOUBTS
@@ -20,11 +21,16 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
     """Sentences, the most important first; none where nothing is wrong."""
     told: list[str] = []
     segments = report["segments"]
-    if not segments:
+    why = report["last_reason"] or "no frames"
+    if not segments and any(flaw.split()[-1] == why.split()[-1] for flaw in FLAWS):
+        told.append(
+            f"No map could start: {why}. Play the video: if it looks right there, convert it once."
+        )
+    elif not segments:
         told.append(
             "No map could start. Move the camera sideways by a tenth of the distance to the scene "
             "or more, not only turn it, with things at several distances in view, not one wall or "
-            f"table alone. It said: {report['last_reason'] or 'no frames'}."
+            f"table alone. It said: {why}."
         )
     first_ns = min(stamps_ns.values(), default=0)
     for before, after in itertools.pairwise(segments):
