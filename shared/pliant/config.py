@@ -60,7 +60,13 @@ class IngestParameters(Parameters):
         default=0.4,
         ge=0.0,
         description="Live mode: a frame is mapped while those that wait for bundle adjustment came "
-        "less than this before it, or none of them is to be mapped; it passes over the others.",
+        "less than this before it, or none of them is to be mapped; the others are only localised.",
+    )
+    pose_lag_s: float = Field(
+        default=2.0,
+        ge=0.0,
+        description="Live mode: a frame that is not mapped is localised by its tracks while those "
+        "that wait for bundle adjustment came less than this before it; else it gets no pose.",
     )
 
 

@@ -15,7 +15,7 @@ from benchmarks.table import markdown
 from pliant.algorithms.map_delta import WAITING
 from pliant.config import config_yaml, load_config
 from pliant.datasets.builtin import builtin_folder
-from pliant.messages.types import PASSED_OVER, Status
+from pliant.messages.types import Status
 from pliant.results.folder import prepare
 from pliant_services.profiles import PROFILES
 from pliant_services.run.command import RunRequest, service_arguments
@@ -30,7 +30,9 @@ _WAIT_S = 1.0
 
 @dataclass
 class _Phase:
-    """A part of the run.  tracked, mapped, passed_over, dropped: frames that were.
+    """A part of the run.  tracked, mapped, placed, dropped: frames that were.
+
+    placed: they got a pose as they came, mapped or not.
 
     largest_lag: frames that bundle adjustment was behind tracking.
     """
@@ -40,14 +42,14 @@ class _Phase:
     end_s: float = 0.0
     tracked: int = 0
     mapped: int = 0
-    passed_over: int = 0
+    placed: int = 0
     dropped: int = 0
     largest_lag: int = 0
 
     def row(self) -> Sequence[str]:
         spent_s = self.end_s - self.start_s
-        rates = (f"{count / spent_s:.1f}" for count in (self.tracked, self.mapped))
-        counts = (self.passed_over, self.dropped, self.largest_lag)
+        rates = (f"{n / spent_s:.1f}" for n in (self.tracked, self.placed, self.mapped))
+        counts = (self.dropped, self.largest_lag)
         return (self.name, *rates, *map(str, counts))
 
 
@@ -74,9 +76,9 @@ class _Watch:
                 phase.dropped += counters["maxima"] == 0
             elif status.service == "bundle_adjustment":
                 self.mapped = status.frame
-                phase.passed_over += status.note == PASSED_OVER
-                maps = counters.get("state", WAITING) != WAITING and status.note != PASSED_OVER
+                maps = counters.get("state", WAITING) != WAITING and "maxima" in status.stages
                 phase.mapped += maps
+                phase.placed += counters.get("inliers", 0) > 0
             lag = self.frame - self.mapped
             phase.largest_lag = max(phase.largest_lag, lag)
             if maps and not self.near_s and len(self.phases) == 3 and lag <= _NEAR_FRAMES:
@@ -126,8 +128,8 @@ def measure(
     heading = (
         "bundle adjustment",
         "tracked/s",
+        "with a pose/s",
         "mapped/s",
-        "passed over",
         "dropped",
         "most behind",
     )

@@ -122,7 +122,7 @@ def test_lossless_publishes_every_frame_and_its_bytes_as_they_came() -> None:
         np.testing.assert_array_equal(image.grey, grey)
     sources = bus.outputs[topics.SOURCE]
     assert [s.data for s in sources if isinstance(s, SourceImage)] == data
-    assert monitor.counters == {"dropped": 0, "broken": 0, "unmapped": 0}
+    assert monitor.counters == {"dropped": 0, "broken": 0, "unmapped": 0, "unplaced": 0}
     assert monitor.frames == list(range(5))
 
 
@@ -166,7 +166,7 @@ class MaskedDataset(FakeDataset):
 def test_a_frame_that_is_masked_as_a_whole_has_no_pixels_and_is_not_broken() -> None:
     images, monitor, bus = run(MaskedDataset([png(i) for i in range(3)]))
     assert [image.missing for image in images] == [MASKED, "", ""]
-    assert monitor.counters == {"dropped": 0, "broken": 0, "unmapped": 0}
+    assert monitor.counters == {"dropped": 0, "broken": 0, "unmapped": 0, "unplaced": 0}
     sources = [s for s in bus.outputs[topics.SOURCE] if isinstance(s, SourceImage)]
     assert [unpacked(s.mask).sum() for s in sources] == [0, HEIGHT, 2 * HEIGHT]
     assert [image.mask for image in images[1:]] == [source.mask for source in sources[1:]]
@@ -190,7 +190,7 @@ def test_a_broken_frame_keeps_its_number_and_says_what_is_wrong(kind: str, mode:
     assert images[1].missing.startswith("broken: frame 1: ")
     assert text in images[1].missing
     assert images[1].grey.size == 0
-    assert monitor.counters == {"dropped": 0, "broken": 1, "unmapped": 0}
+    assert monitor.counters == {"dropped": 0, "broken": 1, "unmapped": 0, "unplaced": 0}
 
 
 def test_live_passes_over_what_a_slow_reader_has_no_time_for() -> None:
@@ -211,7 +211,7 @@ def test_live_passes_over_what_a_slow_reader_has_no_time_for() -> None:
     dataset = FakeDataset([png(i) for i in range(11)], is_live=True, before=before)
     images, monitor, bus = run(dataset, SlowBus(on_image))
     assert [image.missing for image in images] == ["", *["dropped"] * 9, ""]
-    counted = {"dropped": 9, "broken": 0, "unmapped": 0}
+    counted = {"dropped": 9, "broken": 0, "unmapped": 0, "unplaced": 0}
     why = {"dropped_for_tracking": 9, "waited_for_tracking_s": 5.0}
     assert monitor.counters == {**counted, **why}
     sources = [s for s in bus.outputs[topics.SOURCE] if isinstance(s, SourceImage)]

@@ -1,4 +1,4 @@
-"""Live mode: which frames a slow bundle adjustment passes over, and that nobody waits for it."""
+"""Live mode: which frames a slow bundle adjustment maps, and that nobody waits for it."""
 
 import threading
 from collections import deque
@@ -16,7 +16,7 @@ from pliant.bus.base import join, receive, receive_one
 from pliant.bus.replay_bus import ReplayBus
 from pliant.bus.session import free_endpoint, open_router
 from pliant.bus.zenoh_bus import ZenohBus
-from pliant.config import Config, load_config
+from pliant.config import BusParameters, Config, IngestParameters, load_config
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration
 from pliant.messages import topics
@@ -45,38 +45,50 @@ IMAGE = Image(
 )
 
 
+LIMITS = IngestParameters(mapping_lag_s=LAG_S, pose_lag_s=2.0 * LAG_S)
+
+
+def pace_of(window: int, lag_messages: int = 128) -> MappingPace:
+    return MappingPace.of(BusParameters(window=window, lag_messages=lag_messages))
+
+
 def decide(pace: MappingPace, begin: int, waiting: Sequence[int], missing: str = "") -> str:
-    """m where a frame is to be mapped, when so many of those before it wait."""
+    """What becomes of frames, when so many of those before them wait: m, they are mapped; p, they
+    get a pose; -, they do not."""
     decisions = ""
     for frame, wait in enumerate(waiting, begin):
         image = replace(IMAGE, frame=frame, stamp_ns=frame * STEP_NS, missing=missing)
-        decisions += "-" if pace.passes_over(image, wait, LAG_S) else "m"
+        image = pace.mark(image, wait, LIMITS)
+        decisions += "m" if not image.unmapped else "-" if image.unplaced else "p"
     return decisions
 
 
 def test_frames_are_mapped_while_what_waits_is_young_or_none_is_to_be_mapped() -> None:
-    pace = MappingPace(deque(maxlen=16))
-    assert decide(pace, 0, [0, 1, 2, 3, 4, 5]) == "mmm---"
-    assert decide(pace, 6, [4, 5]) == "--"  # the third of them waits
-    assert decide(pace, 8, [5, 1, 2, 3]) == "mmm-"  # none waits that is to be mapped
+    pace = pace_of(17)
+    assert decide(pace, 0, [0, 1, 2, 3, 4, 5]) == "mmmpp-"
+    assert decide(pace, 6, [4, 5]) == "p-"  # the third of them waits
+    assert decide(pace, 8, [5, 1, 2, 3]) == "mmmp"  # none waits that is to be mapped
     assert decide(pace, 12, [0] * 5) == "mmmmm"
-    assert decide(pace, 17, [16, 17]) == "--"  # of what came long ago no stamp is kept
-    assert pace.passed == 3 + 2 + 1 + 2
+    assert pace.counters == {"unmapped": 3 + 2 + 1, "unplaced": 2}
+
+
+def test_what_came_so_long_ago_that_no_stamp_is_kept_is_late() -> None:
+    assert decide(pace_of(4, lag_messages=5), 0, [0, 1, 2, 2, 2, 6]) == "mmmmm-"
 
 
 def test_no_more_wait_to_be_mapped_than_there_is_credit_for() -> None:
-    assert decide(MappingPace(deque(maxlen=2)), 0, [0, 1, 2, 3]) == "mm--"
+    assert decide(pace_of(3), 0, [0, 1, 2, 3]) == "mmpp"
 
 
 def test_frames_without_pixels_are_not_to_be_mapped_and_not_counted() -> None:
-    pace = MappingPace(deque(maxlen=16))
+    pace = pace_of(17)
     assert decide(pace, 0, [0, 1, 2, 3, 4], missing="dropped") == "mmmmm"
-    assert (pace.last, pace.passed) == (-1, 0)
+    assert (pace.last, pace.unmapped) == (-1, 0)
     assert decide(pace, 5, [5, 6]) == "m-"
 
 
 def test_who_is_started_again_decides_as_before() -> None:
-    pace = MappingPace(deque(maxlen=16))
+    pace = pace_of(17)
     decide(pace, 0, range(5))
     again = MappingPace(*load_state(save_state(tuple(vars(pace).values()))))
     assert decide(again, 5, [5, 2, 6]) == decide(pace, 5, [5, 2, 6]) == "-m-"

@@ -225,22 +225,28 @@ def test_a_frame_without_pixels_gets_empty_messages_and_loses_nothing(
     assert last.segment == 0
 
 
-def test_frames_that_mapping_passes_over_are_tracked_all_the_same(
+def test_frames_that_are_not_mapped_are_localised_all_the_same(
     config: Config, ingested: dict[Topic, list[Header]], tracked: list[Header]
 ) -> None:
     images = list(ingested[topics.IMAGE])
-    over = {*range(1, 12, 2), 18, 19, 20}
+    over, unplaced = {*range(1, 12, 2), 18, 19, 20, 21}, {20}
     for frame in over:
-        images[frame] = replace(images[frame], unmapped=True)  # type: ignore[call-arg]
+        marks = {"unmapped": True, "unplaced": frame in unplaced}
+        images[frame] = replace(images[frame], **marks)  # type: ignore[arg-type]
     inputs = {**ingested, topics.IMAGE: images}
     tracks = track(config, inputs)
     assert wire(tracks) == wire(tracked)
     outputs = adjust(config, inputs, tracks)
     updates = [m for m in outputs[topics.MAP_UPDATE] if isinstance(m, MapUpdate)]
     assert [m.frame for m in updates] == list(range(FRAMES))
-    assert {m.frame for m in updates if m.reason == PASSED_OVER} == over
+    begun = next(m.frame for m in updates if m.state == TRACKING)
+    late = {m.frame for m in updates if m.reason == PASSED_OVER}
+    assert late == unplaced | {frame for frame in over if frame < begun}
     posed = {frame for m in updates for frame in m.pose_frames.tolist()}
-    assert posed == set(range(FRAMES)) - over
+    assert posed == set(range(FRAMES)) - unplaced
+    assert not over & {
+        frame for m in updates for frame in m.keyframe_frames.tolist() if frame > begun
+    }
     assert updates[-1].state == TRACKING
     assert updates[-1].segment == 0
 

@@ -70,13 +70,14 @@ def test_tracking_goes_on_and_the_run_can_be_replayed(tmp_path: Path) -> None:
     over = [m.frame for m in sources if m.unmapped]
     assert [m.frame for m in tracks] == [m.frame for m in updates] == list(range(FRAMES))
     assert all(len(tracks[frame].ids) > 100 for frame in over)
-    assert (
-        [m.frame for m in updates if m.reason == PASSED_OVER]
-        == over
-        == report["frames_passed_over"]
-    )
+    unplaced = [m.frame for m in sources if m.unplaced]
+    late = {m.frame for m in updates if m.reason == PASSED_OVER}
+    assert {*unplaced} <= late <= {*over}
+    assert {*report["frames_passed_over"]} <= late
     assert len([frame for frame in over if STOP_FRAME < frame <= GO_FRAME]) > WINDOW
-    assert any(f"{len(over)} images tracked, but not mapped" in line for line in summary(report))
+    placed = [m.frame for m in updates if m.frame in m.pose_frames]
+    assert {*over} - {*unplaced} & {*placed}
+    assert any(f"{len(over)} images not mapped" in line for line in summary(report))
     again = ("replay", output / RECORDING_NAME, "--services", "tracking,bundle_adjustment")
     done = pliant(*again, "--output", tmp_path / "again", "--check")
     assert done.returncode == 0, done.stderr

@@ -200,7 +200,7 @@ def test_a_verdict_speaks_of_all_frames_of_the_source() -> None:
     few = judge(frames=115, in_segments=[115], doubtful=0, absent=5)
     assert few == (GOOD, "96% of the frames of the source have a pose in the largest segment")
     # Neither is much, both together are.
-    both = judge(frames=95, in_segments=[88], doubtful=0, unused=5, broken=5)
+    both = judge(frames=100, in_segments=[88], doubtful=0, broken=5)
     assert both[0] == DOUBTFUL
     ended = judge(frames=60, in_segments=[60], doubtful=0, failed=True)
     assert ended == (DOUBTFUL, "the source ended early")

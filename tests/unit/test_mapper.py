@@ -1,5 +1,7 @@
 """The mapper from end to end on synthetic tracks: poses, map, start, loss, and bad input."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
@@ -14,6 +16,7 @@ from pliant.algorithms.mapping.parameters import (
     WindowParameters,
 )
 from pliant.algorithms.mapping.start import impatient
+from pliant.algorithms.mapping.trial import TrialMapper
 from pliant.algorithms.tracks import FrameExtrema
 
 PARAMETERS = MappingParameters()
@@ -332,6 +335,63 @@ def test_frames_that_are_passed_over_get_no_pose_and_the_next_one_goes_on():
     error, _ = trajectory_error(published, poses)
     assert error < 2e-3
     assert LOST not in published.states
+
+
+@pytest.mark.parametrize("mapper_of", [Mapper, TrialMapper])
+def test_frames_that_are_not_mapped_get_poses_by_their_tracks(mapper_of):
+    """Also those that wait for the map, and those that the end finds waiting.  None is a keyframe
+    once the map has begun, and none makes a point."""
+    poses = sideways(62)
+    mapper, published = mapper_of(CAMERA, PARAMETERS, 0), Published()
+    for frame, tracks in enumerate(Scene.box().frames(poses)):
+        if frame % 4 == 0:
+            published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+            continue
+        began = mapper.point_count > 0
+        delta = mapper.only_localise(frame, frame * INTERVAL_NS, tracks, "no time")
+        assert (frame in delta.pose_frames.tolist()) == (delta.reason != "no time") == began
+        assert len(delta.point_ids) == 0 or delta.snapshot
+        assert not began or frame not in delta.keyframe_frames.tolist()
+        published.apply(delta)
+    published.apply(mapper.finish())
+    assert sorted(published.poses) == list(range(62))
+    error, _ = trajectory_error(published, poses)
+    assert error < 2e-3
+    assert LOST not in published.states
+
+
+def test_a_frame_that_no_tracks_place_waits_for_the_next_mapped_one():
+    """What few tracks say is not believed without a look at the image."""
+    poses = sideways(40)
+    mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
+    for frame, tracks in enumerate(Scene.box().frames(poses)):
+        if frame not in (30, 31):
+            published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+            continue
+        few = FrameExtrema.of(first(tracks, 40), tracks.maxima)
+        delta = mapper.only_localise(frame, frame * INTERVAL_NS, few, "no time")
+        assert (delta.state, delta.reason, len(delta.pose_frames)) == (TRACKING, "no time", 0)
+        published.apply(delta)
+    published.apply(mapper.finish())
+    assert sorted(published.poses) == list(range(40))
+    error, _ = trajectory_error(published, poses)
+    assert error < 2e-3
+
+
+def first(tracks, count):
+    """The first of the tracks of a frame."""
+    arrays = ("ids", "points_px", "ages", "kappas", "states")
+    return replace(tracks, **{name: getattr(tracks, name)[:count] for name in arrays})
+
+
+def test_a_lost_camera_is_not_found_by_frames_that_are_not_mapped():
+    frames = list(Scene.box().frames(sideways(44)))
+    mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
+    for frame, tracks in enumerate(frames[:30]):
+        published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+    assert mapper.process(30, 30 * INTERVAL_NS, FrameExtrema.empty(), None, None).state == LOST
+    delta = mapper.only_localise(31, 31 * INTERVAL_NS, frames[31], "no time")
+    assert (delta.state, delta.reason, len(delta.pose_frames)) == (LOST, "no time", 0)
 
 
 def test_a_frame_without_pixels_leaves_the_state_as_it_was():

@@ -12,7 +12,17 @@ from pliant.algorithms.mapping.frame_pose import doubt, support_of
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, SupportParameters
 from pliant.algorithms.tracks import FrameExtrema
-from pliant.results.judgement import BAD, DOUBTFUL, GOOD, judge, judge_surfels, slipping_frames
+from pliant.map_history import FramePose, MapHistory
+from pliant.messages.types import PASSED_OVER
+from pliant.results.judgement import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    doubtful_frames,
+    judge,
+    judge_surfels,
+    slipping_frames,
+)
 
 
 def doubt_of(points, inliers, settled):
@@ -120,10 +130,11 @@ def test_a_run_is_judged_with_a_reason(frames, in_segments, doubtful, word):
     assert reason
 
 
-def test_of_frames_that_were_not_used_no_verdict_speaks() -> None:
-    for unused, which in ((0, "frames"), (40, "frames that were used")):
-        judged = judge(frames=100, in_segments=[100], doubtful=0, unused=unused)
-        assert judged == (GOOD, f"all {which} have a pose in one segment")
+def test_a_frame_that_was_passed_over_and_placed_later_is_not_doubtful() -> None:
+    history = MapHistory()
+    history.states = dict(enumerate([(TRACKING, PASSED_OVER), (TRACKING, "doubtful: x")]))
+    history.frames = dict.fromkeys(range(2), FramePose(0, 0, np.zeros(7), 100))
+    assert doubtful_frames(history) == [1]
 
 
 def test_a_run_whose_calibration_bends_the_map_is_doubtful() -> None:
@@ -140,16 +151,20 @@ def test_where_much_of_the_scene_moves_the_profile_for_it_is_named() -> None:
 
 
 def test_a_run_of_which_many_images_are_broken_is_doubtful() -> None:
-    few = judge(frames=95, in_segments=[95], doubtful=0, unused=5, broken=5)
-    many = judge(frames=60, in_segments=[60], doubtful=0, unused=40, broken=40)
-    assert (few[0], many) == (GOOD, (DOUBTFUL, "40% of the images are broken"))
+    few = judge(frames=100, in_segments=[95], doubtful=0, broken=5)
+    many = judge(frames=100, in_segments=[60], doubtful=0, broken=40)
+    assert few == (GOOD, "95% of the frames of the source have a pose in the largest segment")
+    assert many[0] == DOUBTFUL
+    assert many[1].endswith("40% of the images are broken")
 
 
 def test_a_run_that_did_not_keep_up_is_doubtful() -> None:
-    some = judge(frames=60, in_segments=[60], doubtful=0, unused=50, behind=40)
-    most = judge(frames=29, in_segments=[29], doubtful=0, unused=71, behind=71)
-    assert (some[0], most[0]) == (GOOD, DOUBTFUL)
-    assert "kept up with 29% of the frames" in most[1]
+    few = judge(frames=100, in_segments=[92], doubtful=0, behind=8)
+    most = judge(frames=100, in_segments=[29], doubtful=0, behind=71)
+    lost = judge(frames=100, in_segments=[29], doubtful=0, behind=20)
+    assert (few[0], most[0], lost[0]) == (GOOD, DOUBTFUL, BAD)
+    assert "29% of the frames have a pose" in most[1]
+    assert "the computer did not keep up with 71%" in most[1]
 
 
 @pytest.mark.parametrize(
@@ -168,7 +183,7 @@ def test_a_run_that_did_not_keep_up_is_doubtful() -> None:
         ({"unusable": 50}, DOUBTFUL, "50% of the depth maps could not be used"),
         ({"depth_from": "flat"}, DOUBTFUL, "started on a plane"),
         ({"depth_from": "map"}, GOOD, "all frames"),
-        ({"broken": 40, "unused": 40}, DOUBTFUL, "of the images are broken"),
+        ({"broken": 40, "in_segments": [60]}, DOUBTFUL, "of the images are broken"),
     ],
 )
 def test_a_run_of_surfels_is_judged_with_a_reason(

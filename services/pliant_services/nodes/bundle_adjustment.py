@@ -3,7 +3,7 @@
 in   camera/stream    once
      map/known        before the first frame: a map of earlier sessions, to go on in
      camera/image     every frame: colours, and for re-acquisition patches and maxima of curvature;
-                      in live mode, whether to pass over the frame
+                      in live mode, whether to map the frame, or only to localise it by its tracks
      tracks/extrema   every frame
 out  map/update       one per frame: pose, points, keyframes, corrections of earlier poses
      map/final        one, after the last frame: the last corrections
@@ -55,7 +55,7 @@ from pliant.messages.types import (
     MapKeyframe,
     MapUpdate,
 )
-from pliant_services.runtime.link_images import clearance, receive_images
+from pliant_services.runtime.link_images import clearance, receive_images, whole
 from pliant_services.runtime.monitor import Monitor
 
 _Kept: TypeAlias = tuple[bytes, bytes]
@@ -81,12 +81,15 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     extrema = receive(bus, topics.EXTREMA, Extrema)
     beside = Beside()
     for image, tracks in join(receive_images(bus, mapped_only=True), extrema):
-        beside.answer(mapper.whole_map, tracks.frame)
         if tracks.missing:
             delta = mapper.skip(tracks.frame)
-        elif image.unmapped:
+        elif image.unplaced:
             delta = mapper.skip(tracks.frame, PASSED_OVER)
+        elif image.unmapped:
+            with monitor.stage("tracked pose"):
+                delta = mapper.only_localise(tracks.frame, tracks.stamp_ns, tracks, PASSED_OVER)
         else:
+            beside.answer(mapper.whole_map, tracks.frame)
             colour = image.colour if image.colour.size else None
             covered = clearance(image)
             grey = filled(image.grey, covered)
@@ -96,11 +99,11 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         bus.publish(topics.MAP_UPDATE, _update(tracks, delta))
         keyframes = mapper.publish_keyframes()
         if tracks.frame in delta.keyframe_frames:
-            waiting[tracks.frame] = _jpeg(image), image.mask
+            waiting[tracks.frame] = _kept(image)
         bus.publish(topics.KEYFRAME, _keyframe(image, keyframes, delta, waiting))
         needed = mapper.waiting_frames
         if tracks.frame in needed:
-            waiting[tracks.frame] = _jpeg(image), image.mask
+            waiting[tracks.frame] = _kept(image)
         waiting = {frame: waiting[frame] for frame in needed}
         monitor.report(
             tracks,
@@ -171,9 +174,11 @@ def _keyframe(
     )
 
 
-def _jpeg(image: Image) -> bytes:
+def _kept(image: Image) -> _Kept:
+    image = whole(image) if image.jpeg else image
     pixels = image.colour[..., ::-1] if image.colour.size else image.grey
-    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+    quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    return cv2.imencode(".jpg", pixels, quality)[1].tobytes(), image.mask
 
 
 def _update(header: Header, delta: MapDelta) -> MapUpdate:

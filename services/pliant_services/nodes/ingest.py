@@ -6,15 +6,13 @@ out  camera/stream   once: the camera
      map/known       before the first frame: the keyframes of a map of earlier sessions
      camera/source   every frame: its bytes as they came
      camera/image    every frame: rectified; empty where it was dropped or does not decode; over a
-                     link as ``link_images`` says; who passes over it, as ``keeping_up`` says
+                     link as ``link_images`` says; what is mapped of it, as ``keeping_up`` says
      camera/depth    every frame: the bytes of its depth map, where it has one that somebody wants
 """
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -75,8 +73,7 @@ def run(
         for keyframe in known.keyframes() if known is not None else ():
             bus.publish(topics.MAP_KNOWN, keyframe)
         bus.end(topics.MAP_KNOWN)
-        # One less than there is credit for: the tracks of a frame are taken after its image.
-        return 0, 0, 0, (deque[int](maxlen=config.bus.window - 1),), ({},), checksum
+        return 0, 0, 0, tuple(vars(MappingPace.of(config.bus)).values()), ({},), checksum
 
     begin, dropped, broken, *kept, sent = resume(bus, start)
     if sent != checksum:  # taken up again with another file
@@ -93,17 +90,17 @@ def run(
             with monitor.stage("rectify"):
                 source = link.source(source)
                 image = rectified(source, rectifier)
-            if live and pace.passes_over(image, images_that_wait(bus), config.ingest.mapping_lag_s):
-                image = replace(image, unmapped=True)
+            if live:
+                image = pace.mark(image, images_that_wait(bus), config.ingest)
             dropped += source.dropped
             broken += image.missing.startswith(BROKEN)
             if clip is not None and not clip.is_as_it_was():
                 clip = None  # what is read of it now is not what was sent
-            bus.publish(topics.SOURCE, _source_message(source, image.unmapped, clip is not None))
+            bus.publish(topics.SOURCE, _source_message(source, image, clip is not None))
             may_lag = readers_that_may_lag(image)
             bus.publish(topics.IMAGE, link.image(image, source), may_lag=may_lag)
             bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
-            counters = {"dropped": dropped, "broken": broken, "unmapped": pace.passed}
+            counters = {"dropped": dropped, "broken": broken, **pace.counters}
             counters |= static_counters(dataset)
             monitor.report(image, note="", **counters, **drops.counters)
             kept = (tuple(vars(pace).values()), (drops.counters,))
@@ -222,7 +219,7 @@ def _clip(dataset: Dataset, config: Config) -> Clip | None:
     return clip_of(dataset) if wanted else None
 
 
-def _source_message(source: SourceFrame, unmapped: bool, of_clip: bool) -> SourceImage:
+def _source_message(source: SourceFrame, image: Image, of_clip: bool) -> SourceImage:
     return SourceImage(
         frame=source.index,
         stamp_ns=source.stamp_ns,
@@ -232,7 +229,8 @@ def _source_message(source: SourceFrame, unmapped: bool, of_clip: bool) -> Sourc
         height=source.height,
         data=source.data,
         made_from=source.made_from,
-        unmapped=unmapped,
+        unmapped=image.unmapped,
+        unplaced=image.unplaced,
         clip_frame=source.clip_frame if of_clip else -1,
         mask=source.mask,
         source_frame=source.number,

@@ -177,6 +177,8 @@ class _Images:
         if not isinstance(decoded, SourceImage) or self._rectifier is None:
             return 0
         frame = recorded_frame(decoded)
-        image = rectified(frame, self._rectifier, unmapped=decoded.unmapped)
+        image = rectified(
+            frame, self._rectifier, unmapped=decoded.unmapped, unplaced=decoded.unplaced
+        )
         buses[topics.IMAGE.key].publish(topics.IMAGE, image)
         return 1

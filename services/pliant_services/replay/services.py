@@ -153,7 +153,8 @@ class Replay:
         if rectifier is None:
             raise RecordingError("the recording has no camera: it stopped before its first frame")
         for source in RecordedImages(self._recorded):
-            yield rectified(recorded_frame(source), rectifier, unmapped=source.unmapped)
+            frame = recorded_frame(source)
+            yield rectified(frame, rectifier, unmapped=source.unmapped, unplaced=source.unplaced)
 
     def _copy(self, writer: RecordingWriter, failed: Event) -> None:
         """What the services do not touch: it makes the new recording one that can be replayed."""

@@ -1,4 +1,4 @@
-"""Live mode: a slow bundle adjustment passes over frames, and the others keep their rate.
+"""Live mode: a slow bundle adjustment maps only some frames, and the others keep their rate.
 
 The ingest alone decides which frames, and its word is recorded with them: so what comes of them
 stays a function of the messages, in a replay, too.
@@ -6,9 +6,11 @@ stays a function of the messages, in a replay, too.
 
 from collections import deque
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from math import inf
 
 from pliant.bus.base import Bus
+from pliant.config import BusParameters, IngestParameters
 from pliant.messages import topics
 from pliant.messages.types import Image
 from pliant_services.processes import PROCESSES
@@ -20,34 +22,59 @@ _MAY_LAG = tuple(process.name for process in PROCESSES if process.may_lag)
 
 @dataclass
 class MappingPace:
-    """Which frames bundle adjustment is to pass over.
+    """What bundle adjustment is to do with each frame: map it, only localise it, or neither.
 
-    stamps_ns: of the last frames, as many as may wait to be mapped.     last: the number of the
-    last frame that it is to map.     passed: how many it passes over.
+    room: how many images may wait to be mapped.   stamps_ns: of the last frames, as many as may
+    wait for bundle adjustment.   last: the number of the last frame that it is to map.
+    unmapped, unplaced: how many it does not map, and how many of them it does not localise either.
     """
 
+    room: int
     stamps_ns: deque[int]
     last: int = -1
-    passed: int = 0
+    unmapped: int = 0
+    unplaced: int = 0
 
-    def passes_over(self, image: Image, waiting: int, lag_s: float) -> bool:
+    @staticmethod
+    def of(config: BusParameters) -> "MappingPace":
+        """At the first frame."""
+        # One less than there is credit for: the tracks of a frame are taken after its image.
+        most = max(config.window, config.lag_messages)
+        return MappingPace(config.window - 1, deque[int](maxlen=most))
+
+    @property
+    def counters(self) -> dict[str, float]:
+        """For the status."""
+        return {"unmapped": self.unmapped, "unplaced": self.unplaced}
+
+    def mark(self, image: Image, waiting: int, limits: IngestParameters) -> Image:
         """Decide on the next frame, when so many of those before it wait for bundle adjustment.
 
-        It is mapped while all that wait are younger than ``lag_s``, and whenever none waits that
-        is to be mapped: so one at a time where mapping takes longer than that, evenly spaced and
-        never far behind.
+        It is mapped while all that wait are younger than ``mapping_lag_s``, and whenever none waits
+        that is to be mapped: so one at a time where mapping takes longer than that, evenly spaced
+        and never far behind.  The others are localised while all that wait are younger than
+        ``pose_lag_s``.
         """
-        oldest_ns = self.stamps_ns[-waiting] if 0 < waiting <= len(self.stamps_ns) else -1
-        late = waiting > 0 and (oldest_ns < 0 or image.stamp_ns - oldest_ns >= lag_s * 1e9)
-        full = waiting >= (self.stamps_ns.maxlen or 0)
+        age_s = self._oldest_s(image.stamp_ns, waiting)
         self.stamps_ns.append(image.stamp_ns)
         if image.missing:
-            return False
-        if (late or full) and self.last >= image.frame - waiting:
-            self.passed += 1
-            return True
-        self.last = image.frame
-        return False
+            return image
+        behind = age_s >= limits.mapping_lag_s or waiting >= self.room
+        if not behind or self.last < image.frame - waiting:
+            self.last = image.frame
+            return image
+        unplaced = age_s >= limits.pose_lag_s
+        self.unmapped += 1
+        self.unplaced += unplaced
+        return replace(image, unmapped=True, unplaced=unplaced)
+
+    def _oldest_s(self, stamp_ns: int, waiting: int) -> float:
+        """How much older than this the oldest is of the frames that wait; -inf where none does."""
+        if waiting == 0:
+            return -inf
+        if waiting > len(self.stamps_ns):
+            return inf
+        return 1e-9 * (stamp_ns - self.stamps_ns[-waiting])
 
 
 @dataclass

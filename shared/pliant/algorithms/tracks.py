@@ -65,6 +65,11 @@ class FrameExtrema(FrameTracks):
         return FrameExtrema(**own, maxima=maxima)
 
     @staticmethod
+    def without_maxima(tracks: FrameTracks) -> "FrameExtrema":
+        """Tracks of a frame whose image nobody looks at."""
+        return FrameExtrema.of(tracks, np.zeros((0, 3), np.float32))
+
+    @staticmethod
     def empty() -> "FrameExtrema":
         """No tracks and no maxima."""
-        return FrameExtrema.of(FrameTracks.empty(), np.zeros((0, 3), np.float32))
+        return FrameExtrema.without_maxima(FrameTracks.empty())

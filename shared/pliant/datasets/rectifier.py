@@ -146,10 +146,16 @@ def _whole(frame: SourceFrame) -> bool:
     return True
 
 
-def rectified(source: SourceFrame, rectifier: Rectifier, *, unmapped: bool = False) -> Image:
+def rectified(
+    source: SourceFrame,
+    rectifier: Rectifier,
+    *,
+    unmapped: bool = False,
+    unplaced: bool = False,
+) -> Image:
     """The image that everybody works on: a pure function, so that a replay makes the same.
 
-    unmapped: as it was decided on and recorded.
+    unmapped, unplaced: as it was decided on and recorded.
     """
     if source.dropped:
         return _without_pixels(source, DROPPED)
@@ -167,6 +173,7 @@ def rectified(source: SourceFrame, rectifier: Rectifier, *, unmapped: bool = Fal
         grey=grey,
         colour=colour if colour is not None else np.zeros((0, 0, 3), np.uint8),
         unmapped=unmapped,
+        unplaced=unplaced,
         mask=mask,
     )
 

@@ -23,7 +23,7 @@ BROKEN = "broken: "
 MASKED = "masked: none of it is used"
 """Why an image is missing all of which a mask covers."""
 PASSED_OVER = "passed over to keep up"
-"""Why a frame that has pixels has no pose."""
+"""Why a frame that has pixels has no pose as it comes: nobody maps it, and no tracks place it."""
 WAITING_FOR_DEPTH = "waiting for depth"
 """Why a frame has no surfels yet."""
 WORLD_FRAME_ID = "world"
@@ -102,7 +102,7 @@ class SourceImage(Header):
     """A frame as it came: ``encoding`` says how ``data`` is read.  Empty where it was dropped.
 
     made_from: "" as it came; else what it was before it was made smaller, or a JPEG for a link.
-    unmapped: as in ``Image``, so that a replay does what the run did.
+    unmapped, unplaced: as in ``Image``, so that a replay does what the run did.
     clip_frame: which frame of ``camera/clip`` it is made from; -1: of none.
     checksum: of a recording that holds the clip instead of ``data``, which is empty then: CRC-32 of
     these.  ``pliant.datasets.recorded_images`` makes them again.
@@ -120,6 +120,7 @@ class SourceImage(Header):
     checksum: int = 0
     mask: bytes = b""
     source_frame: int = -1
+    unplaced: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +154,8 @@ class Image(Header):
     missing: "" or why there are no pixels ("dropped", "broken: ..."); both arrays are empty then.
     jpeg, calibration: over a link, instead of pixels, what they are made from: the source's JPEG
     and its camera as YAML; ``pliant_services.runtime.link_images`` makes them.
-    unmapped: bundle adjustment passes over this frame, as it is behind (live mode).
+    unmapped: bundle adjustment only localises this frame, by its tracks, as it is behind (live
+    mode).   unplaced: it is so far behind that it does not do that either.
     mask: which pixels are used, as of ``pliant.algorithms.image.masks``; b"": all of them.
     """
 
@@ -164,6 +166,7 @@ class Image(Header):
     calibration: str = ""
     unmapped: bool = False
     mask: bytes = b""
+    unplaced: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from pliant.algorithms.map_delta import TRACKING
 from pliant.map_history import MapHistory
+from pliant.messages.types import PASSED_OVER
 
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 
@@ -25,34 +26,38 @@ def doubtful_frames(history: MapHistory) -> list[int]:
     return [
         frame
         for frame, (state, reason) in sorted(history.states.items())
-        if state == TRACKING and reason and frame in history.frames
+        if state == TRACKING and reason not in ("", PASSED_OVER) and frame in history.frames
     ]
 
 
 def judge(
-    *, frames: int, in_segments: list[int], doubtful: int, unused: int = 0, broken: int = 0,
-    absent: int = 0, behind: int = 0, calibration: str = "", failed: bool = False,
+    *, frames: int, in_segments: list[int], doubtful: int, broken: int = 0, absent: int = 0,
+    behind: int = 0, calibration: str = "", failed: bool = False,
 ) -> tuple[str, str]:  # fmt: skip
     """Good, doubtful or bad, and why.
 
-    frames: of the sequence that were used.   in_segments: poses in each segment of the map.
-    doubtful: poses told as such.   unused: frames that were broken, dropped or passed over.
-    broken: those of them that do not decode or have a wrong time.   absent: frames of the source
-    that never came.   behind: those that there was no time for.   calibration: why it bends the
-    map; "" where it does not.   failed: the source broke off.
+    frames: that came, but those that a mask covers.   in_segments: poses in each segment of the
+    map.   doubtful: poses told as such.   broken: frames that do not decode or have a wrong time.
+    absent: frames of the source that never came.   behind: frames without a pose that there was no
+    time for.   calibration: why it bends the map; "" where it does not.   failed: the source broke
+    off.
 
-    Broken and absent frames are frames of the source: they count as frames without a pose.
+    All of them are frames of the source: they count as frames without a pose.
     """
     longest, posed = max(in_segments, default=0), sum(in_segments)
     if not longest:
         return BAD, "there is no map"
-    of_source = max(frames + broken + absent, 1)
+    of_source = max(frames + absent, 1)
     share = longest / of_source
-    used = "frames that were used" if unused else "frames"
-    which = "frames of the source" if broken or absent else used
+    which = "frames of the source" if broken or absent else "frames"
     told = f"{share:.0%} of the {which} have a pose in the largest segment"
-    if share < _LITTLE:
+    if longest < _LITTLE * (of_source - behind):
         return BAD, told
+    if share < _WHOLE and 2 * behind > of_source - longest:
+        return DOUBTFUL, (
+            f"{told}: the computer did not keep up with {behind / of_source:.0%}, take smaller "
+            "images (--max-size) or fewer tracks (--light)"
+        )
     if doubtful > DOUBTS * posed:
         return DOUBTFUL, (
             f"{doubtful / posed:.0%} of the poses are doubtful: something large moves, or the "
@@ -61,20 +66,15 @@ def judge(
     if absent > (1.0 - _WHOLE) * of_source:
         came = 1.0 - absent / of_source
         return DOUBTFUL, f"only {came:.0%} of the frames of the source came"
-    if broken > (1.0 - _WHOLE) * (frames + broken):
-        return DOUBTFUL, f"{broken / (frames + broken):.0%} of the images are broken"
+    if broken > (1.0 - _WHOLE) * frames:
+        return DOUBTFUL, f"{broken / frames:.0%} of the images are broken"
     if share < _WHOLE:
         return DOUBTFUL, told
     if failed:
         return DOUBTFUL, "the source ended early"
-    if behind > (1.0 - _LITTLE) * (frames + behind):
-        return DOUBTFUL, (
-            f"the computer kept up with {frames / (frames + behind):.0%} of the frames: take "
-            "smaller images (--max-size) or fewer tracks (--light)"
-        )
     if calibration:
         return DOUBTFUL, calibration
-    return GOOD, told if longest < frames + absent else f"all {used} have a pose in one segment"
+    return GOOD, told if longest < of_source else "all frames have a pose in one segment"
 
 
 def slipping_frames(tracked: Sequence[int], in_view: Sequence[int]) -> list[int]:
@@ -85,7 +85,7 @@ def slipping_frames(tracked: Sequence[int], in_view: Sequence[int]) -> list[int]
 
 def judge_surfels(
     *, frames: int, in_segments: list[int], slipping: int, depth_from: str, unusable: int,
-    together: int = 0, unused: int = 0, broken: int = 0, absent: int = 0, behind: int = 0,
+    together: int = 0, broken: int = 0, absent: int = 0, behind: int = 0,
     failed: bool = False,
 ) -> tuple[str, str]:  # fmt: skip
     """As ``judge``, of a surface that deforms.
@@ -95,7 +95,7 @@ def judge_surfels(
     together: frames of a camera that was said to stand still in which all move like one thing.
     """
     word, why = judge(
-        frames=frames, in_segments=in_segments, doubtful=0, unused=unused, broken=broken,
+        frames=frames, in_segments=in_segments, doubtful=0, broken=broken,
         absent=absent, behind=behind, failed=failed,
     )  # fmt: skip
     posed = sum(in_segments)

@@ -37,14 +37,14 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
     telling = [reason for frame, reason in reasons.items() if frame not in silent]
     telling = telling or list(reasons.values())
     doubtful = doubtful_frames(history)
-    unused = len(run.missing) + len(run.passed_over)
+    passed_over = [frame for frame in run.passed_over if frame not in final]
+    missing = [*run.missing.values()]
     word, why = judge(
-        frames=frames - unused,
-        unused=unused,
+        frames=frames - missing.count(MASKED),
         broken=len(broken_images(run.missing)),
         absent=absent_frames(run, frames),
         failed=source_failed(run),
-        behind=[*run.missing.values()].count(DROPPED) + len(run.passed_over),
+        behind=missing.count(DROPPED) + len(passed_over),
         in_segments=[len(members) for members in by_segment.values()],
         doubtful=len(doubtful),
         calibration=calibration_doubt(run, final),
@@ -66,7 +66,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "segments": segments,
         "last_reason": last_reason(telling),
         "frames_without_pixels": {str(f): why for f, why in sorted(run.missing.items())},
-        "frames_passed_over": run.passed_over,
+        "frames_passed_over": passed_over,
         "keyframes": len(history.keyframe_poses()),
         "known_map": _known_map(run, final),
         "points": len(history.points()),

@@ -14,7 +14,7 @@ from pliant.config import recorded_config
 from pliant.formats.npz import NpzWriter
 from pliant.formats.tum import write_tum
 from pliant.messages import topics
-from pliant.messages.types import DROPPED, WAITING_FOR_DEPTH, CameraStream, Surfels
+from pliant.messages.types import DROPPED, MASKED, WAITING_FOR_DEPTH, CameraStream, Surfels
 from pliant.recording.reader import Recording
 from pliant.results.folder import (
     PAGE_NAME,
@@ -232,13 +232,12 @@ def _report(run: Run, counts: _Counts, followed: int) -> dict[str, Any]:
     lost = {*counts.lost, *missing}
     slipping = [f for f in slipping_frames(counts.alive, counts.in_view) if f not in lost]
     word, why = judge_surfels(
-        frames=frames - len(without_pixels),
+        frames=frames - reasons.count(MASKED),
         in_segments=[len(set(members) - lost) for members in counts.segments.values()],
         slipping=len(slipping),
         depth_from=_depth_from(run.recorded.metadata),
         unusable=len(counts.notes),
         together=len(counts.together.frames) if _stands_still(run.recorded.metadata) else 0,
-        unused=len(without_pixels),
         broken=len(broken_images(without_pixels)),
         absent=absent_frames(run, frames),
         failed=source_failed(run),

@@ -108,10 +108,13 @@ def _faults(report: dict[str, Any]) -> list[str]:
         lines.append(
             f"{counted(dropped, 'image')} dropped to keep up (live mode){why and f': {why}'}"
         )
-    passed_over = len(report.get("frames_passed_over", ()))
-    if passed_over:
+    lacking = len(report.get("frames_passed_over", ()))
+    ingest = report.get("counters", {}).get("ingest", {})
+    unmapped = max(lacking, int(ingest.get("unmapped", 0)))
+    if unmapped:
         lines.append(
-            f"{counted(passed_over, 'image')} tracked, but not mapped, to keep up (live mode)"
+            f"{counted(unmapped, 'image')} not mapped to keep up (live mode), {lacking} of them "
+            "without a pose"
         )
     if broken:
         lines.append(f"{counted(len(broken), 'broken image')}: {_told_of_broken(broken)}")

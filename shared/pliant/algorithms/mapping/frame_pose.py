@@ -210,10 +210,8 @@ def reacquire_points(
     seen: (M, 3) maxima of the tracks where grey shows them, see ``reacquire``.
     """
     points, parameters = active.points, active.parameters
-    no_px = np.zeros((0, 2), np.float32)
-    none = Observations(rows=np.zeros(0, np.int32), points_px=no_px, rolled_px=no_px)
     if not parameters.reacquisition.enabled:
-        return T_world_camera, none
+        return T_world_camera, Observations.none()
     reacquired = reacquire(
         T_world_camera, active.missing(frame), points, tracks.maxima, seen, grey, active.camera,
         parameters.reacquisition,
@@ -223,15 +221,22 @@ def reacquire_points(
         depths = active.segment.inverse_depths(found.rows, T_world_camera)
         points_px, rolled_px = rolled.found(found.points_px, depths)
         found = Observations(rows=found.rows, points_px=points_px, rolled_px=rolled_px)
-    directions = directions_of(active)
-    rows, points_px = active.observed(tracks.points_px, found, directions)
-    located = refine(
-        T_world_camera, points.xyz[rows], points_px, active.camera, parameters.localisation,
-        near=True, spread=_spread(active, rows, directions),
-    )  # fmt: skip
+    T_world_camera = refine_by_all(active, T_world_camera, tracks, found)
     linked = active.linked(MAPPED)
     points.kappas[active.links.rows[linked]] = tracks.kappas[linked]
-    return located.T_world_camera, found
+    return T_world_camera, found
+
+
+def refine_by_all(
+    active: ActiveMap, T_world_camera: F64, tracks: FrameTracks, found: Observations
+) -> F64:
+    """The pose by its tracks and the points found without one, from close by."""
+    directions = directions_of(active)
+    rows, points_px = active.observed(tracks.points_px, found, directions)
+    return refine(
+        T_world_camera, active.points.xyz[rows], points_px, active.camera,
+        active.parameters.localisation, near=True, spread=_spread(active, rows, directions),
+    ).T_world_camera  # fmt: skip
 
 
 def adjust(
@@ -248,18 +253,26 @@ def adjust(
     errors = reprojection_errors(T_world_camera, xyz, tracks.points_px[linked], camera)
     active.judge_tracks(linked, errors)
     active.see(T_world_camera, tracks.points_px, found)
-    directions = directions_of(active)
-    if parameters.window.sweeps > 0 and not len(directions):
+    if parameters.window.sweeps > 0 and not len(directions_of(active)):
         T_world_camera = active.window.sweep_current(parameters)
-    rows, points_px = active.observed(tracks.points_px, found, directions)
-    errors = reprojection_errors(T_world_camera, points.xyz[rows], points_px, camera)
-    inliers = errors < parameters.localisation.inlier_px
+    return T_world_camera, support_at(active, motion, T_world_camera, found, tracks)
+
+
+def support_at(
+    active: ActiveMap,
+    motion: Motion,
+    T_world_camera: F64,
+    found: Observations,
+    tracks: FrameTracks,
+) -> Support:
+    """What there is for a pose of the frame.  motion: before it."""
+    rows, points_px = active.observed(tracks.points_px, found, directions_of(active))
+    errors = reprojection_errors(T_world_camera, active.points.xyz[rows], points_px, active.camera)
+    inliers = errors < active.parameters.localisation.inlier_px
     telling = _settled(active, motion, tracks)
     telling[_contradicting(active, T_world_camera, tracks.points_px)] = True
     tracked = len(rows) - len(found.rows)
-    return T_world_camera, support_of(
-        points_px, inliers, tracked, tracks.points_px[telling], camera
-    )
+    return support_of(points_px, inliers, tracked, tracks.points_px[telling], active.camera)
 
 
 def _settled(active: ActiveMap, motion: Motion, tracks: FrameTracks) -> BoolArray:

@@ -138,12 +138,14 @@ class Motion:
     """How the camera moved last: T_world_camera (4, 4) of two frames, the newer one last.
 
     tracked: points that support the newer one and have tracks, as far as that is known.
+    unmapped_s: from the last frame that was mapped to the newer one.
     """
 
     frames: tuple[int, int]
     stamps_ns: tuple[int, int]
     poses: tuple[F64, F64]
     tracked: int = 0
+    unmapped_s: float = 0.0
 
     @staticmethod
     def at(frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
@@ -159,6 +161,13 @@ class Motion:
             poses=(self.poses[1], T_world_camera),
             tracked=tracked,
         )
+
+    def then_unmapped(
+        self, frame: int, stamp_ns: int, T_world_camera: F64, tracked: int
+    ) -> "Motion":
+        """The motion after one more pose, of a frame that is not mapped."""
+        unmapped_s = self.unmapped_s + self.lost_s(stamp_ns)
+        return replace(self.then(frame, stamp_ns, T_world_camera, tracked), unmapped_s=unmapped_s)
 
     def moved(self, S: F64) -> "Motion":
         """The motion after the world has moved by a similarity (4, 4)."""

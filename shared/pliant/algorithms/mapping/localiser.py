@@ -34,9 +34,10 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import Recognised, is_same_pose
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.tracks import FrameExtrema
+from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 
 _LOOK_TURN_RAD = np.radians(5.0)
 _LOOK_SHIFT = 0.05
@@ -103,6 +104,22 @@ class Localiser:
         self._changes.add_pose(frame, self._hanging, located, support.inliers)
         why = doubt(support, self._parameters.support)
         return self._publish(TRACKING, why, support.inliers, looks_anew=looks_anew)
+
+    def only_localise(
+        self, frame: int, stamp_ns: int, tracks: FrameTracks, otherwise: str
+    ) -> MapDelta:
+        """As ``Mapper.only_localise``."""
+        active, hanging, motion, found = self._map, self._hanging, self._motion, None
+        if active is not None and motion is not None:
+            found = pose_by_tracks(
+                active, self.calibration, motion, frame, stamp_ns, tracks, self._generator
+            )
+        if found is None or hanging is None or motion is None:
+            return self.skip(frame, otherwise)
+        T_world_camera, _, support = found
+        self._motion = motion.then_unmapped(frame, stamp_ns, T_world_camera, support.tracked)
+        self._changes.add_pose(frame, hanging, T_world_camera, support.inliers)
+        return self._publish(TRACKING, doubt(support, self._parameters.support), support.inliers)
 
     def recognise(self, maxima: F32, grey: U8, generator: np.random.Generator) -> Recognised | None:
         """Where an image (H, W) of the ideal camera, with its maxima (M, 3) of curvature, is seen

@@ -245,6 +245,12 @@ class Observations:
     points_px: F32
     rolled_px: F32
 
+    @staticmethod
+    def none() -> "Observations":
+        """Nothing."""
+        no_px = np.zeros((0, 2), np.float32)
+        return Observations(rows=np.zeros(0, np.int32), points_px=no_px, rolled_px=no_px)
+
 
 class TrackLinks:
     """The rows of the tracks of the latest frame.

@@ -33,7 +33,7 @@ from pliant.algorithms.mapping.frame_pose import (
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.keyframes import keyframe_is_due
 from pliant.algorithms.mapping.localisation import Motion
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, Observations
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import EarlierPose, refined_poses
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
@@ -41,10 +41,11 @@ from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of
 from pliant.algorithms.mapping.start import impatient
+from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses, returned_poses
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.tracks import FrameExtrema
+from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 
 _LEAST_LOST = 3
 """Frames without a pose before a map is given up, however long that takes: of a time lapse."""
@@ -162,7 +163,8 @@ class Mapper:
             active.window.triangulate(limits_of_points(support.inliers, self._parameters))
         hanging = active.keyframes[-1]
         age_s = 1e-9 * (stamp_ns - self._keyframe_ns)
-        self._keyframe_is_new = keyframe_is_due(active, age_s, self._motion.lost_s(stamp_ns))
+        interval_s = self._motion.unmapped_s + self._motion.lost_s(stamp_ns)
+        self._keyframe_is_new = keyframe_is_due(active, age_s, interval_s)
         if self._keyframe_is_new:
             with self._timer("keyframe"):
                 T_world_camera, turned = stand(active, T_world_camera, found, tracks)
@@ -212,11 +214,43 @@ class Mapper:
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
         """Pass over a frame, without pixels (dropped or broken) or without time: it gets no pose.
 
-        Whether the camera is lost is for frames with pixels to decide: the state stays as it was.
-        The tracks that live on are taken up again by the next frame.
+        Whether the camera is lost is for frames that are mapped to decide: the state stays as it
+        was.  The tracks that live on are taken up again by the next frame.
         """
         state = LOST if self._lost_frames else TRACKING
         return self._publish(WAITING if self.atlas.active is None else state, reason, 0)
+
+    def only_localise(
+        self, frame: int, stamp_ns: int, tracks: FrameTracks, otherwise: str
+    ) -> MapDelta:
+        """Localise a frame in the map as it stands, by its tracks: there is no time to map it.
+
+        One that finds no pose waits until the next mapped frame has one.  otherwise: the reason
+        that it is published with.
+        """
+        active, found = self.atlas.active, None
+        self._keyframe_is_new = False
+        if active is not None and not self._lost_frames:
+            found = pose_by_tracks(
+                active, self.calibration, self._motion, frame, stamp_ns, tracks, self._generator
+            )
+        if active is None or found is None:
+            seen = self.calibration.ideal(FrameExtrema.without_maxima(tracks))
+            self._images = (None, None)
+            self._waiting = self._waiting.then(
+                frame, stamp_ns, seen, self._camera, self._parameters
+            )
+            return self.skip(frame, otherwise)
+        hanging = active.keyframes[-1]
+        active.pass_by(frame, found.T_world_camera, found.tracks.points_px, Observations.none())
+        self._place_waiting(active, hanging, found.T_world_camera)
+        self._waiting = Waiting()
+        self._motion = self._motion.then_unmapped(
+            frame, stamp_ns, found.T_world_camera, found.support.tracked
+        )
+        self._add_pose(frame, hanging, found.T_world_camera, found.support.inliers)
+        why = doubt(found.support, self._parameters.support)
+        return self._publish(TRACKING, why, found.support.inliers)
 
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """What is still to be corrected at the end of the stream."""

@@ -24,7 +24,7 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import is_guess, widened
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.tracks import FrameExtrema
+from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 
 _KNOWN = 0.01
 """Standard deviation of the log focal length under which a map can begin for good."""
@@ -38,6 +38,7 @@ class _Taken(NamedTuple):
     tracks: FrameExtrema
     grey: U8 | None
     colour: U8 | None
+    is_mapped: bool = True
 
 
 class TrialMapper:
@@ -87,6 +88,17 @@ class TrialMapper:
         self._taken = kept
         reason = delta.reason or f"the focal length is known to {100.0 * uncertain:.1f} %"
         return _nothing(delta, reason)
+
+    def only_localise(
+        self, frame: int, stamp_ns: int, tracks: FrameTracks, otherwise: str
+    ) -> MapDelta:
+        """As ``Mapper.only_localise``; a trial goes on until the next frame that is mapped."""
+        delta = self._mapper.only_localise(frame, stamp_ns, tracks, otherwise)
+        if not self._on_trial:
+            return delta
+        extrema = FrameExtrema.without_maxima(tracks)
+        self._taken.append(_Taken(frame, stamp_ns, extrema, None, None, is_mapped=False))
+        return _nothing(delta, otherwise)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
         """As ``Mapper.skip``."""
@@ -138,10 +150,15 @@ class TrialMapper:
         self._on_trial = False
         deltas: list[MapDelta] = []
         for taken in self._taken:
-            deltas.append(self._mapper.process(*taken, timer))
+            deltas.append(self._again(taken, timer))
             self._mapper.atlas.stay()
         self._taken = []
         return _joined(deltas)
+
+    def _again(self, taken: _Taken, timer: StageTimer) -> MapDelta:
+        if taken.is_mapped:
+            return self._mapper.process(*taken[:-1], timer)
+        return self._mapper.only_localise(taken.frame, taken.stamp_ns, taken.tracks, "")
 
 
 def mapper_for(
