@@ -9,6 +9,8 @@ from pliant.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from pliant.algorithms.camera import PinholeCamera as PinholeCamera
+    from pliant.api.evaluation import evaluate as evaluate
+    from pliant.api.evaluation import read_trajectory as read_trajectory
     from pliant.api.known import KnownMap as KnownMap
     from pliant.api.known import Located as Located
     from pliant.api.known import load_map as load_map
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from pliant.api.slam import Tracked as Tracked
     from pliant.api.slam import follow as follow
     from pliant.datasets.calibration import Calibration as Calibration
+    from pliant.trajectory import Trajectory as Trajectory
 
 arithmetic.fix()
 # FFmpeg is silent: our own line says what is wrong with a video.  Read at OpenCV's first one.
@@ -32,9 +35,12 @@ _WHERE = {
     "Result": "pliant.api.result",
     "Slam": "pliant.api.slam",
     "Tracked": "pliant.api.slam",
+    "Trajectory": "pliant.trajectory",
+    "evaluate": "pliant.api.evaluation",
     "follow": "pliant.api.slam",
     "load_map": "pliant.api.known",
     "open": "pliant.api.result",
+    "read_trajectory": "pliant.api.evaluation",
     "run": "pliant.api.run",
 }
 """Loaded when they are asked for: a service that needs none of it starts sooner."""

@@ -7,7 +7,7 @@ is frozen and refuses unknown keys, also nested ones.
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, TypeAlias, cast
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError
@@ -273,6 +273,24 @@ def recorded_config(metadata: Mapping[str, Mapping[str, str]], overrides: Sequen
     known = {name for name, _, _ in describe()}
     recorded = [setting for setting in settings_of(content) if setting.partition("=")[0] in known]
     return load_config(None, [*recorded, *overrides])
+
+
+Settings: TypeAlias = Mapping[str, Any] | Sequence[str] | None
+"""As a caller in Python gives them: ``{"bus.window": 8}`` or ``["bus.window=8"]``."""
+
+
+def overrides_of(settings: Settings) -> list[str]:
+    """Settings as ``load_config`` and ``--set`` take them.  Raises ConfigError."""
+    if settings is None or isinstance(settings, Mapping):
+        return list(settings_of(settings or {}))
+    given: list[object] = [settings] if isinstance(settings, str) else list(settings)
+    wrong = next((each for each in given if not isinstance(each, str)), None)
+    if wrong is not None:
+        raise ConfigError(
+            f'settings: {shown(wrong)}: expected texts as "bus.window=8", or a mapping as '
+            '{"bus.window": 8}'
+        )
+    return [str(each) for each in given]
 
 
 def settings_of(content: Mapping[str, object], prefix: str = "") -> Iterator[str]:

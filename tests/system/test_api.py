@@ -115,7 +115,7 @@ def test_a_run_takes_what_the_command_takes() -> None:
     options = {option.opts[0].removeprefix("--").replace("-", "_") for option in command.params}
     given = inspect.signature(pliant.run).parameters.keys()
     assert options - given == left
-    assert given - options == {"settings", "on_frame", "quiet"}
+    assert given - options == {"settings", "on_frame"}
 
 
 def test_a_run_tells_each_pose_as_it_is_known(tmp_path: Path) -> None:

@@ -20,6 +20,13 @@ def evaluate(
     frames: Annotated[
         int | None, typer.Option(help="Frames of the sequence, where no report.json says.")
     ] = None,
+    offset: Annotated[
+        str,
+        typer.Option(
+            help="Added to the times of the poses: seconds (0.1), or frames (3f, -2f).",
+            metavar="SECONDS|FRAMESf",
+        ),
+    ] = "",
     tracks: Annotated[
         bool, typer.Option("--tracks", help="Tracks of the recording against true depth.")
     ] = False,
@@ -58,6 +65,7 @@ def evaluate(
         groundtruth=groundtruth,
         times=times,
         frames=frames,
+        offset=offset,
         tracks=tracks,
         points=points,
         mesh=mesh,

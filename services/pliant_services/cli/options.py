@@ -1,5 +1,8 @@
 """Options that several commands share, so that they read the same everywhere."""
 
+import os
+from collections.abc import Generator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,6 +23,17 @@ Running = Annotated[
 TlsFolder = Annotated[
     Path | None, typer.Option("--tls", help="Folder that `pliant certs` made, for tls/ endpoints.")
 ]
+
+
+@contextmanager
+def silence() -> Generator[None]:
+    """Nothing that is printed within is seen; errors are raised, and printed outside."""
+    with (
+        open(os.devnull, "w", encoding="utf-8") as nowhere,
+        redirect_stdout(nowhere),
+        redirect_stderr(nowhere),
+    ):
+        yield
 
 
 def identity_in(tls: Path | None, name: str) -> "Identity | None":

@@ -1,10 +1,13 @@
 """``pliant run``: the whole pipeline on one source."""
 
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+
+from pliant_services.cli.options import silence
 
 # The headings of the help page, in this order.
 _everyday = partial(typer.Option, rich_help_panel="Everyday options")
@@ -74,6 +77,9 @@ def run(
     view: Annotated[
         Literal["window", "web"] | None, _everyday(help="Look on in Rerun (pliant view).")
     ] = None,
+    quiet: Annotated[
+        bool, _everyday("--quiet", "-q", help="Print errors alone; the exit code tells the rest.")
+    ] = False,
     topic: Annotated[
         str, _source(help="The images of an MCAP file, bag or ros:HOST that has several.")
     ] = "",
@@ -210,4 +216,8 @@ def run(
         on_crash=on_crash,
         resume=resume,
     )
-    raise typer.Exit(run_pipeline(request))
+    if quiet and (poses or view):
+        raise typer.BadParameter("--quiet prints nothing: leave it, or --poses and --view")
+    with silence() if quiet else nullcontext():
+        code = run_pipeline(request)
+    raise typer.Exit(code)

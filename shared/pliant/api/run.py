@@ -3,16 +3,16 @@
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.api.result import Result
-from pliant.config import settings_of
+from pliant.config import Settings, overrides_of
 from pliant.errors import ResultError
 from pliant.exit_codes import DONE, INCOMPLETE
 from pliant.recording import parts
@@ -45,7 +45,7 @@ def run(
     depth: Literal["sensor", "map", "flat"] | None = None,
     depth_frames: Literal["first", "all"] | None = None,
     images: bool = True,
-    settings: Mapping[str, Any] | None = None,
+    settings: Settings = None,
     seed: int | None = None,
     on_frame: OnFrame | None = None,
     quiet: bool = False,
@@ -61,7 +61,8 @@ def run(
     the first frame; every: one of so many frames; sharpest: of those, not the first.    light: a
     fifth of the tracks.    max_size: pixels along the longer side.    map: of an earlier run, to go
     on in; localise: only to find the frames in it.    camera, depth, depth_frames: of the
-    deformable profile.    settings: as ``{"tracking.max_tracks": 5000}``.    quiet: print nothing.
+    deformable profile.    settings: ``{"tracking.max_tracks": 5000}`` or
+    ``["tracking.max_tracks=5000"]``.    quiet: print nothing.
 
     on_frame: called in this thread with each frame's number and its pose (4, 4), as it is known
     then (``result.causal_trajectory``), or None: ``on_frame(12, T_world_camera)``.  The run does
@@ -83,7 +84,7 @@ def run(
     for name, value in options.items():
         if value is not None and value is not False:
             command += [f"--{name}"] if value is True else [f"--{name}", str(value)]
-    for setting in settings_of(settings or {}):
+    for setting in overrides_of(settings):
         command += ["--set", setting]
     command += ["--", str(source)]  # its name may begin with a dash
     said = ""

@@ -1,16 +1,15 @@
 """Mapping image by image in this process: no bus, no files, the same numbers."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pliant.algorithms.arrays import F32, F64, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.api.images import calibration_of, source_frame
 from pliant.api.mapped import Mapped
-from pliant.config import load_config, settings_of
+from pliant.config import Settings, load_config, overrides_of
 from pliant.datasets import open_source
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration, calibration_from_fov
@@ -39,11 +38,12 @@ class Slam(Mapped):
         camera: Calibration | PinholeCamera | None = None,
         *,
         fov: float | None = None,
-        settings: Mapping[str, Any] | None = None,
+        settings: Settings = None,
         seed: int | None = None,
     ) -> None:
         """camera: of the images; without one it is found from them, beginning with a horizontal
-        field of view of ``fov`` degrees.    settings: as ``{"tracking.max_tracks": 5000}``.
+        field of view of ``fov`` degrees.    settings: ``{"tracking.max_tracks": 5000}`` or
+        ``["tracking.max_tracks=5000"]``.
 
         Raises ConfigError for a setting that there is not, CalibrationError.
         """
@@ -51,7 +51,7 @@ class Slam(Mapped):
             raise CalibrationError("camera and fov contradict each other: give one of them")
         self._camera = None if camera is None else calibration_of(camera)
         self._fov = fov
-        self._config = load_config(None, list(settings_of(settings or {})), seed=seed)
+        self._config = load_config(None, overrides_of(settings), seed=seed)
         self._history = MapHistory()
         self._pipeline: Pipeline | None = None
         self._next = SourceFrame(index=0, stamp_ns=-1, encoding="", data=b"")
@@ -154,7 +154,7 @@ def follow(
     calibration: str | Path | None = None,
     fov: float | None = None,
     mask: str | Path | None = None,
-    settings: Mapping[str, Any] | None = None,
+    settings: Settings = None,
     seed: int | None = None,
 ) -> Iterator[Tracked]:
     """Map a source that ``pliant run`` opens, frame by frame, in this process::
@@ -165,7 +165,7 @@ def follow(
 
     Raises DatasetError, CalibrationError, ConfigError.
     """
-    config = load_config(None, list(settings_of(settings or {})), seed=seed)
+    config = load_config(None, overrides_of(settings), seed=seed)
     dataset = open_source(
         str(source),
         calibration=None if calibration is None else Path(calibration),

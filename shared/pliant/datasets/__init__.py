@@ -6,6 +6,8 @@ the calibration of its camera; ``Rectifier`` turns a frame into the image that e
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Literal
 
@@ -33,7 +35,7 @@ from pliant.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from pliant.datasets.video import VideoFile
 from pliant.datasets.working_size import SmallerImages, at_working_size
 from pliant.errors import DatasetError
-from pliant.wording import shown
+from pliant.wording import shortened, shown
 
 __all__ = [
     "FORMATS",
@@ -51,6 +53,7 @@ __all__ = [
     "calibration_yaml",
     "check_start",
     "decode",
+    "formats",
     "notes_on",
     "open_source",
     "read_calibration",
@@ -119,7 +122,35 @@ FORMATS: dict[str, SourceFormat] = {
     "folder": SourceFormat(is_listed_folder, open_listed_folder, has_depth=True),
     "images": SourceFormat(is_bare_folder, open_bare_folder),
 }
-"""Every kind of source; the first that recognises a source opens it."""
+"""Every kind of source that is ours."""
+
+ENTRY_POINTS = "pliant.sources"
+"""Under which an installed package names formats of its own: each a ``SourceFormat``."""
+
+
+@cache
+def formats() -> dict[str, SourceFormat]:
+    """Every kind of source; the first that recognises a source opens it.
+
+    Those of other packages come first, by name.  Raises DatasetError for one that is none.
+    """
+    found: dict[str, SourceFormat] = {}
+    for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
+        try:
+            kind: object = point.load()
+        except Exception as error:  # of foreign code
+            said = shortened(f"{type(error).__name__}: {error}".split("\n")[0], 200)
+            raise DatasetError(
+                f"the source format {point.name} ({point.value}) does not load: {said}; mend or "
+                "uninstall its package"
+            ) from error
+        if not isinstance(kind, SourceFormat):
+            raise DatasetError(
+                f"the source format {point.name} ({point.value}) is {shown(kind)}: expected a "
+                "pliant.datasets.SourceFormat"
+            )
+        found[point.name] = kind
+    return {**found, **FORMATS}
 
 
 def open_source(
@@ -155,7 +186,7 @@ def open_source(
     options = SourceOptions(calibration=calibration, fov_deg=fov_deg, topic=topic, depth=depth)
     path = Path(source)
     try:
-        for kind in FORMATS.values():
+        for kind in formats().values():
             if kind.recognises(source):
                 if topic and not kind.has_topics:
                     raise DatasetError(f"{source}: has no topics to choose from: leave out --topic")
@@ -220,7 +251,7 @@ def sources_in(folder: Path, *, but: Path) -> list[Path]:
 
     Raises DatasetError where there are none, or the folder is one itself.
     """
-    if any(kind.recognises(str(folder)) for kind in FORMATS.values()):
+    if any(kind.recognises(str(folder)) for kind in formats().values()):
         raise DatasetError(f"{folder}: is a sequence itself: `pliant run {folder}`")
     try:
         paths = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
@@ -234,5 +265,5 @@ def sources_in(folder: Path, *, but: Path) -> list[Path]:
 
 
 def _is_clip(path: Path) -> bool:
-    names = [name for name, kind in FORMATS.items() if kind.recognises(str(path))]
+    names = [name for name, kind in formats().items() if kind.recognises(str(path))]
     return bool(names) and (names[0] != "video" or path.suffix.lower() in _VIDEOS)

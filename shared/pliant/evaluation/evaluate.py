@@ -13,11 +13,13 @@ from pliant.evaluation.presentation import (
     evaluation_to_json,
     format_evaluation,
     format_summary,
+    metres,
     summarise,
     summary_to_json,
     write_json,
 )
 from pliant.evaluation.run_evaluation import Evaluation, evaluate_result
+from pliant.evaluation.time_offset import TimeOffset
 from pliant.results.folder import PAGE_NAME, check_free, files_read, keep_apart
 from pliant.results.page.page import put_truth_in
 
@@ -36,6 +38,7 @@ class EvaluationRequest:
     surfels: bool
     plot: Path | None
     json: Path | None
+    offset: str = ""
     force: bool = False
 
 
@@ -46,6 +49,8 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         raise ResultError(f"{missing[0]}: no such result")
     check_free(*request.results, elsewhere=False)
     _check_outputs(request)
+    if request.offset and (request.surfels or request.tracks or request.points or request.mesh):
+        raise ResultError("--offset is for poses: leave it, or --tracks, --map, --mesh, --surfels")
     if request.surfels:
         yield from _evaluate_surfels(request)
         return
@@ -58,6 +63,8 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
     figures: dict[str, Any] = evaluation_to_json(evaluations[0])
     for evaluation in evaluations:
         yield format_evaluation(evaluation)
+        if evaluation.better is not None:
+            yield _proposal(evaluation, evaluation.better)
     if len(evaluations) > 1:
         summaries = [summarise(evaluations, kind=kind) for kind in ("final", "causal")]
         for summary in summaries:
@@ -88,14 +95,31 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
 def _evaluated(result: Path, truth: Path, request: EvaluationRequest) -> Evaluation:
     """Evaluate one result.  Raises ResultError where poses and truth do not meet in time."""
     evaluation = evaluate_result(
-        result, groundtruth=truth, times=request.times, frames=request.frames
+        result,
+        groundtruth=truth,
+        times=request.times,
+        frames=request.frames,
+        offset=request.offset,
     )
     if evaluation.final.apart:
+        better = evaluation.better
+        by_s = 0.0 if better is None else evaluation.offset_s + better.seconds
         raise ResultError(
             f"{result}: no accuracy, {evaluation.final.reason} in {request.groundtruth}: "
             "--groundtruth must be of this recording, its stamps by the same clock"
+            + (f" (both begin alike: --offset {by_s:.3f})" if better is not None else "")
         )
     return evaluation
+
+
+def _proposal(evaluation: Evaluation, better: TimeOffset) -> str:
+    """What a user may try where the times of poses and truth seem to differ."""
+    where = "later" if better.seconds > 0.0 else "earlier"
+    return (
+        f"the truth fits far better {abs(better.seconds):.3f} s ({abs(better.frames):.1f} frames) "
+        f"{where}: ATE {metres(better.rmse_m)} instead of {metres(better.before_m)}: if the clocks "
+        f"differ, --offset {evaluation.offset_s + better.seconds:.3f}"
+    )
 
 
 def _check_outputs(request: EvaluationRequest) -> None:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -242,6 +242,8 @@ def evaluation_to_json(evaluation: Evaluation) -> dict[str, Any]:
         "result": evaluation.result,
         "groundtruth": evaluation.groundtruth,
         "alignment": "Sim(3)",
+        "offset_s": evaluation.offset_s,
+        "better_offset": None if evaluation.better is None else asdict(evaluation.better),
         "initialisation_retries": evaluation.initialisation_retries,
         "final": _trajectory_json(evaluation.final),
         "causal": _trajectory_json(evaluation.causal),

@@ -21,6 +21,7 @@ from pliant.evaluation.criteria import (
     second_pairs,
 )
 from pliant.evaluation.run_report import RunReport, read_run_report
+from pliant.evaluation.time_offset import TimeOffset, better_offset, offset_ns, shifted
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.formats.tum import read_tum
 from pliant.trajectory import (
@@ -110,13 +111,19 @@ class TrajectoryEvaluation:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """One run: both trajectories, and how often its map had to start anew before it could."""
+    """One run: both trajectories, and how often its map had to start anew before it could.
+
+    offset_s: was added to the times of the poses.   better: a further offset with which the final
+    ones fit the truth far better.
+    """
 
     result: str
     groundtruth: str
     initialisation_retries: int | None
     final: TrajectoryEvaluation
     causal: TrajectoryEvaluation | None
+    better: TimeOffset | None = None
+    offset_s: float = 0.0
 
 
 def evaluate_trajectory(
@@ -228,6 +235,7 @@ def evaluate_result(
     groundtruth: Path | Trajectory,
     times: Path | None = None,
     frames: int | None = None,
+    offset: str = "",
     max_difference_ns: int = MAX_DIFFERENCE_NS,
 ) -> Evaluation:
     """Evaluate a result folder (or one trajectory file) against a ground truth.
@@ -237,6 +245,7 @@ def evaluate_result(
     groundtruth: a trajectory, a file of any known format, or a folder with groundtruth.txt.
         times: the times of a KITTI ground truth.
     frames: of the sequence, where report.json does not say.
+    offset: is added to the times of the poses: seconds ("0.1"), or frames ("3f").
     Raises ResultError with one line where a file is missing or not what it should be.
     """
     truth = (
@@ -247,6 +256,8 @@ def evaluate_result(
     true_name = "given poses" if isinstance(groundtruth, Trajectory) else str(groundtruth)
     if not result.is_dir():
         estimate = read_trajectory(result, times=times, allow_empty=True)
+        by_ns = offset_ns(offset or "0", estimate)
+        estimate = shifted(estimate, by_ns)
         final = evaluate_trajectory(
             estimate, truth, frames=frames, max_difference_ns=max_difference_ns
         )
@@ -256,15 +267,19 @@ def evaluate_result(
             initialisation_retries=None,
             final=final,
             causal=None,
+            better=better_offset(estimate, truth),
+            offset_s=1e-9 * by_ns,
         )
     report = read_run_report(result)
     estimate = read_tum(result / FINAL_NAME, allow_empty=True)
+    by_ns = offset_ns(offset or "0", estimate)
+    estimate = shifted(estimate, by_ns)
     others = _other_segments(estimate, report, result / FINAL_NAME)
     evaluations: dict[str, TrajectoryEvaluation] = {}
     for kind, path in (("final", result / FINAL_NAME), ("causal", result / CAUSAL_NAME)):
         if path.exists():
             evaluations[kind] = evaluate_trajectory(
-                estimate if kind == "final" else read_tum(path, allow_empty=True),
+                estimate if kind == "final" else shifted(read_tum(path, allow_empty=True), by_ns),
                 truth,
                 kind=kind,
                 frames=report.frames if frames is None else frames,
@@ -278,4 +293,6 @@ def evaluate_result(
         initialisation_retries=report.initialisation_retries,
         final=evaluations["final"],
         causal=evaluations.get("causal"),
+        better=better_offset(estimate, truth),
+        offset_s=1e-9 * by_ns,
     )

@@ -9,18 +9,25 @@ from pliant.formats.text import numbered_lines
 from pliant.formats.tum import read_tum
 from pliant.trajectory import Trajectory
 
+_EUROC = (
+    "mav0/state_groundtruth_estimate0/data.csv",
+    "state_groundtruth_estimate0/data.csv",
+    "mav0/mocap0/data.csv",
+)
+
 
 def read_trajectory(
     path: Path, *, times: Path | None = None, allow_empty: bool = False
 ) -> Trajectory:
     """Read TUM, EuRoC or KITTI poses, told apart by their first line.
 
-    path: the file, or a folder that holds ``groundtruth.txt``.
+    path: the file, or a folder that holds ``groundtruth.txt`` or the ground truth of EuRoC.
     times: ``times.txt`` of a KITTI sequence; without it KITTI poses have no time, which is an
         error.  Raises ResultError with file and line.
     """
     if path.is_dir():
-        path = path / "groundtruth.txt"
+        names = ("groundtruth.txt", *_EUROC)
+        path = next((path / name for name in names if (path / name).is_file()), path / names[0])
     first = next((line for _, line in numbered_lines(path)), None)
     if first is None:
         if allow_empty:
