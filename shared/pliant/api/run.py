@@ -30,6 +30,7 @@ def run(
     calibration: str | Path | None = None,
     fov: float | None = None,
     mask: str | Path | None = None,
+    auto_mask: bool = True,
     start: float | None = None,
     end: float | None = None,
     every: int | None = None,
@@ -57,7 +58,8 @@ def run(
     Arguments are the options of ``pliant run``: ``pliant run --help`` says more of each.
 
     output: result folder [results/<source>]; force: write into an existing one.    mask: an image
-    whose black parts are ignored in all frames, or a folder of them.    start, end: seconds after
+    whose black parts are ignored in all frames, or a folder of them; auto_mask: mask
+    what never changes.    start, end: seconds after
     the first frame; every: one of so many frames; sharpest: of those, not the first.    light: a
     fifth of the tracks.    max_size: pixels along the longer side.    map: of an earlier run, to go
     on in; localise: only to find the frames in it.    camera, depth, depth_frames: of the
@@ -74,6 +76,7 @@ def run(
     folder = Path("results") / folder_name(str(source)) if output is None else Path(output)
     options: dict[str, object] = {
         "output": folder, "force": force, "calibration": calibration, "fov": fov, "mask": mask,
+        "no-auto-mask": not auto_mask,
         "start": start, "end": end, "every": every, "sharpest": sharpest, "light": light,
         "topic": topic, "max-size": max_size, "mode": mode, "map": map, "localise": localise,
         "profile": profile,
