@@ -185,7 +185,7 @@ def test_a_kill_at_any_point_costs_nothing(result: Path, monkeypatch: pytest.Mon
 def test_a_run_that_ends_before_its_first_frame_leaves_a_result_as_it_was(
     room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (room / "overlay.mp4").write_text("an export")
+    (room / "overlay.webm").write_text("an export")
     before, ends = contents(room), list[BaseException]()
 
     def start(fleet: Fleet, arguments: object) -> None:

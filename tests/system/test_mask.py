@@ -110,7 +110,7 @@ def test_what_is_left_out_is_dark_to_the_eye(result: Path, bonnet: Path, tmp_pat
     for shown, as_it_is, file in zip(seen.images, raw.images, files, strict=True):
         assert_dark_below(shown, file)
         np.testing.assert_array_equal(as_it_is, file)
-    video = cv2.VideoCapture(str(export_result(result, "overlay", tmp_path / "overlay.mp4")))
+    video = cv2.VideoCapture(str(export_result(result, "overlay", tmp_path / "overlay.webm")))
     good, frame = video.read()
     assert good
     assert_dark_below(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)[:240], files[0])

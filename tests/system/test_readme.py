@@ -79,7 +79,7 @@ def test_a_run_leaves_the_files_of_the_table(after_all_commands: Path) -> None:
     first = [line.split("|")[1] for line in table.strip().splitlines()[2:]]
     promised = {name for cell in first for name in re.findall(r"`([^`]+)`", cell)}
     left = {path.name for path in (after_all_commands / "results" / "sequence").iterdir()}
-    assert promised == left - {"overlay.mp4", "eval.json", ".lock"}
+    assert promised == left - {"overlay.webm", "eval.json", ".lock"}
 
 
 @pytest.mark.skipif(os.path.exists("/dev/video0"), reason="there is a camera, which never ends")

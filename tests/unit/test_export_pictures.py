@@ -1,5 +1,6 @@
 """Pictures, videos and animations: sizes, colours where they must be, and clear errors."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,7 +99,7 @@ def test_frames_without_tracks_and_new_ids() -> None:
     assert painter.draw(colour).shape == first.shape
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".avi"])
+@pytest.mark.parametrize("suffix", [".webm", ".mp4", ".avi"])
 def test_video_can_be_read_again(tmp_path: Path, suffix: str) -> None:
     file = tmp_path / f"v{suffix}"
     assert write_overlay_video(file, (frame(i) for i in range(5)), fps=30.0) == 5
@@ -111,8 +112,32 @@ def test_video_can_be_read_again(tmp_path: Path, suffix: str) -> None:
     assert count == 5
 
 
+def test_browsers_play_a_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """It is WebM, whatever its name has in it; nothing is written to the terminal, or beside it."""
+    file = tmp_path / "12:30 %03d.webm"
+    write_overlay_video(file, (frame(i) for i in range(5)), fps=30.0)
+    head = file.read_bytes()[:64]
+    assert head.startswith(b"\x1a\x45\xdf\xa3")
+    assert b"\x42\x82\x84webm" in head
+    assert b"V_VP8" in file.read_bytes()
+    assert capfd.readouterr().err == ""
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_video_that_fails_leaves_the_one_before(tmp_path: Path) -> None:
+    file = tmp_path / "v.webm"
+    write_overlay_video(file, [frame(0)], fps=30.0)
+    before = file.read_bytes()
+    with pytest.raises(ResultError, match="no frames"):
+        write_overlay_video(file, [], fps=30.0)
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]
+    with pytest.raises(ResultError, match="a name is not UTF-8"):
+        write_overlay_video(tmp_path / os.fsdecode(b"caf\xe9.webm"), [frame(0)], fps=30.0)
+
+
 def test_video_errors_are_clear(tmp_path: Path) -> None:
-    with pytest.raises(ResultError, match=r"use \.mp4 or \.avi"):
+    with pytest.raises(ResultError, match=r"use \.webm, \.mp4, \.avi"):
         write_overlay_video(tmp_path / "v.mov", [frame(0)], fps=30.0)
     with pytest.raises(ResultError, match="no frames"):
         write_overlay_video(tmp_path / "v.mp4", [], fps=30.0)

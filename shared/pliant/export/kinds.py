@@ -15,7 +15,7 @@ KINDS = {
     "obj": "obj",
     "watertight": "mesh_watertight.ply",
     "surface": "surface",
-    "overlay": "overlay.mp4",
+    "overlay": "overlay.webm",
     "picture": "picture.png",
     "overview": "overview.webp",
 }

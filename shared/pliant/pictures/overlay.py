@@ -182,7 +182,7 @@ def _fixed_point(points_px: F32, scale: int) -> "np.ndarray[tuple[int, ...], np.
 def write_overlay_video(
     path: Path, frames: Iterable[OverlayFrame], *, fps: float, scale: int | None = None
 ) -> int:
-    """Write a video of the tracks with their tails (.mp4 or .avi); returns the number of frames.
+    """Write a video (.webm, .mp4 or .avi) of the tracks with their tails; returns how many frames.
 
     frames: in order, all of one size.      scale: as in TrackPainter; 10,000 tracks at twice 640
     columns take about 0.4 MB a frame, at 1 a quarter of that.
