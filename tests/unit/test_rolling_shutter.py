@@ -64,6 +64,23 @@ def test_the_motion_is_that_of_the_frames_around():
     assert not motion[1].any()  # no frame is known there
 
 
+def test_the_information_of_a_pose_scales_with_the_map():
+    path, host = Path(), keyframe(0, pose(0.0))
+    path.add(10, host, pose(0.0), 50)
+    path.add(11, host, pose(1.0), 60)
+    path.add(12, keyframe(5, pose(0.0)), pose(2.0), 70)
+    path.refine(11, host, pose(1.1), 65, np.ones((6, 6)))
+    path.refine(13, host, pose(3.0), 80, np.ones((6, 6)))  # of no segment
+    moves = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.0]])
+    path.scale(MapMoves(keyframe_ids=np.array([0], np.int64), moves=moves))
+    frames, T_world_camera, information = path.frames_on([host])
+    assert [(each.frame, each.inliers) for each in frames] == [(10, 50), (11, 65)]
+    np.testing.assert_allclose(T_world_camera[1, :3, 3], 2.0 * pose(1.1)[:3, 3])
+    assert np.isnan(information[0]).all()
+    np.testing.assert_allclose(np.diag(information[1]), [0.25, 0.25, 0.25, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(information[1][0, 3:], 0.5)
+
+
 def test_poses_on_keyframes_of_another_segment_are_passed_over():
     path = Path()
     for t in (-1, 0, 1):

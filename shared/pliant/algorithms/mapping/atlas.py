@@ -160,11 +160,11 @@ class Atlas:
         self._earlier.keep(self.active.segment, self.calibration)
         self.active = None
 
-    def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64) -> None:
+    def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
         """A frame has a pose, which hangs on a keyframe of the segment that the camera is in."""
         assert self.active is not None
         if self._adjusts:
-            self.active.segment.path.add(frame, keyframe, T_world_camera)
+            self.active.segment.path.add(frame, keyframe, T_world_camera, inliers)
 
     def remember(self, keyframe: Keyframe, grey: U8 | None, maxima: F32 | None = None) -> None:
         """A new keyframe is a place to come back to, and may be one that was seen before.

@@ -35,10 +35,10 @@ from pliant.algorithms.mapping.keyframes import keyframe_is_due
 from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, Observations
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.passing import EarlierPose, refined_poses
+from pliant.algorithms.mapping.passing import PassedFrame, refined_poses, smoothed_poses
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import is_same_pose
-from pliant.algorithms.mapping.segment import Moved
+from pliant.algorithms.mapping.segment import Moved, Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of
 from pliant.algorithms.mapping.start import impatient
 from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
@@ -81,6 +81,7 @@ class Mapper:
         last = known[-1].id if known else -1
         self._keyframe_changes = KeyframeChanges(self.atlas.points, after=last)
         self._waiting = Waiting()
+        self._stamps_ns: dict[int, int] = {}  # of the frames
         self._motion = Motion.at(0, 0, np.eye(4))  # in the segment that the camera is in
         self._images: tuple[U8 | None, U8 | None] = (None, None)  # of the newest that waits
         self._lost_frames = 0
@@ -133,6 +134,7 @@ class Mapper:
         stamp_ns: when it was taken, increasing.    grey: (H, W).    colour: (H, W, 3) RGB.
         """
         self._timer, atlas = timer, self.atlas
+        self._stamps_ns[frame] = stamp_ns
         if atlas.active is not None:
             with self._timer("whole map"):
                 before = self.calibration
@@ -188,9 +190,7 @@ class Mapper:
                 atlas.remember(hanging, shown, tracks.maxima)
             with self._timer("passed frames"):
                 surplus = active.segment.passed.take_surplus(self._parameters)
-                self._correct(
-                    refined_poses(surplus, active.points, self.calibration, self._parameters)
-                )
+                self._correct(active.segment, surplus, self.calibration)
         else:
             active.pass_by(frame, T_world_camera, tracks.points_px, found)
         self._place_waiting(active, hanging, T_world_camera)
@@ -229,6 +229,7 @@ class Mapper:
         that it is published with.
         """
         active, found = self.atlas.active, None
+        self._stamps_ns[frame] = stamp_ns
         self._keyframe_is_new = False
         if active is not None and not self._lost_frames:
             found = pose_by_tracks(
@@ -258,8 +259,8 @@ class Mapper:
         self.follow(self.atlas.finish(timer))
         with timer("skipped frames"):
             for segment, seen_by in self.atlas.everything():
-                frames = segment.passed.take_all()
-                self._correct(refined_poses(frames, segment.points, seen_by, self._parameters))
+                self._correct(segment, segment.passed.take_all(), seen_by)
+                self._smooth(segment, seen_by)
         if self.atlas.active is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
         self._keyframe_changes.settle(self.atlas.active.keyframes)
@@ -267,11 +268,24 @@ class Mapper:
 
     def _add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
         self._changes.add_pose(frame, keyframe, T_world_camera, inliers)
-        self.atlas.add_pose(frame, keyframe, T_world_camera)
+        self.atlas.add_pose(frame, keyframe, T_world_camera, inliers)
 
-    def _correct(self, placed: list[EarlierPose]) -> None:
-        """Frames of before are known better by now."""
-        for each in placed:
+    def _correct(
+        self, segment: Segment, frames: list[PassedFrame], seen_by: SelfCalibration
+    ) -> None:
+        """Place frames again by the map as it is now.   seen_by: whose pixels they have."""
+        for each in refined_poses(frames, segment.points, seen_by, self._parameters):
+            pose = each.frame, each.keyframe, each.T_world_camera, each.inliers
+            self._changes.add_pose(*pose)
+            segment.path.refine(*pose, each.information)
+
+    def _smooth(self, segment: Segment, seen_by: SelfCalibration) -> None:
+        """Smooth the poses of a segment that nothing will change any more."""
+        smoothed = smoothed_poses(
+            segment.keyframes, segment.path, self._stamps_ns, segment.points, seen_by,
+            self._parameters,
+        )  # fmt: skip
+        for each in smoothed:
             self._changes.add_pose(each.frame, each.keyframe, each.T_world_camera, each.inliers)
 
     def publish_keyframes(self) -> KeyframeDelta:

@@ -19,7 +19,9 @@ from pliant.algorithms.mapping.directions import MAPPED_SHARE
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.trajectory_smoothing import smooth_trajectory
 
 _ROOM = 2_000_000
 """Most observations that are kept, 24 MB: some 250 frames of 8000."""
@@ -32,7 +34,10 @@ _NONE = np.iinfo(np.int64).max
 
 @dataclass(frozen=True, kw_only=True)
 class EarlierPose:
-    """T_world_camera of a frame, and the keyframe that it hangs on."""
+    """T_world_camera of a frame, and the keyframe that it hangs on.
+
+    inliers: points that support it.
+    """
 
     frame: int
     keyframe: Keyframe
@@ -41,7 +46,14 @@ class EarlierPose:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Passed:
+class RefinedPose(EarlierPose):
+    """information: (6, 6) of the pose, as ``refine_pose`` returns it."""
+
+    information: F64
+
+
+@dataclass(frozen=True, kw_only=True)
+class PassedFrame:
     """A frame that hangs on a keyframe, where it was placed (4, 4), and what it saw there: rows
     (n,) of points and candidates, at points_px (n, 2)."""
 
@@ -56,7 +68,7 @@ class _Passed:
 class PassedFrames:
     """Frames of a segment that are no keyframes and are to be placed once more, oldest first."""
 
-    _frames: list[_Passed] = field(default_factory=list[_Passed])
+    _frames: list[PassedFrame] = field(default_factory=list[PassedFrame])
 
     def add(
         self, frame: int, keyframe: Keyframe, T_world_camera: F64, rows: I32, points_px: F32
@@ -64,7 +76,7 @@ class PassedFrames:
         """A frame hangs on a keyframe, and saw points and candidates in the rows (n,)."""
         T_keyframe_camera = inverse(keyframe.T_world_camera) @ T_world_camera
         self._frames.append(
-            _Passed(
+            PassedFrame(
                 frame=frame, keyframe=keyframe, T_keyframe_camera=T_keyframe_camera, rows=rows,
                 points_px=points_px,
             )
@@ -90,7 +102,7 @@ class PassedFrames:
         """Id of the oldest keyframe on which one hangs; a huge one where there is none."""
         return min((each.keyframe.id for each in self._frames), default=_NONE)
 
-    def take_surplus(self, parameters: MappingParameters) -> list[_Passed]:
+    def take_surplus(self, parameters: MappingParameters) -> list[PassedFrame]:
         """The oldest, of which there is no more room for what they saw."""
         room = min(_ROOM, int(_ROOM_SHARE * parameters.window.kept_observations))
         seen = np.cumsum([len(each.rows) for each in reversed(self._frames)])
@@ -100,27 +112,27 @@ class PassedFrames:
         """Those that hang on one of the keyframes, by id, stay where they are."""
         self._frames = [each for each in self._frames if each.keyframe.id not in keyframes]
 
-    def take_all(self) -> list[_Passed]:
+    def take_all(self) -> list[PassedFrame]:
         """All of them."""
         return self._take(len(self._frames))
 
-    def _take(self, count: int) -> list[_Passed]:
+    def _take(self, count: int) -> list[PassedFrame]:
         taken, self._frames = self._frames[:count], self._frames[count:]
         return taken
 
 
 def refined_poses(
-    frames: Iterable[_Passed],
+    frames: Iterable[PassedFrame],
     points: PointRows,
     seen_by: SelfCalibration,
     parameters: MappingParameters,
-) -> list[EarlierPose]:
+) -> list[RefinedPose]:
     """Poses of those of the frames that see enough of the map as it is now.
 
     seen_by: whose pixels the frames have.
     """
     limits, camera = parameters.localisation, seen_by.view.camera
-    placed: list[EarlierPose] = []
+    placed: list[RefinedPose] = []
     for each in frames:
         keyframe = each.keyframe
         # A row that was given back and used anew begins with a later keyframe.
@@ -130,7 +142,7 @@ def refined_poses(
         if still.sum() < max(limits.min_inliers, MAPPED_SHARE * len(still)):
             continue
         points_px = each.points_px[still]
-        T_world_camera, fits, _ = refine_pose(
+        T_world_camera, fits, information = refine_pose(
             keyframe.T_world_camera @ each.T_keyframe_camera, points.xyz[each.rows[still]],
             points_px, camera, parameters.bundle, inlier_px=limits.inlier_px,
             weights=weigh(points_px, camera, seen_by.k_sigmas(parameters.calibration)),
@@ -138,9 +150,50 @@ def refined_poses(
         inliers = int(np.count_nonzero(fits))
         if inliers >= max(limits.min_inliers, limits.min_predicted_share * len(fits)):
             placed.append(
-                EarlierPose(
+                RefinedPose(
                     frame=each.frame, keyframe=keyframe, T_world_camera=T_world_camera,
-                    inliers=inliers,
+                    inliers=inliers, information=information,
                 )
             )  # fmt: skip
     return placed
+
+
+def smoothed_poses(
+    keyframes: list[Keyframe],
+    path: Path,
+    stamps_ns: dict[int, int],
+    points: PointRows,
+    seen_by: SelfCalibration,
+    parameters: MappingParameters,
+) -> list[EarlierPose]:
+    """Poses of all frames of a segment, smoothed by how the camera moves (``smooth_trajectory``).
+
+    The map stays as it is: a keyframe's frame may differ from its keyframe by what the observations
+    leave open.   path: where all other frames have been placed for the last time.
+    stamps_ns: of the frames.   seen_by: whose pixels the keyframes have.
+    """
+    for keyframe in keyframes:
+        if not path.has(keyframe.frame, keyframe):
+            continue
+        here = points.state[keyframe.rows] == MAPPED
+        points_px = keyframe.points_px[here]
+        _, fits, information = refine_pose(
+            keyframe.T_world_camera, points.xyz[keyframe.rows[here]], points_px,
+            seen_by.view.camera, parameters.bundle, inlier_px=parameters.localisation.inlier_px,
+            iterations=1, weights=weigh(
+                points_px, seen_by.view.camera, seen_by.k_sigmas(parameters.calibration)
+            ),
+        )  # fmt: skip
+        inliers = int(np.count_nonzero(fits))
+        path.refine(keyframe.frame, keyframe, keyframe.T_world_camera, inliers, information)
+    frames, T_world_camera, information = path.frames_on(keyframes)
+    if not frames:
+        return []
+    times_ns = np.array([stamps_ns[each.frame] for each in frames])
+    smoothed = smooth_trajectory(T_world_camera, information, times_ns)
+    return [
+        EarlierPose(
+            frame=each.frame, keyframe=each.keyframe, T_world_camera=pose, inliers=each.inliers
+        )
+        for each, pose in zip(frames, smoothed, strict=True)
+    ]

@@ -33,7 +33,7 @@ class MapChanges:
     """Collects what one frame changes and makes its MapDelta."""
 
     def __init__(self) -> None:
-        self._poses: list[tuple[int, int, int, F64, int]] = []
+        self._poses: dict[int, tuple[int, int, int, F64, int]] = {}
         self._removed: list[I64] = []
         self._moves: MapMoves | None = None
         self._joined: list[tuple[int, int]] = []
@@ -52,10 +52,10 @@ class MapChanges:
         self._same_places += pairs
 
     def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
-        """The pose of a frame is new, and hangs on a keyframe."""
+        """The pose of a frame is new, and hangs on a keyframe.  The last one of a frame counts."""
         T_keyframe_camera = inverse(keyframe.T_world_camera) @ T_world_camera
         pose = matrix_to_pose(T_keyframe_camera)
-        self._poses.append((frame, keyframe.segment, keyframe.id, pose, inliers))
+        self._poses[frame] = frame, keyframe.segment, keyframe.id, pose, inliers
 
     def remove_points(self, ids: I64) -> None:
         """Points are gone; those that were never published are left out later."""
@@ -78,7 +78,8 @@ class MapChanges:
 
         centre: (3,) camera position, which says how much a movement matters.  snapshot: all.
         """
-        poses, self._poses = sorted(self._poses, key=lambda pose: pose[0]), []
+        poses = [pose for _, pose in sorted(self._poses.items())]
+        self._poses = {}
         removed, self._removed = self._removed, []
         moves, self._moves = self._moves, None
         joined, self._joined = self._joined, []

@@ -17,6 +17,7 @@ Keyframes remember p - q, so that a better readout, motion or depth can take its
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,21 +49,61 @@ def _read_out_along(camera: PinholeCamera) -> tuple[int, float]:
     return (0, float(camera.width)) if upright else (1, float(camera.height))
 
 
+class FrameOnKeyframe(NamedTuple):
+    """A frame whose pose is relative to a keyframe.   inliers: points that support it."""
+
+    frame: int
+    keyframe: Keyframe
+    inliers: int
+
+
 class Path:
     """Poses of the frames of a segment, each relative to its keyframe, which may still move."""
 
     def __init__(self, known: dict[int, F64] | None = None) -> None:
         """known: motions (6,) of keyframes by their ids, whose frames nobody has any more."""
         self._poses: dict[int, tuple[int, F64]] = {}
+        self._inliers: dict[int, int] = {}
+        self._information: dict[int, F64] = {}
         self._known = known or {}
 
-    def add(self, frame: int, keyframe: Keyframe, T_world_camera: F64) -> None:
-        """A frame whose pose hangs on a keyframe."""
+    def add(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int = 0) -> None:
+        """A frame whose pose hangs on a keyframe.   inliers: points that support it."""
         self._poses[frame] = (keyframe.id, inverse(keyframe.T_world_camera) @ T_world_camera)
+        self._inliers[frame] = inliers
+
+    def has(self, frame: int, keyframe: Keyframe) -> bool:
+        """Whether the frame hangs on the keyframe.  Keyframes of earlier sessions have none."""
+        return self._poses.get(frame, (-1,))[0] == keyframe.id
+
+    def refine(
+        self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int, information: F64
+    ) -> None:
+        """A frame that hangs on the keyframe is placed again.   information: (6, 6) of the pose, as
+        ``refine_pose`` returns it."""
+        if self.has(frame, keyframe):
+            self.add(frame, keyframe, T_world_camera, inliers)
+            self._information[frame] = information
+
+    def frames_on(self, keyframes: list[Keyframe]) -> tuple[list[FrameOnKeyframe], F64, F64]:
+        """All frames that hang on one of the keyframes, by number, with T_world_camera (N, 4, 4)
+        and its information (N, 6, 6), NaN where that is unknown."""
+        hosts = {keyframe.id: keyframe for keyframe in keyframes}
+        hanging = [(frame, of) for frame, (of, _) in sorted(self._poses.items()) if of in hosts]
+        T_world_host = np.array([hosts[of].T_world_camera for _, of in hanging])
+        T_host_camera = np.array([self._poses[frame][1] for frame, _ in hanging])
+        unknown = np.full((6, 6), np.nan)
+        return (
+            [FrameOnKeyframe(frame, hosts[of], self._inliers[frame]) for frame, of in hanging],
+            T_world_host.reshape(-1, 4, 4) @ T_host_camera.reshape(-1, 4, 4),
+            np.array([self._information.get(frame, unknown) for frame, _ in hanging]),
+        )
 
     def take_in(self, other: "Path") -> None:
         """The frames of another segment are of this one, too."""
         self._poses |= other._poses
+        self._inliers |= other._inliers
+        self._information |= other._information
         self._known |= other._known
 
     def scale(self, moves: MapMoves) -> None:
@@ -71,6 +112,9 @@ class Path:
         scales = np.cbrt(np.linalg.det(moves.matrices(hanging)[:, :3, :3]))
         for frame, scale in zip(self._poses, scales, strict=True):
             self._poses[frame][1][:3, 3] *= scale
+            if frame in self._information:
+                unit = np.repeat([1.0 / scale, 1.0], 3)
+                self._information[frame] = self._information[frame] * np.outer(unit, unit)
         known = np.array(list(self._known), np.int64)
         scales = np.cbrt(np.linalg.det(moves.matrices(known)[:, :3, :3]))
         for keyframe, scale in zip(self._known, scales, strict=True):
