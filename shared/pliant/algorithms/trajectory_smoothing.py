@@ -153,8 +153,8 @@ def _adjoints(D: F64) -> F64:
 def _se3_log(D: F64) -> F64:
     """(N, 6) of (N, 4, 4)."""
     theta = so3_log(D[:, :3, :3])
-    turned = np.linalg.solve(_left_jacobian(theta), D[:, :3, 3, None])[:, :, 0]
-    return np.concatenate([turned, theta], axis=1)
+    rho = np.linalg.solve(_left_jacobian(theta), D[:, :3, 3, None])
+    return np.asarray(np.concatenate([rho[:, :, 0], theta], axis=1), np.float64)
 
 
 def _se3_exp(xi: F64) -> F64:
