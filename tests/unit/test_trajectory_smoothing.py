@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from pliant.algorithms import trajectory_smoothing as smoothing
-from pliant.algorithms.arrays import F64
+from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import inverse, so3_exp
-from pliant.algorithms.trajectory_smoothing import smooth_trajectory
 
 FRAMES = 120
 STAMPS_NS = np.arange(FRAMES, dtype=np.int64) * 33_333_333
@@ -27,6 +26,10 @@ def with_noise(T_world_camera: F64, seed: int = 0) -> F64:
     generator = np.random.default_rng(seed)
     xi = generator.normal(0.0, np.repeat([3e-3, 1e-3], 3), (len(T_world_camera), 6))
     return inverse(smoothing._se3_exp(xi) @ inverse(T_world_camera))
+
+
+def smooth_trajectory(T: F64, information: F64, stamps_ns: I64, most: float = 50.0) -> F64:
+    return smoothing.smooth_trajectory(T, information, stamps_ns, most)
 
 
 def off_m(T: F64, truth: F64) -> float:
@@ -138,3 +141,16 @@ def test_the_unit_of_length_does_not_matter() -> None:
 def test_few_frames_stay_as_they_are() -> None:
     noisy = with_noise(by_hand())[:5]
     assert smooth_trajectory(noisy, INFORMATION[:5], STAMPS_NS[:5]) is noisy
+
+
+def test_poses_of_which_none_follows_from_the_others_stay() -> None:
+    """Stills from all around: only a noise far beyond that of a pose would make them a path."""
+    jumps = with_noise(by_hand()[::6])
+    jumps[:, :3, 3] += np.random.default_rng(4).normal(0.0, 0.3, (20, 3))
+    stays = smooth_trajectory(jumps, INFORMATION[:20], np.arange(20) * 1_000_000_000)
+    assert off_m(stays, jumps) < 2e-3
+
+
+def test_a_noise_that_no_pose_has_is_not_taken_for_one() -> None:
+    noisy = with_noise(by_hand())
+    assert smooth_trajectory(noisy, INFORMATION, STAMPS_NS, most=0.1) is noisy

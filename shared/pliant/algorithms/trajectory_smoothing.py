@@ -46,12 +46,15 @@ _UNPLACED = 4.0
 """Variance of a pose whose information is unknown, as a multiple of the median pose's."""
 
 
-def smooth_trajectory(T_world_camera: F64, information: F64, stamps_ns: I64) -> F64:
+def smooth_trajectory(
+    T_world_camera: F64, information: F64, stamps_ns: I64, most_noise_px: float
+) -> F64:
     """Most likely poses of frames that follow each other.
 
     T_world_camera: (N, 4, 4) as measured.   information: (N, 6, 6) of ``T_camera_world``
     (translation, rotation) for one pixel of noise; NaN where it is unknown.   stamps_ns: (N,)
-    increasing.   Returns (N, 4, 4); the same poses where there are too few frames.
+    increasing.   most_noise_px: what s may be at the most.   Returns (N, 4, 4); the same poses
+    where there are too few frames, or the motion is smooth only under more noise: it is not then.
     """
     known: BoolArray = np.asarray(np.isfinite(information).all(axis=(1, 2)))
     if np.count_nonzero(known) < _LEAST_FRAMES:
@@ -67,6 +70,8 @@ def smooth_trajectory(T_world_camera: F64, information: F64, stamps_ns: I64) -> 
     for _ in range(_ROUNDS):
         motion.weigh(variances)
         variances, _ = motion.fit(variances, 0.5 * _FIRST_STEP)
+    if variances[0] > 2.0 * np.log(most_noise_px):
+        return T_world_camera
     return inverse(_se3_exp(motion.corrections(variances)) @ T)
 
 

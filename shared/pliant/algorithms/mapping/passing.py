@@ -29,6 +29,10 @@ _ROOM = 2_000_000
 _ROOM_SHARE = 1 / 3
 """And of those that the map has room for."""
 
+_COMMON_ERROR = 0.5
+"""Of the error of an inlier: most that all points of a frame may have in common, or half of them
+would be outliers.  Real video has a tenth to a seventh."""
+
 _NONE = np.iinfo(np.int64).max
 
 
@@ -190,7 +194,9 @@ def smoothed_poses(
     if not frames:
         return []
     times_ns = np.array([stamps_ns[each.frame] for each in frames])
-    smoothed = smooth_trajectory(T_world_camera, information, times_ns)
+    supported = float(np.median([each.inliers for each in frames]))
+    most_noise_px = _COMMON_ERROR * parameters.localisation.inlier_px * np.sqrt(max(supported, 1.0))
+    smoothed = smooth_trajectory(T_world_camera, information, times_ns, most_noise_px)
     return [
         EarlierPose(
             frame=each.frame, keyframe=each.keyframe, T_world_camera=pose, inliers=each.inliers
