@@ -10,7 +10,7 @@ import pytest
 import recorded_messages as bags
 from recorded_messages import COUNT, HEIGHT, START_NS, STEP_NS, WIDTH, Ros
 
-from pliant.datasets import open_source
+from pliant.datasets import notes_on, open_source
 from pliant.datasets.calibration import UNSAID_SIGMA
 from pliant.datasets.rectifier import decode
 from pliant.errors import CalibrationError, DatasetError
@@ -271,3 +271,22 @@ def test_any_bytes_are_one_line(tmp_path: Path) -> None:
             except (DatasetError, CalibrationError) as error:
                 said = str(error)
             assert "\n" not in said
+
+
+def test_of_colour_and_depth_the_colour_is_used_and_a_line_says_so(tmp_path: Path) -> None:
+    ros = Ros(2)
+    deep = np.full((HEIGHT, WIDTH), 900, "<u2")
+    messages = {
+        "/camera/color/image_raw": [ros.image(0)],
+        "/camera/color/image_raw/compressed": [ros.compressed(0)],
+        "/camera/depth/image_rect_raw": [ros.image(0, encoding="16UC1", pixels=deep)],
+    }
+    bags.write_ros2_bag(tmp_path / "bag", ros, messages)
+    source = open_source(str(tmp_path / "bag"), fov_deg=70.0)
+    assert np.array_equal(decode(next(iter(source))), bags.picture(0))
+    assert notes_on(source) == [
+        "/camera/color/image_raw is used, not /camera/color/image_raw/compressed, "
+        "/camera/depth/image_rect_raw (--topic chooses)"
+    ]
+    asked = open_source(str(tmp_path / "bag"), topic="/camera/color/image_raw", fov_deg=70.0)
+    assert notes_on(asked) == []

@@ -9,6 +9,7 @@ import pytest
 from pliant.datasets import notes_on, open_source
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.rectifier import Rectifier
+from pliant.errors import DatasetError
 
 COUNT = 5
 COLOUR = np.full((24, 32, 3), 90, np.uint8)
@@ -107,3 +108,68 @@ def test_files_of_other_formats_are_named(tmp_path: Path) -> None:
         f"{tmp_path.name}: 3 files (.dng, .heic) passed over: not a format that is read; convert "
         "them to JPEG or PNG"
     ]
+
+
+def test_a_folder_of_one_source_names_it(tmp_path: Path) -> None:
+    write(tmp_path / "zip" / "seq_01", "{}.png", COLOUR)
+    (tmp_path / "zip" / "__MACOSX" / "seq_01").mkdir(parents=True)
+    (tmp_path / "zip" / "__MACOSX" / "seq_01" / "._0.png").write_bytes(b"x")
+    with pytest.raises(
+        DatasetError, match=r"is no source, but seq_01 in it is: `pliant run .*/seq_01`"
+    ):
+        open_source(str(tmp_path / "zip"))
+    heic = tmp_path / "heic"
+    heic.mkdir()
+    (heic / "IMG_0001.HEIC").write_bytes(b"x")
+    with pytest.raises(
+        DatasetError, match=r"1 file \(\.heic\): not a format that is read; convert"
+    ):
+        open_source(str(heic))
+
+
+def test_pages_behind_the_first_are_named(tmp_path: Path) -> None:
+    for row in range(2):
+        assert cv2.imwritemulti(str(tmp_path / f"{row}.tiff"), [GREY, GREY, GREY])
+    found, said = names(tmp_path)
+    assert len(found) == 2
+    assert said == ["0.tiff: has 3 pages or frames, of which the first is read: convert it"]
+
+
+def test_images_that_a_list_leaves_out_are_named(tmp_path: Path) -> None:
+    write(tmp_path / "rgb", "{}.png", COLOUR, count=30)
+    lines = [f"{0.1 * row:.1f} rgb/{row}.png" for row in range(20)]
+    (tmp_path / "rgb.txt").write_text("\n".join(lines))
+    source = open_source(str(tmp_path), fov_deg=60.0)
+    assert notes_on(source) == ["rgb.txt: lists 20 images; 10 more in rgb/ are left out"]
+
+
+def test_a_listed_file_that_is_missing_costs_itself(tmp_path: Path) -> None:
+    write(tmp_path / "rgb", "{}.png", COLOUR, count=20)
+    lines = [f"{0.1 * row:.1f} rgb/{row}.png" for row in range(20)]
+    (tmp_path / "rgb.txt").write_text("\n".join(lines))
+    (tmp_path / "rgb" / "7.png").unlink()
+    source = open_source(str(tmp_path), fov_deg=60.0)
+    assert [frame.index for frame in source if not frame.data] == [7]
+    assert notes_on(source) == [
+        "rgb.txt: 1 file of 20 (the first in line 8) missing: they count as broken"
+    ]
+    for row in range(3):
+        (tmp_path / "rgb" / f"{row}.png").unlink()
+    with pytest.raises(DatasetError, match="4 of 20 listed images are missing"):
+        open_source(str(tmp_path), fov_deg=60.0)
+
+
+def test_a_raw_drive_of_kitti(tmp_path: Path) -> None:
+    drive = tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync"
+    write(drive / "image_00" / "data", "{:010d}.png", GREY, count=3)
+    write(drive / "image_02" / "data", "{:010d}.png", COLOUR, count=3)
+    times = [f"2011-09-26 13:02:25.{row}94360375" for row in range(3)]
+    (drive / "image_00" / "timestamps.txt").write_text("\n".join(times) + "\n")
+    row = "30.0 0 16.0 0 0 30.0 12.0 0 0 0 1 0"
+    (tmp_path / "2011_09_26" / "calib_cam_to_cam.txt").write_text(f"P_rect_00: {row}\n")
+    source = open_source(str(drive))
+    assert [f.stamp_ns - 1317042145094360375 for f in source] == [0, 10**8, 2 * 10**8]
+    assert (source.calibration.fx, source.name) == (30.0, drive.name)
+    (drive / "image_00" / "timestamps.txt").write_text("a\nb\nc\n")
+    with pytest.raises(DatasetError, match="line 1: 'a' is not a date"):
+        open_source(str(drive))

@@ -23,6 +23,7 @@ from pliant.datasets.folder import (
     open_bare_folder,
     open_listed_folder,
 )
+from pliant.datasets.image_kinds import foreign_files
 from pliant.datasets.images import SUFFIXES, SourceOptions
 from pliant.datasets.kitti import is_kitti, open_kitti
 from pliant.datasets.masks import Masked
@@ -209,13 +210,21 @@ def open_source(
         raise DatasetError(f"{source}: cannot be read: {error.strerror or error}") from None
     if not path.is_dir():
         raise DatasetError(f"{source}: neither a file nor a folder; {HELP}")
-    if any(_is_clip(each) for each in path.iterdir()):
-        raise DatasetError(
-            f"{source}: is no source, but holds some: name one of them, or all by "
-            f"`pliant batch {source}`"
-        )
-    what = "holds none of the sources" if any(path.iterdir()) else "is an empty folder"
-    raise DatasetError(f"{source}: {what}; {HELP}")
+    raise DatasetError(f"{source}: {_why_none(path)}")
+
+
+def _why_none(folder: Path) -> str:
+    """Why a folder is no source, and what may be."""
+    clips = [each for each in sorted(folder.iterdir()) if each.name[0] != "." and _is_clip(each)]
+    if len(clips) == 1:
+        return f"is no source, but {clips[0].name} in it is: `pliant run {clips[0]}`"
+    if clips:
+        return f"is no source, but holds some: name one of them, or all by `pliant batch {folder}`"
+    foreign = foreign_files(folder)
+    if foreign:
+        return foreign[0].removeprefix(f"{folder.name}: ").replace(" passed over", "")
+    what = "holds none of the sources" if any(folder.iterdir()) else "is an empty folder"
+    return f"{what}; {HELP}"
 
 
 def notes_on(dataset: Dataset) -> list[str]:

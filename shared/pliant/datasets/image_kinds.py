@@ -33,9 +33,10 @@ _SUBFOLDERS = (
     *("images", "image", "rgb", "color", "colour", "img", "imgs", "frames", "data"),
     *("left", "cam0", "image_00"),
 )
+_MAY_HAVE_PAGES = (".tif", ".tiff", ".webp")
 _FOREIGN = {
     *(".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"),
-    *(".raf", ".raw", ".exr", ".jxl", ".jp2", ".tga", ".svg", ".npy"),
+    *(".raf", ".raw", ".exr", ".jxl", ".tga", ".svg", ".npy"),
 }
 
 
@@ -55,7 +56,7 @@ def images_of_one_kind(folder: Path) -> tuple[list[Path], list[str]]:
     Raises DatasetError.
     """
     files = image_files(folder)
-    notes = _not_read(folder)
+    notes = [*foreign_files(folder), *_pages(files)]
     kinds: dict[str, list[Path]] = defaultdict(list)
     for path in files:
         kinds[_kind(path)].append(path)
@@ -117,7 +118,19 @@ def _pixels(path: Path) -> tuple[tuple[int, ...], bool]:
     return ((0, 0), False) if pixels is None else (pixels.shape, pixels.dtype != np.uint8)
 
 
-def _not_read(folder: Path) -> list[str]:
+def _pages(files: Sequence[Path]) -> list[str]:
+    """A note where the images are animations or have pages, of which the first is read."""
+    able = next((path for path in files if path.suffix.lower() in _MAY_HAVE_PAGES), None)
+    try:
+        count = 1 if able is None else cv2.imcount(str(able))
+    except cv2.error:
+        count = 1
+    if able is None or count <= 1:
+        return []
+    return [f"{able.name}: has {count} pages or frames, of which the first is read: convert it"]
+
+
+def foreign_files(folder: Path) -> list[str]:
     """A note on image files of formats that are not read."""
     try:
         suffixes = [path.suffix.lower() for path in folder.iterdir() if path.name[0] != "."]

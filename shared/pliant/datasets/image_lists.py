@@ -13,7 +13,7 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 from pliant.datasets.frame_times import increasing, why_wrong
-from pliant.datasets.images import ListedImage
+from pliant.datasets.images import ListedImage, image_files
 from pliant.datasets.times import likely_unit, nanoseconds, number_of, rate
 from pliant.errors import DatasetError
 from pliant.wording import counted, shortened, shown
@@ -21,7 +21,7 @@ from pliant.wording import counted, shortened, shown
 _LINE = re.compile(r"([^\s,;]+)[\s,;]+(\S.*)")
 _PAIR = re.compile(r"(\S.*?)[\s,;]+([0-9.eE+-]+)[\s,;]+(\S.*)")
 _MAX_WRONG = 0.1
-"""With a larger share of times that do not increase, the list itself is wrong."""
+"""With a larger share of times that do not increase or missing files, the list itself is wrong."""
 
 
 @dataclass
@@ -64,7 +64,7 @@ def read_list(file: Path, folder: Path, *, unit: str = "seconds") -> ImageList:
     if not rows:
         raise DatasetError(f"{file}: lists no images")
     missing = [row for row in rows if not row.path.is_file()]
-    if missing:
+    if len(missing) > _MAX_WRONG * len(rows):
         raise DatasetError(
             f"{file}: line {missing[0].line}: no file {shortened(missing[0].name)} in {folder} "
             f"({len(missing)} of {len(rows)} listed images are missing); bring them back or "
@@ -73,8 +73,28 @@ def read_list(file: Path, folder: Path, *, unit: str = "seconds") -> ImageList:
     stamps, notes = stamps_of([(row.line, row.time) for row in rows], file, unit)
     images = [ListedImage(stamp_ns=t, path=row.path) for t, row in zip(stamps, rows, strict=True)]
     images, told = mended(images, [row.line for row in rows], file)
+    if missing:
+        of = f"{counted(len(missing), 'file')} of {len(rows)}"
+        told.append(
+            f"{file.name}: {of} (the first in line {missing[0].line}) missing: they count as broken"
+        )
     others = [row.other for row in rows if row.other is not None]
-    return ImageList(images, others if len(others) == len(rows) else [], [*notes, *told])
+    return ImageList(
+        images, others if len(others) == len(rows) else [], [*notes, *told, *_unlisted(file, rows)]
+    )
+
+
+def _unlisted(file: Path, rows: "Sequence[_Row]") -> list[str]:
+    """A note where the folders of the listed images hold others."""
+    listed = {row.path for row in rows}
+    folders = {path.parent for path in listed}
+    there = {path for folder in folders if folder.is_dir() for path in image_files(folder)}
+    others = {path for row in rows if (path := row.other) is not None}
+    left = len(there - listed - others)
+    if not left:
+        return []
+    names = ", ".join(sorted({f"{folder.name}/" for folder in folders})[:3])
+    return [f"{file.name}: lists {len(listed)} images; {left} more in {names} are left out"]
 
 
 def stamps_of(

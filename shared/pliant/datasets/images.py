@@ -14,7 +14,10 @@ from pliant.datasets.image_sizes import LOOKED_AT, most_frequent, size_of
 from pliant.datasets.stereo import StereoPair
 from pliant.errors import CalibrationError, DatasetError
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".pnm")
+SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"),
+    *(".pnm", ".jp2"),
+)
 _TRIED_FOR_SIZE = 20
 
 

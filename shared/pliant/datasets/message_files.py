@@ -1,5 +1,6 @@
 """What files of recorded messages have in common: the choice of a topic, its frames, its camera."""
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -64,6 +65,7 @@ class MessageImages:
         self._file = file
         with file.open() as opened:
             self._topic = _choose(opened.topics, options.topic, file.path)
+            self.notes += _other_topics(opened.topics, self._topic, options.topic)
             self._where = f"{file.path}: {self._topic.name}"
             size = self._look(opened)
             found = None
@@ -135,8 +137,30 @@ def _choose(topics: list[MessageTopic], wanted: str, path: Path) -> MessageTopic
         names = ", ".join(sorted({t.kind for t in topics})) or "nothing"
         raise DatasetError(f"{path}: no topic with images; it carries {names[:300]}")
     if not wanted and len(images) > 1:
+        likely = _of_a_camera(images)
+        if len(likely) == 1:
+            return likely[0]
         raise DatasetError(f"{path}: several topics with images, choose by --topic: {listed}")
     return named[0] if wanted else images[0]
+
+
+_NO_CAMERA = re.compile(r"depth|disparity|mask|segment|label|confidence|theora", re.IGNORECASE)
+
+
+def _of_a_camera(images: list[MessageTopic]) -> list[MessageTopic]:
+    """Topics of images without depth maps, masks, empty topics, and the same images compressed."""
+    found = [t for t in images if not _NO_CAMERA.search(t.name) and t.count != 0]
+    names = {topic.name for topic in found}
+    return [t for t in found if t.name.removesuffix("/compressed") not in names - {t.name}]
+
+
+def _other_topics(topics: list[MessageTopic], chosen: MessageTopic, wanted: str) -> list[str]:
+    """A note on the topics that were passed over without being asked to."""
+    others = [t.name for t in topics if t.kind in IMAGE_TYPES and t.name != chosen.name]
+    if wanted or not others:
+        return []
+    named = shortened(", ".join(sorted(others)), 120)
+    return [f"{chosen.name} is used, not {named} (--topic chooses)"]
 
 
 def _with_images(listed: str) -> str:
