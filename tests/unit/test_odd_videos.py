@@ -23,6 +23,7 @@ from odd_videos import (
     write_video,
 )
 
+from pliant.algorithms.image.fields import is_combed
 from pliant.datasets import notes_on, open_source
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.mp4_boxes import video_streams
@@ -147,6 +148,23 @@ def test_interlaced_video_is_read_by_one_field(tmp_path: Path) -> None:
     dataset = open_source(str(tmp_path / "tape.avi"), fov_deg=60.0, longest_side_px=720)
     assert notes_on(dataset)[0].startswith("interlaced: one field of each frame")
     assert_film(list(dataset), shown[:-1])
+
+
+def test_two_fields_in_a_file_that_says_nothing_of_it(tmp_path: Path) -> None:
+    """As of old tapes that were converted: a frame that is a comb of two times is one field."""
+    shown = moving(FRAMES, 320, 240, step=6)
+    combed = [image.copy() for image in shown]
+    for comb, later in zip(combed, shown[1:], strict=False):
+        comb[1::2] = later[1::2]
+    write_video(tmp_path / "tape.avi", combed[:-1], "FFV1")
+    dataset = open_source(str(tmp_path / "tape.avi"), fov_deg=60.0)
+    assert notes_on(dataset)[0].startswith("interlaced: one field of each frame")
+    for frame, image in zip(dataset, shown, strict=False):
+        assert np.abs(decode(frame)[:, :, ::-1].astype(int) - image).mean() < 1.0
+    assert not any(is_combed(image) for image in (*shown, scene(320, 240, seed=3)))
+    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
+    assert not is_combed(noise)
+    assert not is_combed(np.zeros((1, 1, 3), np.uint8))
 
 
 def test_pixels_by_packets_are_those_of_opencv(tmp_path: Path) -> None:

@@ -15,12 +15,14 @@ from pliant.algorithms.arrays import U8
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.images import SourceOptions, choose_calibration
-from pliant.datasets.video_decoder import VideoDecoder, file_version, opened
+from pliant.datasets.video_decoder import FIELDS, VideoDecoder, file_version, opened
 from pliant.datasets.video_streams import VideoStream
 from pliant.errors import DatasetError
 
 GIVE_UP = 600
 """Frames that do not decode, one behind the other, before nothing more is expected."""
+_LOOKED_AT = 15
+"""Frames that tell whether they are combs of two fields, though the file does not say so."""
 _ROUNDED_NS = 1_000
 """More than what times lose as OpenCV gives them, milliseconds in a float."""
 
@@ -43,7 +45,11 @@ class VideoFile:
             first = decoder.read()
             if first is None:
                 raise DatasetError(f"{file}: a video without frames")
+            for _ in range(_LOOKED_AT):
+                if decoder.combed or decoder.read() is None:
+                    break
             self.notes, self.rate_hz = [*decoder.notes], decoder.rate_hz
+            self.notes += [FIELDS] if decoder.combed else []
             aspect = decoder.aspect
             self._count = decoder.count
             self.frame_count = _shown(decoder.stream, decoder.count)

@@ -13,6 +13,7 @@ from typing import Any, Protocol, cast
 import cv2
 
 from pliant.algorithms.arrays import U8
+from pliant.algorithms.image.fields import is_combed, one_field
 from pliant.datasets.packet_decoder import PacketDecoder, codec_of, decodes
 from pliant.datasets.video_streams import ChosenStream, PatchedFile, choose, streams_of
 from pliant.errors import DatasetError
@@ -23,7 +24,7 @@ _MOST_LINES = 1088
 _LOOKED_AT = 8
 """Pictures that say whether a stream is interlaced."""
 _SAME_ASPECT = 0.01
-_FIELDS = "interlaced: one field of each frame is used, and the lines between are interpolated"
+FIELDS = "interlaced: one field of each frame is used, and the lines between are interpolated"
 _COLOURS = "HDR or wide-gamut video: colours stay as they are coded"
 _LIKELY_ASPECTS = (Fraction(1, 4), Fraction(4))
 
@@ -45,6 +46,7 @@ class VideoDecoder:
     rate_hz: frames a second, or a usual rate where the container says nothing likely.
     count: how many pictures it has, by the word of the container; None: that says nothing likely.
     aspect: width over height of its pixels.
+    combed: whether a picture that was read had two fields, though the stream is none of these.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class VideoDecoder:
     ) -> None:
         self._capture = capture
         self._size: tuple[int, int] | None = None
+        self.combed = False
         self.stream = chosen.stream
         self.notes = tuple(notes)
         self.aspect = aspect
@@ -80,6 +83,8 @@ class VideoDecoder:
         read, pixels = self._capture.retrieve()
         if not read or pixels is None:
             return None
+        if is_combed(pixels):
+            self.combed, pixels = True, one_field(pixels)
         size = (pixels.shape[1], pixels.shape[0])
         self._size = self._size or size
         if size != self._size and _same_aspect(size, self._size):
@@ -177,7 +182,7 @@ def _special(packets: cv2.VideoCapture | None) -> list[str]:
     if min(sides) <= _MOST_LINES:
         kinds += [decoder.grab() and (decoder.interlaced, False) for _ in range(_LOOKED_AT)]
     found = [any(kind) for kind in zip(*filter(None, kinds), strict=True)]
-    return [note for note, here in zip((_FIELDS, _COLOURS), found, strict=False) if here]
+    return [note for note, here in zip((FIELDS, _COLOURS), found, strict=False) if here]
 
 
 def _aspect(capture: cv2.VideoCapture, rotation_deg: int) -> Fraction:
