@@ -110,10 +110,11 @@ def test_merged_rows_are_followed_as_numpy_would(seed, share):
 @settings(max_examples=50)
 @given(st.lists(st.sets(st.integers(0, 40)), min_size=1, max_size=6))
 def test_links_follow_living_tracks_and_drop_dead_ones(frames):
-    links, expected = TrackLinks(), {}
+    links, points, expected = TrackLinks(), PointRows(), {}
+    points.allocate(7 * 41)  # none of them is a point of the map, to which tracks may come back
     for alive in frames:
         ids = np.array(sorted(alive), np.int64)
-        links.follow(ids)
+        links.follow(ids, points)
         expected = {i: expected.get(i, UNLINKED) for i in ids.tolist()}
         assert links.rows.tolist() == [expected[i] for i in ids.tolist()]
         for k, i in enumerate(ids.tolist()):

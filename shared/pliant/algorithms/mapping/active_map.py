@@ -113,7 +113,7 @@ class ActiveMap:
         self.points.kappas[rows] = start.kappas
         self.points.promote(rows)
         self.links.ids, self.links.rows = start.ids, rows
-        self.links.follow(newest.ids)
+        self.links.follow(newest.ids, self.points)
         self._link_new_tracks(newest.points_px)
         self._paint(rows, start.newest_px, colours)
         self._paint(self.links.rows, newest.points_px, colours)

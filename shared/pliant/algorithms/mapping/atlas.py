@@ -149,7 +149,7 @@ class Atlas:
         else:
             self._forget_questions()
         active.look_with(seen)
-        active.links.follow(ids)
+        active.links.follow(ids, self.points)
 
     def leave(self) -> None:
         """The camera is not in its segment any more, which becomes an earlier one."""

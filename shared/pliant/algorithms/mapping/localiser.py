@@ -87,7 +87,7 @@ class Localiser:
         tracks = self.calibration.ideal(extrema)
         image = image_of_tracks(self.calibration, None, grey)
         if self._map is not None:
-            self._map.links.follow(tracks.ids)
+            self._map.links.follow(tracks.ids, self._points)
         located = self._locate(stamp_ns, tracks, image, timer)
         if located is None or self._map is None or self._hanging is None:
             return self._publish(LOST if self._map else WAITING, "not recognised in the map", 0)
@@ -186,7 +186,7 @@ class Localiser:
         self._hanging, self._motion = found.keyframe, None
         segment = next(each for each in self._segments if each.id == found.keyframe.segment)
         self._map = ActiveMap(segment, 0, self.calibration, self._parameters)
-        self._map.links.follow(tracks.ids)
+        self._map.links.follow(tracks.ids, self._points)
         self._map.look_around(found.T_world_camera)
         self._looked_from = found.T_world_camera
         return found.T_world_camera

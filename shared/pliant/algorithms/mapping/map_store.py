@@ -15,6 +15,9 @@ PATCH_SIDE = PATCH_SIZE + 2 * TEMPLATE_MARGIN
 UNLINKED = -1
 """Row of a track that belongs to no point."""
 
+_KEPT_GONE = 20_000
+"""Tracks that have gone, whose points are remembered: bounds memory and time."""
+
 FREE, CANDIDATE, MAPPED, MERGED = 0, 1, 2, 3
 """State of a row: nothing, a track that still lacks parallax, a point of the map, the alias of
 another row until the keyframes have been published."""
@@ -256,17 +259,46 @@ class TrackLinks:
     """The rows of the tracks of the latest frame.
 
     ids: (N,) ascending ids of the tracks.    rows: (N,) their rows, UNLINKED where they have none.
+
+    Tracks may be missing for some frames (``tracking.bridging``): points of the map are kept for
+    those that went last.
     """
 
     def __init__(self) -> None:
         self.ids: I64 = np.zeros(0, np.int64)
         self.rows: I32 = np.zeros(0, np.int32)
+        self._gone: I64 = np.zeros((0, 3), np.int64)  # id, row and point of tracks
 
-    def follow(self, ids: I64) -> None:
-        """Go on to the tracks of the next frame: living tracks keep their rows."""
-        rows = np.full(len(ids), UNLINKED, np.int32)
-        _carry_over(self.ids, self.rows, ids, rows)
+    def follow(self, ids: I64, points: PointRows) -> None:
+        """Go on to the tracks of the next frame: living tracks keep their rows, and those that come
+        back have their points again, where these are still in the map and without a track."""
+        before, rows = self.ids, np.full(len(ids), UNLINKED, np.int32)
+        _carry_over(before, self.rows, ids, rows)
+        mapped = self.in_state(points.state, MAPPED)
+        gone = mapped[~np.isin(before[mapped], ids, assume_unique=True)]
+        if len(before):
+            old = np.flatnonzero(ids <= before[-1])
+            back = old[~np.isin(ids[old], before, assume_unique=True)]
+            self._take_back(ids, rows, back, points)
+        row = self.rows[gone]
+        new = np.column_stack([before[gone], row, points.ids[row]])
+        self._gone = np.concatenate([self._gone, new.astype(np.int64)])[-_KEPT_GONE:]
         self.ids, self.rows = ids, rows
+
+    def _take_back(self, ids: I64, rows: I32, back: I64, points: PointRows) -> None:
+        """Link tracks, by their indices, that were missing."""
+        if not len(back) or not len(self._gone):
+            return
+        newest = len(self._gone) - 1
+        known, last = np.unique(self._gone[::-1, 0], return_index=True)
+        at = np.minimum(np.searchsorted(known, ids[back]), len(known) - 1)
+        found = known[at] == ids[back]
+        back, (_, row, point) = back[found], self._gone[newest - last[at[found]]].T
+        usable = (points.ids[row] == point) & (points.state[row] == MAPPED)
+        usable &= ~np.isin(row, rows)
+        back, row = back[usable], row[usable]
+        _, first = np.unique(row, return_index=True)
+        rows[back[first]] = row[first]
 
     def in_state(self, state: U8, wanted: int) -> I64:
         """Indices of the tracks whose row has the wanted state.  state: of all rows."""

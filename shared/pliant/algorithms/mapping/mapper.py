@@ -141,7 +141,7 @@ class Mapper:
                 self.follow(atlas.catch_up(frame))
                 if not self.calibration.sees_like(before):
                     self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
-            atlas.active.links.follow(extrema.ids)
+            atlas.active.links.follow(extrema.ids, atlas.points)
         with self._timer("corrected view"):
             tracks = self.calibration.ideal(extrema)
         self._images = (grey, grey if colour is None else colour)

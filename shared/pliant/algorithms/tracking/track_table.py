@@ -75,17 +75,18 @@ class TrackTable:
 
     @staticmethod
     def with_capacity(capacity: int) -> "TrackTable":
-        """No tracks, and room for so many."""
+        """No tracks, and room for so many, and for half as many patches of others."""
+        patches = capacity + capacity // 2
         return TrackTable(
             count=0,
-            free_count=capacity,
+            free_count=patches,
             rows=np.zeros(capacity, TRACK),
             patches=Patches(
-                templates=np.zeros(capacity * TEMPLATE_FLOATS, np.float32),
-                births=np.zeros(capacity * BIRTH_FLOATS, np.float32),
-                deformations=np.zeros((capacity, 8), np.float32),
+                templates=np.zeros(patches * TEMPLATE_FLOATS, np.float32),
+                births=np.zeros(patches * BIRTH_FLOATS, np.float32),
+                deformations=np.zeros((patches, 8), np.float32),
             ),
-            free_slots=np.arange(capacity - 1, -1, -1, dtype=np.int32),
+            free_slots=np.arange(patches - 1, -1, -1, dtype=np.int32),
         )
 
     @property

@@ -8,6 +8,15 @@ from pliant.algorithms.image.patch_sums import TEMPLATE_FLOATS
 from pliant.algorithms.image.pixels import halve, pixels_of
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracking.advance import FrameImages, StepLimits, advance_tracks, scan_order
+from pliant.algorithms.tracking.bridging import (
+    LastSharp,
+    are_lost,
+    is_as_sharp,
+    is_over,
+    keep_slots,
+    put_back,
+    release,
+)
 from pliant.algorithms.tracking.deformation import WINDOW_SIDE, slopes_of_motion, turn_templates
 from pliant.algorithms.tracking.dominant_flow import (
     BriefExtractor,
@@ -51,6 +60,8 @@ class ExtremaTracker:
         self._window = np.zeros((WINDOW_SIDE, WINDOW_SIDE), np.float32)
         # Of the frame before; none of them means anything until has_previous.
         self._has_previous = False
+        self._lost_at_once = False
+        self._kept: LastSharp | None = None  # from before most tracks were lost at once
         self._stamp_ns = 0
         self._smooth = np.zeros(self._shape, np.float32)
         self._spare_smooth = np.zeros(self._shape, np.float32)
@@ -98,6 +109,8 @@ class ExtremaTracker:
         if self._has_previous:
             with timer("tracks"):
                 self._advance(now, flow, 1e-9 * (stamp_ns - self._stamp_ns), clearance)
+                if self._kept is not None:
+                    self._bridge(self._kept, now, features, pyramid, stamp_ns, clearance)
         with timer("upkeep"):
             self._start_tracks(now, pixels, maxima, clearance)
         self._spare_smooth, self._smooth = self._smooth, smooth
@@ -109,9 +122,12 @@ class ExtremaTracker:
     def _dominant_flow(self, features: BriefFeatures) -> F64:
         if self._features is None:
             return np.eye(2, 3)
+        return self._flow_between(self._features, features)
+
+    def _flow_between(self, before: BriefFeatures, now: BriefFeatures) -> F64:
         sources, targets = match_features(
-            self._features,
-            features,
+            before,
+            now,
             max_distance_bits=MAX_BRIEF_DISTANCE_BITS,
             max_shift_px=self._parameters.flow_max_shift_px,
         )
@@ -127,6 +143,7 @@ class ExtremaTracker:
     ) -> None:
         table, p = self._table, self._parameters
         before = FrameImages(pixels_of(self._smooth), pixels_of(self._pyramid[0]))
+        tracks_before = table.tracks.copy()
         advance_tracks(
             before,
             now,
@@ -140,6 +157,12 @@ class ExtremaTracker:
             self._scratch,
         )
         _end_covered(table.tracks, clearance)
+        at_once = are_lost(table.count, int(table.tracks["alive"].sum()))
+        if at_once and not self._lost_at_once and is_as_sharp(self._maxima, self._kept):
+            if self._kept is not None:
+                release(table, self._kept)
+            self._kept = self._last_sharp(tracks_before)
+        self._lost_at_once = at_once
         self._compact()
         if p.patch_refinement and p.turn_patches:
             slopes = slopes_of_motion(table.tracks, flow.affine, *self._shape)
@@ -168,11 +191,66 @@ class ExtremaTracker:
             _end_covered(table.tracks, clearance)
             self._compact()
 
+    def _last_sharp(self, tracks: Tracks) -> LastSharp | None:
+        if self._features is None or not self._parameters.patch_refinement:
+            return None
+        return LastSharp(
+            stamp_ns=self._stamp_ns,
+            smooth=self._smooth.copy(),
+            pyramid=self._pyramid,
+            maxima=self._maxima,
+            features=self._features,
+            local=self._local,
+            tracks=tracks,
+        )
+
+    def _bridge(
+        self,
+        kept: LastSharp,
+        now: FrameImages,
+        features: BriefFeatures,
+        pyramid: list[F32],
+        stamp_ns: int,
+        clearance: F32 | None,
+    ) -> None:
+        """Find tracks again that were lost with others, by the frame before that."""
+        table, p = self._table, self._parameters
+        lost = kept.lost(table)
+        if not is_over(kept, lost, stamp_ns, p.coast_s):
+            affine = self._flow_between(kept.features, features)
+            flow = self._flow_from(kept, pyramid, affine.astype(np.float32).ravel())
+            advance_tracks(
+                FrameImages(pixels_of(kept.smooth), pixels_of(kept.pyramid[0])),
+                now,
+                pixels_of(self._kappa),
+                flow,
+                _step_limits(p, 1e-9 * (stamp_ns - kept.stamp_ns)),
+                scan_order(lost, self._shape[0]),
+                np.zeros((len(lost), 2), np.float32),
+                lost,
+                table.patches.templates,
+                self._scratch,
+            )
+            _end_covered(lost, clearance)
+            put_back(table, lost[lost["alive"] == 1])
+            lost = lost[lost["alive"] == 0]
+        if is_over(kept, lost, stamp_ns, p.coast_s):
+            release(table, kept)
+            self._kept = None
+
+    def _flow_from(self, kept: LastSharp, pyramid: list[F32], affine: F32) -> Flow:
+        if not self._parameters.local_flow:
+            return Flow(np.zeros_like(kept.local), affine)
+        return local_flow(kept.pyramid, pyramid, kept.maxima, affine, np.zeros_like(kept.local))
+
     def _compact(self) -> None:
         table = self._table
+        freed_from = table.free_count
         table.count, table.free_count = compact(
             table.rows, table.count, table.free_slots, table.free_count
         )
+        if self._kept is not None:
+            keep_slots(table, freed_from, self._kept)
 
     def _frame_tracks(self, maxima: F32, flow: F64) -> FrameExtrema:
         tracks = self._table.tracks
