@@ -44,7 +44,7 @@ def pose_by_tracks(
 
     tracks: as the tracker gives them, of the rectified image.
     """
-    active.links.follow(tracks.ids)
+    active.links.follow(tracks.ids, active.points)
     seen = calibration.ideal(FrameExtrema.without_maxima(tracks))
     located = localise(active, calibration, motion, stamp_ns, seen, None, generator)
     if located is None or not located.is_firm:
