@@ -2,7 +2,8 @@
 
 from abc import ABC, abstractmethod
 
-from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.arrays import U8
+from pliant.api.open3d_types import PointArray
 from pliant.map_history import MapHistory, Points
 from pliant.trajectory import Trajectory
 
@@ -30,9 +31,10 @@ class Mapped(ABC):
         return self.history.trajectory_in(self.history.longest_segment(), self.history.causal)
 
     @property
-    def points(self) -> F64:
+    def points(self) -> PointArray:
         """(P, 3) points in the world."""
-        return self._points.positions
+        points = self._points
+        return PointArray.of(points.positions, points.colours)
 
     @property
     def colours(self) -> U8:

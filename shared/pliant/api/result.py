@@ -16,8 +16,8 @@ from pliant.algorithms.arrays import F32, F64, I64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import pose_to_matrix
-from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.api.mapped import Mapped
+from pliant.api.open3d_types import Mesh
 from pliant.datasets.calibration import Calibration, calibration_from_yaml
 from pliant.datasets.own_recording import recorded_frame
 from pliant.datasets.recorded_images import RecordedImages
@@ -109,9 +109,10 @@ class Result(Mapped):
         return super().trajectory
 
     @cached_property
-    def mesh(self) -> TriangleMesh | None:
+    def mesh(self) -> Mesh | None:
         """The fine mesh of the longest segment; None where there is none."""
-        return mesh_of(self._run.mesh, self.history.longest_segment())
+        found = mesh_of(self._run.mesh, self.history.longest_segment())
+        return None if found is None else Mesh(**vars(found))
 
     @cached_property
     def calibration(self) -> Calibration | None:
