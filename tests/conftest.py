@@ -86,6 +86,7 @@ ALLOWED_SKIPS = (
     "a small file system can be mounted by root only",
     "takes minutes: scripts/soak",
     "chromium is not installed",
+    "xvfb is not installed",
     "systemd-analyze is not installed",
     "there is a camera, which never ends",
 )

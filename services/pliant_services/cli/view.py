@@ -25,6 +25,9 @@ def view(
         typer.Option(min=1, max=65535, help="Port of --web [9090, or one that is free]."),
     ] = None,
     save: Annotated[Path | None, typer.Option(help="Into an .rrd file instead.")] = None,
+    open3d: Annotated[
+        bool, typer.Option("--open3d", help="A result in Open3D's window, without Rerun.")
+    ] = False,
     patience: Annotated[
         float, typer.Option(hidden=True, help="Seconds to wait for a session that is to start.")
     ] = 0.0,
@@ -35,6 +38,8 @@ def view(
     pliant view results/room
 
     pliant view results/room --web
+
+    pliant view results/room --open3d
 
     pliant view --connect tcp/127.0.0.1:7447 --session run-1234
     """
@@ -54,5 +59,6 @@ def view(
         save=save,
         force=force,
         patience_s=patience,
+        open3d=open3d,
     )
     run_view(request)

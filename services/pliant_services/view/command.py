@@ -57,10 +57,14 @@ class ViewRequest:
     force: bool = False
     web_port: int | None = None
     patience_s: float = 0.0
+    open3d: bool = False
 
 
 def run_view(request: ViewRequest) -> None:
     """Show it.  Raises PliantError."""
+    if request.open3d:
+        _show_in_open3d(request)
+        return
     where = place(web=request.web, save=request.save, force=request.force)
     if not isinstance(where, Path):
         _show(request, where)
@@ -82,6 +86,23 @@ def run_view(request: ViewRequest) -> None:
     except OSError as error:
         raise ResultError(f"{where}: cannot be written ({error.strerror})") from None
     print(where)
+
+
+def _show_in_open3d(request: ViewRequest) -> None:
+    """A result that is over.  Raises PliantError."""
+    if request.web or request.save is not None or request.endpoints:
+        raise ResultError(
+            "--open3d opens a window of a result: without --web, --save and --connect"
+        )
+    if request.source is None:
+        raise ResultError("nothing to view: give a result or a recording")
+    if request.source.is_dir() and running_session(request.source)[0]:
+        raise ResultError(f"{request.source}: the run goes on; --open3d shows results only")
+    check_display("--web or --save FILE.rrd of Rerun")
+    from pliant.api.result import Result
+    from pliant_services.view.open3d_window import show
+
+    show(Result(request.source))
 
 
 def _show(request: ViewRequest, where: Where) -> None:
@@ -261,12 +282,15 @@ def place(*, web: bool, save: Path | None, force: bool) -> Where:
         return save
     if web:
         return "web"
-    if (
-        not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-        and sys.platform == "linux"
-    ):
-        raise ResultError("there is no display here: use --web, or --save FILE.rrd")
+    check_display("--web, or --save FILE.rrd")
     return "window"
+
+
+def check_display(instead: str) -> None:
+    """Raise ResultError where no window can be seen."""
+    has_one = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if sys.platform == "linux" and not has_one:
+        raise ResultError(f"there is no display here: use {instead}")
 
 
 def _stay() -> None:
