@@ -27,10 +27,11 @@ from pliant.algorithms.image.fields import is_combed
 from pliant.datasets import notes_on, open_source
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.mp4_boxes import video_streams
-from pliant.datasets.packet_decoder import decodes
+from pliant.datasets.packet_decoder import decodes, parameter_sets
 from pliant.datasets.rectifier import Rectifier, decode
+from pliant.datasets.video import shown_frames
 from pliant.datasets.video_decoder import opened
-from pliant.datasets.video_streams import Patch, PatchedFile, choose, streams_of
+from pliant.datasets.video_streams import Patch, PatchedFile, VideoStream, choose, streams_of
 from pliant.errors import DatasetError
 
 FRAMES = 10
@@ -148,6 +149,45 @@ def test_interlaced_video_is_read_by_one_field(tmp_path: Path) -> None:
     dataset = open_source(str(tmp_path / "tape.avi"), fov_deg=60.0, longest_side_px=720)
     assert notes_on(dataset)[0].startswith("interlaced: one field of each frame")
     assert_film(list(dataset), shown[:-1])
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_frames_of_matroska_are_counted(tmp_path: Path, live: bool) -> None:
+    """A screen recorder writes one where something moves, and a live one no lengths."""
+    write_video(tmp_path / "part.webm", moving(6), "VP80")
+    made, times = packets_of(tmp_path / "part.webm"), (0, 20, 40, 1000, 1020, 9000)
+    packets = [(ms, data) for ms, (_, data) in zip(times, made, strict=True)]
+    content = matroska([("V_VP8", WIDTH, HEIGHT, True, packets)])
+    if live:
+        for kind in (b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75"):
+            parts = content.split(kind)
+            content = kind.join(
+                [parts[0], *(b"\x01" + b"\xff" * 7 + each[8:] for each in parts[1:])]
+            )
+    file = tmp_path / "screen.webm"
+    file.write_bytes(content)
+    dataset = open_source(str(file), fov_deg=60.0)
+    assert dataset.frame_count == 6
+    assert [frame.stamp_ns for frame in dataset] == [ms * 1_000_000 for ms in times]
+
+
+def test_a_cut_may_begin_with_frames_that_hang_on_what_is_gone() -> None:
+    """They are not expected, and a decoder of H.264 is told what stands in the header alone."""
+    times = [0, 40_000_000, 80_000_000, 120_000_000]
+    stream = VideoStream(width=1, height=1, stamps_ns=times, origin_ns=80_000_000)
+    assert shown_frames(stream, 4, 0) == 2
+    assert shown_frames(stream, 4, -80_000_000) == 4
+
+    class Cut:
+        def get(self, property_id: int) -> float:
+            return int.from_bytes(b"h264", "little") if property_id == cv2.CAP_PROP_FOURCC else 1
+
+        def retrieve(self, image: None, index: int) -> tuple[bool, np.ndarray]:
+            sets = b"\1\2\3\4\xff\xe1\0\3abc\1\0\2de"
+            return True, np.frombuffer(sets, np.uint8).reshape(1, -1)
+
+    found = parameter_sets(Cut())  # type: ignore[arg-type]
+    assert found.tobytes() == b"\0\0\0\1abc\0\0\0\1de"
 
 
 def test_two_fields_in_a_file_that_says_nothing_of_it(tmp_path: Path) -> None:

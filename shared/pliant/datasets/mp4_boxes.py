@@ -59,7 +59,8 @@ def video_streams(file: BinaryIO, size: int) -> Container:
         if inside.all() or not inside.any():  # what would show nothing is none to follow
             shown = ()
         hide = [Patch(track.box.at + 4, _FREE)]
-        hide += _parts_in_fragments(file, size, track.number) if fragments else []
+        parts = list(_parts_in_fragments(file, size, track.number)) if fragments else []
+        hide += [Patch(part.at + 4, _FREE) for part in parts]
         width, height = track.size()
         streams.append(
             VideoStream(
@@ -67,7 +68,9 @@ def video_streams(file: BinaryIO, size: int) -> Container:
                 height=height,
                 is_default=track.is_enabled(),
                 is_still=track.number in chapters or track.samples() == 1,
-                stamps_ns=times.tolist(),
+                frames=track.samples() + sum(_samples_of(file, part) for part in parts),
+                stamps_ns=np.sort(times).tolist(),
+                origin_ns=int(times[0]) if len(times) else 0,
                 shown_ns=shown,
                 may_change=not track.keeps_size(),
                 hide=tuple(hide),
@@ -123,7 +126,7 @@ class _Track:
         return 0
 
     def stamps_ns(self) -> I64:
-        """When its samples are shown, sorted; media time."""
+        """When its samples are shown, in the order of decoding; media time."""
         scale = _time_scale(self._file, self.boxes(b"mdia")[0], b"mdhd")
         steps = self._runs(b"stts")
         count = min(self.samples(), sum(max(0, each) for each, _ in steps.tolist()))
@@ -134,7 +137,6 @@ class _Track:
         later = self._runs(b"ctts")
         if int(np.maximum(later[:, 0], 0).sum()) >= count:
             ticks = ticks + np.repeat(later[:, 1], np.maximum(later[:, 0], 0))[:count]
-        ticks = np.sort(ticks)
         return ticks // scale * _NS + ticks % scale * _NS // scale
 
     def shown_ns(self, movie_scale: int) -> tuple[tuple[int, int], ...]:
@@ -194,13 +196,18 @@ def _covers(file: BinaryIO, moov: _Box) -> Iterator[Patch]:
                         yield Patch(cover.at + 4, _FREE)
 
 
-def _parts_in_fragments(file: BinaryIO, size: int, number: int) -> Iterator[Patch]:
-    """What hides a track in the fragments."""
+def _parts_in_fragments(file: BinaryIO, size: int, number: int) -> Iterator[_Box]:
+    """The boxes of a track in the fragments."""
     for moof in _boxes(file, 0, size, b"moof"):
         for part in _boxes(file, moof.start, moof.end, b"traf"):
             header = next(_boxes(file, part.start, part.end, b"tfhd"), None)
             if header is not None and int.from_bytes(_read(file, header, 8)[4:8]) == number:
-                yield Patch(part.at + 4, _FREE)
+                yield part
+
+
+def _samples_of(file: BinaryIO, part: _Box) -> int:
+    runs = _boxes(file, part.start, part.end, b"trun")
+    return sum(int.from_bytes(_read(file, run, 8)[4:8]) for run in runs)
 
 
 def _boxes(file: BinaryIO, start: int, end: int, kind: bytes = b"") -> Iterator[_Box]:

@@ -13,7 +13,7 @@ import ctypes as c
 import weakref
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import cv2
 import numpy as np
@@ -86,6 +86,12 @@ _CALLS: dict[str, tuple[str, Any, list[Any]]] = {
 }
 
 
+class Reader(Protocol):
+    """What tells properties as ``cv2.VideoCapture`` does."""
+
+    def get(self, property_id: int, /) -> float: ...
+
+
 class PacketDecoder:
     """A ``cv2.VideoCapture`` in raw mode and a decoder: reads as a ``cv2.VideoCapture`` does.
 
@@ -109,6 +115,7 @@ class PacketDecoder:
         calls["av_opt_set_int"](self._scaler, b"sws_flags", _BICUBIC, 0)
         self._frame = _Frame.from_address(self._picture)
         self._after_ns = 0
+        self._head = parameter_sets(packets)
         if not codec or calls["avcodec_open2"](self._context, codec, None) < 0:
             raise LookupError("its decoder")
 
@@ -189,7 +196,8 @@ class PacketDecoder:
 
     def _send(self, data: U8) -> bool:
         """Hand a packet to the decoder; its time is in ns."""
-        calls, data = self._calls, data.reshape(-1)
+        calls, data = self._calls, np.concatenate((self._head, data.reshape(-1)))
+        self._head = self._head[:0]
         if calls["av_new_packet"](self._packet, data.size) < 0:
             return False
         packet = _Packet.from_address(self._packet)
@@ -200,13 +208,30 @@ class PacketDecoder:
         return sent >= 0
 
 
-def codec_of(capture: cv2.VideoCapture) -> str:
+def codec_of(capture: Reader) -> str:
     """What OpenCV calls the codec of a stream."""
     return (
         int(capture.get(cv2.CAP_PROP_FOURCC))
         .to_bytes(8, "little", signed=True)[:4]
         .decode("latin-1")
     )
+
+
+def parameter_sets(packets: cv2.VideoCapture) -> U8:
+    """What a decoder of H.264 has to know before a first packet that is no IDR picture, as a clip
+    has that was cut from another: OpenCV puts it before IDR pictures alone."""
+    index = int(packets.get(cv2.CAP_PROP_CODEC_EXTRADATA_INDEX))
+    head = cast(U8 | None, packets.retrieve(None, index)[1])
+    data = head.tobytes() if head is not None else b""
+    if codec_of(packets) != "h264" or data[:1] != b"\1":  # no avcC of ISO/IEC 14496-15
+        return np.zeros(0, np.uint8)
+    units, at = b"", 5
+    for mask in (0x1F, 0xFF):  # sequence parameter sets, picture parameter sets
+        count, at = data[at] & mask if at < len(data) else 0, at + 1
+        for _ in range(count):
+            end = at + 2 + int.from_bytes(data[at : at + 2])
+            units, at = units + b"\0\0\0\1" + data[at + 2 : end], end
+    return np.frombuffer(units, np.uint8)
 
 
 def decodes(codec: str) -> bool:

@@ -42,9 +42,13 @@ class VideoFile:
         self.file = file
         self._version = file_version(file)
         with opened(file) as decoder:
-            first = decoder.read()
+            first = next(filter(_is_there, (decoder.read() for _ in range(GIVE_UP))), None)
             if first is None:
-                raise DatasetError(f"{file}: a video without frames")
+                raise DatasetError(
+                    f"{file}: OpenCV decodes none of its frames ({decoder.codec}): convert it, "
+                    "e.g. to H.264"
+                )
+            first_ns = decoder.stamp_ns
             for _ in range(_LOOKED_AT):
                 if decoder.combed or decoder.read() is None:
                     break
@@ -52,7 +56,7 @@ class VideoFile:
             self.notes += [FIELDS] if decoder.combed else []
             aspect = decoder.aspect
             self._count = decoder.count
-            self.frame_count = _shown(decoder.stream, decoder.count)
+            self.frame_count = shown_frames(decoder.stream, decoder.count, first_ns)
         height, width = first.shape[:2]
         self.calibration: Calibration = choose_calibration(
             options,
@@ -119,18 +123,24 @@ class VideoFile:
             index, previous_ns = index + 1, stamp_ns
 
 
-def _shown(stream: VideoStream | None, count: int | None) -> int | None:
-    """How many frames come."""
-    if stream is None or not stream.shown_ns:
+def _is_there(pixels: U8 | None) -> bool:
+    return pixels is not None
+
+
+def shown_frames(stream: VideoStream | None, count: int | None, first_ns: int) -> int | None:
+    """How many frames come; first_ns: when the first that decodes does.  Those before it hang on
+    frames that a cut has taken away."""
+    if stream is None or not stream.stamps_ns:
         return count
-    return sum(map(stream.shows, stream.stamps_ns))
+    first_ns += stream.origin_ns - _ROUNDED_NS
+    return sum(stream.shows(each) for each in stream.stamps_ns if each >= first_ns)
 
 
 def _is_shown(stream: VideoStream | None, stamp_ns: int) -> bool:
     """Whether the edit list shows a frame, by its time after the first one of all."""
     if stream is None or not stream.shown_ns:
         return True
-    return stream.shows(stamp_ns + stream.stamps_ns[0] + _ROUNDED_NS)
+    return stream.shows(stamp_ns + stream.origin_ns + _ROUNDED_NS)
 
 
 def raw_frame(pixels: U8, index: int, stamp_ns: int) -> SourceFrame:

@@ -45,7 +45,7 @@ class VideoDecoder:
     stream: what the container says of it.     notes: what is done to it, for people.
     rate_hz: frames a second, or a usual rate where the container says nothing likely.
     count: how many pictures it has, by the word of the container; None: that says nothing likely.
-    aspect: width over height of its pixels.
+    aspect: width over height of its pixels.     codec: as OpenCV calls it.
     combed: whether a picture that was read had two fields, though the stream is none of these.
     """
 
@@ -58,11 +58,13 @@ class VideoDecoder:
         self.stream = chosen.stream
         self.notes = tuple(notes)
         self.aspect = aspect
+        self.codec = codec_of(capture)
         stated = capture.get(cv2.CAP_PROP_FPS)
         likely = 0.1 < stated < 1e4
         self.rate_hz = stated if likely else _DEFAULT_FPS
+        known = chosen.stream.frames if chosen.stream is not None else None
         count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if likely else 0
-        self.count = count if count > 0 else None
+        self.count = known or (count if count > 0 else None)
 
     @property
     def stamp_ns(self) -> int:
@@ -116,8 +118,8 @@ def opened(file: Path) -> Generator[VideoDecoder, None, None]:
         aspect = _aspect(capture, rotation)
         special = _special(_packets(file, chosen, capture, held))
         notes += special
-        may_change = chosen.stream is None or chosen.stream.may_change
-        packets = _packets(file, chosen, capture, held) if special or may_change else None
+        wanted = special or chosen.may_change
+        packets = _packets(file, chosen, capture, held) if wanted else None
         decoder = capture if packets is None else PacketDecoder(packets, rotation)
         yield VideoDecoder(cast(Capture, decoder), chosen, aspect, notes)
 

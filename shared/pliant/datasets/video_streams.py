@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+_AVI = b"RIFF"
+"""AVI has one size for all its frames, and no times of them but their order of decoding."""
+
 
 @dataclass(frozen=True)
 class Patch:
@@ -27,7 +30,9 @@ class VideoStream:
     width, height: of the stored images, pixels.
     is_default: not marked as one to be passed over.
     is_still: a cover picture or thumbnails, no film.
+    frames: how many it has; None where its headers do not say.
     stamps_ns: when frames are shown, sorted, in media time; () where only reading tells.
+    origin_ns: when the first is shown in the order of decoding, from which OpenCV counts.
     shown_ns: intervals of media time that are to be shown; () for all.
     may_change: whether the size of its images may change on the way.
     hide: what makes a reader pass over this stream.
@@ -37,7 +42,9 @@ class VideoStream:
     height: int
     is_default: bool = True
     is_still: bool = False
+    frames: int | None = None
     stamps_ns: Sequence[int] = ()
+    origin_ns: int = 0
     shown_ns: tuple[tuple[int, int], ...] = ()
     may_change: bool = True
     hide: tuple[Patch, ...] = ()
@@ -50,10 +57,14 @@ class VideoStream:
 
 @dataclass(frozen=True, kw_only=True)
 class Container:
-    """The video streams in the order of the file.  patches: needed whichever stream is read."""
+    """The video streams in the order of the file, none where it is not understood.
+
+    patches: needed whichever stream is read.     may_change: as of a stream that is not listed.
+    """
 
     streams: tuple[VideoStream, ...] = ()
     patches: tuple[Patch, ...] = ()
+    may_change: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +73,7 @@ class ChosenStream:
 
     stream: VideoStream | None = None
     patches: tuple[Patch, ...] = ()
+    may_change: bool = True
     note: str = ""
 
 
@@ -69,13 +81,18 @@ def choose(container: Container) -> ChosenStream:
     """The largest film among the streams that are marked as default, or among all."""
     streams = container.streams
     if not streams:
-        return ChosenStream(patches=container.patches)
+        return ChosenStream(patches=container.patches, may_change=container.may_change)
     wanted = [each for each in streams if not each.is_still] or list(streams)
     wanted = [each for each in wanted if each.is_default] or wanted
     chosen = max(wanted, key=lambda each: each.width * each.height)
     others = [each for each in streams if each is not chosen]
     patches = [*container.patches, *(patch for each in others for patch in each.hide)]
-    return ChosenStream(stream=chosen, patches=tuple(patches), note=_note(streams, chosen))
+    return ChosenStream(
+        stream=chosen,
+        patches=tuple(patches),
+        may_change=chosen.may_change,
+        note=_note(streams, chosen),
+    )
 
 
 def _note(streams: Sequence[VideoStream], chosen: VideoStream) -> str:
@@ -101,7 +118,8 @@ def streams_of(file: Path) -> Container:
             source.seek(0)
             if kind.recognises(source.read(kind.MAGIC_BYTES)):
                 return kind.video_streams(source, size)
-    return Container()
+        source.seek(0)
+        return Container(may_change=source.read(len(_AVI)) != _AVI)
 
 
 class PatchedFile(io.BufferedIOBase):
