@@ -24,7 +24,8 @@ E = 1700000000 * S
         (["0.1", "0.13", "0.2"], [0, 1, 2], [S // 10, 13 * S // 100, S // 5]),
         (["0.2", "0.13", "0.1"], [2, 1, 0], [S // 10, 13 * S // 100, S // 5]),
         (["10.5", "9.5"], [1, 0], [95 * S // 10, 105 * S // 10]),
-        (["x.1", "x.13", "x.2"], [0, 1, 2], [S // 10, 13 * S // 100, S // 5]),
+        ([".9", "1.0", ".95"], [0, 2, 1], [9 * S // 10, 95 * S // 100, S]),
+        (["x0.1", "x0.13", "x0.2"], [0, 1, 2], [S // 10, 13 * S // 100, S // 5]),
         (["1305031102.175304", "1305031102.211214"], [0, 1], [A, B]),
         # nano-, micro- and milliseconds, from zero and of a date
         (["1403636579763555584", "1403636579813555456"], [0, 1], [C, D]),
@@ -67,6 +68,12 @@ def test_names_that_are_times(names: list[str], order: list[int], stamps_ns: lis
         ["a", "b", "c"],
         ["IMG_1234", "IMG_1235", "IMG_1240"],
         ["img-1.0", "img-1.00"],  # the same time twice
+        ["frame.0001", "frame.0002", "frame.0003"],
+        ["frame.1", "frame.2", "frame.13"],
+        ["shot1.0001", "shot1.0002", "shot1.0003"],
+        ["v2.01", "v2.02", "v2.03"],
+        ["a1.0001", "a1.0003", "a1.0004"],
+        ["v2.01", "v2.03", "v2.04"],
         ["frame_1", "other_2"],
         ["20240102_123005", "20240102_123005_1"],
         ["20249902_123005", "20249902_123006"],
@@ -113,6 +120,15 @@ def test_a_folder_is_in_the_order_of_its_times_and_says_which_they_are(tmp_path:
     assert [f.name for f in frames] == ["0.1.png", "0.13.png", "0.2.png"]
     assert [f.stamp_ns for f in frames] == [100000000, 130000000, 200000000]
     assert notes_on(source) == ["times: from the file names, in seconds: 14.3 images/s"]
+
+
+def test_times_without_a_leading_zero_are_no_hidden_files(tmp_path: Path) -> None:
+    write(tmp_path, [".9.png", "1.0.png", ".95.png"])
+    (tmp_path / "._1.0.png").write_bytes(b"what macOS leaves")
+    (tmp_path / ".thumb.png").write_bytes(b"hidden")
+    frames = list(open_source(str(tmp_path), fov_deg=60.0))
+    assert [f.name for f in frames] == [".9.png", ".95.png", "1.0.png"]
+    assert [f.stamp_ns for f in frames] == [900000000, 950000000, 1000000000]
 
 
 def test_a_folder_whose_names_tell_no_times_says_what_is_assumed(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from pliant.config import Config, config_yaml, load_config
 from pliant.datasets import check_start, notes_on, open_source
 from pliant.datasets.base import is_builtin
 from pliant.datasets.calibration import Calibration
+from pliant.datasets.calibration_files import file_and_camera
 from pliant.datasets.calibration_formats import UNDERSTOOD
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import CalibrationError, PliantError, ResultError
@@ -76,7 +77,8 @@ def run_pipeline(request: RunRequest) -> int:
     if known is not None:
         read.append(known.path)
     # What the configuration says is taken over before anything goes: it may be of this folder.
-    read += [path for path in (request.mask, request.calibration) if path is not None]
+    read += [request.mask] if request.mask is not None else []
+    read += [file_and_camera(request.calibration)[0]] if request.calibration is not None else []
     keep_apart(output, read)
     if request.save is not None:
         keep_apart(request.save, [*read, *files_read(output)], option="--save")

@@ -38,9 +38,7 @@ def read_calibration(
 
     Raises CalibrationError: one line with the file, what is wrong and what to do.
     """
-    named, camera = _CAMERA.fullmatch(str(file)), ""
-    if named is not None and not file.exists() and Path(named[1]).exists():
-        file, camera = Path(named[1]), named[2]
+    file, camera = file_and_camera(file)
     file = next((file / name for name in NAMES if (file / name).is_file()), file)
     text = _read(file)
     wanted = Wanted(image_size=image_size, kitti_camera=kitti_camera, camera=camera, source=source)
@@ -50,6 +48,14 @@ def read_calibration(
         raise CalibrationError(f"{file}: {error}") from None
     check_size(calibration, image_size, str(file))
     return calibration
+
+
+def file_and_camera(file: Path) -> tuple[Path, str]:
+    """Of ``FILE:cam1`` the file, and the camera that is named; "" where none is."""
+    named = _CAMERA.fullmatch(str(file))
+    if named is None or file.exists() or not Path(named[1]).exists():
+        return file, ""
+    return Path(named[1]), named[2]
 
 
 def calibration_from_camera_info(content: Keys) -> Calibration:

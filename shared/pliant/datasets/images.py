@@ -19,6 +19,8 @@ SUFFIXES = (
     *(".pnm", ".jp2"),
 )
 _TRIED_FOR_SIZE = 20
+_HIDDEN = re.compile(r"\.(?![0-9]+\.[A-Za-z]+$)")
+"""Names of hidden files; .25.png is a time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +190,7 @@ def image_files(folder: Path) -> list[Path]:
         paths = [
             path
             for path in folder.iterdir()
-            if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+            if path.suffix.lower() in SUFFIXES and not _HIDDEN.match(path.name) and path.is_file()
         ]
     except OSError as error:
         raise DatasetError(f"{folder}: cannot be read: {error.strerror}") from None

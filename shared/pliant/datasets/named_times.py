@@ -17,12 +17,12 @@ from decimal import Decimal
 
 from pliant.datasets.times import UNITS, is_date, likely_unit, median_step, steps_between
 
-_NUMBER = re.compile(r"(?<![0-9.])(?:[0-9]+(?:\.[0-9]+)?|\.[0-9]+)")
+_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?|^\.[0-9]+")
 _DATE = re.compile(
     r"(?<![0-9])((?:19|20)[0-9]{2})[-_.]?([01][0-9])[-_.]?([0-3][0-9])[T_ -]*"
     r"([0-2][0-9])[-_.:hH]?([0-5][0-9])[-_.:mM]?([0-5][0-9])(?:[-_.,]?([0-9]{3,9}))?(?![0-9])"
 )
-_LONGEST_STEP_S, _SHORTEST_STEP_S = 600.0, 1e-4
+_LONGEST_STEP_S, _SHORTEST_STEP_S = 600.0, 5e-4
 _FRAME_STEP = 1000
 """Whole numbers with smaller steps may be those of frames, of which every n-th is there."""
 _LEAST_STEP = 4
@@ -64,11 +64,21 @@ def _times_in(column: Sequence[str]) -> NamedTimes | None:
     unit = likely_unit(values, "seconds" if has_points else "")
     step = median_step(values)
     seconds = step * UNITS[unit] / 1e9
+    if has_points and _is_counter(column):
+        return None
     if not _SHORTEST_STEP_S <= seconds <= _LONGEST_STEP_S:
         return None
     if not (has_points or is_date(values, unit) or step >= _FRAME_STEP or _uneven(values, step)):
         return None
     return _in_order([round(value * UNITS[unit]) for value in values], unit)
+
+
+def _is_counter(column: Sequence[str]) -> bool:
+    """Whether numbers with points are a constant and a counter, as in shot1.0001, shot1.0002."""
+    parts = [text.partition(".") for text in column]
+    if len({whole for whole, _, _ in parts}) > 1 or len({len(count) for _, _, count in parts}) > 1:
+        return False
+    return median_step([Decimal(count or "0") for _, _, count in parts]) < _LEAST_STEP
 
 
 def _uneven(values: Sequence[Decimal], step: float) -> bool:
