@@ -1,6 +1,8 @@
 """One wrong time costs one frame, and every frame that did not come is counted."""
 
+import base64
 import itertools
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import recorded_messages as bags
-from recorded_messages import START_NS, STEP_NS, Ros
+from recorded_messages import HEIGHT, START_NS, STEP_NS, WIDTH, Ros
 
 from pliant.datasets import notes_on, open_source
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.frame_times import in_order, increasing
 from pliant.datasets.rectifier import decode
-from pliant.errors import DatasetError
+from pliant.errors import CalibrationError, DatasetError
 from pliant.results.judgement import BAD, DOUBTFUL, GOOD, judge
 
 COUNT = 40
@@ -204,3 +206,54 @@ def test_a_verdict_speaks_of_all_frames_of_the_source() -> None:
     assert both[0] == DOUBTFUL
     ended = judge(frames=60, in_segments=[60], doubtful=0, failed=True)
     assert ended == (DOUBTFUL, "the source ended early")
+
+
+def write_json(path: Path, messages: list[dict[str, Any]], calibration: dict[str, Any]) -> None:
+    """An MCAP file of Foxglove's types as JSON, with whatever fields."""
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="test")
+        for topic, name, contents in (
+            ("/image", "RawImage", messages),
+            ("/calib", "CameraCalibration", [calibration]),
+        ):
+            schema = writer.register_schema(f"foxglove.{name}", "jsonschema", b"{}")
+            channel = writer.register_channel(topic, "json", schema)
+            for i, content in enumerate(contents):
+                time_ns = START_NS + i * STEP_NS
+                writer.add_message(channel, time_ns, json.dumps(content).encode(), time_ns)
+        writer.finish()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"timestamp": None}, {"timestamp": "soon"}, {"timestamp": {"sec": "x"}},
+        {"timestamp": {"sec": 10**12}}, {"timestamp": {"sec": -5}}, {"width": None},
+        {"width": "wide"}, {"height": 10**30}, {"data": 3}, {"data": "*"}, {"encoding": ["rgb8"]},
+        {"encoding": "z" * 10**6}, {"step": {}}, {"timestamp": {}},
+    ],
+)  # fmt: skip
+def test_json_with_odd_fields_costs_one_frame(changed: dict[str, Any], tmp_path: Path) -> None:
+    data = base64.b64encode(bags.picture(0).tobytes()).decode()
+    messages: list[dict[str, Any]] = []
+    for i in range(COUNT):
+        stamp = {"sec": (START_NS + i * STEP_NS) // 10**9, "nsec": i * STEP_NS % 10**9}
+        content = {"width": WIDTH, "height": HEIGHT, "encoding": "rgb8", "step": WIDTH * 3}
+        messages.append({**content, "timestamp": stamp, "data": data})
+    messages[4] = {k: v for k, v in {**messages[4], **changed}.items() if v is not None}
+    write_json(tmp_path / "a.mcap", messages, {})
+    came = list(open_source(str(tmp_path / "a.mcap"), fov_deg=70.0))
+    assert [f.index for f in came] == list(range(COUNT))
+    broken: dict[int, str] = {}
+    for each in came:
+        try:
+            decode(each)
+        except BrokenFrame as error:
+            broken[each.index] = str(error)
+    assert all(len(why) < 1000 for why in broken.values())
+    assert [*broken] == ([] if changed == {"timestamp": {}} else [4])
+    with pytest.raises(CalibrationError, match="the calibration in /calib"):
+        open_source(str(tmp_path / "a.mcap"))

@@ -15,6 +15,8 @@ _AHEAD = 16
 _AHEAD_BYTES = 1 << 26
 """So many frames, or so many bytes of them but at least three frames, are looked at ahead."""
 _LEAST_AHEAD = 3
+_MOST_NS = 1 << 62
+"""Later ones are none: year 2116."""
 
 
 def increasing(stamps_ns: Sequence[int]) -> list[int]:
@@ -73,7 +75,7 @@ def _marked(frames: Iterable[SourceFrame], *, ahead: bool) -> Iterator[tuple[Sou
     last_ns, size = -1, 0
 
     def first() -> tuple[SourceFrame, bool]:
-        later = [i for i, f in enumerate(window) if f.data and f.stamp_ns > last_ns]
+        later = [i for i, f in enumerate(window) if f.data and last_ns < f.stamp_ns < _MOST_NS]
         kept = increasing([window[i].stamp_ns for i in later])
         return window.popleft(), bool(kept) and later[kept[0]] == 0
 

@@ -16,7 +16,7 @@ from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_files import calibration_from_camera_info
 from pliant.datasets.raw_pixels import OTHER_NAMES, RAW_BYTES, is_deep, raw_rows
 from pliant.errors import CalibrationError
-from pliant.wording import shown
+from pliant.wording import shortened, shown
 
 IMAGE_TYPES = (
     "sensor_msgs/Image",
@@ -68,6 +68,18 @@ def source_frame(kind: str, image: RecordedImage, index: int) -> SourceFrame:
     """
     if image.fault:
         raise BrokenFrame(image.fault)
+    try:
+        return _frame_of(kind, image, index)
+    except FOREIGN as error:  # JSON may have anything
+        said = shortened(" ".join(str(error).split())) or type(error).__name__
+        raise BrokenFrame(f"its message is no {kind} ({said})") from None
+
+
+FOREIGN = (AttributeError, TypeError, ValueError, OverflowError, KeyError)
+"""What reading fields raises that are not there, or not what they should be."""
+
+
+def _frame_of(kind: str, image: RecordedImage, index: int) -> SourceFrame:
     message, stamp_ns = image.message, capture_time(image)
     if kind not in _RAW_TYPES:
         data = bytes(message.data)

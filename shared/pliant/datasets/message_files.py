@@ -190,9 +190,10 @@ def _calibration(opened: OpenMessages, images: MessageTopic, where: str) -> Cali
     rectified = any("rect" in part for part in images.name.split("/"))
     try:
         return image_messages.calibration(message.message, rectified=rectified)
-    except CalibrationError as error:
+    except (CalibrationError, *image_messages.FOREIGN) as error:
         raise CalibrationError(
-            f"{where}: the calibration in {able[0].name}: {error}; give --calibration FILE"
+            f"{where}: the calibration in {able[0].name}: {shortened(str(error), 200)}; give "
+            "--calibration FILE"
         ) from None
 
 
