@@ -1,7 +1,11 @@
 """Where the services of a run meet: a socket of its user, or a port."""
 
+import subprocess
+import sys
 import tempfile
 import threading
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
@@ -31,6 +35,43 @@ def test_a_run_of_one_machine_meets_at_a_socket_of_its_user(tmp_path, monkeypatc
     assert not local.note
     assert meets(local)
     assert not list(tmp_path.iterdir())
+
+
+_ROUTER = """
+import sys, tempfile
+tempfile.tempdir = sys.argv[1]
+from pliant.bus.session import LocalRouter
+local = LocalRouter()
+print(local.endpoint, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_what_routers_that_were_killed_have_left_goes(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / "pliant-results").mkdir()
+    (tmp_path / "pliant-results" / "bus").touch()
+    folders: list[Path] = []
+    with ExitStack() as running:
+        for _ in range(2):
+            process = running.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-c", _ROUTER, str(tmp_path)],
+                    stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+                )
+            )  # fmt: skip
+            running.callback(process.kill)
+            assert process.stdout is not None
+            endpoint = process.stdout.readline().strip()
+            folders.append(Path(endpoint.partition("/")[2]).parent)
+            if len(folders) == 1:
+                process.kill()
+                process.wait()
+        assert [folder.exists() for folder in folders] == [False, True]
+        local = LocalRouter()
+        assert folders[1].exists()
+        assert meets(local)
+    assert (tmp_path / "pliant-results" / "bus").exists()
 
 
 @pytest.mark.parametrize("why", ["too long", "No such file", "is the port in use"])

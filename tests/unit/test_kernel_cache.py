@@ -253,3 +253,13 @@ def _functions(elf: bytes) -> Iterator[tuple[str, str]]:
                 elf[start : elf.index(b"\0", start)].decode(),
                 {0: "local", 1: "global", 2: "weak"}[info >> 4],
             )
+
+
+def test_kernels_without_assertions_are_others() -> None:
+    """What is compiled for one of them is not there for the other."""
+    code = "from pliant_services.runtime.kernels import _fingerprint; print(_fingerprint())"
+    plain, optimised = (
+        subprocess.run([sys.executable, *flags, "-c", code], capture_output=True, check=True).stdout
+        for flags in ((), ("-OO",))
+    )
+    assert plain != optimised

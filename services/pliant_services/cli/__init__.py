@@ -6,6 +6,8 @@ import io
 import os
 import signal
 import sys
+import threading
+import traceback
 from contextlib import suppress
 from typing import Annotated, Any, cast
 
@@ -13,7 +15,7 @@ import typer
 
 from pliant import __version__
 from pliant.errors import PliantError, SourceLostError
-from pliant.exit_codes import FAILED, INCOMPLETE, INTERRUPTED, USAGE
+from pliant.exit_codes import DONE, FAILED, INCOMPLETE, INTERRUPTED, USAGE
 from pliant.wording import shortened
 from pliant_services.cli.groups import GroupedCommands
 from pliant_services.runtime.interruptions import deliver_swallowed_interruptions
@@ -53,6 +55,12 @@ def options(
 
 
 _INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_LACKING = {
+    errno.EMFILE: "too many open files for this shell's limit: ulimit -n 1024",
+    errno.ENFILE: "too many open files on this machine: close other programs",
+    errno.ENOMEM: "the memory does not suffice: close other programs, or lift ulimit -v",
+}
+"""What the system refuses, by its error, and what to do."""
 # Typer carries its own copy of click, or uses click itself, depending on its version.
 _UsageError: type[typer.BadParameter] = next(
     cast(Any, c) for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException"
@@ -72,8 +80,26 @@ def main(application: typer.Typer | None = None) -> None:
         run_and_exit(application or app)
     except KeyboardInterrupt:  # one more, just before it was ignored
         os._exit(INTERRUPTED)
+    except BaseException as error:
+        others = [each for each in threading.enumerate() if each is not threading.main_thread()]
+        if all(each.daemon for each in others):
+            raise
+        _leave_at_once(error)  # the interpreter would wait for threads that a failure left behind
     finally:
         _take_no_more()
+
+
+def _leave_at_once(error: BaseException) -> None:
+    """End with the exit code of an error, or with its traceback."""
+    code = FAILED
+    if isinstance(error, SystemExit) and isinstance(error.code, int | None):
+        code = error.code or DONE
+    elif not isinstance(error, SystemExit):
+        traceback.print_exception(error)
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
 
 
 def run_and_exit(application: typer.Typer) -> None:
@@ -94,6 +120,10 @@ def run_and_exit(application: typer.Typer) -> None:
 
 def _run(application: typer.Typer) -> int:
     try:
+        os.getcwd()
+    except OSError as error:
+        return _say(f"this shell's folder cannot be entered any more ({error.strerror}): cd to one")
+    try:
         importlib.import_module("pliant_services.cli.commands")  # registers them
         code = application(standalone_mode=False)
     except PliantError as error:
@@ -110,7 +140,15 @@ def _run(application: typer.Typer) -> int:
         code = INTERRUPTED
     except SystemExit as end:  # of a signal
         return end.code if isinstance(end.code, int) else FAILED
+    except MemoryError:
+        return _say(_LACKING[errno.ENOMEM])
+    except RuntimeError as error:
+        if str(error) != "can't start new thread":
+            raise
+        return _say(f"{error}: close other programs, or lift ulimit -u and ulimit -v")
     except OSError as error:
+        if error.errno in _LACKING:
+            return _say(_LACKING[error.errno])
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         where = f"{error.filename}" if error.filename else "the output"

@@ -57,6 +57,7 @@ from pliant_services.run.spectators import Viewer, check_viewer, has_viewer
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.announced import announced
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
+from pliant_services.runtime.limits import check_limits
 
 _DEFORMABLE = "deformable"
 _WRITTEN_AGAIN = "the run had come to its end already: its results are written again"
@@ -67,6 +68,7 @@ def run_pipeline(request: RunRequest) -> int:
 
     Everything is checked before an earlier result is touched.
     """
+    check_limits()
     output = request.output or Path("results") / folder_name(request.source)
     source = Path(request.source)
     read = [source, *parts.parts_of(source)] if os.path.exists(request.source) else []
@@ -303,11 +305,17 @@ def _finish(
     from pliant.results.verdict import grade, summary
     from pliant.results.write import write_results
 
+    again = f"pliant run ... --output {output} --resume writes them"
     try:
         report = write_results(output)
-    except PliantError:
+    except KeyboardInterrupt:
+        print(f"the results are not written: {again}", file=sys.stderr, flush=True)
+        raise
+    except PliantError as error:
         if failure is not None:  # it came first, and says why this one followed
             raise failure from None
+        if isinstance(error, ResultError):
+            raise ResultError(f"{error}: {again}") from None
         raise
     with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
         files = ", ".join(files_of(output, report))

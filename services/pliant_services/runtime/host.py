@@ -23,6 +23,7 @@ from pliant.config import Config
 from pliant.errors import SourceLostError
 from pliant.messages import topics
 from pliant_services import processes
+from pliant_services.runtime.limits import check_limits
 from pliant_services.runtime.monitor import StatusMonitor
 
 _GRACE_S = 3.0
@@ -64,6 +65,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
     Raises SourceLostError, after everything before has been sent, for a source that failed.
     """
     process = processes.BY_NAME[name]
+    check_limits()
     _keep_freed_memory()
     module = importlib.import_module(process.module)
     arguments = dict(options.arguments)

@@ -70,6 +70,7 @@ def _fingerprint() -> str:
     root, nodes = Path(pliant.__file__).parent, Path(__file__).parents[1] / "nodes"
     for path in (*sorted(root.rglob("*.py")), *sorted(nodes.glob("*.py"))):
         digest.update(f"{path} {path.stat().st_mtime_ns}".encode())
-    where = f"{root} {os.environ.get('NUMBA_CACHE_DIR', '')}"
+    # Without assertions and docstrings kernels have other bytes, and are compiled once more.
+    where = f"{root} {os.environ.get('NUMBA_CACHE_DIR', '')} {sys.flags.optimize}"
     digest.update(f"{where} {sys.version} {version('numba')} {arithmetic.target()}".encode())
     return digest.hexdigest()[:24]

@@ -1,11 +1,14 @@
 """Zenoh sessions as Pliant uses them: explicit endpoints, nothing found by scouting."""
 
+import fcntl
 import json
 import os
 import shutil
 import socket
+import stat
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
@@ -20,6 +23,7 @@ CONNECT_TIMEOUT_S = 7.0  # with the start of Python, a user waits ten seconds at
 _PATIENCE_MS = 60_000  # Zenoh's defaults lose messages after a stall of 5 to 10 s (its second line)
 _LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103
 _SOCKET = "unixsock-stream"
+_FOLDER, _BUS = "pliant-", "bus"
 _NO_SOCKET = "no Unix socket could be had: every user of this machine can reach the services"
 _MAX_BYTES = max(topic.max_bytes for topic in TOPICS) + (1 << 20)
 """Whoever announces more than our largest topic takes is cut off, before memory is taken for it."""
@@ -156,13 +160,44 @@ class LocalRouter:
                 shutil.rmtree(self._folder, ignore_errors=True)
 
 
+def _clear_left(temporary: Path) -> None:
+    """Remove the folders of routers that were killed: nobody holds their locks, or listens."""
+    for folder in temporary.glob(f"{_FOLDER}*"):
+        with suppress(OSError):
+            names = {path.name for path in folder.iterdir()}
+            found = folder.lstat()
+            ours = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
+            if not ours or names != {_BUS, f"{_BUS}.lock"}:
+                continue
+            flags = os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC
+            lock = os.open(folder / f"{_BUS}.lock", flags)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if not _listens(folder / _BUS):
+                    shutil.rmtree(folder)
+            finally:
+                os.close(lock)
+
+
+def _listens(path: Path) -> bool:
+    """Whether somebody does at a Unix socket.  Raises OSError where that cannot be told."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            return False
+    return True
+
+
 def _socket_folder() -> tuple[str, str, str]:
     """A new folder that only its owner may enter, the endpoint in it, and why there is none."""
     try:
-        folder = tempfile.mkdtemp(prefix="pliant-")
+        _clear_left(Path(tempfile.gettempdir()))
+        folder = tempfile.mkdtemp(prefix=_FOLDER)
     except OSError as error:
         return "", free_endpoint(), f"{_NO_SOCKET} ({error.strerror})"
-    path = f"{folder}/bus"
+    path = f"{folder}/{_BUS}"
     if len(os.fsencode(path)) > _LONGEST_SOCKET:
         os.rmdir(folder)
         return "", free_endpoint(), f"{_NO_SOCKET} ({path} is too long: set TMPDIR)"
