@@ -1,11 +1,12 @@
 """Poisson reconstruction by Open3D, for comparison with our own meshes."""
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32
+from pliant.open3d_geometry import to_cloud
+from pliant.open3d_library import load_open3d
 
 NEIGHBOURS = 16
 DEPTH = 8
@@ -16,11 +17,10 @@ CUT = 0.05
 def poisson_mesh(points_world: F64, p_world_camera: F64) -> tuple[F32, F32, I32]:
     """Vertices, normals and triangles through points, normals towards the cameras that saw them.
 
-    points_world, p_world_camera: (N, 3).  On Debian and Ubuntu Open3D needs libegl1, libgl1,
-    libx11-6 and libusb-1.0-0.
+    points_world, p_world_camera: (N, 3).
     """
-    open3d: Any = import_module("open3d")  # it takes 1-3 s
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points_world))
+    open3d: Any = load_open3d()
+    cloud = to_cloud(points_world, None)
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
     normals = np.asarray(cloud.normals)
     away = (normals * (points_world - p_world_camera)).sum(axis=1) > 0.0

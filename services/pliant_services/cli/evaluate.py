@@ -36,6 +36,10 @@ def evaluate(
     mesh: Annotated[
         bool, typer.Option("--mesh", help="The mesh against true depth maps at the keyframes.")
     ] = False,
+    scan: Annotated[
+        Path | None,
+        typer.Option(help="The mesh against a scan in the world of the true poses (PLY)."),
+    ] = None,
     surfels: Annotated[
         bool,
         typer.Option("--surfels", help="Surfels against the source's depth, or exact surfaces."),
@@ -51,6 +55,8 @@ def evaluate(
     """Compare a result with the truth: ATE under Sim(3), RPE, success rate, final and causal.
 
     pliant eval results/room --groundtruth built-in:room --tracks --map --mesh
+
+    pliant eval results/hall --groundtruth hall/groundtruth.txt --scan hall/laser.ply
 
     pliant eval results/cloth --groundtruth path/to/cloth --surfels
 
@@ -69,6 +75,7 @@ def evaluate(
         tracks=tracks,
         points=points,
         mesh=mesh,
+        scan=scan,
         surfels=surfels,
         plot=plot,
         json=json,

@@ -38,6 +38,7 @@ class EvaluationRequest:
     surfels: bool
     plot: Path | None
     json: Path | None
+    scan: Path | None = None
     offset: str = ""
     force: bool = False
 
@@ -49,6 +50,10 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         raise ResultError(f"{missing[0]}: no such result")
     check_free(*request.results, elsewhere=False)
     _check_outputs(request)
+    if request.scan is not None and (request.surfels or len(request.results) > 1):
+        raise ResultError(
+            "--scan is for the mesh of one result: leave out the others, or --surfels"
+        )
     if request.offset and (request.surfels or request.tracks or request.points or request.mesh):
         raise ResultError("--offset is for poses: leave it, or --tracks, --map, --mesh, --surfels")
     if request.surfels:
@@ -88,6 +93,11 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         from pliant.evaluation.recorded_mesh import mesh_against_truth
 
         yield from mesh_against_truth(request.results[0], truth, evaluations[0], figures)
+    if request.scan is not None:
+        from pliant.evaluation.mesh_scan import mesh_against_scan
+
+        alignment = evaluations[0].final.alignment
+        yield from mesh_against_scan(request.results[0], request.scan, alignment, figures)
     if request.json is not None:
         write_json(request.json, figures)
 
@@ -130,6 +140,7 @@ def _check_outputs(request: EvaluationRequest) -> None:
     truth = Path(request.groundtruth)
     read = [truth, *(file for each in request.results for file in [each, *files_read(each)])]
     read += [truth.with_name("times.txt") if request.times is None else request.times]
+    read += [] if request.scan is None else [request.scan]
     for option, path in (("--json", request.json), ("--plot", request.plot)):
         if path is None:
             continue
