@@ -4,8 +4,9 @@ import itertools
 import shutil
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,7 @@ from pliant.bus.session import (
 from pliant.errors import BusError, ResultError
 from pliant.messages import topics
 from pliant.recording.reader import Recording
+from pliant_services.runtime import relay
 from pliant_services.runtime.relay import Relays
 from pliant_services.security.access import NAMES, OPERATOR, access_control, may_write
 from pliant_services.security.certificates import ROUTER, make_certificates
@@ -165,6 +167,44 @@ def test_a_service_publishes_its_own_topics_and_no_other(endpoint: str, folder: 
     assert set(came) == {"pliant/s/tracks/extrema"}
 
 
+def test_certificates_of_a_session_are_good_for_no_other(tmp_path: Path) -> None:
+    authority = tmp_path / "authority"
+    for name in ("lab", "yard"):
+        make_certificates(tmp_path / name, NAMES, ["127.0.0.1"], authority=authority, session=name)
+    with pytest.raises(ResultError, match=r"not of operator\.yard"):
+        make_certificates(tmp_path / "lab", NAMES, [], authority=authority, session="yard")
+    found = free_endpoint().replace("tcp/", "tls/")
+    lab, yard = (
+        {service: Identity.in_folder(tmp_path / name, service) for service in NAMES}
+        for name in ("lab", "yard")
+    )
+    served = access_control(["lab", "yard"])
+    heard: dict[str, list[str]] = {"lab": [], "yard": []}
+    changed = threading.Condition()
+
+    def hear(where: str, sample) -> None:
+        with changed:
+            heard[where].append(str(sample.key_expr))
+            changed.notify_all()
+
+    with (
+        closing(open_router(found, identity=lab["router"], access_control=served)),
+        open_session([found], lab[OPERATOR]) as in_lab,
+        open_session([found], yard[OPERATOR]) as in_yard,
+        open_session([found], lab["tracking"]) as tracking,
+    ):
+        in_lab.declare_subscriber("pliant/**", partial(hear, "lab"))
+        in_lab.declare_subscriber("pliant/lab/**", partial(hear, "lab"))
+        in_yard.declare_subscriber("pliant/yard/**", partial(hear, "yard"))
+        with changed:
+            while not heard["lab"]:  # over one link: what is not allowed would have come before
+                for name in ("yard", "lab"):
+                    tracking.put(f"pliant/{name}/tracks/extrema", b"tracks")
+                changed.wait(0.2)
+    assert set(heard["lab"]) == {"pliant/lab/tracks/extrema"}
+    assert heard["yard"] == []
+
+
 def test_everybody_in_the_list_of_processes_may_write_something() -> None:
     assert all(may_write(name) for name in NAMES[1:])
     assert "pliant/*/camera/image" in may_write("ingest")
@@ -174,6 +214,37 @@ def test_everybody_in_the_list_of_processes_may_write_something() -> None:
 def test_a_folder_without_the_certificate_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(BusError, match="pliant certs"):
         Identity.in_folder(tmp_path, "tracking")
+
+
+def test_what_strangers_announce_costs_no_threads_and_few_sessions_are_relayed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(relay, "_MOST_VIEWED", 3)
+    monkeypatch.setattr(relay, "_MOST_SESSIONS", 150)
+    found = free_endpoint()
+    router = open_router(found)
+    relays, names = Relays(router), [f"s{number}" for number in range(200)]
+
+    def until(holds: Callable[[], bool]) -> None:
+        with relays._changed:
+            assert relays._changed.wait_for(holds, PATIENCE_S)
+
+    with closing(router), closing(relays), open_session([found]) as stranger:
+        tokens = stranger.liveliness()
+        before = _threads()
+        held = [tokens.declare_token(f"pliant/{name}/ready/x/1/2/3") for name in ("a b", *names)]
+        until(lambda: len(relays._tokens) == 150)
+        assert relays._tokens.keys() <= {*names}
+        assert _threads() == before
+        held += [tokens.declare_token(f"pliant/{name}/viewer/1") for name in names]
+        until(lambda: len(relays._relays) == 3 and len(relays._viewers) == 150)
+        held.clear()
+        until(lambda: not relays._relays and not relays._tokens)
+
+
+def _threads() -> int:
+    """Of this process, those of libraries included."""
+    return len(list(Path("/proc/self/task").iterdir()))
 
 
 def test_a_viewer_sees_a_session_through_the_router_and_a_late_one_its_camera(folder: Path) -> None:

@@ -263,6 +263,12 @@ def test_a_second_service_of_the_same_name_takes_over() -> None:
         peers.raise_if_refused()
 
 
+def test_a_service_that_stays_gives_way_to_no_newer_one() -> None:
+    peers = Peers("recorder", incarnation=5, stays=True)
+    peers.on_token(f"pliant/s/{token_key('recorder', 6)}", alive=True, now=0.0)
+    peers.raise_if_refused()
+
+
 def test_the_newest_checkpoint_that_readers_allow_is_used(tmp_path) -> None:
     checkpoints = Checkpoints(tmp_path / "tracking", interval=10)
     for frame in (9, 19, 29):

@@ -15,6 +15,14 @@ def router(
         Path | None,
         typer.Option(help="Folder that `pliant certs` made: who may publish what, by certificate."),
     ] = None,
+    sessions: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--session",
+            help="With --tls: a session with certificates of its own (pliant certs --session); may "
+            "be repeated [certificates are good for all sessions].",
+        ),
+    ] = None,
     once: Annotated[
         bool, typer.Option("--once", help="Leave when the first session is over.")
     ] = False,
@@ -29,7 +37,8 @@ def router(
     import threading
 
     from pliant.bus.peers import OVER_KEY
-    from pliant.bus.session import Identity, is_beyond_loopback, open_router
+    from pliant.bus.session import Identity, is_beyond_loopback, open_router, session_name
+    from pliant.errors import PliantError
     from pliant_services.runtime.relay import Relays
     from pliant_services.security.access import access_control
     from pliant_services.security.certificates import ROUTER
@@ -43,6 +52,9 @@ def router(
         signal.signal(kind, on_signal)
     endpoints = listen or ["tcp/127.0.0.1:7447"]
     secure = tls is not None
+    if sessions and not secure:
+        raise PliantError("--session needs --tls: without certificates all reach all sessions")
+    served = [session_name(each) for each in sessions or ()]
     open_to_all = [] if secure else [each for each in endpoints if is_beyond_loopback(each)]
     if open_to_all:
         typer.echo(
@@ -54,7 +66,7 @@ def router(
     session = open_router(
         *endpoints,
         identity=Identity.in_folder(tls, ROUTER) if tls is not None else None,
-        access_control=access_control() if secure else None,
+        access_control=access_control(served) if secure else None,
     )
 
     def on_over(_: object) -> None:

@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from pliant.bus.session import Identity, free_endpoint, open_router
+from pliant.bus.session import Identity, free_endpoint, open_router, session_name
 from pliant.config import recorded_config
 from pliant.errors import RecordingError
 from pliant.messages.topics import Topic
@@ -44,6 +44,7 @@ class PlayRequest:
 
 def run_play(request: PlayRequest) -> int:
     """Play until the end or a key says so; returns the exit code.  Raises PliantError."""
+    session_name(request.session)
     playback = Playback(request.recording)
     config = recorded_config(Recording(request.recording).metadata(), [])
     required, left_out = _required(playback, request.readers)

@@ -101,6 +101,7 @@ def run_service(name: str, config: Config, options: ServiceOptions) -> None:
         patience_s=config.bus.patience_s if options.patience_s is None else options.patience_s,
         checkpoints=checkpoints,
         keeps_books=process.observer and restartable,
+        stays=process.observer,
         windows={
             **observer_windows(config, options.fleet),
             **(checkpoint_windows(config, options.fleet) if restartable else {}),

@@ -8,10 +8,13 @@ while a viewer is there; the camera, which is told once, is kept for those who c
 
 import threading
 import time
+from functools import partial
 from typing import Any
 
 import zenoh
 
+from pliant.bus.links import directly
+from pliant.bus.session import is_session_name
 from pliant.errors import MessageError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
@@ -19,6 +22,9 @@ from pliant.messages.topics import Topic
 _STATUS_RING = 256
 _PAUSE_S = 0.005
 _LAST_WORDS_S = 2.0
+_MOST_VIEWED = 64
+_MOST_SESSIONS, _MOST_TOKENS = 4096, 256
+"""Beyond so many sessions, and so many services or viewers of one, no more are known."""
 
 
 class Relay:
@@ -36,9 +42,11 @@ class Relay:
         self._stopping = threading.Event()
         self._camera: tuple[bytes, bytes] | None = None
         self._held: list[Any] = [
-            router.declare_subscriber(f"{self._prefix}/{topics.STREAM.key}", self._on_camera),
+            router.declare_subscriber(
+                f"{self._prefix}/{topics.STREAM.key}", directly(self._on_camera)
+            ),
             router.liveliness().declare_subscriber(
-                f"{self._prefix}/viewer/*", self._on_viewer, history=True
+                f"{self._prefix}/viewer/*", directly(self._on_viewer), history=True
             ),
         ]
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -138,22 +146,28 @@ class Relay:
 
 
 class Relays:
-    """The viewers' side of a router: a relay for each session, from its first service to its last.
+    """The viewers' side of a router: a relay for each session that runs and that somebody views.
 
-    Zenoh is called by a thread of its own, never in a callback.
+    Zenoh is called by a thread of its own, never in a callback.  What strangers announce costs no
+    threads: callbacks run in Zenoh's own, and no more than ``_MOST_VIEWED`` sessions are relayed.
     """
 
     def __init__(self, router: zenoh.Session) -> None:
         self._router = router
         self._changed = threading.Condition()
         self._tokens: dict[str, set[str]] = {}
+        self._viewers: dict[str, set[str]] = {}
         self._cameras: dict[str, tuple[bytes, bytes]] = {}
         self._relays: dict[str, Relay] = {}
         self._stopping = False
+        liveliness = router.liveliness()
         self._held: list[Any] = [
-            router.declare_subscriber(f"pliant/*/{topics.STREAM.key}", self._on_camera),
-            router.liveliness().declare_subscriber(
-                "pliant/*/ready/**", self._on_token, history=True
+            router.declare_subscriber(f"pliant/*/{topics.STREAM.key}", directly(self._on_camera)),
+            liveliness.declare_subscriber(
+                "pliant/*/ready/**", directly(partial(self._on_token, self._tokens)), history=True
+            ),
+            liveliness.declare_subscriber(
+                "pliant/*/viewer/*", directly(partial(self._on_token, self._viewers)), history=True
             ),
         ]
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -167,34 +181,38 @@ class Relays:
         self._thread.join()
 
     def _on_camera(self, sample: zenoh.Sample) -> None:
-        camera = _camera_in(sample)
-        if camera is not None:
-            name = _session_of(sample)
-            with self._changed:
-                self._cameras[name] = camera
-                if name in self._relays:
-                    self._relays[name].know_camera(camera)
-
-    def _on_token(self, sample: zenoh.Sample) -> None:
+        camera, name = _camera_in(sample), _session_of(sample)
+        if camera is None or not name:
+            return
         with self._changed:
-            tokens = self._tokens.setdefault(_session_of(sample), set())
-            if sample.kind == zenoh.SampleKind.PUT:
-                tokens.add(str(sample.key_expr))
-            else:
-                tokens.discard(str(sample.key_expr))
+            self._cameras[name] = camera
+            if name in self._relays:
+                self._relays[name].know_camera(camera)
+            while len(self._cameras) > _MOST_SESSIONS:  # of sessions that never were, say
+                del self._cameras[next(iter(self._cameras))]
+
+    def _on_token(self, held: dict[str, set[str]], sample: zenoh.Sample) -> None:
+        name, key = _session_of(sample), str(sample.key_expr)
+        with self._changed:
+            tokens = held.get(name, set())
+            if sample.kind != zenoh.SampleKind.PUT:
+                tokens.discard(key)
+                if not tokens:
+                    held.pop(name, None)
+                    if held is self._tokens:  # the session is over
+                        self._cameras.pop(name, None)
+            elif name and len(tokens) < _MOST_TOKENS and (tokens or len(held) < _MOST_SESSIONS):
+                held.setdefault(name, tokens).add(key)
             self._changed.notify_all()
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._stopping or self._here() != set(self._relays))
-                here = set[str]() if self._stopping else self._here()
-                over = {name: self._relays.pop(name) for name in set(self._relays) - here}
-                new = sorted(here - set(self._relays))
-                for name in over:
-                    self._tokens.pop(name, None)
-                    self._cameras.pop(name, None)
-            for relay in over.values():
+                self._changed.wait_for(self._has_changed)
+                wanted = set[str]() if self._stopping else self._wanted()
+                over = [self._relays.pop(name) for name in set(self._relays) - wanted]
+                new = sorted(wanted - set(self._relays))
+            for relay in over:
                 relay.close()
             if self._stopping:
                 return
@@ -204,9 +222,16 @@ class Relays:
                     self._relays[name] = relay
                     if name in self._cameras:
                         relay.know_camera(self._cameras[name])
+                    self._changed.notify_all()
 
-    def _here(self) -> set[str]:
-        return {name for name, tokens in self._tokens.items() if tokens}
+    def _has_changed(self) -> bool:
+        return self._stopping or self._wanted() != set(self._relays)
+
+    def _wanted(self) -> set[str]:
+        """Sessions that run and are viewed: those that are relayed first, then in order of name."""
+        viewed = self._tokens.keys() & self._viewers.keys()
+        relayed = [name for name in self._relays if name in viewed]
+        return {*relayed, *sorted(viewed - {*relayed})[: _MOST_VIEWED - len(relayed)]}
 
 
 def _camera_in(sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
@@ -223,4 +248,6 @@ def _camera_in(sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
 
 
 def _session_of(sample: zenoh.Sample) -> str:
-    return str(sample.key_expr).split("/")[1]
+    """The session that a sample is of; "" where its name can be none's."""
+    name = str(sample.key_expr).split("/")[1]
+    return name if is_session_name(name) else ""

@@ -9,7 +9,7 @@ import zenoh
 
 from pliant.bus.health import Health, health_key, read_health
 from pliant.bus.peers import STOP_KEY, misfit, service_of
-from pliant.bus.session import Identity, open_session
+from pliant.bus.session import Identity, is_session_name, open_session, session_name
 from pliant.errors import BusError
 
 _HEADINGS = (
@@ -53,6 +53,8 @@ def listen(
 
     def on_token(sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
+        if not is_session_name(key.split("/")[1]):
+            return
         if sample.kind == zenoh.SampleKind.PUT:
             announced[key] = key.split("/")[1], service_of(key)
         else:
@@ -63,7 +65,8 @@ def listen(
         if found is None:
             return
         name, health = found
-        if str(sample.key_expr) != f"pliant/{name}/{health_key(health.service)}":
+        expected = f"pliant/{name}/{health_key(health.service)}"
+        if not is_session_name(name) or str(sample.key_expr) != expected:
             return
         now = time.time_ns()
         before = seen.get((name, health.service))
@@ -72,6 +75,7 @@ def listen(
         else:
             before.last, before.last_ns = health, now
 
+    session = session if session == "*" else session_name(session)
     with open_session(endpoints, identity) as connection:
         tokens = f"pliant/{session}/ready/**"
         liveliness = connection.liveliness()
@@ -141,6 +145,7 @@ def stop_session(
                 here.pop(key, None)
             changed.notify_all()
 
+    session_name(session)
     with open_session(endpoints, identity) as connection:
         tokens = f"pliant/{session}/ready/**"
         subscriber = connection.liveliness().declare_subscriber(tokens, on_token, history=True)

@@ -11,24 +11,39 @@ from pliant.errors import PliantError, ResultError
 from pliant.files import write_whole
 
 ROUTER = "router"
+ANY_SESSION = "*"
+_LONGEST_NAME = 64  # of a holder, in a certificate
 _AUTHORITY = "pliant"
 _VALID = timedelta(days=825)  # the longest that common TLS libraries take
 _BACKDATED = timedelta(days=1)  # machines' clocks differ
 
 
+def common_name(name: str, session: str = ANY_SESSION) -> str:
+    """What the certificate calls its holder; the router serves all sessions."""
+    return name if session == ANY_SESSION or name == ROUTER else f"{name}.{session}"
+
+
 def make_certificates(
-    folder: Path, names: Sequence[str], hosts: Sequence[str], *, authority: Path | None = None
+    folder: Path,
+    names: Sequence[str],
+    hosts: Sequence[str],
+    *,
+    authority: Path | None = None,
+    session: str = ANY_SESSION,
 ) -> list[str]:
     """Make what is missing of the authority and the named certificates; returns what was made.
 
     Only the one named ROUTER proves a server, with these ``hosts``, the names and addresses by
     which it is reached; the others prove clients.  authority: the folder of the authority's own
     key, beside the other unless it is given: whoever has that key is whoever they want to be, so it
-    is not where services look.  Keys are readable by their owner alone.  Raises PliantError without
+    is not where services look.  session: the only one in which they are good.  Keys are readable by
+    their owner alone.  Raises PliantError without
     the package ``cryptography``, ResultError where a folder cannot be written or does not fit.
     """
     authority = authority or authority_of(folder)
     _check(folder, authority)
+    if max(len(common_name(name, session)) for name in names) > _LONGEST_NAME:
+        raise ResultError(f"--session {session}: too long a name for certificates")
     x509 = _module("x509")
     ec = _module("hazmat.primitives.asymmetric.ec")
     made: list[str] = []
@@ -44,10 +59,12 @@ def make_certificates(
         x509.load_pem_x509_certificate(issuer)  # a broken one is noticed before keys are made
         write_whole(folder / "ca.pem", issuer)
         for name in names:
+            holder = common_name(name, session)
             if (folder / f"{name}.key").exists():
+                _check_holder(folder / f"{name}.pem", holder)
                 continue
             key = ec.generate_private_key(ec.SECP256R1())
-            certificate = _leaf_named(name, key, hosts if name == ROUTER else None)
+            certificate = _leaf_named(holder, key, hosts if name == ROUTER else None)
             _write(folder, name, key, _sign(certificate, signing))
             made.append(name)
     except OSError as error:
@@ -75,6 +92,17 @@ def _check(folder: Path, authority: Path) -> None:
         raise ResultError(
             f"{authority / 'ca.key'}: not there, and {folder} has certificates of it: say with "
             "--authority where it is"
+        )
+
+
+def _check_holder(path: Path, holder: str) -> None:
+    x509 = _module("x509")
+    subject = x509.load_pem_x509_certificate(path.read_bytes()).subject
+    names = [each.value for each in subject.get_attributes_for_oid(x509.oid.NameOID.COMMON_NAME)]
+    if names != [holder]:
+        raise ResultError(
+            f"{path}: of {', '.join(names)}, not of {holder}: keep those of another session in "
+            "another folder"
         )
 
 

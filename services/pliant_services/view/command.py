@@ -14,7 +14,7 @@ import zenoh
 
 from pliant.bus.links import received
 from pliant.bus.peers import misfit
-from pliant.bus.session import Identity, open_session
+from pliant.bus.session import Identity, open_session, session_name
 from pliant.errors import BusError, MessageError, PliantError, ResultError
 from pliant.export.images import camera_of
 from pliant.export.models import MESH_NAME, draw
@@ -147,7 +147,7 @@ def follow(
     Raises BusError where nothing listens or what runs is of another version, ResultError where the
     session does not run.
     """
-    prefix = f"pliant/{session}/view/"
+    prefix = f"pliant/{session_name(session)}/view/"
     waiting = Backlog(_WAITING, _WAITING_BYTES)
 
     def on_sample(sample: zenoh.Sample) -> None:

@@ -62,7 +62,7 @@ class InLink:
         self._shared = shared
         self._credit = _publisher(shared, f"credit/{topic.key}/{reader}")
         key = f"{shared.prefix}/{topic.key}"
-        self._held = shared.session.declare_subscriber(key, _directly(self._on_sample))
+        self._held = shared.session.declare_subscriber(key, directly(self._on_sample))
 
     def tell(self, incarnation: int, ask: int = NOTHING) -> None:
         """Tell the sender our counts."""
@@ -141,7 +141,7 @@ class OutLink:
         self._shared = shared
         self._publisher = _publisher(shared, topic.key)
         key = f"{shared.prefix}/credit/{topic.key}/*"
-        self._held = shared.session.declare_subscriber(key, _directly(self._on_credit))
+        self._held = shared.session.declare_subscriber(key, directly(self._on_credit))
 
     def send(self, kind: int, payload: bytes, may_lag: Collection[str]) -> None:
         """Number a message, keep it, and send it."""
@@ -202,7 +202,7 @@ def first_arrived(links: Sequence[InLink]) -> InLink:
     return min((e for e in links if e.box.waiting), key=lambda e: e.box.waiting[0].arrival)
 
 
-def _directly(callback: Callable[[zenoh.Sample], None]) -> "zenoh.handlers.Callback[zenoh.Sample]":
+def directly(callback: Callable[[zenoh.Sample], None]) -> "zenoh.handlers.Callback[zenoh.Sample]":
     """In Zenoh's own thread, not in one more for each topic that every message must wake."""
     return zenoh.handlers.Callback(callback, indirect=False)
 

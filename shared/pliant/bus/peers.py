@@ -73,6 +73,8 @@ class Peers:
     """What is said of those of another version that nobody here needs, by name: once."""
     over: bool = False
     """Whether the recorder has said that everything is on its disk."""
+    stays: bool = False
+    """Whether another start of this service cannot take over."""
 
     def on_token(self, key: str, *, alive: bool, now: float) -> str:
         """Take note of a token that appeared or vanished; returns the service it is of, "" where
@@ -101,7 +103,7 @@ class Peers:
         incarnations.add(int(number))
         self.met.setdefault(name, set()).add(int(number))
         self.gone_since.pop(name, None)
-        if name == self.service and int(number) > self.incarnation:
+        if name == self.service and int(number) > self.incarnation and not self.stays:
             self.refusal = f"another {name} took over in this session"
         return name
 

@@ -3,6 +3,8 @@
 import fcntl
 import json
 import os
+import re
+import reprlib
 import shutil
 import socket
 import stat
@@ -21,12 +23,32 @@ from pliant.messages.topics import TOPICS
 
 CONNECT_TIMEOUT_S = 7.0  # with the start of Python, a user waits ten seconds at most
 _PATIENCE_MS = 60_000  # Zenoh's defaults lose messages after a stall of 5 to 10 s (its second line)
+TOKEN_LEASE_S = 5.0 + 1e-3 * _PATIENCE_MS
+"""By then the router has given up a service whose machine has vanished."""
 _LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103
 _SOCKET = "unixsock-stream"
 _FOLDER, _BUS = "pliant-", "bus"
 _NO_SOCKET = "no Unix socket could be had: every user of this machine can reach the services"
 _MAX_BYTES = max(topic.max_bytes for topic in TOPICS) + (1 << 20)
 """Whoever announces more than our largest topic takes is cut off, before memory is taken for it."""
+
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+
+def is_session_name(name: str) -> bool:
+    """Whether a name can be a session's: one part of a key, which matches nothing but itself."""
+    return _NAME.fullmatch(name) is not None
+
+
+def session_name(name: str) -> str:
+    """The name of a session.  Raises BusError for anything else."""
+    if not is_session_name(name):
+        raise BusError(
+            f"--session {reprlib.repr(name)}: use letters, digits, '_', '-' and '.', 64 at most, "
+            "and begin with a letter or a digit"
+        )
+    return name
 
 
 @dataclass(frozen=True)

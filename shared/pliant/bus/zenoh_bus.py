@@ -32,13 +32,15 @@ from pliant.bus.checkpoints import Checkpoints, Place
 from pliant.bus.keeper import Keeper
 from pliant.bus.links import DATA, END, InLink, OutLink, Shared
 from pliant.bus.peers import OVER_KEY, STOP_KEY, Peers, token_key
-from pliant.bus.session import Identity, open_session
+from pliant.bus.session import TOKEN_LEASE_S, Identity, open_session, session_name
 from pliant.bus.waits import Waits
-from pliant.errors import MessageError
+from pliant.errors import BusError, MessageError
 from pliant.messages import codec
 from pliant.messages.topics import Topic
 from pliant.messages.types import Header, StreamEnd
 from pliant.state import load_state, save_state
+
+_LOOK_S = 0.5
 
 
 class ZenohBus:
@@ -57,6 +59,7 @@ class ZenohBus:
         patience_s: float = 0.0,
         checkpoints: Checkpoints | None = None,
         keeps_books: bool = False,
+        stays: bool = False,
         windows: Mapping[str, Window] | None = None,
         lags: Mapping[str, Window] | None = None,
         packed: Collection[Topic] = (),
@@ -75,6 +78,7 @@ class ZenohBus:
         patience_s: how long a peer may be away.
         checkpoints: where our state is kept; ``restore`` must come before the first message then.
         keeps_books: we know ourselves what we have; ``start_from`` must come first then.
+        stays: who of our name was in the session first stays there: no newer start takes over.
         windows: what is kept for readers that acknowledge seldom, by name.
         lags: of readers that may be further behind with some messages, by name, how far.
         packed: topics whose pixels are made smaller, for a link.
@@ -84,8 +88,9 @@ class ZenohBus:
         on_fault: told what was passed over, in a line a second at most.
         interrupted: whether Ctrl-C has come where it raises nothing; asked while readers are not
         here yet, for whom we would wait for ever.
-        Raises BusError when no endpoint answers.
+        Raises BusError when no endpoint answers, or when we are not the first and that one stays.
         """
+        self._prefix = f"pliant/{session_name(session)}"
         lags = lags or {}
         own_lag = lags.get(service, Window(0, 0))
         # Who may lag is waited for by what it has told: it tells all.
@@ -96,10 +101,11 @@ class ZenohBus:
         self._changed = threading.Condition()
         self._wake = threading.Event()
         needed = {name for readers in outputs.values() for name in readers} | set(inputs.values())
-        self._peers = Peers(service, time.time_ns(), needed)
+        self._peers = Peers(service, time.time_ns(), needed, stays=stays)
         self._waits = Waits(self._changed, self._peers, patience_s, interrupted or (lambda: False))
         self._session = open_session(endpoints, identity)
-        self._prefix = f"pliant/{session}"
+        if stays:
+            self._wait_until_first(on_fault or (lambda line: None))
         self.stop_requested = False
         """Whether somebody has asked the session to end (``pliant stop``)."""
         shared = Shared(self._session, self._prefix, self._changed, self._wake, self._peers)
@@ -154,6 +160,22 @@ class ZenohBus:
             if self._checkpoints is not None:
                 self._checkpoints.close()
             self._session.close()  # type: ignore[no-untyped-call]
+
+    def _wait_until_first(self, say: Callable[[str], None]) -> None:
+        """Wait until no other start of us is there: the token of one that died may outlive it."""
+        name, session = self._peers.service, self._prefix.removeprefix("pliant/")
+        tokens = f"{self._prefix}/ready/{name}/**"
+        enough, said = time.monotonic() + TOKEN_LEASE_S, False
+        while any(reply.ok is not None for reply in self._session.liveliness().get(tokens)):
+            if not said:
+                say(f"{name}: session {session} has a {name}: waiting until it is gone")
+                said = True
+            if time.monotonic() > enough or self._waits.interrupted():
+                self._session.close()  # type: ignore[no-untyped-call]
+                raise BusError(
+                    f"session {session} has a {name}, which stays: choose another --session"
+                )
+            time.sleep(_LOOK_S)
 
     # -- sending -------------------------------------------------------------------------------
 
