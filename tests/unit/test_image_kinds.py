@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pliant.datasets import notes_on, open_source
+from pliant.datasets import notes_on, open_source, sources_in
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import DatasetError
@@ -173,3 +173,15 @@ def test_a_raw_drive_of_kitti(tmp_path: Path) -> None:
     (drive / "image_00" / "timestamps.txt").write_text("a\nb\nc\n")
     with pytest.raises(DatasetError, match="line 1: 'a' is not a date"):
         open_source(str(drive))
+
+
+@pytest.mark.parametrize("other", ["kitchen/0.png", "clip.mp4", "drive.bag"])
+def test_a_collection_is_no_sequence(other: str, tmp_path: Path) -> None:
+    write(tmp_path / "data", "{}.png", COLOUR)
+    (tmp_path / other).parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(tmp_path / "x.png"), COLOUR)
+    (tmp_path / "x.png").rename(tmp_path / other)
+    found = [path.name for path in sources_in(tmp_path, but=tmp_path / "results")]
+    assert found == sorted(["data", Path(other).parts[0]])
+    with pytest.raises(DatasetError, match="holds some: name one of them"):
+        open_source(str(tmp_path))

@@ -11,7 +11,13 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Literal
 
-from pliant.datasets.base import BrokenFrame, Dataset, SourceFrame, is_builtin
+from pliant.datasets.base import (
+    VIDEO_SUFFIXES,
+    BrokenFrame,
+    Dataset,
+    SourceFrame,
+    is_builtin,
+)
 from pliant.datasets.calibration import Calibration, calibration_from_yaml, calibration_yaml
 from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.camera_device import CameraDevice, camera_index
@@ -248,12 +254,6 @@ def check_start(dataset: Dataset) -> None:
 HELP = "`pliant run --help` and docs/sources.md say what is read"
 """Where the sources are listed that are understood."""
 
-_VIDEOS = (
-    *(".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts"),
-    *(".wmv", ".flv", ".ogv", ".3gp", ".mjpeg"),
-)
-"""A file of these endings in a folder is a clip: of one that a user names, OpenCV decides."""
-
 
 def sources_in(folder: Path, *, but: Path) -> list[Path]:
     """The sources that lie directly in a folder, by name.  but: one that is none, as results are.
@@ -275,4 +275,4 @@ def sources_in(folder: Path, *, but: Path) -> list[Path]:
 
 def _is_clip(path: Path) -> bool:
     names = [name for name, kind in formats().items() if kind.recognises(str(path))]
-    return bool(names) and (names[0] != "video" or path.suffix.lower() in _VIDEOS)
+    return bool(names) and (names[0] != "video" or path.suffix.lower() in VIDEO_SUFFIXES)

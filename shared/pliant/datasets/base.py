@@ -99,6 +99,12 @@ class Dataset(Protocol):
         ...
 
 
+VIDEO_SUFFIXES = (
+    *(".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".ts"),
+    *(".wmv", ".flv", ".ogv", ".3gp", ".mjpeg"),
+)
+"""A file of these endings in a folder is a clip: of one that a user names, OpenCV decides."""
+
 _MAGIC = (
     (b"\xff\xd8\xff", "jpeg"),
     (b"\x89PNG\r\n\x1a\n", "png"),

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.image.decoding import decoded
+from pliant.datasets.base import VIDEO_SUFFIXES
 from pliant.datasets.images import image_files
 from pliant.errors import DatasetError
 from pliant.wording import counted, shortened
@@ -28,6 +29,7 @@ _NO_IMAGES = {
     *("labels", "normal", "normals", "conf", "confidence", "flow", "thumb", "thumbnail", "preview"),
 }
 _SECOND = {"right", "ir", "infra", "infrared", "thermal", "fisheye"}
+_CAMERAS = {"cam", "camera", "image", "images", "left", "grey", "gray", "undistorted"}
 _SAME_FRAMES = 0.9
 _SUBFOLDERS = (
     *("images", "image", "rgb", "color", "colour", "img", "imgs", "frames", "data"),
@@ -46,8 +48,20 @@ def folder_of_images(folder: Path) -> Path | None:
         return None
     if image_files(folder):
         return folder
-    inner = (folder / name for name in _SUBFOLDERS)
-    return next((each for each in inner if each.is_dir() and image_files(each)), None)
+    inner = [folder / name for name in _SUBFOLDERS]
+    found = next((each for each in inner if each.is_dir() and image_files(each)), None)
+    return None if found is None or _is_collection(folder) else found
+
+
+def _is_collection(folder: Path) -> bool:
+    """Whether it also holds clips, or folders of images that have nothing to do with each other."""
+    for path in folder.iterdir():
+        if path.suffix.lower() in (*VIDEO_SUFFIXES, ".bag", ".mcap"):
+            return True
+        known = path.name in _SUBFOLDERS or _words(path.name) & (_NO_IMAGES | _SECOND | _CAMERAS)
+        if not known and path.name[0] != "." and path.is_dir() and image_files(path):
+            return True
+    return False
 
 
 def images_of_one_kind(folder: Path) -> tuple[list[Path], list[str]]:
