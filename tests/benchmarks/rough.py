@@ -229,7 +229,7 @@ def measure(folder: Path, config: Config, only: list[str]) -> Iterator[str]:
             continue
         built_in = case.source.startswith(BUILTIN_PREFIX)
         source = open_source(case.source if built_in else str(folder / case.source))
-        yield markdown_row((name, *_row(RoughFrames(source, case), config)))
+        yield markdown_row((name, *report_row(cast(Dataset, RoughFrames(source, case)), config)))
 
 
 def follow(frames: Dataset, config: Config) -> Run:
@@ -245,8 +245,8 @@ def follow(frames: Dataset, config: Config) -> Run:
     return run
 
 
-def _row(frames: RoughFrames, config: Config) -> tuple[str, ...]:
-    run = follow(cast(Dataset, frames), config)
+def report_row(frames: Dataset, config: Config) -> tuple[str, ...]:
+    run = follow(frames, config)
     history, count = run.history, len(run.tracks)
     final = history.final()
     report = rigid_report(run, final)

@@ -16,13 +16,21 @@ class CorrectedView:
 
     correction: as MapDelta.calibration_correction, or () for none.  What a rolling shutter does is
     left: it moves pixels along the image, which depth hardly feels.
-    camera: the ideal camera.
+    camera: the ideal camera.   log_focal: of the image relative to the correction's, where it
+    changes during a clip: the image is magnified by as much about ``centre``.
     """
 
-    def __init__(self, camera: PinholeCamera, correction: tuple[float, ...]) -> None:
+    def __init__(
+        self,
+        camera: PinholeCamera,
+        correction: tuple[float, ...],
+        log_focal: float = 0.0,
+        centre: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         self.camera = camera
         s, k1, k2, a, b = parts_of(correction)
         self._correction = np.array([s, k1, k2, 0.0, a, b])
+        self._log_focal, self._centre = log_focal, centre
 
     @property
     def lens(self) -> tuple[float, float]:
@@ -31,6 +39,7 @@ class CorrectedView:
 
     def pixels(self, points_px: F32) -> F32:
         """(N, 2) pixels of the rectified image in the ideal one."""
+        points_px = self._magnified(points_px, -self._log_focal)
         if not self._correction.any():
             return points_px
         return ideal_pixels(np.ascontiguousarray(points_px), self.camera, self._correction)
@@ -38,12 +47,22 @@ class CorrectedView:
     def seen(self, points_px: F32) -> F32:
         """(N, 2) pixels of the ideal image in the rectified one: undoes ``pixels``."""
         if not self._correction.any():
-            return points_px
+            return self._magnified(points_px, self._log_focal)
         camera = self.camera
         x = (points_px[:, 0].astype(np.float64) - camera.cx) / camera.fx
         y = (points_px[:, 1].astype(np.float64) - camera.cy) / camera.fy
         u, v = self._seen(x, y)
-        return np.stack([u, v], axis=1).astype(np.float32)
+        return self._magnified(np.stack([u, v], axis=1).astype(np.float32), self._log_focal)
+
+    def magnified(self, points_px: F32, log_factors: F64) -> F32:
+        """(N, 2) pixels of the rectified image moved about its centre, each by its own (N,)."""
+        if not log_factors.any():
+            return points_px
+        moved = self._centre + np.exp(log_factors)[:, None] * (points_px - self._centre)
+        return moved.astype(np.float32)
+
+    def _magnified(self, points_px: F32, log_factor: float) -> F32:
+        return self.magnified(points_px, np.full(len(points_px), log_factor))
 
     def image(self, pixels: U8) -> U8:
         """(H, W) or (H, W, 3) the ideal image of a rectified one."""
@@ -52,7 +71,7 @@ class CorrectedView:
     @property
     def move(self) -> Move | None:
         """What ``image`` does to an image, as of ``MovedImage``."""
-        return self._places if self._correction.any() else None
+        return self._places if self._correction.any() or self._log_focal else None
 
     @property
     def shows(self) -> BoolArray:
@@ -69,6 +88,9 @@ class CorrectedView:
         x: F64 = (np.arange(camera.width, dtype=np.float64) - camera.cx) / camera.fx
         y: F64 = (np.arange(camera.height, dtype=np.float64)[:, None] - camera.cy) / camera.fy
         u, v = self._seen(x, y)
+        if self._log_focal:
+            (cx, cy), factor = self._centre, np.exp(self._log_focal)
+            u, v = cx + factor * (u - cx), cy + factor * (v - cy)
         return u.astype(np.float32), v.astype(np.float32)
 
     def _seen(self, x: F64, y: F64) -> tuple[F64, F64]:
@@ -81,9 +103,15 @@ class CorrectedView:
         return u, camera.cy + np.exp(s) * camera.fy * (y * factor + b)
 
 
-def moved_px(points_px: F32, before: CorrectedView, after: CorrectedView) -> F32:
-    """(N, 2) pixels of one ideal camera in another one."""
-    return after.pixels(before.seen(points_px))
+def moved_px(
+    points_px: F32, before: CorrectedView, after: CorrectedView, log_factors: F64 | None = None
+) -> F32:
+    """(N, 2) pixels of one ideal camera in another one.
+
+    log_factors: (N,) by which the focal length of each has been found to be larger; None: by 0.
+    """
+    seen = before.seen(points_px)
+    return after.pixels(seen if log_factors is None else after.magnified(seen, -log_factors))
 
 
 def parts_of(correction: tuple[float, ...]) -> tuple[float, float, float, float, float]:
@@ -94,12 +122,14 @@ def parts_of(correction: tuple[float, ...]) -> tuple[float, float, float, float,
 
 
 @lru_cache(maxsize=4)
-def corrected_view(camera: PinholeCamera, correction: tuple[float, ...]) -> CorrectedView:
+def corrected_view(
+    camera: PinholeCamera, correction: tuple[float, ...], log_focal: float = 0.0
+) -> CorrectedView:
     """The view whose camera is the pinhole that was found, so that its pixels move least.
 
-    camera: the one that was believed in.    correction: as of ``CorrectedView``.
+    camera: the one that was believed in.    correction, log_focal: as of ``CorrectedView``.
     """
     s, k1, k2, a, b = parts_of(correction)
     fx, fy = camera.fx * float(np.exp(s)), camera.fy * float(np.exp(s))
     found = replace(camera, fx=fx, fy=fy, cx=camera.cx + fx * a, cy=camera.cy + fy * b)
-    return CorrectedView(found, (0.0, k1, k2))
+    return CorrectedView(found, (0.0, k1, k2), log_focal, (camera.cx, camera.cy))

@@ -92,6 +92,8 @@ class MapDelta:
         shutter takes the rows of a frame in this share of the frame interval.   () where nothing
         was estimated.
     calibration_sigmas: standard deviation of each of these, at residuals of 1 px.
+    focal_keyframes, log_focals: keyframes whose focal length is e^log_focal times that of the
+        corrected calibration: of clips in which it changes.
     snapshot: every keyframe and point of the active window is in it, changed or not.
     """
 
@@ -128,6 +130,9 @@ class MapDelta:
     same_places: Annotated[I64, Shape("L", 2)] = field(
         default_factory=lambda: np.zeros((0, 2), np.int64)
     )
+
+    focal_keyframes: Annotated[I64, Shape("Z")] = field(default_factory=_no_ids)
+    log_focals: Annotated[F64, Shape("Z")] = field(default_factory=lambda: np.zeros(0))
 
     def hosts(self) -> I64:
         """(P,) ``point_hosts``; -1 in recordings from before maps moved."""

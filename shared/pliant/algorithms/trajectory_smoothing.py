@@ -72,7 +72,9 @@ def smooth_trajectory(
         variances, _ = motion.fit(variances, 0.5 * _FIRST_STEP)
     if variances[0] > 2.0 * np.log(most_noise_px):
         return T_world_camera
-    return inverse(_se3_exp(motion.corrections(variances)) @ T)
+    smoothed = inverse(_se3_exp(motion.corrections(variances)) @ T)
+    # Rounding breaks the filter down where poses are exact but for a few.
+    return smoothed if np.isfinite(smoothed).all() else T_world_camera
 
 
 class _Motion:

@@ -47,7 +47,9 @@ def found_calibration(run: Run) -> Calibration | None:
     """The source's calibration, at the size of its images, corrected as its last segment is.
 
     Its ``focal_sigma`` says what is still open: a map that was made with a wrong one is bent, and
-    so what it says of it is as far off as the two differ.  None where there is no stream.
+    so what it says of it is as far off as the two differ.  Where the focal length changes during
+    the clip it is the middle of the range, and uncertain by half of it.
+    None where there is no stream.
     """
     if run.stream is None or not run.stream.calibration:
         return None
@@ -60,6 +62,11 @@ def found_calibration(run: Run) -> Calibration | None:
     sigma = run.calibration_sigmas[0] if run.calibration_sigmas else 0.0
     sigma = max(sigma, abs(correction[0])) if _is_contradicted(run) else sigma
     usual = CalibrationUncertainty().focal
+    if run.focal_range is not None:
+        low, high = run.focal_range
+        middle = math.sqrt(low * high)
+        found = replace(found, fx=middle * found.fx, fy=middle * found.fy)
+        sigma = max(sigma, 0.5 * math.log(high / low))
     found = at_size(found, *size)
     return replace(found, focal_sigma=min(sigma, 1.0) if sigma > usual else 0.0)
 
@@ -120,6 +127,9 @@ def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
     camera = run.stream.camera
     focal = camera.fx * math.exp(correction[0])
     fov = math.degrees(2.0 * math.atan(0.5 * camera.width / focal))
+    changes = focal_changes(run)
+    if changes:
+        return changes
     known = f"{fov:.1f} degrees across, +-{100.0 * sigmas[0]:.1f} %"
     if run.stream.focal_sigma > 0.0:
         if sigmas[0] > _KNOWN:
@@ -131,6 +141,18 @@ def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
         f"the images contradict the calibration: focal length {math.exp(correction[0]):.3f} times "
         f"what was given (+-{100.0 * sigmas[0]:.1f} %), k1 {correction[1]:+.3f}, "
         f"{_corner_px(camera, correction):.0f} px at the corner; run again with calibration.yaml"
+    )
+
+
+def focal_changes(run: Run) -> str:
+    """How the focal length changes during the clip; "" where it does not."""
+    if run.stream is None or run.focal_range is None or not run.calibration_correction:
+        return ""
+    focal = run.stream.camera.fx * math.exp(run.calibration_correction[0])
+    low, high = (focal * each for each in run.focal_range)
+    return (
+        f"the focal length changes during the clip ({low:.0f} to {high:.0f} px): zoom, focus "
+        "breathing or stabilisation; film with zoom, focus and stabilisation locked"
     )
 
 

@@ -32,15 +32,15 @@ def doubtful_frames(history: MapHistory) -> list[int]:
 
 def judge(
     *, frames: int, in_segments: list[int], doubtful: int, broken: int = 0, absent: int = 0,
-    behind: int = 0, calibration: str = "", failed: bool = False,
+    behind: int = 0, calibration: str = "", focal: str = "", failed: bool = False,
 ) -> tuple[str, str]:  # fmt: skip
     """Good, doubtful or bad, and why.
 
     frames: that came, but those that a mask covers.   in_segments: poses in each segment of the
     map.   doubtful: poses told as such.   broken: frames that do not decode or have a wrong time.
     absent: frames of the source that never came.   behind: frames without a pose that there was no
-    time for.   calibration: why it bends the map; "" where it does not.   failed: the source broke
-    off.
+    time for.   calibration: why it bends the map; "" where it does not.   focal: how the focal
+    length changes during the clip; "" where it does not.   failed: the source broke off.
 
     All of them are frames of the source: they count as frames without a pose.
     """
@@ -58,6 +58,8 @@ def judge(
             f"{told}: the computer did not keep up with {behind / of_source:.0%}, take smaller "
             "images (--max-size) or fewer tracks (--light)"
         )
+    if focal:
+        return DOUBTFUL, focal
     if doubtful > DOUBTS * posed:
         return DOUBTFUL, (
             f"{doubtful / posed:.0%} of the poses are doubtful: something large moves, or the "

@@ -11,7 +11,11 @@ from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.exposure import FLAWS
 from pliant.algorithms.map_density import count_distinct, well_observed
 from pliant.messages.types import DROPPED, MASKED
-from pliant.results.calibration import calibration_doubt, calibration_verdict
+from pliant.results.calibration import (
+    calibration_doubt,
+    calibration_verdict,
+    focal_changes,
+)
 from pliant.results.judgement import doubtful_frames, judge
 from pliant.results.mesh_files import mesh_report
 from pliant.results.run import Run
@@ -48,6 +52,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         in_segments=[len(members) for members in by_segment.values()],
         doubtful=len(doubtful),
         calibration=calibration_doubt(run, final),
+        focal=focal_changes(run),
     )
     return {
         "verdict": word,
@@ -187,6 +192,10 @@ def _correction(run: Run) -> dict[str, float] | None:
     found |= {"principal_x": a, "principal_y": b}
     if sigmas:
         found["focal_sigma"] = sigmas[0]
+    if run.focal_range is not None:
+        found["focal_factor_min"], found["focal_factor_max"] = (
+            float(np.exp(s)) * each for each in run.focal_range
+        )
     return {name: round(value, 6) for name, value in found.items()}
 
 

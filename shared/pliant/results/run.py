@@ -56,6 +56,7 @@ class Run:
     source_failure: str = ""
     corrections: dict[int, tuple[float, ...]] = field(default_factory=dict[int, tuple[float, ...]])
     calibration_sigmas: tuple[float, ...] = ()
+    log_focals: dict[int, float] = field(default_factory=dict[int, float])
     mesh: list[MeshPiece] = field(default_factory=list[MeshPiece])
     ends: dict[str, StreamEnd] = field(default_factory=dict[str, StreamEnd])
     arrivals_ns: list[int] = field(default_factory=list[int])
@@ -79,6 +80,17 @@ class Run:
         if update.calibration_correction:
             self.corrections[update.segment] = update.calibration_correction
             self.calibration_sigmas = update.calibration_sigmas
+        focal = zip(update.focal_keyframes.tolist(), update.log_focals.tolist(), strict=True)
+        self.log_focals |= dict(focal)
+
+    @property
+    def focal_range(self) -> tuple[float, float] | None:
+        """The least and the greatest focal length, in units of the calibration that was found, but
+        for a twentieth of the keyframes at each end; None where it does not change."""
+        if not self.log_focals:
+            return None
+        low, high = np.exp(np.percentile([*self.log_focals.values()], (5.0, 95.0))).tolist()
+        return low, high
 
     @property
     def scale_is_metric(self) -> bool:

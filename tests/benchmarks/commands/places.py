@@ -70,6 +70,24 @@ def rough(
     show(measure(folder, load_config(None, overrides or []), only or []))
 
 
+@app.command()
+def zoom(
+    folder: Annotated[Path, typer.Argument(help="Folder of sequences with a ground truth.")],
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Cases whose names have this.")
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Focus breathing, zoom and electronic stabilisation: is the map right, or flagged?
+
+    scripts/bench zoom ../shared/data/rigid --only tum_fr1_xyz
+    """
+    from benchmarks.zoom import measure
+    from pliant.config import load_config
+
+    show(measure(folder, load_config(None, overrides or []), only or []))
+
+
 @app.command("kept-maps")
 def kept_maps(sources: Sources, overrides: Overrides = None) -> None:
     """Sources cut in two: the second half localised in the map of the first, and going on in it.

@@ -209,6 +209,16 @@ def _readout_moves(cameras: Cameras, m: int, local: F64, fu: F32, fv: F32, A: F6
 
 
 @fast_kernel
+def camera_moves(
+    cameras: Cameras, m: int, b: int, principal: F64, local: F64, flow: F32, rolls: bool, A: F64
+) -> None:
+    """Write A (SHARED x 2 x BLOCK) of camera m and block b, for other modules."""
+    _moves(cameras, m, principal, local, A)
+    if rolls:
+        _readout_moves(cameras, m, local, flow[0, b], flow[1, b], A)
+
+
+@fast_kernel
 def _add_own(local: F64, A: F64, unknown: BoolArray, own: F64, gradient: F64, cross: F64) -> None:
     """Add ``A^T M A``, ``A^T e`` and ``A^T M B`` (SHARED x 6 by rows)."""
     for q in range(SHARED):

@@ -176,6 +176,7 @@ class BundleResult:
     correction: (6,) of the calibration, where it was unknown: see ``solve_schur``.
     covariance: (6, 6) of the correction, where residuals have a standard deviation of 1 px, if it
         was asked for.
+    log_focal: (M,) of each camera relative to the shared focal length, (0,) where it is the same.
     """
 
     T_world_camera: F64
@@ -188,6 +189,7 @@ class BundleResult:
     costs: F64 = field(default_factory=lambda: np.zeros(0))
     correction: F64 = field(default_factory=lambda: np.zeros(6))
     covariance: F64 = field(default_factory=lambda: np.zeros((6, 6)))
+    log_focal: F64 = field(default_factory=lambda: np.zeros(0))
 
 
 def shared_intrinsics(camera: PinholeCamera, count: int) -> F64:

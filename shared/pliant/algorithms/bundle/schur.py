@@ -1,7 +1,7 @@
 """Bundle adjustment by Levenberg-Marquardt with the Schur complement (Eq. 9-10)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -35,6 +35,7 @@ from pliant.algorithms.bundle.packed_layout import (
 from pliant.algorithms.bundle.problem import (
     AnyProblem,
     BundleParameters,
+    BundleProblem,
     BundleResult,
     CalibrationUncertainty,
 )
@@ -46,12 +47,17 @@ from pliant.algorithms.bundle.reduced import (
     solve_reduced,
     substitute_reduced,
 )
+from pliant.algorithms.bundle.varying_focal import FocalWalk, VaryingFocal
 from pliant.compiler.kernel import kernel
 
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e8
 
 _GAUGE_DAMPING = 1e-9
 """Keeps the scale of a map, which nothing holds, from making its system singular."""
+
+_NONE: F64 = np.zeros(0)
+_HELD = 1e9
+"""Damping of unknowns that are not to move."""
 
 OnIteration: TypeAlias = Callable[[float], None]
 """Called with the cost after each iteration, so that a benchmark can note the time."""
@@ -66,6 +72,7 @@ def solve_schur(
     start: F64 | None = None,
     with_covariance: bool = False,
     doubled: bool = False,
+    walk: FocalWalk | None = None,
 ) -> BundleResult:
     """Minimise Eq. 6 over all movable cameras and points by damped Gauss-Newton steps.
 
@@ -82,13 +89,15 @@ def solve_schur(
     (no rotation, one plane, forward motion) the prior holds it, as ``covariance`` then says.
     doubled: twice each step is tried as well, which takes some 0.6 of the iterations to a cost that
     has all but settled.
+    walk: prior of the focal length of each camera relative to the shared one; None: they are equal.
     Raises ValueError where cameras differ in their lenses.
     """
     layout = build_packed_layout(problem)
-    calibration = None
+    calibration, focal = None, None
     if uncertainty is not None:
         calibration = SharedCalibration(layout, problem.intrinsics[:, 4:], uncertainty, start)
-    system = SchurSystem(layout, parameters, calibration)
+        focal = None if walk is None else VaryingFocal(layout, walk, uncertainty.prior_px)
+    system = SchurSystem(layout, parameters, calibration, focal)
     state, costs, converged = _iterate(system, parameters, on_iteration, doubled)
     return BundleResult(
         T_world_camera=poses_of(layout, problem, state.motion),
@@ -103,18 +112,46 @@ def solve_schur(
         covariance=system.calibration_covariance(state)
         if with_covariance
         else np.zeros((SHARED, SHARED)),
+        log_focal=state.focal,
     )
+
+
+def gain_of_focal(
+    problem: BundleProblem,
+    found: BundleResult,
+    parameters: BundleParameters,
+    uncertainty: CalibrationUncertainty,
+    walk: FocalWalk,
+) -> tuple[float, F64]:
+    """How much less a linear step from what was found would cost, px^2, if the cameras had focal
+    lengths of their own; and these (M,).  (0, 0) where the step has no solution.
+
+    With b the right side of Eq. 9 and S its matrix that is ``b^T S^-1 b`` with them, less the same
+    without them.
+    """
+    moved = replace(problem, T_world_camera=found.T_world_camera, points_world=found.points_world)
+    layout = build_packed_layout(moved)
+    calibration = SharedCalibration(
+        layout, problem.intrinsics[:, 4:], uncertainty, found.correction
+    )
+    focal = VaryingFocal(layout, walk, uncertainty.prior_px)
+    system = SchurSystem(layout, parameters, calibration, focal)
+    return system.gain_of_focal(system.start())
 
 
 @dataclass(frozen=True)
 class State:
-    """Cameras and observations under a calibration (SHARED,), points (3, P) and the cost, px^2."""
+    """Cameras and observations under a calibration (SHARED,), points (3, P) and the cost, px^2.
+
+    focal: (M,) of ``varying_focal``; (0,) where all cameras have the same.
+    """
 
     cameras: Cameras
     slots: Slots
     points: F64
     calibration: F64
     cost: float
+    focal: F64
 
     @property
     def motion(self) -> F64:
@@ -160,41 +197,55 @@ class SchurSystem:
         layout: PackedLayout,
         parameters: BundleParameters,
         calibration: SharedCalibration | None = None,
+        focal: VaryingFocal | None = None,
     ) -> None:
         self.layout = layout
         self.limits = limits_of(parameters)
         self.calibration = calibration
+        self.focal = focal
         M = len(layout.free)
         self._moving = np.flatnonzero(layout.free)
         free = np.full(M, -1, np.int32)
         free[self._moving] = np.arange(len(self._moving), dtype=np.int32)
-        met = _meetings(layout.places, free, len(self._moving))
+        if focal is None:
+            met = _meetings(layout.places, free, len(self._moving))
+        else:
+            all_met = _meetings(layout.places, np.arange(M, dtype=np.int32), M)
+            met = focal.meetings(all_met, self._moving)
         self.pattern = find_pattern(met, bordered=calibration is not None)
         self._position = free
-        self._position[self._moving] = self.pattern.position
+        self._position[self._moving] = self.pattern.position[: len(self._moving)]
+        if focal is not None:
+            focal.position = self.pattern.position[len(self._moving) :]
         self.at: State | None = None
         self.normal = np.empty((M, 27))
         self.shared = no_shared_blocks()
         self._records = _records_for(len(layout.places.camera))
         self._factors = np.empty((layout.points.shape[1], FACTOR))
         self._S = np.empty((len(self.pattern.row), 36))
-        self._scratch = scratch_for(M)
+        blocks = 0 if focal is None else len(focal.position)
+        self._scratch = scratch_for(M + blocks)
 
     def start(self) -> State:
         """The state that the problem starts from."""
         start = np.zeros(SHARED) if self.calibration is None else self.calibration.start
-        return self.state(self.layout.cameras.motion, self.layout.points, start)
+        z = np.zeros(0) if self.focal is None else self.focal.start
+        return self.state(self.layout.cameras.motion, self.layout.points, start, z)
 
-    def state(self, motion: F64, points: F64, q: F64) -> State:
-        """The state of given cameras, points and calibration."""
+    def state(self, motion: F64, points: F64, q: F64, z: F64 = _NONE) -> State:
+        """The state of given cameras, points, calibration and focal lengths."""
         cameras, slots = self.layout.cameras, self.layout.slots
         if self.calibration is not None:
             cameras, slots = self.calibration.at(q)
+        if self.focal is not None:
+            cameras = self.focal.scaled(cameras, z)
         cameras = cameras._replace(motion=motion)
         cost = cost_of_observations(cameras, points, slots, self.limits)
         if self.calibration is not None:
             cost += self.calibration.prior_cost(q)
-        return State(cameras, slots, points, q, cost)
+        if self.focal is not None:
+            cost += self.focal.prior_cost(z)
+        return State(cameras, slots, points, q, cost, z)
 
     def linearise(self, state: State) -> None:
         """Bring all that no damping changes to a state."""
@@ -206,6 +257,9 @@ class SchurSystem:
         )  # fmt: skip
         if self.calibration is not None:
             self.shared = self.calibration.linearise(cameras, self._records, state.calibration)
+            if self.focal is not None:
+                unknown, principal = self.calibration.unknown, state.calibration[4:]
+                self.focal.linearise(cameras, self._records, unknown, principal)
         self.at = state
 
     def step(self, state: State, damping: float, doubled: bool = False) -> State | None:
@@ -229,11 +283,20 @@ class SchurSystem:
             change = solution[-1, :SHARED].copy()
         moved = np.empty_like(state.points)
         substitute(self._linearised(state), steps, change, self._factors, state.points, moved)
-        near = self.state(move_cameras(state.motion, steps), moved, state.calibration + change)
+        refocus = state.focal  # (0,): there is none
+        if self.focal is not None:
+            refocus = self.focal.steps(solution)
+            self.focal.substitute(self._linearised(state), refocus, self._factors, moved)
+        near = self.state(
+            move_cameras(state.motion, steps), moved, state.calibration + change,
+            state.focal + refocus,
+        )  # fmt: skip
         if not doubled:
             return near
         motion, points = move_cameras(state.motion, 2.0 * steps), 2.0 * moved - state.points
-        far = self.state(motion, points, state.calibration + 2.0 * change)
+        far = self.state(
+            motion, points, state.calibration + 2.0 * change, state.focal + 2.0 * refocus
+        )
         return far if far.cost < near.cost else near
 
     def calibration_covariance(self, state: State) -> F64:
@@ -253,6 +316,19 @@ class SchurSystem:
             solution = substitute_reduced(self.pattern, S, b) if factored else None
             covariance[:, k] = np.inf if solution is None else solution[-1, :SHARED]
         return covariance
+
+    def gain_of_focal(self, state: State) -> tuple[float, F64]:
+        """As of the function."""
+        assert self.focal is not None
+        self.linearise(state)
+        S, b, diagonal = self._reduced_system(state, _GAUGE_DAMPING)
+        small, held = _GAUGE_DAMPING * diagonal, _GAUGE_DAMPING * diagonal
+        held[self.focal.position] *= _HELD / _GAUGE_DAMPING
+        free = solve_reduced(self.pattern, S.copy(), b, small)
+        alone = solve_reduced(self.pattern, S, b, held)
+        if free is None or alone is None:
+            return 0.0, np.zeros_like(state.focal)
+        return float((b * (free - alone)).sum()), self.focal.steps(free)
 
     def _reduced_system(self, state: State, damping: float) -> tuple[F64, F64, F64]:
         """Of Eq. 9, at a linearised state: S without damping, the right side (N, 6) and diag(H)
@@ -277,6 +353,10 @@ class SchurSystem:
             departure = state.calibration - self.calibration.given
             b[-1, :SHARED] += shared.gradient - prior * departure
             diagonal[-1, :SHARED] = np.diag(own)
+        if self.focal is not None:
+            self.focal.add_to(
+                system, self._linearised(state), self._scratch, self._factors, diagonal, state.focal
+            )
         return S, b, diagonal
 
     def _linearised(self, state: State) -> Linearised:

@@ -126,7 +126,7 @@ class ActiveMap:
             )
             others = self.points.state[self.links.rows[j]] == CANDIDATE
             self._append_keyframe(
-                number, start.T_world_camera[k],
+                number, frames[number].stamp_ns, start.T_world_camera[k],
                 np.concatenate([rows[start.point_index[supported]], self.links.rows[j[others]]]),
                 np.concatenate([start.points_px[supported], frames[number].points_px[i[others]]]),
                 None,
@@ -214,7 +214,8 @@ class ActiveMap:
     def pass_by(self, frame: int, T_world_camera: F64, points_px: F32, found: Observations) -> None:
         """The current frame is no keyframe: it hangs on the last one."""
         seen = self._seen(points_px, found)
-        self.segment.passed.add(frame, self.keyframes[-1], T_world_camera, *seen)
+        log_focal = self.seen_by.log_focal
+        self.segment.passed.add(frame, self.keyframes[-1], T_world_camera, *seen, log_focal)
 
     def _seen(self, points_px: F32, found: Observations) -> tuple[I32, F32]:
         """Rows and pixels of all points and candidates that the current frame sees."""
@@ -239,6 +240,7 @@ class ActiveMap:
     def insert_keyframe(
         self,
         frame: int,
+        stamp_ns: int,
         T_world_camera: F64,
         points_px: F32,
         rolled_px: F32,
@@ -257,6 +259,7 @@ class ActiveMap:
         self._paint(self.links.rows[new], points_px[new], colours)
         keyframe = self._append_keyframe(
             frame,
+            stamp_ns,
             T_world_camera,
             np.concatenate([self.links.rows, found.rows]),
             np.concatenate([points_px, found.points_px]),
@@ -301,12 +304,15 @@ class ActiveMap:
             self.points.colours[rows] = image.colours(points_px)
 
     def _append_keyframe(
-        self, frame: int, T_world_camera: F64, rows: I32, points_px: F32, rolled_px: F32 | None
-    ) -> Keyframe:
+        self, frame: int, stamp_ns: int, T_world_camera: F64, rows: I32, points_px: F32,
+        rolled_px: F32 | None,
+    ) -> Keyframe:  # fmt: skip
         rows, first = np.unique(rows, return_index=True)
         keyframe = Keyframe(
             id=self.next_keyframe_id,
             frame=frame,
+            stamp_ns=stamp_ns,
+            log_focal=self.seen_by.log_focal,
             segment=self.segment.id,
             T_world_camera=T_world_camera.copy(),
             rows=rows,

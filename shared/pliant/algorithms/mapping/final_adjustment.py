@@ -3,7 +3,8 @@
 Everything works on the list of observations, so that time and memory grow with their number.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import moved_px
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.changing_focal import gaps_s, is_change, may_change, walk_from
 from pliant.algorithms.mapping.directions import at_infinity
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
@@ -39,6 +41,7 @@ class ListedMap:
 
     rows: (N,) of the points.     xyz: (N, 3).     T_world_camera: (M, 4, 4).
     camera, point: (O,) of each observation.    px: (O, 2).   weights: (O,).   flow: (O, 2) px.
+    log_focal: (M,) and gaps_s: (M - 1,) of the keyframes, see ``changing_focal``.
     """
 
     rows: I32
@@ -50,6 +53,13 @@ class ListedMap:
     weights: F32
     fixed: BoolArray
     flow: F32 | None = None
+    log_focal: F64 = field(default_factory=lambda: np.zeros(0))
+    gaps_s: F64 = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.log_focal):
+            self.log_focal = np.zeros(len(self.T_world_camera))
+            self.gaps_s = np.full(max(len(self.T_world_camera) - 1, 0), np.inf)
 
     def most_seen(self, per_keyframe: int) -> "ListedMap":
         """With the fewest points, those that most keyframes see first, that leave every keyframe
@@ -161,31 +171,38 @@ def adjust_keyframes(
     ``Path``.    Returns what is known now, the rows of points that too few keyframes see or that
     are at infinity, and how what hangs on each keyframe moves.
     """
-    before = known.view
+    given, before = known, known.view
     seen = list_map(keyframes, points, known, parameters)
-    seen.px = before.seen(seen.px)
+    seen.px = before.magnified(before.seen(seen.px), seen.log_focal[seen.camera])
     if parameters.calibration.sigmas.any():
         seen.flow = readout_flow(
             seen.T_world_camera, motions, seen.xyz, seen.camera, seen.point, seen.px, before.camera
         )
     iterations = parameters.window.final_iterations
     poses, depths = seen.T_world_camera.copy(), seen.depths()
-    found = adjust_listed(seen, known, parameters, iterations=iterations, start=known.correction)
+    found = adjust_listed(
+        seen, known, parameters, iterations=iterations, start=known.correction, varying=True
+    )
     known = known.corrected(found.correction, found.covariance, len(keyframes))
+    known = replace(known, changes=bool(len(found.log_focal)), log_focal=float(seen.log_focal[-1]))
     view = known.view
     ids = np.array([keyframe.id for keyframe in keyframes], np.int64)
     moves = moves_between(ids, poses, seen.T_world_camera, seen.scales(depths))
     if seen.flow is not None:
         seen.px = seen.px - (found.correction[3] * seen.flow).astype(np.float32)
-    seen.px = view.pixels(seen.px)
+    seen.px = view.pixels(view.magnified(seen.px, -seen.log_focal[seen.camera]))
     points.xyz[seen.rows] = seen.xyz
     for slot, keyframe in enumerate(keyframes):
         keyframe.T_world_camera = seen.T_world_camera[slot]
     good = _forget_outliers(seen, keyframes, points, view.camera, parameters.window.outlier_px)
     count = np.bincount(seen.point[good], minlength=len(seen.rows))
     _update_statistics(seen, good, count, points, view.camera)
-    for keyframe in keyframes:
-        keyframe.points_px = moved_px(keyframe.points_px + keyframe.rolled_px, before, view)
+    for slot, keyframe in enumerate(keyframes):
+        was, keyframe.log_focal = keyframe.log_focal, float(seen.log_focal[slot])
+        keyframe.points_px = moved_px(
+            keyframe.points_px + keyframe.rolled_px,
+            given.view_at(was), known.view_at(keyframe.log_focal),
+        )  # fmt: skip
         keyframe.rolled_px = np.zeros_like(keyframe.points_px)
     far = at_infinity(seen.xyz, keyframes[0].T_world_camera[:3, 3])
     return known, seen.rows[(count < 2) | far], moves
@@ -198,11 +215,13 @@ def adjust_listed(
     *,
     iterations: int,
     start: F64,
+    varying: bool = False,
 ) -> BundleResult:
     """Schur LM over all but the first keyframe, all points that two see, and the calibration.
 
     ``seen`` is changed, but for its observations, which are pixels of the rectified image.
-    known: of the camera.   start: (6,) correction of the calibration to begin from.
+    known: of the camera.   start: (6,) correction of the calibration to begin from.   varying: the
+    focal length may change between keyframes, see ``changing_focal``.
     """
     counts = np.bincount(seen.point, minlength=len(seen.rows))
     chosen = counts >= 2
@@ -211,9 +230,18 @@ def adjust_listed(
     uncertainty = known.prior(parameters.calibration, start) if uncertain else None
     kept = chosen[seen.point] & _spread_out(seen.point, counts, _MOST_SEEN)
     problem = _problem(seen, chosen, kept, known.given)
-    found = solve_schur(
-        problem, bundle, uncertainty=uncertainty, start=start, with_covariance=True, doubled=True
-    )
+    solve = partial(
+        solve_schur, problem, bundle, uncertainty=uncertainty, start=start, with_covariance=True,
+        doubled=True,
+    )  # fmt: skip
+    walk, gaps = walk_from(seen.log_focal, seen.gaps_s), seen.gaps_s
+    varying = varying and uncertainty is not None
+    found = solve(walk=walk if varying and known.changes else None)
+    if varying and not known.changes and may_change(problem, found, bundle, uncertainty, gaps):
+        other = solve(walk=walk)
+        found = other if is_change(other.log_focal, gaps) else found
+    if len(found.log_focal):
+        seen.log_focal = found.log_focal
     seen.xyz[chosen] = found.points_world
     seen.T_world_camera = found.T_world_camera
     return found
@@ -250,6 +278,8 @@ def list_map(
         px=px,
         weights=weigh(px, known.view.camera, _k_sigmas(parameters, known)),
         fixed=np.array([k.turned for k in keyframes]) | (np.arange(len(keyframes)) == 0),
+        log_focal=np.array([keyframe.log_focal for keyframe in keyframes]),
+        gaps_s=gaps_s(keyframes),
     )
 
 

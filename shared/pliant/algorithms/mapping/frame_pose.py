@@ -303,7 +303,7 @@ def image_of_tracks(
     are of the camera found so far.   rolled: and have been taken ``at_once``."""
     if pixels is None:
         return None
-    return MovedImage(pixels, calibration.view.move if rolled is None else rolled.places)
+    return MovedImage(pixels, calibration.frame_view.move if rolled is None else rolled.places)
 
 
 def stand(

@@ -158,7 +158,7 @@ class Localiser:
 
     def publish_keyframes(self) -> KeyframeDelta:
         """None are made."""
-        return KeyframeChanges(self._points).publish(None)
+        return KeyframeChanges(self._points).publish(None, self.calibration)
 
     def _locate(
         self, stamp_ns: int, tracks: FrameExtrema, image: MovedImage | None, timer: StageTimer

@@ -153,6 +153,8 @@ class Keyframe:
     published_pose: T_world_camera when last published.
     turned: it stands where the last one does: what turns on the spot tells nothing of depths, and
     its pose rests on all that it saw when it was made.
+    stamp_ns: when it was taken; -1: nobody knows.   log_focal: of its focal length relative to the
+    calibration, with which its pixels are those of an ideal camera: see ``changing_focal``.
     focus: (3,) where it looks: on its axis, at the median depth of its points.  Set when it leaves
     the window; NaN where it sees no point of the map.
     """
@@ -165,6 +167,8 @@ class Keyframe:
     points_px: F32
     rolled_px: F32
     turned: bool = False
+    stamp_ns: int = -1
+    log_focal: float = 0.0
     published_pose: F64 | None = None
     focus: F64 | None = None
 

@@ -177,8 +177,8 @@ class Mapper:
                 if rolled is not None:
                     active.segment.unroll(active.window.keyframes, self.calibration)
                 hanging = active.insert_keyframe(
-                    frame, T_world_camera, tracks.points_px, seen.points_px - tracks.points_px,
-                    found, shown, colours, turned,
+                    frame, stamp_ns, T_world_camera, tracks.points_px,
+                    seen.points_px - tracks.points_px, found, shown, colours, turned,
                 )  # fmt: skip
             self.follow(atlas.calibrate())
             T_world_camera = hanging.T_world_camera
@@ -292,11 +292,9 @@ class Mapper:
         """What is to be published of keyframes after the last frame, or after ``finish``."""
         active = self.atlas.active
         if active is None:
-            return self._keyframe_changes.publish(None)
+            return self._keyframe_changes.publish(None, self.calibration)
         self._keyframe_changes.settle(active.keyframes[: -self._parameters.window.keyframes])
-        delta = self._keyframe_changes.publish(active.keyframes[-1])
-        seen = self.calibration.view.seen(delta.points_px)
-        return dataclasses.replace(delta, points_px=seen)
+        return self._keyframe_changes.publish(active.keyframes[-1], self.calibration)
 
     @property
     def waiting_frames(self) -> list[int]:
@@ -460,4 +458,12 @@ class Mapper:
             centre=centre,
             snapshot=snapshot,
         )
-        return self.calibration.published_with(delta)
+        delta = self.calibration.published_with(delta)
+        if snapshot and self.calibration.changes:
+            made = [k for segment, _ in self.atlas.everything() for k in segment.keyframes]
+            delta = dataclasses.replace(
+                delta,
+                focal_keyframes=np.array([keyframe.id for keyframe in made], np.int64),
+                log_focals=np.array([keyframe.log_focal for keyframe in made]),
+            )
+        return delta

@@ -59,13 +59,14 @@ class RefinedPose(EarlierPose):
 @dataclass(frozen=True, kw_only=True)
 class PassedFrame:
     """A frame that hangs on a keyframe, where it was placed (4, 4), and what it saw there: rows
-    (n,) of points and candidates, at points_px (n, 2)."""
+    (n,) of points and candidates, at points_px (n, 2).   log_focal: as of a keyframe."""
 
     frame: int
     keyframe: Keyframe
     T_keyframe_camera: F64
     rows: I32
     points_px: F32
+    log_focal: float = 0.0
 
 
 @dataclass
@@ -75,14 +76,15 @@ class PassedFrames:
     _frames: list[PassedFrame] = field(default_factory=list[PassedFrame])
 
     def add(
-        self, frame: int, keyframe: Keyframe, T_world_camera: F64, rows: I32, points_px: F32
-    ) -> None:
+        self, frame: int, keyframe: Keyframe, T_world_camera: F64, rows: I32, points_px: F32,
+        log_focal: float = 0.0,
+    ) -> None:  # fmt: skip
         """A frame hangs on a keyframe, and saw points and candidates in the rows (n,)."""
         T_keyframe_camera = inverse(keyframe.T_world_camera) @ T_world_camera
         self._frames.append(
             PassedFrame(
                 frame=frame, keyframe=keyframe, T_keyframe_camera=T_keyframe_camera, rows=rows,
-                points_px=points_px,
+                points_px=points_px, log_focal=log_focal,
             )
         )  # fmt: skip
 
@@ -96,6 +98,17 @@ class PassedFrames:
             replace(each, points_px=moved_px(each.points_px, before, after))
             for each in self._frames
         ]
+
+    def focus(self, view: CorrectedView, keyframes: list[Keyframe]) -> None:
+        """The focal length changes as between the keyframes.   view: whose pixels they have."""
+        numbers = [keyframe.frame for keyframe in keyframes]
+        log_focals = [keyframe.log_focal for keyframe in keyframes]
+        for n, each in enumerate(self._frames):
+            log_focal = float(np.interp(each.frame, numbers, log_focals))
+            if log_focal != each.log_focal:
+                factors = np.full(len(each.rows), log_focal - each.log_focal)
+                points_px = moved_px(each.points_px, view, view, factors)
+                self._frames[n] = replace(each, points_px=points_px, log_focal=log_focal)
 
     def take_in(self, earlier: "PassedFrames") -> None:
         """Those of an earlier segment are of this one, too."""

@@ -10,6 +10,7 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, U8, with_bits
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta, MapMoves
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.compiler.kernel import kernel
 
 _MOVED_SHARE = 2e-3
@@ -195,8 +196,12 @@ class KeyframeChanges:
         self._final += keyframes[first:]
         self._settled = max([self._settled, *(keyframe.id for keyframe in keyframes[first:])])
 
-    def publish(self, newest: Keyframe | None) -> KeyframeDelta:
-        """What has not been published yet.  newest: the last keyframe that was made, if any."""
+    def publish(self, newest: Keyframe | None, known: SelfCalibration) -> KeyframeDelta:
+        """What has not been published yet, in pixels of the rectified image.
+
+        newest: the last keyframe that was made, if any.   known: of the camera, whose pixels they
+        have.
+        """
         new = -1
         changed = [(keyframe, True) for keyframe in self._final]
         self._final = []
@@ -209,7 +214,8 @@ class KeyframeChanges:
             point_ids = self._points.ids[keyframe.rows[mapped]]
             order = np.argsort(point_ids)
             ids.append(point_ids[order])
-            pixels.append((keyframe.points_px + keyframe.rolled_px)[mapped[order]])
+            points_px = (keyframe.points_px + keyframe.rolled_px)[mapped[order]]
+            pixels.append(known.view_at(keyframe.log_focal).seen(points_px))
         return KeyframeDelta(
             new=new,
             keyframe_ids=np.array([keyframe.id for keyframe, _ in changed], np.int64),

@@ -190,9 +190,19 @@ class Segment:
         _inverse_depths(rows, self.points.state, self.points.xyz, T_world_camera, depths)
         return depths
 
-    def rolled(self, calibration: SelfCalibration, motion: F64) -> RolledFrame:
-        """What the readout does to a frame that moves so."""
-        return RolledFrame(calibration.view, calibration.readout, motion, self.inverse_distance)
+    def rolled(
+        self, calibration: SelfCalibration, motion: F64, log_focal: float | None = None
+    ) -> RolledFrame:
+        """What the readout does to a frame that moves so.
+
+        log_focal: None: that of the newest frame.
+        """
+        log_focal = calibration.log_focal if log_focal is None else log_focal
+        readout = calibration.readout
+        if log_focal:  # of a magnified image fewer rows are seen
+            readout *= float(np.exp(log_focal))
+        view = calibration.view_at(log_focal)
+        return RolledFrame(view, readout, motion, self.inverse_distance)
 
     def unroll(self, keyframes: list[Keyframe], calibration: SelfCalibration) -> None:
         """Let keyframes see as if they had been taken at once, as is now known of readout, motion
@@ -202,7 +212,7 @@ class Segment:
                 continue
             seen = keyframe.points_px + keyframe.rolled_px
             depths = self.inverse_depths(keyframe.rows, keyframe.T_world_camera)
-            rolled = self.rolled(calibration, motion)
+            rolled = self.rolled(calibration, motion, keyframe.log_focal)
             keyframe.rolled_px = rolled.shifts(seen, depths)
             keyframe.points_px = seen - keyframe.rolled_px
 
@@ -276,6 +286,8 @@ class Segment:
         self.points.remove(gone)
         self.unroll(self.keyframes, found)
         self.passed.seen_by(known.view, found.view)
+        if found.changes:
+            self.passed.focus(found.view, self.keyframes)
         if found.readout and not known.readout:
             self.passed.forget()
         if not self.thinned:

@@ -67,12 +67,16 @@ class SelfCalibration:
     given: the camera as it was given, of the rectified images.
     correction: (6,) what is wrong with it, see ``solve_schur``.   covariance: (6, 6) of that.
     next_keyframes: how many a map must have to be asked again.
+    changes: whether the focal length changes during the clip.   log_focal: of the newest frame
+    relative to the correction's: see ``changing_focal``.
     """
 
     given: PinholeCamera
     correction: F64
     covariance: F64
     next_keyframes: int = 0
+    changes: bool = False
+    log_focal: float = 0.0
 
     @staticmethod
     def of(camera: PinholeCamera, uncertainty: CalibrationUncertainty) -> "SelfCalibration":
@@ -155,12 +159,21 @@ class SelfCalibration:
     @property
     def view(self) -> CorrectedView:
         """Moves what is seen to where the camera found so far, were it ideal, would see it."""
-        return corrected_view(self.given, tuple(self.correction.tolist()))
+        return self.view_at(0.0)
+
+    @property
+    def frame_view(self) -> CorrectedView:
+        """As ``view``, of the newest frame with its own focal length."""
+        return self.view_at(self.log_focal)
+
+    def view_at(self, log_focal: float) -> CorrectedView:
+        """As ``view``, of what was seen with another focal length."""
+        return corrected_view(self.given, tuple(self.correction.tolist()), log_focal)
 
     def ideal(self, tracks: FrameExtrema) -> FrameExtrema:
         """Tracks of the camera found so far."""
-        view = self.view
-        if view.lens == (0.0, 0.0):
+        view = self.frame_view
+        if view.lens == (0.0, 0.0) and self.log_focal == 0.0:
             return tracks
         maxima = tracks.maxima.copy()
         maxima[:, :2] = view.pixels(tracks.maxima[:, :2])
@@ -179,7 +192,9 @@ class SelfCalibration:
     def corrected(self, correction: F64, covariance: F64, keyframes: int) -> "SelfCalibration":
         """With what so many keyframes told of it."""
         following = max(keyframes + 1, int(np.ceil(_GROWTH * keyframes)))
-        return SelfCalibration(self.given, correction, covariance, following)
+        return dataclasses.replace(
+            self, correction=correction, covariance=covariance, next_keyframes=following
+        )
 
 
 def _is_far(step: F64, covariance: F64, sigmas: float) -> bool:

@@ -142,6 +142,7 @@ class WholeMap:
         if not loops:
             seen = seen.most_seen(parameters.whole_map.points_per_keyframe)
         seen.px = calibration.view.seen(seen.px)
+        seen.log_focal = np.zeros_like(seen.log_focal)  # the pixels are free of it
         if parameters.calibration.readout > 0.0 and not loops:
             seen.flow = readout_flow(
                 seen.T_world_camera, segment.path.motions(segment.keyframes), seen.xyz, seen.camera,
