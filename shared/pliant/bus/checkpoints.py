@@ -6,6 +6,7 @@ whose outputs every reader has safe.
 """
 
 import io
+import os
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -50,7 +51,9 @@ class Checkpoints:
             for unfinished in folder.glob("*.part"):
                 unfinished.unlink()
         except OSError as error:
-            raise BusError(f"{folder}: no checkpoints there: {error.strerror}") from None
+            raise BusError(
+                f"{folder}: cannot make the folder of checkpoints: {error.strerror}{_owner(folder)}"
+            ) from None
         self._places = {
             place.frame: place for place in (_read_place(p) for p in folder.glob("*.state"))
         }
@@ -119,6 +122,18 @@ class Checkpoints:
 
     def _path(self, frame: int) -> Path:
         return self._folder / f"{frame:09d}.state"
+
+
+def _owner(folder: Path) -> str:
+    """Whose the folder is in which another one cannot be made, and what helps; "" if it is ours."""
+    there = next(each for each in (folder, *folder.parents) if each.exists())
+    uid, gid, own = there.stat().st_uid, there.stat().st_gid, os.getuid()
+    if own in (0, uid):
+        return ""
+    return (
+        f" ({there} belongs to user {uid}, this is user {own}): PLIANT_USER={uid}:{gid} for "
+        "containers, else another --state"
+    )
 
 
 def _write_whole(path: Path, parts: tuple[Any, ...]) -> None:
