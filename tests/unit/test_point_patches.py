@@ -27,7 +27,7 @@ def wall():
     return np.clip(picture, 0, 255), np.column_stack([places, np.full(COUNT, 2.0)])
 
 
-def seen_from(T, wall, points, world):
+def seen_from(T, wall, points, world, id=0):
     """A keyframe of the wall at T, as a map has it whose world lies by a similarity to ours."""
     picture, places = wall
     to_wall = np.array([[0.005, 0.0, -1.0], [0.0, 0.005, -1.0], [0.0, 0.0, 1.0]])
@@ -41,8 +41,9 @@ def seen_from(T, wall, points, world):
     points.promote(rows)
     points.xyz[rows] = transform(world, places)
     cut_patches(grey, points_px, rows, points.patches)
+    points.patch_keyframe[rows] = id
     return Keyframe(
-        id=0, frame=0, segment=0, T_world_camera=move_by_similarity(world, T), rows=rows,
+        id=id, frame=0, segment=0, T_world_camera=move_by_similarity(world, T), rows=rows,
         points_px=points_px, rolled_px=np.zeros((COUNT, 2), np.float32),
     )  # fmt: skip
 
@@ -81,9 +82,10 @@ def test_a_patch_is_as_the_last_keyframe_saw_it_that_sees_the_point(wall):
     """Also where the place is an earlier one."""
     points, closer = PointRows(), looking((0.0, 0.0, 0.9), (0.0, 0.0, 0.6))
     first = seen_from(AHEAD, wall, points, np.eye(4))
-    seen = seen_from(closer, wall, points, np.eye(4))
+    seen = seen_from(closer, wall, points, np.eye(4), id=1)
     last = replace(seen, rows=first.rows)
     points.patches[first.rows] = points.patches[seen.rows]
+    points.patch_keyframe[first.rows] = seen.id
     new = seen_from(AHEAD, wall, points, WORLD)
     rows = np.column_stack([first.rows, new.rows])
     S_old_new = np.linalg.inv(WORLD)

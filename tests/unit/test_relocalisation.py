@@ -120,7 +120,7 @@ def place_of(mapper: Mapper, number: int) -> Place:
     assert active is not None
     known = mapper.atlas.places.index.features
     keyframe = next(k for k in active.keyframes[number:] if k.id in known)
-    return Place(keyframe=keyframe, features=known[keyframe.id], segment=active.keyframes)
+    return Place(keyframe=keyframe, corners=known[keyframe.id], segment=active.keyframes)
 
 
 @pytest.mark.parametrize("alike", [True, False])

@@ -66,7 +66,7 @@ def look(own, monkeypatch, segment, newest, proves, alike=None, elsewhere=(), co
 
     monkeypatch.setattr(known_places, "same_place", same_place)
     known = keyframes[: newest + 1]
-    places = [Place(keyframe=k, features=None, segment=known) for k in known]
+    places = [Place(keyframe=k, corners=None, segment=known) for k in known]
     some = [places[k] for k in alike or proves if k < newest]
     others = (places[k] for k in elsewhere)
     counted = Comparisons() if counted is None else counted

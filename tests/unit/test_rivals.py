@@ -54,7 +54,7 @@ def ask(
     all if None; the others are poses that points alone may tell."""
     points = PointRows()
     places = [
-        Place(keyframe=k, features=NOTHING, segment=[k])
+        Place(keyframe=k, corners=NOTHING, segment=[k])
         for k in keyframes(points, 1 + max(said))
         if k.id in list(said)[:places_with_corners]
     ]

@@ -280,6 +280,7 @@ class ActiveMap:
             mapped = self.points.state[newest.rows] == MAPPED
             rows, points_px = newest.rows[mapped], newest.points_px[mapped]
             cut_patches(grey, points_px, rows, self.points.patches)
+            self.points.patch_keyframe[rows] = newest.id
 
     def _adjust_window(self) -> None:
         self.window.adjust(self.parameters)

@@ -144,6 +144,7 @@ def take_in(
         keyframes = [_keyframe(each, ids, rows, calibration) for each in mine]
         for keyframe in keyframes:
             keyframe.focus = focus_of(keyframe, points)
+            points.patch_keyframe[keyframe.rows] = keyframe.id
         path = Path({each.id: each.motion for each in mine if each.motion.any()})
         segment = Segment(
             id=number, points=points, keyframes=keyframes, path=path, since=len(keyframes)

@@ -53,6 +53,10 @@ _TRIES = 3
 _PLACES = 5
 """That look most like a frame are looked at more closely."""
 
+_LOOKED_AT = 64
+"""Places that look most like a keyframe: whether one of these shares points with it.  Where more
+look so much alike and all share points, the map has not drifted there."""
+
 _ELSEWHERE = 2
 """Places more where one of these is proved: what looks the same is often seen by many keyframes."""
 
@@ -138,7 +142,7 @@ class Revisits:
             islice(
                 (
                     old
-                    for old in places
+                    for old in islice(places, _LOOKED_AT)
                     if old.keyframe.id not in window
                     and np.count_nonzero(mine[old.keyframe.rows]) < least
                 ),
@@ -313,7 +317,7 @@ class KnownPlaces:
         proves in its own segment, where these are asked for; what it has in common with earlier
         ones waits in ``meetings``.   image: its maxima (M, 3), and itself (H, W).
         """
-        new = Place(keyframe=keyframe, features=seen, segment=segment.keyframes)
+        new = Place(keyframe=keyframe, corners=seen, segment=segment.keyframes)
         rest = segment.points, view.camera, parameters, self.comparisons
         found = self.revisits.look(new, self._like(seen, [segment], view), *rest) if loops else []
         if earlier:
@@ -354,9 +358,8 @@ class KnownPlaces:
         """Keyframes of the segments that look like an image, the most alike first."""
         known = {k.id: (k, each.keyframes) for each in segments for k in each.keyframes}
         for keyframe, segment in (known[i] for i in self.index.query(seen) if i in known):
-            features = self.index.features[keyframe.id]
-            there = replace(features, points_px=view.pixels(features.points_px))
-            yield Place(keyframe=keyframe, features=there, segment=segment)
+            corners = self.index.features[keyframe.id]
+            yield Place(keyframe=keyframe, corners=corners, segment=segment, view=view)
 
 
 def _showing_else(

@@ -37,7 +37,7 @@ class PointRows:
     base_keyframes, base_parallax_rad: what of those is due to keyframes out of the window.
     kappas: curvature when last seen.    strikes: bad frames of its track in a row.
     misses: frames in a row in which it should have been found again, and was not.
-    patches: grey levels around the point when a keyframe last saw it.
+    patches: grey levels around the point when a keyframe last saw it.   patch_keyframe: id of that.
     """
 
     def __init__(self) -> None:
@@ -61,6 +61,7 @@ class PointRows:
         self.strikes: U8 = np.zeros(1024, np.uint8)
         self.misses: U8 = np.zeros(1024, np.uint8)
         self.patches: U8 = np.zeros((1024, PATCH_SIDE, PATCH_SIDE), np.uint8)
+        self.patch_keyframe: I32 = np.zeros(1024, np.int32)
         self.culled = 0
         """Points of the map that were published and are not kept any more."""
         self._free: I32 = np.zeros(0, np.int32)

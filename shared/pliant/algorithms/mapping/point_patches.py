@@ -29,7 +29,10 @@ def look_alike(
     old and new.   old, new: keyframes of their segments, oldest first.   min_zncc: least
     correlation of the patches.
     """
-    T_old, T_new = _last_to_see(rows[:, 0], old, points), _last_to_see(rows[:, 1], new, points)
+    T_old, T_new = (
+        _seen_from(points.patch_keyframe[some], segment)
+        for some, segment in ((rows[:, 0], old), (rows[:, 1], new))
+    )
     X_old = transform_each(inverse(T_old), points.xyz[rows[:, 0]])
     # Of the old point as it lies before the new camera: where both cameras stand at one place
     # nothing holds the scale, and it matters to nothing that they see.
@@ -43,12 +46,13 @@ def look_alike(
     return _correlations(patches[rows[:, 0]], patches[rows[:, 1]], steps) >= min_zncc
 
 
-def _last_to_see(rows: I32, segment: list[Keyframe], points: PointRows) -> F64:
-    """(n, 4, 4) poses of the last keyframes of a segment that see points."""
-    last = np.zeros(len(points.state), np.int32)
-    for number, keyframe in enumerate(segment):
-        last[keyframe.rows] = number
-    return np.array([segment[n].T_world_camera for n in last[rows]]).reshape(-1, 4, 4)
+def _seen_from(ids: I32, segment: list[Keyframe]) -> F64:
+    """(n, 4, 4) poses of keyframes of a segment by their ids (n,), of the one before where the map
+    has given one up."""
+    known = np.array([keyframe.id for keyframe in segment])
+    unique, each = np.unique(ids, return_inverse=True)
+    at = np.maximum(np.searchsorted(known, unique, side="right") - 1, 0)
+    return np.array([segment[n].T_world_camera for n in at]).reshape(-1, 4, 4)[each]
 
 
 @kernel

@@ -7,6 +7,7 @@ and where no other place is proved nearly as well: what looks the same in two pl
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ import numpy as np
 from pliant.algorithms.absolute_pose import pose_by_ransac
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.mapping.covisibility import most_shared, rows_of
 from pliant.algorithms.mapping.localisation import NEAR, are_enough, look_about, prove, refine
@@ -55,11 +57,23 @@ class _Proposed(NamedTuple):
 @dataclass(frozen=True, kw_only=True)
 class Place:
     """A keyframe that may be what the camera sees, the corners of its image, and all keyframes of
-    its segment, oldest first."""
+    its segment, oldest first.
+
+    view: whose pixels the keyframe has; the corners are at those of the rectified image.  None: the
+    corners are at the keyframe's.
+    """
 
     keyframe: Keyframe
-    features: Features
+    corners: Features
     segment: list[Keyframe]
+    view: CorrectedView | None = None
+
+    @cached_property
+    def features(self) -> Features:
+        """The corners at the pixels that the keyframe has."""
+        if self.view is None:
+            return self.corners
+        return replace(self.corners, points_px=self.view.pixels(self.corners.points_px))
 
 
 @dataclass(frozen=True, kw_only=True)

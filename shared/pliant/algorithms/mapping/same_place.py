@@ -262,6 +262,8 @@ def same_place(
         corners.append((here, seen))
         known &= deep[alike[:, column]]
     (xyz_a, seen_a), (xyz_b, seen_b) = corners
+    if np.count_nonzero(known) < parameters.recovery.min_agreeing:
+        return "few_corners"
     pairs = Pairs(xyz_a=xyz_a, xyz_b=xyz_b, seen_a=seen_a, seen_b=seen_b).of(known)
     found = similarity_by_ransac(
         pairs, generator, gate=limits.ransac_gate_px / camera.fx,
