@@ -120,6 +120,19 @@ def test_keyframes_go_where_their_pairs_take_more_room_than_what_they_see(monkey
     assert len(some.keyframes) == int(0.9 * int(np.sqrt(10 * room)))
 
 
+def test_keyframes_go_where_each_has_too_many_neighbours() -> None:
+    """Of a place that is seen again and again; a path of any length keeps all of them."""
+    few = limits(10_000, 1).model_copy(update={"kept_neighbours": 20})
+    place = segment([[0, 1, 2, 3, 10 + k // 2] for k in range(60)])
+    thin(place, 10_000, few, NO_TRACK, whole=1, settled=False)
+    assert len(place.keyframes) == 60
+    thin(place, 10_000, few, NO_TRACK, whole=1)
+    assert len(place.keyframes) == int(0.9 * int(60 * 20 / 59))
+    path = segment([list(range(k, k + 5)) for k in range(60)])
+    thin(path, 10_000, few, NO_TRACK, whole=1)
+    assert len(path.keyframes) == 60
+
+
 def test_points_that_one_keyframe_is_left_to_see_go_with_those_that_saw_them_too() -> None:
     """The final adjustment would take such points out of the results."""
     some = segment([list(range(10 * k, 10 * k + 25)) for k in range(60)])

@@ -364,16 +364,16 @@ class ActiveMap:
     def _make_room(self, first: int) -> None:
         """Thin what has left the window, as soon as it has been adjusted with the whole map: as it
         is found then, it stays.   first: index of the first keyframe of the window."""
-        segment, room = self.segment, self.room
+        segment, room, adjusted = self.segment, self.room, self.segment.adjusted >= 0
         settled = first - 1  # not the one that has just left: it is not published yet
-        if segment.adjusted >= 0:
+        if adjusted:
             ids = [keyframe.id for keyframe in self.keyframes]
             newest = min(segment.adjusted, segment.passed.first_keyframe - 1)
             settled = min(settled, bisect.bisect_right(ids, newest))
         else:
             room = int(_MOST_UNADJUSTED * room)
         whole = len(self.keyframes) - max(settled, 0)
-        thin(segment, room, self.parameters.window, self.links.rows, whole=whole)
+        thin(segment, room, self.parameters.window, self.links.rows, whole=whole, settled=adjusted)
         segment.adjusted = -1
 
     def _look_at(

@@ -28,7 +28,7 @@ from pliant.compiler.kernel import kernel
 _CHUNK = 4096
 """Points whose rays are compared at a time: bounds a dense table of keyframes x points."""
 
-_MOST_SEEN = 32
+MOST_SEEN = 32
 """Keyframes that tell where a point is.  Each pair of them costs time, so that a room that is seen
 again and again would take the square of it, and the mean of 32 is known as well as need be."""
 
@@ -228,7 +228,7 @@ def adjust_listed(
     bundle = parameters.bundle.model_copy(update={"max_iterations": iterations})
     uncertain = parameters.calibration.sigmas.any()
     uncertainty = known.prior(parameters.calibration, start) if uncertain else None
-    kept = chosen[seen.point] & _spread_out(seen.point, counts, _MOST_SEEN)
+    kept = chosen[seen.point] & _spread_out(seen.point, counts, MOST_SEEN)
     problem = _problem(seen, chosen, kept, known.given)
     solve = partial(
         solve_schur, problem, bundle, uncertainty=uncertainty, start=start, with_covariance=True,

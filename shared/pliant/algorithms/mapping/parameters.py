@@ -203,6 +203,12 @@ class WindowParameters(Parameters):
         description="Observations that the adjustments of the whole map have room for, some 200 "
         "bytes each: beyond, points that few keyframes see hang on a keyframe, as they were found",
     )
+    kept_neighbours: int = Field(
+        default=300,
+        ge=10,
+        description="Keyframes with which one may share points, in the mean of the squares: an "
+        "adjustment takes time by that mean, and beyond it keyframes hang on another one",
+    )
     kept_per_keyframe: int = Field(
         default=150,
         ge=1,

@@ -6,8 +6,8 @@ the adjustment any more how the map lies, and hangs on a keyframe that moves it.
 
 First go points.  A keyframe sees thousands, and a fraction of them holds it as well; those seen by
 the most keyframes hold the most and stay.  Of each keyframe an equal share is left.  Where that
-becomes less than a place needs, or pairs of keyframes are too many, keyframes go: the one of which
-the least is lost.  Of what a point seen by n keyframes tells, one of these is a share of
+becomes less than a place needs, or keyframes have too many neighbours, keyframes go: the one of
+which the least is lost.  Of what a point seen by n keyframes tells, one of these is a share of
 1 / (n - 1), and all of it where n = 1; the mean over the points that it sees is what is lost with a
 keyframe.  Where a place was visited many times, that is one visit of many; on a path, every other
 keyframe of where the camera was slow.  Points that one keyframe alone is left to see go with them:
@@ -19,6 +19,7 @@ import heapq
 import numpy as np
 
 from pliant.algorithms.arrays import I32, I64, BoolArray
+from pliant.algorithms.mapping.final_adjustment import MOST_SEEN
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.parameters import WindowParameters
 from pliant.algorithms.mapping.segment import GivenUp, Segment
@@ -46,13 +47,25 @@ def observations_of(segments: list[Segment]) -> int:
     return sum(len(keyframe.rows) for segment in segments for keyframe in segment.keyframes)
 
 
-def thin(segment: Segment, room: int, limits: WindowParameters, linked: I32, *, whole: int) -> None:
+def thin(
+    segment: Segment,
+    room: int,
+    limits: WindowParameters,
+    linked: I32,
+    *,
+    whole: int,
+    settled: bool = True,
+) -> None:
     """Let a segment have no more observations than there is room for, as far as that can be.
 
     linked: row of each living track, negative where it has none.   whole: newest keyframes that
     stay as they are, with the points that they see: nobody may have been told of them yet.
+    settled: the others have just been adjusted together, so that those may go, too, that have more
+    neighbours than ``limits`` allow.
     """
     most = int(np.sqrt(_PAIRS * room))
+    if settled and len(segment.keyframes) > limits.kept_neighbours:
+        most = min(most, _most_keyframes(segment, limits.kept_neighbours))
     if observations_of([segment]) > room:
         room = int((1.0 - _SPARE) * room)
         _give_up_points(segment, room, limits.kept_per_keyframe, linked, whole)
@@ -136,6 +149,28 @@ def _give_up_keyframes(segment: Segment, surplus: int, count: int, linked: I32, 
         seen = np.zeros(len(counts), np.bool_)
         seen[np.concatenate([known[slot].rows for slot in gone])] = True
         _let_go(segment, seen & (counts < 2) & _may_go(segment, linked, whole))
+
+
+def _most_keyframes(segment: Segment, neighbours: int) -> int:
+    """How many keyframes a segment may have so that each shares points with so many, as the root of
+    the mean square: to factor the equations of an adjustment takes time by that mean."""
+    count = len(segment.keyframes)
+    start, slots = _seen_by(segment)
+    met = np.zeros((count, count), np.bool_)
+    _meet(start, slots, met)
+    found = float(np.sqrt(np.square(met.sum(axis=1)).mean()))
+    return count if found <= neighbours else int(count * neighbours / found)
+
+
+@kernel
+def _meet(start: I64, slots: I32, met: BoolArray) -> None:
+    """Mark keyframes (K, K) that share a point, of those that see many as many as tell of one."""
+    for row in range(start.size - 1):
+        seen = slots[start[row] : start[row + 1]]
+        step = max(1, seen.size // MOST_SEEN)
+        for a in range(0, seen.size, step):
+            for c in range(0, a, step):
+                met[seen[a], seen[c]] = met[seen[c], seen[a]] = True
 
 
 def _loss(counts: I64) -> float:
