@@ -99,8 +99,7 @@ def match(a: Features, b: Features) -> I64:
     """(m, 2) corners of a and of b that are each other's best, clearly better than the next."""
     A, B = (np.ascontiguousarray(each.descriptors).view(np.uint64) for each in (a, b))
     there, back = np.full(len(A), -1, np.int32), np.full(len(B), -1, np.int32)
-    _best(A, B, there, _RATIO)
-    _best(B, A, back, 1.0)
+    _best(A, B, there, back)
     found = np.flatnonzero(there >= 0)
     found = found[back[there[found]] == found]
     return np.column_stack([found, there[found]]).astype(np.int64)
@@ -135,8 +134,10 @@ def _bits(word: np.uint64) -> np.int64:
 
 
 @kernel
-def _best(A: U64, B: U64, found: I32, ratio: float) -> None:
-    """Index of the nearest of B to each of A, left where none is near or the next is as well."""
+def _best(A: U64, B: U64, there: I32, back: I32) -> None:
+    """Index of the nearest of B to each of A, left where none is near or the next is as well; and
+    of the nearest of A to each of B."""
+    closest = np.full(B.shape[0], 257, np.int64)
     for i in range(A.shape[0]):
         nearest, least, following = -1, 256, 256
         for j in range(B.shape[0]):
@@ -147,8 +148,10 @@ def _best(A: U64, B: U64, found: I32, ratio: float) -> None:
                 nearest, least, following = j, distance, least
             elif distance < following:
                 following = distance
-        if least <= _MAX_BITS and least <= ratio * following:
-            found[i] = nearest
+            if distance < closest[j]:
+                closest[j], back[j] = distance, i
+        if least <= _MAX_BITS and least <= _RATIO * following:
+            there[i] = nearest
 
 
 def words_of(descriptors: U8) -> I32:

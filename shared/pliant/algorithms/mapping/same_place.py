@@ -17,7 +17,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import hat, inverse, so3_exp, transform
+from pliant.algorithms.geometry import inverse, so3_exp, transform
 from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.point_patches import look_alike
@@ -88,16 +88,8 @@ def refine_similarity(S_a_b: F64, pairs: Pairs, *, scale: float) -> F64:
 
     scale: of these, on the plane z = 1.
     """
-    as_image = scale / _DEPTH_SIGMA
     for _ in range(_ROUNDS):
-        residuals, J = residuals_of(S_a_b, pairs)
-        residuals[:, 4] *= as_image
-        J[:, 4] *= as_image
-        squared = residuals**2
-        squared[:, :4] = squared[:, :4].sum(axis=1, keepdims=True)
-        weights = (1.0 / (1.0 + squared / scale**2)) ** 2
-        H = np.einsum("nri,nr,nrj->ij", J, weights, J)
-        g = np.einsum("nri,nr,nr->i", J, weights, residuals)
+        H, g = _normal_equations(*residuals_of(S_a_b, pairs), scale, scale / _DEPTH_SIGMA)
         step = -np.linalg.solve(H + 1e-12 * np.trace(H) * np.eye(7), g)
         if not np.abs(step[[0, 1, 2, 6]]).max() < _MOST:
             break  # nothing holds it
@@ -122,31 +114,83 @@ def residuals_of(S_a_b: F64, pairs: Pairs) -> tuple[F64, F64]:
     With Y = S X_b: ``dY = -[Y] domega + dtau + Y dsigma``; S^-1 X_a turns with the opposite step;
     ``d log |Y| = Y . dY / |Y|^2``.
     """
-    Y = pairs.xyz_b @ S_a_b[:3, :3].T + S_a_b[:3, 3]
-    back = np.linalg.inv(S_a_b)
-    Z = pairs.xyz_a @ back[:3, :3].T + back[:3, 3]
-    X, farness = pairs.xyz_a, np.square(Y).sum(axis=1)
-    ratio = 0.5 * np.log(farness / np.square(X).sum(axis=1))
-    residuals = np.column_stack([_project(Y) - pairs.seen_a, _project(Z) - pairs.seen_b, ratio])
-    one = np.broadcast_to(np.eye(3), (len(Y), 3, 3))
-    dY = np.concatenate([-hat(Y), one, Y[:, :, None]], axis=2)
-    dZ = -back[:3, :3] @ np.concatenate([-hat(X), one, X[:, :, None]], axis=2)
-    away = (Y / farness[:, None])[:, None] @ dY
-    return residuals, np.concatenate([_slope(Y) @ dY, _slope(Z) @ dZ, away], axis=1)
+    back = np.asarray(np.linalg.inv(S_a_b), np.float64)
+    count = len(pairs.xyz_a)
+    residuals, J = np.empty((count, 5)), np.empty((count, 5, 7))
+    _linearise(
+        S_a_b, back, pairs.xyz_a, pairs.xyz_b, pairs.seen_a, pairs.seen_b, residuals, J
+    )  # fmt: skip
+    return residuals, J
+
+
+@kernel
+def _linearise(
+    S: F64, back: F64, xyz_a: F64, xyz_b: F64, seen_a: F64, seen_b: F64, residuals: F64, J: F64
+) -> None:
+    Y, Z, dY, dZ = np.empty(3), np.empty(3), np.empty((3, 7)), np.empty((3, 7))
+    for n in range(len(xyz_a)):
+        X, far = xyz_a[n], 0.0
+        for r in range(3):
+            Y[r], Z[r] = S[r, 3], back[r, 3]
+            for c in range(3):
+                Y[r] += S[r, c] * xyz_b[n, c]
+                Z[r] += back[r, c] * X[c]
+            far += Y[r] * Y[r]
+        _derivatives(Y, dY)
+        _derivatives(X, J[n, :3])  # of X_a, which S^-1 then takes to b
+        for r in range(3):
+            for k in range(7):
+                dZ[r, k] = 0.0
+                for c in range(3):
+                    dZ[r, k] -= back[r, c] * J[n, c, k]
+        _project_into(Y, dY, seen_a[n], residuals[n, :2], J[n, :2])
+        _project_into(Z, dZ, seen_b[n], residuals[n, 2:4], J[n, 2:4])
+        residuals[n, 4] = 0.5 * np.log(far / (X[0] * X[0] + X[1] * X[1] + X[2] * X[2]))
+        for k in range(7):
+            J[n, 4, k] = (Y[0] * dY[0, k] + Y[1] * dY[1, k] + Y[2] * dY[2, k]) / far
+
+
+@kernel
+def _derivatives(X: F64, dX: F64) -> None:
+    """(3, 7) of a point by ``moved``."""
+    dX[:] = 0.0
+    dX[0, 1], dX[0, 2], dX[1, 2] = X[2], -X[1], X[0]
+    dX[1, 0], dX[2, 0], dX[2, 1] = -X[2], X[1], -X[0]
+    for r in range(3):
+        dX[r, 3 + r], dX[r, 6] = 1.0, X[r]
+
+
+@kernel
+def _project_into(X: F64, dX: F64, seen: F64, error: F64, J: F64) -> None:
+    """Error (2,) of the projection, and its derivatives (2, 7)."""
+    z = _MIN_DEPTH if abs(X[2]) < _MIN_DEPTH else X[2]
+    for r in range(2):
+        error[r] = X[r] / z - seen[r]
+        for k in range(7):
+            J[r, k] = (dX[r, k] - X[r] / z * dX[2, k]) / z
+
+
+@kernel
+def _normal_equations(residuals: F64, J: F64, scale: float, as_image: float) -> tuple[F64, F64]:
+    """(7, 7) and (7,) with Geman-McClure weights.   as_image: what distances count as."""
+    H, g = np.zeros((7, 7)), np.zeros(7)
+    for n in range(len(residuals)):
+        r = residuals[n]
+        image = r[0] * r[0] + r[1] * r[1] + r[2] * r[2] + r[3] * r[3]
+        for k in range(5):
+            times = as_image * as_image if k == 4 else 1.0
+            squared = times * r[4] * r[4] if k == 4 else image
+            weight = times / (1.0 + squared / scale**2) ** 2
+            for i in range(7):
+                g[i] += weight * J[n, k, i] * r[k]
+                for j in range(7):
+                    H[i, j] += weight * J[n, k, i] * J[n, k, j]
+    return H, g
 
 
 def _project(X: F64) -> F64:
     z = np.where(np.abs(X[..., 2:]) < _MIN_DEPTH, _MIN_DEPTH, X[..., 2:])
     return X[..., :2] / z
-
-
-def _slope(X: F64) -> F64:
-    """(N, 2, 3) of the projection."""
-    z = np.where(np.abs(X[:, 2]) < _MIN_DEPTH, _MIN_DEPTH, X[:, 2])
-    J = np.zeros((len(X), 2, 3))
-    J[:, 0, 0] = J[:, 1, 1] = 1.0 / z
-    J[:, 0, 2], J[:, 1, 2] = -X[:, 0] / z**2, -X[:, 1] / z**2
-    return J
 
 
 def _squared(S_a_b: F64, pairs: Pairs) -> F64:
