@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from running import TINY, assert_one_line, children, digests, in_this_process, pliant, running
 
+from pliant.export.export import export_result
 from pliant.formats.ply import read_ply
+from pliant.open3d_library import Open3dError, load_open3d
 
 pytestmark = pytest.mark.system
 
@@ -76,6 +78,25 @@ def test_a_mesher_that_is_killed_fuses_again_and_the_mesh_is_that_of_an_ordinary
     assert "had come to its end" in again.stderr
     assert digests(output) == digests(result)
     assert not (output / "state").exists()
+
+
+def test_the_mesh_is_made_again_closed_and_without_small_pieces(
+    result: Path, tmp_path: Path
+) -> None:
+    try:
+        load_open3d()
+    except Open3dError as error:
+        pytest.skip(f"open3d is installed but cannot be loaded ({error})")
+    output = tmp_path / "solid"
+    done = pliant("mesh", result, "--output", output, "--watertight", "--clean")
+    assert done.returncode == 0, done.stderr
+    assert "mesh_watertight.ply: " in done.stdout
+    exported = export_result(result, "watertight", tmp_path / "exported.ply")
+    assert (output / "mesh_watertight.ply").read_bytes() == exported.read_bytes()
+    whole, clean = (read_ply(folder / "mesh.ply").faces for folder in (result, output))
+    assert whole is not None
+    assert clean is not None
+    assert 0.5 * len(whole) < len(clean) < len(whole)
 
 
 def test_the_mesh_is_made_again_with_other_parameters(result: Path, tmp_path: Path) -> None:
