@@ -97,6 +97,8 @@ def test_the_mesh_is_made_again_closed_and_without_small_pieces(
     assert whole is not None
     assert clean is not None
     assert 0.5 * len(whole) < len(clean) < len(whole)
+    report = json.loads((output / "mesh.json").read_text())["mesh"]
+    assert {"fine": len(clean)}.items() <= {m["level"]: m["triangles"] for m in report}.items()
 
 
 def test_the_mesh_is_made_again_with_other_parameters(result: Path, tmp_path: Path) -> None:

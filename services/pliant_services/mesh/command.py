@@ -15,6 +15,7 @@ from pliant.files import write_whole
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.map_history import MapHistory
 from pliant.messages import topics
+from pliant.messages.mesh_pieces import joined, split
 from pliant.messages.topics import Topic
 from pliant.messages.types import CameraStream, Header, MeshPiece, Status
 from pliant.open3d_library import load_open3d
@@ -88,7 +89,9 @@ def run_mesh(
     with written(output, force=force):
         found = mesh_recording(recording, config)
         yield from dict.fromkeys(found.notes)
-        write_all(output, found, folded_map(recording), clean=clean)
+        if clean:
+            found.pieces = list(without_small_pieces(found.pieces))
+        write_all(output, found, folded_map(recording))
         report = {
             "mesh": mesh_report(found.pieces),
             "seconds": found.seconds,
@@ -120,6 +123,16 @@ def _beside(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}_mesh")
 
 
+def without_small_pieces(pieces: Sequence[MeshPiece]) -> Iterator[MeshPiece]:
+    """The meshes, cleaned."""
+    for some in meshes_of(pieces).values():
+        first = some[0]
+        yield from split(
+            first, cleaned(joined(some)), segment=first.segment, level=first.level,
+            voxel_size=first.voxel_size, keyframes=first.keyframes,
+        )  # fmt: skip
+
+
 def write_watertight(output: Path, found: Meshing, segment: int) -> Iterator[str]:
     """The fine mesh of a segment, closed.  Raises ResultError where it does not close."""
     mesh = mesh_of(found.pieces, segment)
@@ -129,12 +142,11 @@ def write_watertight(output: Path, found: Meshing, segment: int) -> Iterator[str
         yield f"{WATERTIGHT_NAME}: {counted(len(closed.triangles), 'triangle')}"
 
 
-def write_all(output: Path, found: Meshing, history: MapHistory, *, clean: bool = False) -> None:
+def write_all(output: Path, found: Meshing, history: MapHistory) -> None:
     """The meshes and pictures of every segment, as the results of a run have them."""
     longest = history.longest_segment()
     for segment in sorted({segment for segment, _ in meshes_of(found.pieces)}):
         poses = [pose for of, pose in history.keyframe_poses().values() if of == segment]
         suffix = "" if segment == longest else f"_segment_{segment}"
         T_world_camera = pose_to_matrix(np.array(poses, np.float64).reshape(-1, 7))
-        changed = cleaned if clean else None
-        write_meshes(output, found.pieces, segment, suffix, T_world_camera, changed)
+        write_meshes(output, found.pieces, segment, suffix, T_world_camera)

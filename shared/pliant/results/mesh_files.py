@@ -1,6 +1,6 @@
 """The meshes of a recording as the files that a user opens."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +30,13 @@ def mesh_of(pieces: Sequence[MeshPiece], segment: int, level: str = "fine") -> T
 
 
 def write_meshes(
-    folder: Path, pieces: Sequence[MeshPiece], segment: int, suffix: str, T_world_camera: F64,
-    changed: Callable[[TriangleMesh], TriangleMesh] | None = None,
-) -> None:  # fmt: skip
-    """Write the meshes of a segment, and pictures of the fine one from over the camera's path.
-
-    changed: what is done to each mesh before.
-    """
+    folder: Path, pieces: Sequence[MeshPiece], segment: int, suffix: str, T_world_camera: F64
+) -> None:
+    """Write the meshes of a segment, and pictures of the fine one from over the camera's path."""
     for (of, level), some in meshes_of(pieces).items():
         if of != segment or level not in _NAMES:
             continue
-        mesh = joined(some) if changed is None else changed(joined(some))
+        mesh = joined(some)
         path = folder / f"{_NAMES[level]}{suffix}.ply"
         write_mesh(path, mesh)
         if level == "fine" and len(mesh.triangles) and len(T_world_camera):
