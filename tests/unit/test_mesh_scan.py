@@ -1,5 +1,6 @@
 """A mesh against a scan, and Open3D's figures beside ours."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.errors import ResultError
 from pliant.evaluation.criteria import Similarity
+from pliant.evaluation.evaluate import EvaluationRequest, run_evaluation
 from pliant.evaluation.mesh_scan import compare_with_scan, mesh_against_scan
 from pliant.evaluation.surface_distance import sample_surface, share_within
 from pliant.formats.ply import write_ply
@@ -112,3 +114,27 @@ def test_what_cannot_be_compared_is_said(open3d: Any, tmp_path: Path) -> None:
     write_ply(scan, points[:2])
     with pytest.raises(ResultError, match="fewer than three"):
         list(mesh_against_scan(tmp_path, scan, still, {}))
+
+
+def test_a_missing_scan_or_library_is_said_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request: dict[str, Any] = {
+        "results": [tmp_path],
+        "groundtruth": "nowhere",
+        "times": None,
+        "frames": None,
+        "tracks": False,
+        "points": False,
+        "mesh": False,
+        "surfels": False,
+        "plot": None,
+        "json": None,
+    }
+    scan = tmp_path / "scan.ply"
+    with pytest.raises(ResultError, match="no such scan"):
+        list(run_evaluation(EvaluationRequest(**request, scan=scan)))
+    scan.touch()
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(Open3dError):
+        list(run_evaluation(EvaluationRequest(**request, scan=scan)))

@@ -20,6 +20,7 @@ from pliant.evaluation.presentation import (
 )
 from pliant.evaluation.run_evaluation import Evaluation, evaluate_result
 from pliant.evaluation.time_offset import TimeOffset
+from pliant.open3d_library import load_open3d
 from pliant.results.folder import PAGE_NAME, check_free, files_read, keep_apart
 from pliant.results.page.page import put_truth_in
 
@@ -50,10 +51,7 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         raise ResultError(f"{missing[0]}: no such result")
     check_free(*request.results, elsewhere=False)
     _check_outputs(request)
-    if request.scan is not None and (request.surfels or len(request.results) > 1):
-        raise ResultError(
-            "--scan is for the mesh of one result: leave out the others, or --surfels"
-        )
+    _check_scan(request)
     if request.offset and (request.surfels or request.tracks or request.points or request.mesh):
         raise ResultError("--offset is for poses: leave it, or --tracks, --map, --mesh, --surfels")
     if request.surfels:
@@ -130,6 +128,18 @@ def _proposal(evaluation: Evaluation, better: TimeOffset) -> str:
         f"{where}: ATE {metres(better.rmse_m)} instead of {metres(better.before_m)}: if the clocks "
         f"differ, --offset {evaluation.offset_s + better.seconds:.3f}"
     )
+
+
+def _check_scan(request: EvaluationRequest) -> None:
+    """Raise PliantError, before the work, where it cannot be used."""
+    if request.scan is not None and (request.surfels or len(request.results) > 1):
+        raise ResultError(
+            "--scan is for the mesh of one result: leave out the others, or --surfels"
+        )
+    if request.scan is not None:
+        if not request.scan.is_file():
+            raise ResultError(f"{request.scan}: no such scan")
+        load_open3d()
 
 
 def _check_outputs(request: EvaluationRequest) -> None:
