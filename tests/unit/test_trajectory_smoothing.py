@@ -119,10 +119,11 @@ def test_one_bad_pose_does_not_move_its_neighbours() -> None:
     assert off_m(beside[60:61], truth[60:61]) < 0.01
 
 
-def test_a_pose_of_unknown_information_follows_the_others() -> None:
+@pytest.mark.parametrize("unknown", [np.nan, 0.0])
+def test_a_pose_of_unknown_information_follows_the_others(unknown: float) -> None:
     truth = by_hand()
     noisy, information = with_noise(truth), INFORMATION.copy()
-    information[:8] = np.nan
+    information[:8] = unknown
     smoothed = smooth_trajectory(noisy, information, STAMPS_NS)
     assert off_m(smoothed, truth) < 0.7 * off_m(noisy, truth)
 

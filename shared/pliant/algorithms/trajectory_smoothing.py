@@ -52,11 +52,14 @@ def smooth_trajectory(
     """Most likely poses of frames that follow each other.
 
     T_world_camera: (N, 4, 4) as measured.   information: (N, 6, 6) of ``T_camera_world``
-    (translation, rotation) for one pixel of noise; NaN where it is unknown.   stamps_ns: (N,)
+    (translation, rotation) for one pixel of noise; NaN or 0 where it is unknown.   stamps_ns: (N,)
     increasing.   most_noise_px: what s may be at the most.   Returns (N, 4, 4); the same poses
     where there are too few frames, or the motion is smooth only under more noise: it is not then.
     """
-    known: BoolArray = np.asarray(np.isfinite(information).all(axis=(1, 2)))
+    told = np.diagonal(information, axis1=1, axis2=2)
+    known: BoolArray = np.asarray(
+        np.isfinite(information).all(axis=(1, 2)) & (told > 0.0).all(axis=1)
+    )
     if np.count_nonzero(known) < _LEAST_FRAMES:
         return T_world_camera
     T = inverse(T_world_camera)
