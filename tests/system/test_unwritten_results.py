@@ -1,10 +1,21 @@
 """A run that was recorded to its end, and was killed before its results stood."""
 
+import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
-from running import FILES, NO_MESH, TINY, assert_one_line, digests, in_this_process
+from running import (
+    FILES,
+    NO_MESH,
+    TINY,
+    assert_one_line,
+    digests,
+    in_this_process,
+    running,
+    services_of,
+)
 
 from pliant.recording.recover import recover
 from pliant.results.folder import STATE_FOLDER
@@ -51,6 +62,18 @@ def test_what_was_cut_off_cannot_be_resumed(tiny_run: Path, tmp_path: Path) -> N
     (folder / "cut.mcap").unlink()
     done = in_this_process("run", TINY, "--resume", "--output", folder)
     assert_one_line(done, "begun without --on-crash restart, and cannot go on")
+
+
+def test_a_service_that_is_killed_while_it_starts_is_started_again(
+    tiny_run: Path, tmp_path: Path
+) -> None:
+    with running(TINY, *NO_MESH, "--on-crash", "restart", "--output", tmp_path / "tiny") as run:
+        while "recorder" not in (services := services_of(run.process.pid)):
+            assert run.process.poll() is None
+        os.kill(services["recorder"], signal.SIGKILL)
+        code, _, errors = run.finish()
+    assert code == 0, errors
+    assert digests(tmp_path / "tiny") == digests(tiny_run)
 
 
 def test_what_resumes_a_run_stays_until_its_results_stand(

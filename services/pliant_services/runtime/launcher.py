@@ -111,7 +111,7 @@ class Fleet:
             self._children.append(self._spawn(name))  # one by one: a Ctrl-C leaves none behind
         deadline = time.monotonic() + READY_TIMEOUT_S
         while not self._ready >= set(self._services):
-            self.raise_if_died()
+            self._all_left()  # who dies now is started again, too
             if time.monotonic() > deadline:
                 missing = sorted(set(self._services) - self._ready)
                 raise BusError(
