@@ -8,7 +8,7 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.mapping import final_adjustment
-from pliant.algorithms.mapping.changing_focal import focal_range, is_change
+from pliant.algorithms.mapping.changing_focal import Evidence, focal_range
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 
@@ -54,7 +54,8 @@ def test_one_focal_length_is_left_alone(control):
 )
 def test_a_focal_length_that_changes_is_found_and_the_path_is_right(factors, monkeypatch):
     error, final = run(factors)
-    monkeypatch.setattr(final_adjustment, "may_change", lambda *_: False)
+    none = Evidence(0.0, np.zeros(2), np.zeros(1))
+    monkeypatch.setattr(final_adjustment, "evidence_of_change", lambda *_: none)
     assert error < 0.5 * run(factors)[0]
     frames = dict(zip(final.keyframe_ids.tolist(), final.keyframe_frames.tolist(), strict=True))
     true = np.array([factors[frames[k]] for k in final.focal_keyframes.tolist()])
@@ -67,6 +68,8 @@ def test_what_jumps_from_keyframe_to_keyframe_is_no_change_and_what_lasts_is():
     gaps = np.full(99, 0.1)
     jumping = 0.01 * (-1.0) ** np.arange(100)
     lasting = 0.015 * np.sign(np.sin(np.arange(100) / 16.0))
-    assert not is_change(jumping, gaps)
-    assert is_change(lasting, gaps)
+    assert not Evidence(30.0, jumping, gaps).calls_for_more
+    assert not Evidence(5.0, lasting, gaps).calls_for_more
+    assert Evidence(30.0, lasting, gaps).confirmed_by(lasting)
+    assert Evidence(200.0, jumping, gaps).confirmed_by(jumping)
     np.testing.assert_allclose(focal_range(lasting, gaps), (-0.015, 0.015), atol=1e-3)

@@ -5,8 +5,11 @@ residuals that hardly grow.  The adjustment of all keyframes asks whether a foca
 would explain what it leaves: how much less one linear step would cost with them (a score test), in
 units of the variance of the residuals.  Errors of other kinds, of the rolling shutter for instance,
 look like a z that jumps from keyframe to keyframe; what a camera does lasts for a while.  So z must
-also vary by more than calibrations are believed, averaged over half a second.
+also vary by more than calibrations are believed, averaged over half a second; or else explain so
+much that nothing else does.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,9 +30,12 @@ _RATE = 0.05
 _SPREAD = 0.3
 """Of the log focal length in a clip."""
 
-_GAIN = 10.0
-"""Times what noise would gain by each focal length: real clips with one focal length gain up to 16,
-with less range; zoomed ones from 30 on."""
+_GAIN = 25.0
+"""Times what noise would gain by each focal length: real clips with one focal length gain up to 20,
+zoomed ones from 30 on."""
+
+_CERTAIN = 50.0
+"""As ``_GAIN``, from which on the range does not matter: stabilised clips gain from 100 on."""
 
 _RANGE = 2.0 * CalibrationUncertainty().focal
 """Of the log focal length: two standard deviations of a calibration that is believed.  Errors of
@@ -64,23 +70,40 @@ def focal_range(log_focals: F64, gaps: F64) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def is_change(log_focals: F64, gaps: F64, share: float = 1.0) -> bool:
-    """Whether they range farther than this share of what is believed of a calibration anyway."""
-    low, high = focal_range(log_focals, gaps)
-    return high - low > share * _RANGE
+class Evidence(NamedTuple):
+    """gain: what focal lengths of their own would explain, times what noise would gain by them.
+    log_focals: (M,) by one step.   gaps_s: (M - 1,)."""
+
+    gain: float
+    log_focals: F64
+    gaps_s: F64
+
+    @property
+    def calls_for_more(self) -> bool:
+        """Whether an adjustment with these unknowns is worth its time."""
+        return self.confirmed_by(self.log_focals, _ONE_STEP)
+
+    def confirmed_by(self, log_focals: F64, share: float = 1.0) -> bool:
+        """Whether log focal lengths (M,) range over as much as changes do, or the gain is certain.
+
+        share: of that range.
+        """
+        low, high = focal_range(log_focals, self.gaps_s)
+        ranges = self.gain > _GAIN and high - low > share * _RANGE
+        return ranges or self.gain > _CERTAIN
 
 
-def may_change(
+def evidence_of_change(
     problem: BundleProblem, found: BundleResult, parameters: BundleParameters,
-    uncertainty: CalibrationUncertainty | None, gaps: F64,
-) -> bool:  # fmt: skip
-    """Whether what an adjustment leaves speaks for focal lengths that change."""
+    uncertainty: CalibrationUncertainty, gaps: F64,
+) -> Evidence:  # fmt: skip
+    """What an adjustment leaves that focal lengths which change would explain."""
     M = len(problem.T_world_camera)
     told = 2 * len(problem.points_px) - 3 * len(problem.points_world) - 6 * M
-    if uncertainty is None or M < 3 or told <= 0:
-        return False
+    if M < 3 or told <= 0:
+        return Evidence(0.0, np.zeros(M), gaps)
     gain, step = gain_of_focal(
         problem, found, parameters, uncertainty, walk_from(np.zeros(M), gaps)
     )
     variance = 2.0 * found.final_cost / told
-    return gain > _GAIN * M * variance and is_change(step, gaps, _ONE_STEP)
+    return Evidence(gain / (M * variance) if variance > 0.0 else 0.0, step, gaps)

@@ -15,7 +15,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import moved_px
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.changing_focal import gaps_s, is_change, may_change, walk_from
+from pliant.algorithms.mapping.changing_focal import evidence_of_change, gaps_s, walk_from
 from pliant.algorithms.mapping.directions import at_infinity
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
@@ -235,11 +235,13 @@ def adjust_listed(
         doubled=True,
     )  # fmt: skip
     walk, gaps = walk_from(seen.log_focal, seen.gaps_s), seen.gaps_s
-    varying = varying and uncertainty is not None
-    found = solve(walk=walk if varying and known.changes else None)
-    if varying and not known.changes and may_change(problem, found, bundle, uncertainty, gaps):
-        other = solve(walk=walk)
-        found = other if is_change(other.log_focal, gaps) else found
+    known_to_change = varying and known.changes and uncertainty is not None
+    found = solve(walk=walk if known_to_change else None)
+    if varying and uncertainty is not None and not known_to_change:
+        evidence = evidence_of_change(problem, found, bundle, uncertainty, gaps)
+        if evidence.calls_for_more:
+            other = solve(walk=walk)
+            found = other if evidence.confirmed_by(other.log_focal) else found
     if len(found.log_focal):
         seen.log_focal = found.log_focal
     seen.xyz[chosen] = found.points_world
