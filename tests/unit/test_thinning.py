@@ -284,7 +284,8 @@ def test_beyond_its_room_the_map_is_adjusted_as_before(whole, room, least):
     assert len(moved) >= 1
     assert np.isin(kept.given_up.ids, moved[-1]).any()
     assert len(published.poses) == len(poses)
-    assert trajectory_error(published, poses)[0] < 2.5 * trajectory_error(all_of_it, poses)[0]
+    # Smoothing halves the error of the whole map, and takes a fifth off the others.
+    assert trajectory_error(published, poses)[0] < 4.0 * trajectory_error(all_of_it, poses)[0]
 
 
 def test_a_loop_is_closed_in_a_map_that_has_given_up_some(drifted):

@@ -20,7 +20,7 @@ smoother (Bryson and Frazier's form, which inverts 6 x 6 matrices alone) is exac
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I64, BoolArray
+from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import hat, inverse, so3_exp, so3_log
 from pliant.compiler.kernel import kernel
 
@@ -42,9 +42,6 @@ _MOST_CHANGE = 20.0
 _FIRST_STEP, _LAST_STEP = 2.0, 0.1
 """Of the search for the logarithms of the variances."""
 
-_UNPLACED = 4.0
-"""Variance of a pose whose information is unknown, as a multiple of the median pose's."""
-
 
 def smooth_trajectory(
     T_world_camera: F64, information: F64, stamps_ns: I64, most_noise_px: float
@@ -52,32 +49,53 @@ def smooth_trajectory(
     """Most likely poses of frames that follow each other.
 
     T_world_camera: (N, 4, 4) as measured.   information: (N, 6, 6) of ``T_camera_world``
-    (translation, rotation) for one pixel of noise; NaN or 0 where it is unknown.   stamps_ns: (N,)
-    increasing.   most_noise_px: what s may be at the most.   Returns (N, 4, 4); the same poses
-    where there are too few frames, or the motion is smooth only under more noise: it is not then.
+    (translation, rotation) for one pixel of noise; NaN or 0 where it is unknown, and then the pose
+    stays.   stamps_ns: (N,) increasing.   most_noise_px: what s may be at the most.
+    Returns (N, 4, 4).  Poses stay where there are too few frames, or where only more noise would
+    make their motion smooth.  A trajectory is split where a pose would contradict its own
+    observations, as at a cut.
     """
     told = np.diagonal(information, axis1=1, axis2=2)
-    known: BoolArray = np.asarray(
-        np.isfinite(information).all(axis=(1, 2)) & (told > 0.0).all(axis=1)
-    )
-    if np.count_nonzero(known) < _LEAST_FRAMES:
-        return T_world_camera
+    known = np.isfinite(information).all(axis=(1, 2)) & (told > 0.0).all(axis=1)
+    smoothed, runs = T_world_camera.copy(), [np.flatnonzero(known)]
+    while runs:
+        run = runs.pop()
+        if len(run) < _LEAST_FRAMES:
+            continue
+        poses, cut = _smooth_run(
+            T_world_camera[run], information[run], stamps_ns[run], most_noise_px
+        )
+        if cut:
+            runs += [run[:cut], run[cut:]]
+        else:
+            smoothed[run] = poses
+    return smoothed
+
+
+def _smooth_run(
+    T_world_camera: F64, information: F64, stamps_ns: I64, most_noise_px: float
+) -> tuple[F64, int]:
+    """The poses, and the frame before which the trajectory has to be split; 0: nowhere."""
     T = inverse(T_world_camera)
     D = T[1:] @ T_world_camera[:-1]
     steps, adjoints = _se3_log(D), _adjoints(D)
     dt = 1e-9 * np.diff(stamps_ns)
-    covariance = _covariances(information, known)
-    velocity = steps / dt[:, None]
-    motion = _Motion(covariance, steps, adjoints, dt, velocity)
+    motion = _Motion(_covariances(information), steps, adjoints, dt, steps / dt[:, None])
     variances = motion.first_fit()
     for _ in range(_ROUNDS):
         motion.weigh(variances)
         variances, _ = motion.fit(variances, 0.5 * _FIRST_STEP)
     if variances[0] > 2.0 * np.log(most_noise_px):
-        return T_world_camera
-    smoothed = inverse(_se3_exp(motion.corrections(variances)) @ T)
-    # Rounding breaks the filter down where poses are exact but for a few.
-    return smoothed if np.isfinite(smoothed).all() else T_world_camera
+        return T_world_camera, 0
+    xi, chi2_steps = motion.corrections(variances)
+    if not np.isfinite(xi).all():  # rounding: poses are exact but for a few
+        return T_world_camera, 0
+    moved_px2 = np.einsum("ni,nij,nj->n", xi, information, xi)
+    worst = int(np.argmax(moved_px2))
+    if moved_px2[worst] > most_noise_px**2:
+        beside = [n for n in (worst, worst + 1) if 0 < n < len(xi)]
+        return T_world_camera, max(beside, key=lambda n: float(chi2_steps[n]))
+    return inverse(_se3_exp(xi) @ T), 0
 
 
 class _Motion:
@@ -121,10 +139,10 @@ class _Motion:
         self._frame_weights = (_TAILS + 6.0) / (_TAILS + self._chi2_frames)
         self._step_weights = (_TAILS + 12.0) / (_TAILS + self._chi2_steps)
 
-    def corrections(self, variances: F64) -> F64:
-        """(N, 6) of the smoothed poses."""
+    def corrections(self, variances: F64) -> tuple[F64, F64]:
+        """(N, 6) of the smoothed poses; (N,) squared residuals of the step to each frame."""
         self._run(variances, smooth=True)
-        return self._states[:, :6].copy()
+        return self._states[:, :6].copy(), self._chi2_steps.copy()
 
     def _run(self, variances: F64, *, smooth: bool) -> float:
         s2, q_translation, q_rotation = np.exp(variances).tolist()
@@ -142,13 +160,11 @@ def _first_guess(velocity: F64, dt: F64) -> F64:
     return np.array([0.0, *np.log(q.reshape(2, 3).mean(axis=1))])
 
 
-def _covariances(information: F64, known: BoolArray) -> F64:
+def _covariances(information: F64) -> F64:
     """(N, 6, 6) for one pixel of noise."""
-    median = np.median(information[known], axis=0)
-    filled = np.where(known[:, None, None], information, median / _UNPLACED)
     # A direction of which nothing is known must not make the inverse infinite.
-    floor = 1e-9 * np.diagonal(filled, axis1=1, axis2=2).max(axis=1)
-    return np.asarray(np.linalg.inv(filled + floor[:, None, None] * np.eye(6)), np.float64)
+    floor = 1e-9 * np.diagonal(information, axis1=1, axis2=2).max(axis=1)
+    return np.asarray(np.linalg.inv(information + floor[:, None, None] * np.eye(6)), np.float64)
 
 
 def _adjoints(D: F64) -> F64:
