@@ -20,6 +20,7 @@ import pytest
 import yaml
 
 from pliant import arithmetic
+from pliant.results.folder import has_frames
 from pliant_services import cli
 
 TINY = "built-in:tiny"
@@ -107,6 +108,11 @@ class Running:
                 self.services = services_of(self.process.pid)
                 return
         raise AssertionError(f"{text!r} did not come:\n{''.join(seen)}")
+
+    def wait_for_frames(self, folder: Path) -> None:
+        """Block until the recording in the result folder has a frame."""
+        while not has_frames(folder):
+            assert self.process.poll() is None
 
     def send(self, kind: signal.Signals, service: str = "") -> None:
         os.kill(self.services[service] if service else self.process.pid, kind)

@@ -223,6 +223,7 @@ def test_a_second_ctrl_c_does_not_wait(tmp_path: Path) -> None:
     folder = tmp_path / "result"
     with running(TINY, "--output", folder, "--mode", "live", *NO_MESH) as run:
         run.wait_for(UP)
+        run.wait_for_frames(folder)
         run.send(signal.SIGSTOP, "tracking")
         run.send(signal.SIGINT)
         run.wait_for("Ctrl-C again")

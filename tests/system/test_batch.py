@@ -24,6 +24,7 @@ from running import (
 )
 
 from pliant.datasets.builtin import builtin_folder
+from pliant.results.folder import has_frames
 from pliant_services.batch import on_cluster
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
@@ -98,11 +99,12 @@ def test_an_interrupted_batch_goes_on_and_a_broken_clip_stops_nobody(
     (clips / "notes.txt").write_text("of the day")
     again = ("batch", clips, "--output", output, *engine, *OPTIONS)
 
-    code, table, errors = disturbed(
-        command(*again),
-        output / "logs" / "tiny_scene.log",
-        lambda batch: batch.send_signal(signal.SIGINT),
-    )
+    def interrupt(batch: subprocess.Popen[str]) -> None:
+        while not has_frames(output / "tiny_scene"):
+            assert batch.poll() is None
+        batch.send_signal(signal.SIGINT)
+
+    code, table, errors = disturbed(command(*again), output / "logs" / "tiny_scene.log", interrupt)
     assert code == 130, errors
     assert "Traceback" not in errors
     assert "tiny_scene  begun" in table

@@ -27,6 +27,7 @@ class Published:
 
     def __init__(self):
         self.keyframes, self.poses, self.points, self.states, self.reasons = {}, {}, {}, [], []
+        self.frame_of_keyframe = {}
 
     def apply(self, delta):
         check_arrays(delta)
@@ -34,6 +35,8 @@ class Published:
             self._move(delta.map_moves())
         for i, pose in zip(delta.keyframe_ids.tolist(), delta.keyframe_poses, strict=True):
             self.keyframes[i] = pose_to_matrix(pose)
+        frames = delta.keyframe_frames.tolist()
+        self.frame_of_keyframe |= zip(delta.keyframe_ids.tolist(), frames, strict=True)
         for k, frame in enumerate(delta.pose_frames.tolist()):
             pose = pose_to_matrix(delta.poses_keyframe_camera[k])
             segment = int(delta.pose_segments[k])
