@@ -131,6 +131,15 @@ def rigid_data() -> Path:
 
 
 @pytest.fixture
+def precious(tmp_path: Path) -> Path:
+    """A file that no link may lead a writer to."""
+    file = tmp_path / "elsewhere" / "precious"
+    file.parent.mkdir()
+    file.write_text("precious")
+    return file
+
+
+@pytest.fixture
 def endpoint() -> Iterator[str]:
     """Where a router of this process listens."""
     found = free_endpoint()

@@ -80,14 +80,6 @@ def test_a_folder_in_the_way_leaves_all_as_it_was(room: Path) -> None:
     assert contents(room) == before
 
 
-@pytest.fixture
-def precious(tmp_path: Path) -> Path:
-    file = tmp_path / "elsewhere" / "precious"
-    file.parent.mkdir()
-    file.write_text("precious")
-    return file
-
-
 def test_a_lock_that_is_a_link_empties_nothing(precious: Path, tmp_path: Path) -> None:
     folder = tmp_path / "new"
     folder.mkdir()

@@ -10,14 +10,6 @@ from pliant.files import append, create, mark, move_all, write_whole
 from pliant.staging import clear_staging, put_tree_in_place, staging
 
 
-@pytest.fixture
-def precious(tmp_path: Path) -> Path:
-    file = tmp_path / "elsewhere" / "precious"
-    file.parent.mkdir()
-    file.write_text("precious")
-    return file
-
-
 def test_no_writer_follows_a_link(precious: Path, tmp_path: Path) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()

@@ -30,8 +30,8 @@ _ROOM_SHARE = 1 / 3
 """And of those that the map has room for."""
 
 _COMMON_ERROR = 0.5
-"""Of the error of an inlier: most that all points of a frame may have in common, or half of them
-would be outliers.  Real video has a tenth to a seventh."""
+"""Largest error that all points of a frame may share, as a share of the inlier limit: with more,
+half of them would be outliers.  Real video shows 0.10 to 0.15."""
 
 _NONE = np.iinfo(np.int64).max
 
