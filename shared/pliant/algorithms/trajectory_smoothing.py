@@ -43,6 +43,10 @@ _FIRST_STEP, _LAST_STEP = 2.0, 0.1
 """Of the search for the logarithms of the variances."""
 
 
+_CONTRADICTION = 4.0
+"""A smoothed pose contradicts its own observations from this multiple of the most noise on."""
+
+
 def smooth_trajectory(
     T_world_camera: F64, information: F64, stamps_ns: I64, most_noise_px: float
 ) -> F64:
@@ -92,7 +96,7 @@ def _smooth_run(
         return T_world_camera, 0
     moved_px2 = np.einsum("ni,nij,nj->n", xi, information, xi)
     worst = int(np.argmax(moved_px2))
-    if moved_px2[worst] > most_noise_px**2:
+    if moved_px2[worst] > (_CONTRADICTION * most_noise_px) ** 2:
         beside = [n for n in (worst, worst + 1) if 0 < n < len(xi)]
         return T_world_camera, max(beside, key=lambda n: float(chi2_steps[n]))
     return inverse(_se3_exp(xi) @ T), 0
