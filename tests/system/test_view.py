@@ -7,8 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import cast
-from urllib.request import urlopen
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
+import numpy as np
 import pytest
 from benchmarks.viewer_cost import run_with
 from running import command, in_this_process, pliant
@@ -17,6 +19,7 @@ from pliant.bus.session import free_endpoint
 from pliant.errors import ResultError
 from pliant.viewers import rerun
 from pliant.viewers.rerun import RerunCanvas
+from pliant.viewers.rerun_data import RerunData
 from pliant.viewers.rerun_program import RerunProgram, listens
 from pliant_services.run import spectators
 from pliant_services.run.command import RunRequest, run_pipeline
@@ -109,11 +112,8 @@ def test_a_viewer_that_cannot_start_leaves_an_earlier_result(
 
 def test_a_taken_port_is_one_line() -> None:
     pytest.importorskip("rerun")
-    with socket.create_server(("0.0.0.0", 0)) as taken, socket.create_server(("", 0)) as free:
-        web_port, grpc_port = taken.getsockname()[1], free.getsockname()[1]
-        free.close()
-        with pytest.raises(ResultError, match="is taken here"):
-            RerunCanvas("web", name="taken", web_port=web_port, grpc_port=grpc_port)
+    with socket.create_server(("0.0.0.0", 0)) as taken, pytest.raises(ResultError, match="taken"):
+        RerunCanvas("web", name="taken", web_port=taken.getsockname()[1])
 
 
 def test_two_are_seen_in_browsers_at_once() -> None:
@@ -132,11 +132,11 @@ def test_two_are_seen_in_browsers_at_once() -> None:
 
 
 def test_two_that_begin_at_once_do_not_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rerun's own were free when both looked, and the other one has them now."""
+    """Rerun's own was free when both looked, and the other one has it now."""
     pytest.importorskip("rerun")
     free = rerun.free_port
-    with socket.create_server(("127.0.0.1", 0)) as web, socket.create_server(("", 0)) as grpc:
-        there = {rerun._WEB_PORT: web.getsockname()[1], rerun._GRPC_PORT: grpc.getsockname()[1]}
+    with socket.create_server(("127.0.0.1", 0)) as web:
+        there = {rerun._WEB_PORT: web.getsockname()[1]}
         monkeypatch.setattr(rerun, "free_port", lambda port=None: there.get(port) or free())
         canvas = RerunCanvas("web", name="second")
         try:
@@ -161,9 +161,64 @@ def test_a_browser_is_told_to_reach_this_machine_alone() -> None:
     assert b"re_viewer.js" in content
     assert b'href="https://' not in content
     assert "default-src 'none'" in policy
-    hosts = {word for word in policy.replace(";", " ").split() if "/" in word or "." in word}
-    assert len(hosts) == 1
-    assert hosts.pop().startswith("http://127.0.0.1:")
+    assert "://" not in policy
+
+
+def answer_to(address: str, host: str) -> int:
+    try:
+        with urlopen(Request(address, headers={"Host": host})) as page:
+            return int(page.status)
+    except HTTPError as error:
+        return error.code
+
+
+def test_other_users_and_sites_that_mean_this_machine_see_nothing() -> None:
+    """Any local user reaches the port, and a browser by any name that resolves to it."""
+    pytest.importorskip("rerun")
+    canvas = RerunCanvas("web", name="private")
+    try:
+        root, _, token = canvas.address.partition("?")[0].rstrip("/").rpartition("/")
+        own = root.removeprefix("http://")
+        for where in ("/", "/re_viewer.js", "/run.rrd"):
+            if where != "/run.rrd":
+                assert answer_to(f"{root}/{token}{where}", own) == 200
+                assert answer_to(f"{root}/{token}{where}", "127.0.0.1:1") == 200
+            for host in ("pliant.example:9090", "pliant.example", "localhost.example", "[", ""):
+                assert answer_to(f"{root}/{token}{where}", host) == 403
+            for told in (
+                where,
+                f"/{token[:-1]}{where}",
+                f"/%00{where}",
+                f"/{token.lower()}{where}",
+            ):
+                assert answer_to(f"{root}{told}", own) == 404
+    finally:
+        canvas.close()
+
+
+def test_a_browser_that_comes_late_gets_the_beginning_and_what_follows() -> None:
+    rr = pytest.importorskip("rerun")
+    stream = rr.RecordingStream("late", recording_id="late")
+    data = RerunData(stream, most_bytes=30_000)
+    with data.staying():
+        stream.log("stays", rr.TextLog("stays"), static=True)
+    for frame in range(20):  # 5,000 bytes each at least
+        stream.set_time("frame", sequence=frame)
+        stream.log(f"frame/{frame}", rr.Points3D(np.random.default_rng(frame).random((300, 3))))
+        data.take()
+    parts = data.since(0)
+    assert parts is not None
+    assert b"stays" in parts[0][1]
+    whole = b"".join(part for _, part in parts)
+    assert [b"/frame/0" in whole, b"/frame/19" in whole] == [False, True]
+    assert len(whole) < 60_000
+    stream.log("after", rr.TextLog("after"))
+    data.take()
+    later = data.since(parts[-1][0] + 1)
+    assert later is not None
+    assert b"/after" in later[-1][1]
+    data.close()
+    assert data.since(later[-1][0] + 1) is None
 
 
 @pytest.mark.slow
@@ -188,17 +243,19 @@ def test_a_run_that_a_browser_looks_on_at_gives_its_results_and_stays(tmp_path: 
 def test_rerun_listens_on_this_machine_alone_and_leaves_with_us() -> None:
     """Its own library would listen to everybody."""
     pytest.importorskip("rerun")
-    grpc_port, web_port = (int(free_endpoint().rsplit(":", 1)[1]) for _ in range(2))
-    canvas = RerunCanvas("web", name="local", web_port=web_port, grpc_port=grpc_port)
+    web_port = int(free_endpoint().rsplit(":", 1)[1])
+    canvas = RerunCanvas("web", name="local", web_port=web_port)
     try:
+        assert canvas._server is not None
+        ports = (web_port, *canvas._server.ports)
         tables = [Path(f"/proc/net/{name}").read_text() for name in ("tcp", "tcp6")]
         rows = [line.split() for table in tables for line in table.splitlines()[1:]]
         addresses = {row[1] for row in rows if row[3] == "0A"}  # those that listen
-        for port in (grpc_port, web_port):
+        for port in ports:
             assert {a for a in addresses if a.endswith(f":{port:04X}")} == {f"0100007F:{port:04X}"}
     finally:
         canvas.close()
-    assert not any(listens(port) for port in (grpc_port, web_port))
+    assert not any(listens(port) for port in ports)
 
 
 def test_ctrl_c_while_rerun_comes_up_leaves_no_server(monkeypatch: pytest.MonkeyPatch) -> None:

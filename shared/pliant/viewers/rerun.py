@@ -16,9 +16,9 @@ Time runs by "frame" and by "capture".  Needs Rerun: ``pip install 'pliant[view]
 
 import importlib
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Literal
-from urllib.parse import quote
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from pliant.viewers.age_colours import track_colours
 from pliant.viewers.canvas import Moment
 from pliant.viewers.foxglove import Z_UP_XYZW, world_name
 from pliant.viewers.point_blocks import PointBlocks
+from pliant.viewers.rerun_data import RerunData
 from pliant.viewers.rerun_page import RerunPage
 from pliant.viewers.rerun_program import RerunProgram, address_of, free_port, listens
 from pliant.viewers.surfel_quads import SurfelPicture
@@ -46,7 +47,7 @@ _POINT_RADIUS = 1.0  # the mesh is seen between them
 _SERVICE_COLOURS = ((80, 160, 255), (255, 160, 0), (90, 200, 110), (230, 90, 160), (200, 200, 90))
 _SURFEL_RADIUS = 2.5
 _OUTSIDE_IS_OPEN = "Front"  # a room is looked into from without
-_MEMORY_LIMIT = "1GiB"
+_MEMORY_LIMIT = 1 << 30
 _WEB_PORT, _GRPC_PORT = 9090, 9876
 _LAYOUT = "pliant-2"
 """Rerun keeps a user's layout by this name: to be counted up when entities or views change."""
@@ -71,23 +72,22 @@ class RerunCanvas:
 
     dims_masks = True
 
-    def __init__(
-        self, where: Where, *, name: str, web_port: int | None = None, grpc_port: int | None = None
-    ) -> None:
+    def __init__(self, where: Where, *, name: str, web_port: int | None = None) -> None:
         """Open it.  Raises ResultError where Rerun is missing or the file cannot be written.
 
-        web_port: where a browser finds it.    grpc_port: where that takes its data.  By default
-        they are Rerun's own, or where these are taken others that are free.
+        web_port: where a browser finds it, by default Rerun's own, or where that is taken another
+        that is free.
         """
         self._rr = rr = load_rerun()
         self._server: RerunProgram | None = None
         self._page: RerunPage | None = None
+        self._data: RerunData | None = None
         self._stream: Any = rr.RecordingStream(_LAYOUT, recording_id=name)
         self._segment = 0
         self._is_window = False
         self._curves: set[str] = set()
         self._services: dict[str, int] = {}
-        blueprint = self._blueprint()
+        blueprint = self._blueprint(follows=not isinstance(where, Path))
         if isinstance(where, Path):
             try:
                 where.open("wb").close()
@@ -95,19 +95,16 @@ class RerunCanvas:
                 raise ResultError(f"{where}: cannot be written ({error.strerror})") from None
             self._stream.save(where, default_blueprint=blueprint)
         elif where == "web":
+            self._data = RerunData(self._stream, most_bytes=_MEMORY_LIMIT)
+            with self._data.staying():
+                self._stream.send_blueprint(blueprint)
             try:
-                web_port, grpc_port = self._serve(
-                    web_port or free_port(_WEB_PORT), grpc_port or free_port(_GRPC_PORT)
-                )
+                self.address = self._serve(web_port or free_port(_WEB_PORT), self._data)
             except ResultError:
-                if web_port and grpc_port:
+                if web_port:
                     raise
                 # Another viewer may have begun meanwhile, and has what was free.
-                web_port, grpc_port = self._serve(web_port or free_port(), grpc_port or free_port())
-            address = address_of(grpc_port)
-            self._stream.connect_grpc(address, default_blueprint=blueprint)
-            query = f"url={quote(address, safe='')}&hide_welcome_screen"  # it has examples
-            self.address = f"http://localhost:{web_port}/?{query}"
+                self.address = self._serve(free_port(), self._data)
         else:
             self._is_window = True
             if not listens(_GRPC_PORT):  # else one is open already
@@ -115,18 +112,17 @@ class RerunCanvas:
             self._stream.connect_grpc(address_of(_GRPC_PORT), default_blueprint=blueprint)
         self._place_world(0)
 
-    def _serve(self, web_port: int, grpc_port: int) -> tuple[int, int]:
-        """Let browsers look on at these ports, which it returns."""
+    def _serve(self, web_port: int, data: RerunData) -> str:
+        """Let browsers look on at this port.  Returns the address for them."""
         behind = free_port()
-        serving = ["--serve-web", "--web-viewer-port", str(behind)]
-        limit = ["--server-memory-limit", _MEMORY_LIMIT]
-        self._server = RerunProgram([grpc_port, behind], [*serving, *limit])
+        serving = ["--serve-web", "--web-viewer-port", str(behind)]  # it has the page, and no data
+        self._server = RerunProgram([free_port(), behind], serving)
         try:
-            self._page = RerunPage(web_port, behind=behind, data=grpc_port)
+            self._page = RerunPage(web_port, behind=behind, data=data)
         except ResultError:
             self._server.close()
             raise
-        return web_port, grpc_port
+        return self._page.address
 
     address = ""
     """Where a browser finds it."""
@@ -153,6 +149,8 @@ class RerunCanvas:
     def close(self) -> None:
         """Send what is left, and finish a file; nothing can be seen in a browser any more."""
         self.send()
+        if self._data is not None:
+            self._data.close()
         self._stream.disconnect()
         if self._page is not None:
             self._page.close()
@@ -172,7 +170,7 @@ class RerunCanvas:
             camera_xyz=self._rr.ViewCoordinates.RDF,
             image_plane_distance=_IMAGE_DISTANCE,
         )
-        self._stream.log(_IMAGE, pinhole, static=True)
+        self._log_for_good(_IMAGE, pinhole)
 
     def image(self, at: Moment, data: bytes, encoding: str) -> None:
         """The image as it is encoded."""
@@ -240,7 +238,7 @@ class RerunCanvas:
             order = self._services.setdefault(service, len(self._services))
             colour = _SERVICE_COLOURS[order % len(_SERVICE_COLOURS)]
             line = self._rr.SeriesLines(colors=[colour], names=[service])
-            self._stream.log(path, line, static=True)
+            self._log_for_good(path, line)
         self._log(at, path, self._rr.Scalars(value))
 
     def note(self, at: Moment, text: str) -> None:
@@ -252,8 +250,8 @@ class RerunCanvas:
     def _place_world(self, segment: int) -> None:
         self._segment = segment
         turned = self._rr.Transform3D(quaternion=self._rr.Quaternion(xyzw=Z_UP_XYZW))
-        self._stream.log("map", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        self._stream.log(_world(segment), turned, static=True)
+        self._log_for_good("map", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._log_for_good(_world(segment), turned)
 
     def _log_mesh(self, at: Moment, path: str, mesh: TriangleMesh, faces: str) -> None:
         if not len(mesh.triangles):
@@ -268,12 +266,17 @@ class RerunCanvas:
         )
         self._log(at, path, surface)
 
+    def _log_for_good(self, path: str, what: Any) -> None:
+        with self._data.staying() if self._data else nullcontext():
+            self._stream.log(path, what, static=True)
+
     def _log(self, at: Moment, path: str, what: Any) -> None:
         self._stream.set_time("frame", sequence=at.frame)
         self._stream.set_time("capture", duration=at.stamp_ns * 1e-9)
         self._stream.log(path, what)
 
-    def _blueprint(self) -> Any:
+    def _blueprint(self, *, follows: bool) -> Any:
+        """follows: shows what is newest, instead of playing from the beginning."""
         rrb: Any = importlib.import_module("rerun.blueprint")
         no_legend = rrb.PlotLegend(visible=False)  # a service has one colour in all plots
         return rrb.Blueprint(
@@ -300,6 +303,7 @@ class RerunCanvas:
                 ),
                 column_shares=[3, 2],
             ),
+            rrb.TimePanel(state="collapsed", play_state="following" if follows else "playing"),
             collapse_panels=True,
         )
 

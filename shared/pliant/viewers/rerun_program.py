@@ -32,7 +32,7 @@ class RerunProgram:
                     f"port {port} is taken here: another viewer may be open; close it, or choose "
                     "another --web-port"
                 )
-        self._ports = ports
+        self.ports = ports
         command = [sys.executable, "-m", "rerun", "--bind", LOOPBACK, "--port", str(ports[0])]
         self._process = subprocess.Popen(
             [*command, *arguments],
@@ -65,7 +65,7 @@ class RerunProgram:
         # The server is its child, which nobody here can wait for: on a busy machine it may still
         # take connections.
         deadline = time.monotonic() + _GONE_S
-        while any(listens(port) for port in self._ports) and time.monotonic() < deadline:
+        while any(listens(port) for port in self.ports) and time.monotonic() < deadline:
             time.sleep(_LOOK_S)
 
 
