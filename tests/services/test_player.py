@@ -5,6 +5,7 @@ import pty
 import termios
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from pliant.messages.types import Image
 from pliant.recording.playback import Playback
 from pliant_services.nodes import ingest, recorder
 from pliant_services.replay import play as play_command
+from pliant_services.replay import player as player_module
 from pliant_services.replay.play import Pace, PlayRequest, run_play, take_keys
 from pliant_services.replay.player import Played, chosen_topics, play
 from pliant_services.runtime.monitor import SilentMonitor
@@ -154,6 +156,39 @@ def test_a_rate_is_a_share_of_the_pace_of_capture() -> None:
     assert time.monotonic() - start >= 0.05
     unbounded = Pace(0.0)
     assert unbounded.wait_until(10**18)
+
+
+def test_a_loop_stays_in_one_session_and_is_not_seen_to_end(
+    endpoint: str, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A session that is closed leaves some memory behind, and a compose profile loops for ever."""
+
+    class Thrice(Pace):
+        loops = 0
+
+        def restart(self) -> None:
+            super().restart()
+            self.loops += 1
+            if self.loops == 4:
+                self.stop()
+
+    opened: list[str] = []
+
+    class Counted(ZenohBus):
+        def __init__(self, *, service: str, **options: Any) -> None:
+            opened.append(service)
+            super().__init__(service=service, **options)
+
+    said: list[str] = []
+    monkeypatch.setattr(play_command, "Pace", Thrice)
+    monkeypatch.setattr(play_command, "_say", said.append)
+    monkeypatch.setattr(player_module, "ZenohBus", Counted)
+    request = PlayRequest(recording=path, rate=0.0, loop=True, connect=[endpoint])
+    assert run_play(request) == 0
+    assert opened == ["ingest"]
+    assert [line for line in said if "played" in line] == [f"{1 + 3 * FRAMES} messages played"] * 3
+    with pytest.raises(RecordingError, match="--loop is for viewers"):
+        run_play(PlayRequest(recording=path, loop=True, readers=["tracking"]))
 
 
 def test_an_end_before_the_start_is_one_line(path: Path) -> None:

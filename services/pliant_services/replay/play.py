@@ -50,6 +50,8 @@ def run_play(request: PlayRequest) -> int:
     required, left_out = _required(playback, request.readers)
     if request.end_s is not None and request.end_s <= request.start_s:
         raise RecordingError(f"--end {request.end_s:g} is not after --start {request.start_s:g}")
+    if request.loop and request.readers:
+        raise RecordingError("--loop is for viewers: what --readers read ends with the recording")
     what = Played(
         start_s=request.start_s,
         end_s=request.end_s,
@@ -70,21 +72,27 @@ def run_play(request: PlayRequest) -> int:
             endpoints = [endpoint]
         _say(f"playing on {endpoints[0]}, session {request.session}")
         pace = stack.enter_context(_keys(Pace(request.rate)))
-        while True:
-            pace.restart()
-            count = play(
-                playback,
-                what,
-                endpoints=endpoints,
-                session=request.session,
-                identity=lambda name: _identity(request.tls, name),
-                window=config.bus.window,
-                windows=observer_windows(config, fleet),
-                wait_until=pace.wait_until,
-            )
+
+        def again(count: int) -> bool:
             _say(f"{counted(count, 'message')} played")
-            if pace.stopped or not request.loop:
-                return 0
+            pace.restart()
+            return not pace.stopped
+
+        pace.restart()
+        count = play(
+            playback,
+            what,
+            endpoints=endpoints,
+            session=request.session,
+            identity=lambda name: _identity(request.tls, name),
+            window=config.bus.window,
+            windows=observer_windows(config, fleet),
+            wait_until=pace.wait_until,
+            again=again if request.loop else None,
+        )
+        if not request.loop:
+            _say(f"{counted(count, 'message')} played")
+        return 0
 
 
 def _identity(tls: Path | None, name: str) -> Identity | None:

@@ -74,14 +74,17 @@ def play(
     window: int,
     windows: Mapping[str, Window],
     wait_until: Callable[[int], bool],
+    again: Callable[[int], bool] | None = None,
     identity: Callable[[str], Identity | None] = lambda name: None,
 ) -> int:
-    """Publish the recording once, ends included; returns the number of messages.
+    """Publish the recording, and where it ends; returns the number of messages.
 
-    identity: the certificate of a service that is impersonated, for tls/ endpoints.
+    wait_until: is given each message's capture time in nanoseconds from the start, returns when it
+    is due, and False where playing shall end.     again: is given how many messages were published
+    after each time, and says whether to publish all once more, in the same session; without it
+    once.     identity: the certificate of a service that is impersonated, for tls/ endpoints.
 
-    ``wait_until``: is given each message's capture time in nanoseconds from the start, returns when
-    it is due, and False where playing shall end.  Raises RecordingError and BusError.
+    Raises RecordingError and BusError.
     """
     chosen = chosen_topics(playback, what)
     by_sender: dict[str, list[Topic]] = {}
@@ -105,7 +108,14 @@ def play(
             )
             stack.enter_context(bus)
             buses |= dict.fromkeys((topic.key for topic in outputs), bus)
-        return _publish(playback, what, chosen, buses, wait_until)
+        if again is None:
+            return _publish(playback, what, chosen, buses, wait_until, closes=True)
+        count = _publish(playback, what, chosen, buses, wait_until, closes=False)
+        while again(count):
+            count = _publish(playback, what, chosen, buses, wait_until, closes=False)
+        for bus in dict.fromkeys(buses.values()):
+            bus.end_all(complete=False)
+        return count
 
 
 def _publish(
@@ -114,7 +124,10 @@ def _publish(
     chosen: Sequence[Topic],
     buses: Mapping[str, ZenohBus],
     wait_until: Callable[[int], bool],
+    *,
+    closes: bool,
 ) -> int:
+    """closes: topics are ended where they were, once and for all."""
     images = _Images(topics.IMAGE in chosen)
     count = 0
     complete = True
@@ -123,7 +136,7 @@ def _publish(
         if message.topic == topics.STREAM_END:
             end = message.decode()
             assert isinstance(end, StreamEnd)
-            if end.topic in buses:
+            if closes and end.topic in buses:
                 buses[end.topic].end(_topic(chosen, end.topic), complete=end.complete)
             continue
         if message.topic.per_frame and not wait_until(message.publish_time_ns - start_ns):
@@ -133,8 +146,9 @@ def _publish(
             buses[message.topic.key].publish_encoded(message.topic, message.data)
             count += 1
         count += images.follow(message, buses)
-    for bus in dict.fromkeys(buses.values()):
-        bus.end_all(complete=complete)
+    if closes:
+        for bus in dict.fromkeys(buses.values()):
+            bus.end_all(complete=complete)
     return count
 
 
