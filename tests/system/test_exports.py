@@ -12,11 +12,8 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from running import assert_one_line, in_this_process
 
-from pliant import open3d_library
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config
 from pliant.datasets import open_source
@@ -24,14 +21,11 @@ from pliant.datasets.depth import DepthRectifier
 from pliant.errors import ResultError
 from pliant.export import overview
 from pliant.export.export import export_result
-from pliant.export.textured import keyframe_images, textured_mesh
 from pliant.formats.ply import read_ply
-from pliant.formats.textured import write_glb
 from pliant.formats.tum import read_tum
 from pliant.messages import topics
 from pliant.messages.types import CameraStream
 from pliant.recording.reader import Recording
-from pliant.results.run import read_run
 from pliant.viewers.point_blocks import BLOCK_POINTS, PointBlocks
 from pliant_services.nodes import recorder
 
@@ -396,76 +390,3 @@ def test_every_is_for_surfaces(result: Path, tmp_path: Path) -> None:
         export_result(result, "tum", tmp_path / "poses.txt", every=2)
     with pytest.raises(ResultError, match="has no surfels"):
         export_result(result, "surface", tmp_path / "surface")
-
-
-def test_a_textured_mesh_has_the_colours_that_its_keyframes_show(
-    result: Path, tmp_path: Path
-) -> None:
-    path = export_result(result, "glb", tmp_path / "mesh.glb", triangles=8000)
-    assert path.read_bytes()[:4] == b"glTF"
-    obj = export_result(result, "obj", tmp_path / "obj", triangles=800)
-    assert {each.name for each in obj.iterdir()} == {"mesh.obj", "mesh.mtl", "mesh.png"}
-    recording = Recording(result / "recording.mcap")
-    mesh = textured_mesh(recording, 8000)
-    write_glb(tmp_path / "again.glb", mesh)
-    assert path.read_bytes() == (tmp_path / "again.glb").read_bytes()
-    assert 4000 < len(mesh.triangles) <= 8000
-    assert mesh.uvs.min() >= 0.0
-    assert mesh.uvs.max() <= 1.0
-    assert (np.linalg.norm(mesh.normals, axis=1) > 0.99).mean() > 0.99
-    run = read_run(recording.path)
-    assert run.stream is not None
-    images = list(keyframe_images(recording, run, run.history.longest_segment()))
-    assert len(images) > 4
-    for T_world_camera, image, _ in images[:: len(images) // 3]:
-        seen = view_mesh(mesh.positions, mesh.triangles, run.stream.camera, T_world_camera)
-        at = seen.interpolate(mesh.triangles, mesh.uvs) * np.float32(len(mesh.texture)) - 0.5
-        drawn = cv2.remap(mesh.texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-        inside = seen.triangles >= 0
-        assert inside.mean() > 0.5
-        off = np.abs(drawn.astype(float) - image)[inside]
-        contrast = np.abs(image - np.median(image)).mean()
-        assert np.median(off) < 0.3 * contrast
-
-
-def test_a_solid_is_closed_and_small_pieces_are_left_out(result: Path, tmp_path: Path) -> None:
-    try:
-        import_module("open3d")
-    except (ImportError, OSError) as error:
-        pytest.skip(f"open3d is installed but cannot be loaded ({error})")
-    solid = read_ply(export_result(result, "watertight", tmp_path / "solid.ply"))
-    assert solid.faces is not None
-    edges = np.concatenate([solid.faces[:, k] for k in ([0, 1], [1, 2], [2, 0])])
-    _, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
-    assert (counts == 2).all()
-    whole, clean = (
-        textured_mesh(Recording(result / "recording.mcap"), 8000, clean=clean)
-        for clean in (False, True)
-    )
-    assert 0.5 * len(whole.triangles) < len(clean.triangles) <= 8000
-    with pytest.raises(ResultError, match="--clean: tum has no such option"):
-        export_result(result, "tum", tmp_path / "poses.txt", clean=True)
-
-
-@pytest.mark.parametrize(
-    "command", [("export", "--to", "watertight"), ("export", "--to", "glb", "--clean"),
-    ("mesh", "--watertight"), ("mesh", "--clean")]
-)  # fmt: skip
-def test_without_open3d_s_libraries_one_line_says_what_to_install(
-    result: Path, command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(name: str) -> None:
-        raise ImportError("libGL.so.1: cannot open shared object file")
-
-    monkeypatch.setattr(open3d_library, "import_module", refuse)
-    name, *options = command
-    done = in_this_process(name, result, *options, "--output", tmp_path / "out.glb"
-        if "glb" in options else tmp_path / ("out.ply" if name == "export" else "out"))  # fmt: skip
-    assert_one_line(done, "libGL.so.1")
-    assert "apt install libegl1" in done.stderr
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_triangles_are_for_textured_meshes(result: Path, tmp_path: Path) -> None:
-    with pytest.raises(ResultError, match="--triangles: tum has no such option, only glb and obj"):
-        export_result(result, "tum", tmp_path / "poses.txt", triangles=500)

@@ -83,6 +83,25 @@ def test_the_scene_has_the_points_the_path_and_the_mesh(result: pliant.Result, p
     assert np.abs(points - result.points[inside]).max() < step.max()
 
 
+def test_the_mesh_has_a_texture_of_its_keyframes(result: pliant.Result, page: str) -> None:
+    """Of many more texels than it has vertices, whose colours alone would be a blur."""
+    header, data = scene_of(page)
+    (layer,) = (each for each in header["layers"] if each["name"] == "mesh")
+    encoded = base64.b64decode(header["texture"].removeprefix("data:image/webp;base64,"))
+    read = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert read is not None
+    texture = np.asarray(read, np.float64)
+    assert texture.shape == (1024, 1024, 3)
+    assert len(encoded) < 500_000
+    uvs = np.frombuffer(data, "<u2", 2 * layer["count"], layer["uvs"]).reshape(-1, 2) / 65535
+    columns, rows = np.clip((uvs * 1024).astype(int), 0, 1023).T
+    assert result.mesh is not None
+    places = layer_of(header, data, "mesh")[::50].astype(np.float32)
+    away = np.linalg.norm(places[:, None] - result.mesh.positions[None, ::10], axis=2)
+    own = result.mesh.colours[::10][away.argmin(axis=1)].astype(np.float64)
+    assert np.median(np.abs(texture[rows, columns][::50] - own)) < 15.0
+
+
 def in_browser(
     page: Path, profile: Path, what: str, size: str = "1000,900"
 ) -> subprocess.CompletedProcess[str]:

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from pliant.algorithms.arrays import F32, U8, U16
+from pliant.algorithms.image.masks import mask_image
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
 from pliant.algorithms.meshing.parameters import SurfaceParameters
 from pliant.algorithms.meshing.rendering import normals_of
@@ -28,7 +29,6 @@ from pliant.export.images import (
     camera_of,
     image_name,
     make_folder,
-    mask_image,
     pinhole_yaml,
     rectified_images,
     write_list,

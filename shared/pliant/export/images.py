@@ -1,6 +1,6 @@
 """The images of a recording, made again from their source bytes, and as a folder of their own."""
 
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Container, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +11,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, U8, U16, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view
-from pliant.algorithms.image.masks import unpacked
+from pliant.algorithms.image.masks import mask_image, unpacked
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import (
@@ -102,11 +102,6 @@ def camera_of(recording: Recording) -> CameraStream:
         assert isinstance(message, CameraStream)
         return message
     raise ResultError("the recording has no camera: it stopped before its first frame")
-
-
-def mask_image(used: BoolArray, view: Callable[[U8], U8]) -> U8:
-    """A mask (H, W) as an image, white where all is used that a view of images makes a pixel of."""
-    return np.where(view(255 * used.astype(np.uint8)) == 255, np.uint8(255), np.uint8(0))
 
 
 class RectifiedImage(NamedTuple):

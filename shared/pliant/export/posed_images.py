@@ -19,6 +19,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.image.masks import mask_image
 from pliant.algorithms.image.sharpness import sharpness
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame, motion_between
 from pliant.errors import ResultError
@@ -27,7 +28,6 @@ from pliant.export.images import (
     ShownView,
     image_name,
     make_folder,
-    mask_image,
     rectified_images,
     write_png,
 )

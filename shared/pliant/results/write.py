@@ -48,7 +48,7 @@ def write_rigid_results(output: Path, scale: Scale | None = None) -> dict[str, A
     final = run.history.final()
     # What takes the longest, on other cores.  They write nothing: an interruption waits for them.
     with ThreadPoolExecutor() as others, all_or_none(output) as folder:
-        drawn = others.submit(drawn_map, run, final)
+        drawn = others.submit(drawn_map, run, recording, final)
         clip = others.submit(clip_of_keyframes, run, recording)
         report = rigid_report(run, final)
         _write_map(folder, recording, run)

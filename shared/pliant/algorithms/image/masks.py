@@ -5,6 +5,7 @@ with as the *clearance*: (H, W) float32, how many pixels the nearest that is not
 larger of the distances along the two axes; 0 where it is not used itself.
 """
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import cv2
@@ -102,3 +103,8 @@ def glaring(image: U8, clearance: F32 | None) -> U8:
     if clearance is None:
         return image
     return np.where(clearance > EDGE_PX, image, np.uint8(255))
+
+
+def mask_image(used: BoolArray, view: Callable[[U8], U8]) -> U8:
+    """A mask (H, W) as an image, white where all is used that a view of images makes a pixel of."""
+    return np.where(view(255 * used.astype(np.uint8)) == 255, np.uint8(255), np.uint8(0))

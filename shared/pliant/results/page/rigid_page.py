@@ -12,7 +12,9 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.geometry import inverse, pose_to_matrix, transform
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.errors import ResultError
+from pliant.formats.textured import TexturedMesh
 from pliant.pictures.masked import dimmed_by
 from pliant.pictures.movie import encode_animation
 from pliant.recording.reader import Recording
@@ -22,8 +24,11 @@ from pliant.results.page.chart import BLUE, ORANGE, Line, chart
 from pliant.results.page.page import bullets, canvas, ended, fill_page, table_rows
 from pliant.results.page.scene import make_scene
 from pliant.results.run import Run, SeenKeyframe, seen_by_keyframes
+from pliant.results.textured_mesh import textured
 from pliant.wording import counted
 
+_TRIANGLES, _TEXELS, _VIEWS = 40_000, 1024, 48
+"""Of the mesh, of a side of its texture, and keyframes that colour it: a page has a megabyte."""
 _PICTURES = 24
 _WIDTH_PX = 480
 _FPS = 4.0
@@ -52,16 +57,22 @@ def write_page(
     )  # fmt: skip
 
 
-def drawn_map(run: Run, final: dict[int, tuple[int, F64]]) -> str:
-    """The map that can be turned; "" without one."""
+def drawn_map(run: Run, recording: Recording, final: dict[int, tuple[int, F64]]) -> str:
+    """The map that can be turned, its mesh with a texture of keyframes; "" without one."""
     longest = run.history.longest_segment()
     poses = np.array([pose for segment, pose in final.values() if segment == longest])
     if not len(poses):
         return ""
-    points = run.history.points_in(longest)
+    points, fine = run.history.points_in(longest), mesh_of(run.mesh, longest)
+    mesh: TriangleMesh | TexturedMesh | None = fine
+    if fine is not None and len(fine.triangles) and run.stream is not None:
+        mesh = textured(
+            fine, recording, run, run.stream, longest,
+            triangles=_TRIANGLES, texels=_TEXELS, views=_VIEWS,
+        )  # fmt: skip
     return canvas(
         make_scene(
-            points.positions, points.colours, pose_to_matrix(poses), mesh_of(run.mesh, longest),
+            points.positions, points.colours, pose_to_matrix(poses), mesh,
             run.history.same_places_in(longest),
         )
     )  # fmt: skip

@@ -5,16 +5,19 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.meshing.decimation import decimated
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.formats.textured import TexturedMesh
 from pliant.pictures.map import PATH_COLOUR, PLACES_COLOUR, MapView, choose_view
 
 MAX_POINTS = 40_000
 MAX_TRIANGLES = 60_000
 _LEVELS = 65535
+_QUALITY = 80
 _HALF_SLOPES = np.array([4.0 / 3.0, 1.0]) / 2.4
 """To the right and to the upper border of a canvas of 4 to 3, as viewer.js projects."""
 _FILLED = 0.92
@@ -35,13 +38,14 @@ def make_scene(
     points: F64,
     colours: U8,
     T_world_camera: F64,
-    mesh: TriangleMesh | None,
+    mesh: TriangleMesh | TexturedMesh | None,
     places: F64 | None = None,
     *,
     frame_path: bool = True,
 ) -> Scene:
     """Points (P, 3), the camera's path (N, 4, 4), N >= 1, and the mesh, as many as a page carries.
 
+    mesh: with a texture it is shown as it is, else decimated.
     places: (L, 2, 3) lines between what shows one place.    frame_path: whether the path is in view
     at first, or the surface alone, which fills the canvas then.
 
@@ -55,10 +59,15 @@ def make_scene(
     block = _Block(low, size)
     shown = cloud
     if mesh is not None and len(mesh.triangles):
-        vertices, tints, triangles = decimated(*_outwards(mesh), MAX_TRIANGLES)
+        tints: U8 | None = None
+        uvs: F32 | None = None
+        if isinstance(mesh, TexturedMesh):
+            vertices, triangles, uvs = mesh.positions, mesh.triangles, mesh.uvs
+        else:
+            vertices, tints, triangles = decimated(*_outwards(mesh), MAX_TRIANGLES)
         inside = ((vertices >= low - size) & (vertices <= high + size)).all(axis=1)
         triangles = triangles[inside[triangles].all(axis=1)]
-        block.add("mesh", vertices, tints, triangles)
+        block.add("mesh", vertices, tints, triangles, uvs)
         shown = vertices[np.unique(triangles)] if len(triangles) else cloud
     inside = ((points >= low) & (points <= high)).all(axis=1)
     step = max(1, -(-int(inside.sum()) // MAX_POINTS))
@@ -73,7 +82,7 @@ def make_scene(
     up = view.up / np.linalg.norm(view.up)
     level = direction - (direction @ up) * up
     level /= max(float(np.linalg.norm(level)), 1e-9)
-    header = {
+    header: dict[str, Any] = {
         "low": low.tolist(),
         "size": size.tolist(),
         "target": target.tolist(),
@@ -82,6 +91,10 @@ def make_scene(
         "axes": [np.cross(level, up).tolist(), up.tolist(), level.tolist()],
         "layers": block.layers,
     }
+    if isinstance(mesh, TexturedMesh):
+        quality = [cv2.IMWRITE_WEBP_QUALITY, _QUALITY]
+        _, image = cv2.imencode(".webp", mesh.texture[:, :, ::-1], quality)
+        header["texture"] = f"data:image/webp;base64,{base64.b64encode(image.tobytes()).decode()}"
     return Scene(json.dumps(header), base64.b64encode(b"".join(block.parts)).decode())
 
 
@@ -120,14 +133,17 @@ class _Block:
         self._length = 0
 
     def add(
-        self, name: str, places: F64 | F32, colours: U8, triangles: I32 | None = None,
-        line: bool = False, pairs: bool = False,
+        self, name: str, places: F64 | F32, colours: U8 | None, triangles: I32 | None = None,
+        uvs: F32 | None = None, line: bool = False, pairs: bool = False,
     ) -> None:  # fmt: skip
         shares = np.clip((places - self._low) / self._size, 0.0, 1.0)
         layer: dict[str, Any] = {"name": name, "count": len(places), "line": line}
         layer |= {"pairs": True} if pairs else {}
         layer["places"] = self._put(np.round(_LEVELS * shares).astype("<u2").tobytes())
-        layer["colours"] = self._put(np.ascontiguousarray(colours, np.uint8).tobytes())
+        if colours is not None:
+            layer["colours"] = self._put(np.ascontiguousarray(colours, np.uint8).tobytes())
+        if uvs is not None:
+            layer["uvs"] = self._put(np.round(_LEVELS * uvs).astype("<u2").tobytes())
         if triangles is not None:
             layer["triangles"] = len(triangles)
             layer["indices"] = self._put(triangles.astype("<u4").tobytes())

@@ -8,18 +8,19 @@ const canvas = document.getElementById("view");
 const gl = canvas.getContext("webgl2", { antialias: true });
 
 const VERTEX = `#version 300 es
-in vec3 place; in vec3 colour; uniform mat4 seen; uniform vec3 low; uniform vec3 size; uniform float dot_px;
-out vec3 tint; out vec3 world;
-void main() { world = low + place * size; tint = colour; gl_Position = seen * vec4(world, 1.0);
+in vec3 place; in vec3 colour; in vec2 uv; uniform mat4 seen; uniform vec3 low; uniform vec3 size; uniform float dot_px;
+out vec3 tint; out vec3 world; out vec2 at;
+void main() { world = low + place * size; tint = colour; at = uv; gl_Position = seen * vec4(world, 1.0);
   gl_PointSize = clamp(dot_px / gl_Position.w, 1.5, 12.0); }`;
 const FRAGMENT = `#version 300 es
-precision highp float; in vec3 tint; in vec3 world; uniform vec3 eye; uniform float lit; out vec4 shown;
+precision highp float; in vec3 tint; in vec3 world; in vec2 at; uniform vec3 eye; uniform float lit; uniform float textured;
+uniform sampler2D photographs; out vec4 shown;
 void main() { float light = 1.0;
   if (lit > 0.5) {
     vec3 normal = normalize(cross(dFdx(world), dFdy(world)));
     light = 0.45 + 0.55 * abs(dot(normal, normalize(eye - world)));
   }
-  shown = vec4(tint * light, 1.0); }`;
+  shown = vec4(textured > 0.5 ? texture(photographs, at).rgb : tint * light, 1.0); }`;
 
 function compiled(kind, source) {
   const shader = gl.createShader(kind);
@@ -35,20 +36,21 @@ function begin() {
   gl.linkProgram(program);
   gl.useProgram(program);
   const at = (name) => gl.getUniformLocation(program, name);
-  const places = { seen: at("seen"), low: at("low"), size: at("size"), eye: at("eye"), lit: at("lit"), dot: at("dot_px") };
+  const places = { seen: at("seen"), low: at("low"), size: at("size"), eye: at("eye"), lit: at("lit"), textured: at("textured"), dot: at("dot_px") };
 
   function parts(layer) {
     const array = gl.createVertexArray();
     gl.bindVertexArray(array);
-    const fill = (name, offset, count, kind) => {
+    const fill = (name, offset, count, kind, size = 3) => {
       const place = gl.getAttribLocation(program, name);
       gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
       gl.bufferData(gl.ARRAY_BUFFER, new DataView(bytes, offset, count), gl.STATIC_DRAW);
       gl.enableVertexAttribArray(place);
-      gl.vertexAttribPointer(place, 3, kind, true, 0, 0);
+      gl.vertexAttribPointer(place, size, kind, true, 0, 0);
     };
     fill("place", layer.places, 6 * layer.count, gl.UNSIGNED_SHORT);
-    fill("colour", layer.colours, 3 * layer.count, gl.UNSIGNED_BYTE);
+    if (layer.colours !== undefined) fill("colour", layer.colours, 3 * layer.count, gl.UNSIGNED_BYTE);
+    if (layer.uvs !== undefined) fill("uv", layer.uvs, 4 * layer.count, gl.UNSIGNED_SHORT, 2);
     if (layer.triangles) {
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
       gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new DataView(bytes, layer.indices, 12 * layer.triangles), gl.STATIC_DRAW);
@@ -147,12 +149,14 @@ function begin() {
     for (const layer of layers.filter((each) => each.shown)) {
       gl.bindVertexArray(layer.array);
       gl.uniform1f(places.lit, layer.triangles ? 1 : 0);
+      gl.uniform1f(places.textured, layer.uvs === undefined ? 0 : 1);  // photographs have their light
       if (layer.triangles) gl.drawElements(gl.TRIANGLES, 3 * layer.triangles, gl.UNSIGNED_INT, 0);
       else gl.drawArrays(layer.pairs ? gl.LINES : layer.line ? gl.LINE_STRIP : gl.POINTS, 0, layer.count);
     }
     gl.bindVertexArray(marks.array);
     gl.disable(gl.DEPTH_TEST);
     gl.uniform1f(places.lit, 0);
+    gl.uniform1f(places.textured, 0);
     gl.uniform1f(places.dot, 1e6);
     gl.vertexAttrib3f(gl.getAttribLocation(program, "colour"), 1, 0.2, 0.5);
     gl.drawArrays(gl.POINTS, 0, picked.length);
@@ -187,6 +191,16 @@ function begin() {
   }, { passive: false });
   new ResizeObserver(draw).observe(canvas);
   draw();
+  if (header.texture) {
+    const image = new Image();
+    image.onload = () => {
+      gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, image);
+      gl.generateMipmap(gl.TEXTURE_2D);
+      draw();
+    };
+    image.src = header.texture;
+  }
   canvas.dataset.drawn = "yes";
 }
 

@@ -1,0 +1,89 @@
+"""The mesh of a run with a texture of what its keyframes show."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
+from pliant.algorithms.corrected_view import corrected_view
+from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.image.masks import mask_image, unpacked
+from pliant.algorithms.meshing.decimation import decimated
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.algorithms.meshing.texturing import (
+    TexelColours,
+    cut_apart,
+    find_texels,
+    make_atlas,
+    patches,
+)
+from pliant.formats.textured import TexturedMesh
+from pliant.messages import topics
+from pliant.messages.types import CameraStream, Keyframe
+from pliant.recording.reader import Recording
+from pliant.results.run import Run
+
+
+def textured(
+    fine: TriangleMesh, recording: Recording, run: Run, stream: CameraStream, segment: int, *,
+    triangles: int, texels: int, views: int | None = None,
+) -> TexturedMesh:  # fmt: skip
+    """The mesh of a segment of at most so many triangles, with a square texture.
+
+    texels: along a side.    views: of so many keyframes, spread over all; None: of all of them.
+    """
+    points, tints, faces = decimated(fine.positions, fine.colours, fine.triangles, triangles)
+    cut, _ = cut_apart(faces, patches(points[faces]))
+    uvs = make_atlas(points[faces], cut, texels)
+    on_mesh = find_texels(uvs, texels)
+    shown = TexelColours(on_mesh, points, faces)
+    view = corrected_view(stream.camera, run.correction_of(segment))
+    for T_world_camera, image, used in keyframe_images(recording, run, segment, views):
+        seen = None if used is None else mask_image(used, view.image) > 0
+        shown.add(view.image(image), view.camera, T_world_camera, seen)
+    unseen = np.rint(on_mesh.interpolate(tints[faces].astype(np.float32))).astype(np.uint8)
+    return _with_texture(points, faces, uvs, shown.texture(unseen))
+
+
+def keyframe_images(
+    recording: Recording, run: Run, segment: int, most: int | None = None
+) -> Iterator[tuple[F64, U8, BoolArray | None]]:
+    """Final pose, (H, W, 3) image and mask (H, W) of each keyframe of a segment that has one.
+
+    most: of so many of its keyframes, spread over all; None: of all.
+    """
+    here = sorted(n for n, known in run.history.keyframes.items() if known.segment == segment)
+    wanted = set(here[:: max(1, -(-len(here) // most))] if most else here)
+    for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
+        for message in recording.decoded(topic):
+            assert isinstance(message, Keyframe)
+            masks = message.masks()
+            for number, jpeg in message.images().items():
+                if number not in wanted or not jpeg:
+                    continue
+                image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
+                if image is not None:
+                    used = unpacked(masks[number]) if number in masks else None
+                    pose = pose_to_matrix(run.history.keyframes[number].pose_world_camera)
+                    yield pose, np.asarray(image, np.uint8), used
+
+
+def _with_texture(points: F32, faces: I32, uvs: F32, texture: U8) -> TexturedMesh:
+    """One vertex for each pair of a point and a place in the texture."""
+    rows = np.concatenate([faces.reshape(-1, 1).astype(np.float32), uvs.reshape(-1, 2)], axis=1)
+    _, first, where = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    corners = points[faces].astype(np.float64)
+    turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros((len(points), 3))
+    for k in range(3):
+        np.add.at(normals, faces[:, k], turned)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    source = faces.ravel()[first]
+    return TexturedMesh(
+        positions=points[source],
+        normals=normals[source].astype(np.float32),
+        uvs=uvs.reshape(-1, 2)[first],
+        triangles=where.reshape(-1, 3).astype(np.int32),
+        texture=texture,
+    )
