@@ -78,6 +78,20 @@ def test_what_finds_no_room_goes_first(points, monkeypatch):
     assert [each.frame for each in frames.take_all()] == [25, 26]
 
 
+def test_a_camera_that_stands_still_keeps_no_more_and_more(monkeypatch):
+    """No keyframe comes, after which what finds no room would go."""
+    monkeypatch.setattr(passing, "_ROOM", 1000)
+    poses = sideways(12)
+    poses += [poses[-1]] * 20
+    mapper = Mapper(CAMERA, impatient(PARAMETERS), seed=0)
+    kept = []
+    for k, tracks in enumerate(Scene.box().frames(poses)):
+        mapper.process(k, k * INTERVAL_NS, tracks, None, None)
+        active = mapper.atlas.active
+        kept.append(sum(len(each.rows) for each in active.segment.passed._frames) if active else 0)
+    assert 1000 < max(kept) <= 2000
+
+
 def test_frames_between_keyframes_gain_from_the_whole_map():
     poses = sideways(20)
     mapper, history = Mapper(CAMERA, impatient(PARAMETERS), seed=0), MapHistory()

@@ -35,7 +35,12 @@ from pliant.algorithms.mapping.keyframes import keyframe_is_due
 from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, Observations
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.passing import PassedFrame, refined_poses, smoothed_poses
+from pliant.algorithms.mapping.passing import (
+    STANDING_ROOMS,
+    PassedFrame,
+    refined_poses,
+    smoothed_poses,
+)
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved, Segment
@@ -188,11 +193,12 @@ class Mapper:
                 self._recognised = None
             with self._timer("places"):
                 atlas.remember(hanging, shown, tracks.maxima)
-            with self._timer("passed frames"):
-                surplus = active.segment.passed.take_surplus(self._parameters)
-                self._correct(active.segment, surplus, self.calibration)
         else:
             active.pass_by(frame, T_world_camera, tracks.points_px, found)
+        with self._timer("passed frames"):
+            rooms = 1 if self._keyframe_is_new else STANDING_ROOMS
+            surplus = active.segment.passed.take_surplus(self._parameters, rooms)
+            self._correct(active.segment, surplus, self.calibration)
         self._place_waiting(active, hanging, T_world_camera)
         self._lost_frames, self._waiting, self._images = 0, Waiting(), (None, None)
         self._motion = self._motion.then(frame, stamp_ns, T_world_camera, support.tracked)

@@ -29,6 +29,9 @@ _ROOM = 2_000_000
 _ROOM_SHARE = 1 / 3
 """And of those that the map has room for."""
 
+STANDING_ROOMS = 2
+"""How often that room is filled where no keyframe comes, as while a camera stands still."""
+
 _COMMON_ERROR = 0.5
 """Largest error that all points of a frame may share, as a share of the inlier limit: with more,
 half of them would be outliers.  Real video shows 0.10 to 0.15."""
@@ -119,9 +122,9 @@ class PassedFrames:
         """Id of the oldest keyframe on which one hangs; a huge one where there is none."""
         return min((each.keyframe.id for each in self._frames), default=_NONE)
 
-    def take_surplus(self, parameters: MappingParameters) -> list[PassedFrame]:
-        """The oldest, of which there is no more room for what they saw."""
-        room = min(_ROOM, int(_ROOM_SHARE * parameters.window.kept_observations))
+    def take_surplus(self, parameters: MappingParameters, rooms: int = 1) -> list[PassedFrame]:
+        """The oldest, of which there is no more room for what they saw, so many times over."""
+        room = rooms * min(_ROOM, int(_ROOM_SHARE * parameters.window.kept_observations))
         seen = np.cumsum([len(each.rows) for each in reversed(self._frames)])
         return self._take(len(seen) - int(np.searchsorted(seen, room, side="right")))
 
