@@ -173,6 +173,32 @@ def test_under_a_guessed_focal_length_it_does_not_wait() -> None:
     assert not isinstance(find_start_of(waiting, known, guess), str)
 
 
+def street(frames: int) -> list[WaitingFrame]:
+    """A walk straight ahead towards what is far, beside what is near and leaves the image soon."""
+    random = np.random.default_rng(0)
+    near = random.uniform((-6.0, -3.0, 4.0), (6.0, 3.0, 24.0), (4000, 3))
+    near = near[np.abs(near[:, 0]) > 2.0]
+    far = random.uniform((-80.0, -20.0, 50.0), (80.0, 20.0, 120.0), (4000, 3))
+    points = np.concatenate([near, far])
+    born = random.integers(-60, frames, len(points))
+    centres = np.arange(frames)[:, None] * np.array([0.0, 0.0, 0.045])
+    return [
+        frame_of(k, points, centres[k], (born <= k) & (k < born + 60), 0.2) for k in range(frames)
+    ]
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.4])
+def test_straight_ahead_a_quarter_of_the_tracks_is_enough_after_a_while(sigma: float) -> None:
+    """What is near leaves the image first, so that most of what two views share is always far."""
+    parameters = widened(MappingParameters(), sigma)
+    known = SelfCalibration.of(CAMERA, parameters.calibration)
+    long = round(1e9 * parameters.start.long_s / INTERVAL_NS)
+    waiting = street(long + 2)
+    assert "too little parallax" in str(find_start_of(waiting[: long - 2], known, parameters))
+    found = find_start_of(waiting, known, parameters)
+    assert not isinstance(found, str), found
+
+
 def test_it_reaches_back_to_frames_whose_tracks_have_ended() -> None:
     centres, waiting = ride(24, 0.06, life=8)
     start = started(waiting[-8:])

@@ -21,6 +21,11 @@ class StartParameters(Parameters):
     min_parallax_deg: float = Field(
         default=1.0, gt=0.0, description="Least median parallax of the two frames, degrees"
     )
+    long_s: float = Field(
+        default=2.0,
+        ge=0.0,
+        description="Seconds after which it is enough that a quarter of the tracks has it",
+    )
     max_s: float = Field(
         default=4.0, gt=0.0, description="Seconds that frames wait; older ones get no pose"
     )

@@ -24,7 +24,7 @@ from pliant.algorithms.map_delta import MapDelta
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reaching_back import reach_back
-from pliant.algorithms.mapping.start import find_start, impatient, why_no_start
+from pliant.algorithms.mapping.start import find_start, waits_long, why_no_start
 from pliant.algorithms.tracks import FrameExtrema
 
 _GUESS = 0.05
@@ -249,33 +249,38 @@ def _find_start_of_guess(
 ) -> tuple[Start, SelfCalibration] | str:
     """The start under the focal length with which it agrees best with itself.
 
-    Where any of the focal lengths explains the flow by a turn alone or finds too little parallax,
-    it waits: a wrong one sees parallax in every turn.  Only the motion that two views fit best is
-    asked for: a wrong focal length bends all until they are alike, and the map begins anew with the
-    right one (``trial.py``), which compares them and waits for more parallax: the farther the
-    camera has moved, the fewer tracks agree with a wrong one.
+    Where a turn and some lens explain the flow, or any of the focal lengths finds too little
+    parallax, it waits: a wrong one sees parallax in every turn.  Angles shrink as a focal length
+    grows; after a while the same parallax in px is enough for the longer ones.  Only the motion
+    that two views fit best is asked for: a wrong focal length bends all until they are alike, and
+    the map begins anew with the right one (``trial.py``), which compares them and waits for more
+    parallax: the farther the camera has moved, the fewer tracks agree with a wrong one.
     """
     sigma = parameters.calibration.focal
     tried = [known.correction + k * sigma * np.eye(6)[0] for k in _HYPOTHESES]
     cameras = [corrected_view(known.given, tuple(each.tolist())).camera for each in tried]
-    reasons = [why_no_start(waiting, camera, parameters) for camera in cameras[::-1]]
-    if any(reasons):
-        return next(filter(None, reasons))
+    reason = why_no_start(waiting, known.view.camera, parameters)
+    if reason:
+        return reason
     best: tuple[float, Start, F64] | None = None
+    start = parameters.start
     for correction, camera in zip(tried, cameras, strict=True):
-        found = find_start(waiting, camera, impatient(parameters), motions=1)
+        share = min(1.0, known.given.fx / camera.fx) if waits_long(waiting, start) else 1.0
+        wanted = {"patient_s": 0.0, "min_parallax_deg": share * start.min_parallax_deg}
+        limits = parameters.model_copy(update={"start": start.model_copy(update=wanted)})
+        found = find_start(waiting, camera, limits, motions=1)
         if isinstance(found, str):
             return found
         refined = _refine(found, camera, parameters)
         cost = refined.final_cost / len(found.points_px)
         if best is None or cost < best[0]:
             poses, points = refined.T_world_camera, refined.points_world
-            start = dataclasses.replace(found, T_world_camera=poses, points_world=points)
-            best = cost, start, correction + refined.correction
+            begun = dataclasses.replace(found, T_world_camera=poses, points_world=points)
+            best = cost, begun, correction + refined.correction
     assert best is not None
-    _, start, correction = best
-    following = int(np.ceil(_GROWTH * len(start.frames)))
-    return start, SelfCalibration(known.given, correction, known.covariance, following)
+    _, begun, correction = best
+    following = int(np.ceil(_GROWTH * len(begun.frames)))
+    return begun, SelfCalibration(known.given, correction, known.covariance, following)
 
 
 def _refine(start: Start, camera: PinholeCamera, parameters: MappingParameters) -> BundleResult:

@@ -9,10 +9,12 @@ beginnings merely wait.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I64
+from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.epipolar import (
     RelativePose,
@@ -27,6 +29,7 @@ from pliant.algorithms.mapping.first_map import Start, WaitingFrame, adjusted_st
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.parameters import MappingParameters, StartParameters
 from pliant.algorithms.triangulation import triangulate
+from pliant.algorithms.turn_of_lens import turn_of_lens
 
 _TRIED_REFERENCES = 8
 """Earlier frames compared with a new one."""
@@ -68,6 +71,13 @@ class _Pair:
     flow_px: float
 
 
+class _Parallax(NamedTuple):
+    """What a start wants: so much, at this percentile of the tracks that agree."""
+
+    least_deg: float
+    percentile: float
+
+
 def find_start(
     waiting: list[WaitingFrame],
     camera: PinholeCamera,
@@ -88,9 +98,9 @@ def find_start(
         return reason
     # The more parallax the better; shared tracks count less, for there are many.
     pairs.sort(key=lambda pair: -pair.residual_px * len(pair.indices_newest) ** 0.5)
-    least_deg = _least_parallax_deg(waiting, start)
+    wanted = _wanted_parallax(waiting, start)
     for pair in pairs[:2]:
-        found = _start_from(pair, waiting, camera, parameters, motions, least_deg)
+        found = _start_from(pair, waiting, camera, parameters, motions, wanted)
         if not isinstance(found, str):
             return found
         reason = reason or found
@@ -99,17 +109,24 @@ def find_start(
 
 def impatient(parameters: MappingParameters) -> MappingParameters:
     """With these a map starts as soon as it can."""
-    start = parameters.start.model_copy(update={"patient_s": 0.0})
+    start = parameters.start.model_copy(update={"patient_s": 0.0, "long_s": 0.0})
     return parameters.model_copy(update={"start": start})
+
+
+def waits_long(waiting: list[WaitingFrame], start: StartParameters) -> bool:
+    """Whether more parallax may never come."""
+    return _waited_s(waiting) >= start.long_s
 
 
 def why_no_start(
     waiting: list[WaitingFrame], camera: PinholeCamera, parameters: MappingParameters
 ) -> str:
-    """Why a camera sees too few tracks or too little parallax for a start; "" where it does not."""
+    """Why a camera of which little is known sees too few tracks or too little parallax for a start
+    whatever its lens is; "" where it does not."""
     if len(waiting) < _MIN_FRAMES:
         return f"too few frames: {len(waiting)} of {_MIN_FRAMES}"
-    return _why_not(_pairs(waiting, camera, parameters.start), waiting, parameters.start)
+    pairs = _pairs(waiting, camera, parameters.start, parameters.calibration)
+    return _why_not(pairs, waiting, parameters.start)
 
 
 def _why_not(pairs: list[_Pair], waiting: list[WaitingFrame], start: StartParameters) -> str:
@@ -121,8 +138,12 @@ def _why_not(pairs: list[_Pair], waiting: list[WaitingFrame], start: StartParame
 
 
 def _pairs(
-    waiting: list[WaitingFrame], camera: PinholeCamera, parameters: StartParameters
+    waiting: list[WaitingFrame],
+    camera: PinholeCamera,
+    parameters: StartParameters,
+    unknown: CalibrationUncertainty | None = None,
 ) -> list[_Pair]:
+    """unknown: of the camera; None: a turn explains what it does with the camera as it is."""
     newest = waiting[-1]
     earlier = len(waiting) - 1
     tried = np.unique(np.linspace(0, earlier - 1, min(earlier, _TRIED_REFERENCES)).astype(int))
@@ -140,9 +161,13 @@ def _pairs(
         some = np.linspace(0, len(a) - 1, _ROTATION_SAMPLE).astype(int)
         samples.append((waiting[index].points_px[a[some]], newest.points_px[b[some]]))
     points_a, points_b = np.array(samples).swapaxes(0, 1)
-    _, residuals = rotation_between(
-        _normalise(camera, points_a), _normalise(camera, points_b), scale=_NOISE_PX / camera.fx
-    )
+    a, b, scale = _normalise(camera, points_a), _normalise(camera, points_b), _NOISE_PX / camera.fx
+    if unknown is None:
+        _, residuals = rotation_between(a, b, scale=scale)
+    else:
+        residuals = turn_of_lens(
+            a[:, ::2], b[:, ::2], scale=scale, focal_sigma=unknown.focal, lens_sigma=unknown.k1
+        )
     residuals_px = np.median(residuals, axis=-1) * camera.fx
     flows_px = np.median(np.linalg.norm(points_a - points_b, axis=-1), axis=-1)
     return [
@@ -184,7 +209,7 @@ def _start_from(
     camera: PinholeCamera,
     parameters: MappingParameters,
     motions: int | None,
-    least_deg: float,
+    wanted: _Parallax,
 ) -> Start | str:
     start = parameters.start
     a = _normalise(camera, waiting[pair.reference].points_px[pair.indices_reference])
@@ -193,13 +218,13 @@ def _start_from(
     every = max(1, len(a) // _GLANCE)
     glance = likely_pose(a[::every], b[::every], gate=gate)
     if glance is not None and glance.inliers.mean() >= start.min_inlier_share:
-        parallax = _parallax_deg(glance)
-        if parallax < _CLEARLY_LESS * least_deg:
-            return _too_little(parallax, least_deg, "deg")
+        parallax = _parallax_deg(glance, wanted.percentile)
+        if parallax < _CLEARLY_LESS * wanted.least_deg:
+            return _too_little(parallax, wanted.least_deg, "deg")
     tried = relative_poses(a, b, gate=gate)
     if not tried:
         return "no essential matrix fits the tracks"
-    reason = _why_not_with(tried[0], start, least_deg)
+    reason = _why_not_with(tried[0], start, wanted)
     if reason:
         return reason  # parallax that a worse motion sees is its mistake
     shared = waiting[-1].ids[pair.indices_newest]
@@ -207,9 +232,10 @@ def _start_from(
     # One motion is compared with none, and fewer tracks than these are all needed.
     most = _TELLING if len(compared) > 1 and len(shared) >= 2 * _TELLING else len(shared)
     telling = shared[:: max(1, len(shared) // most)]
+    least = wanted._replace(least_deg=start.min_parallax_deg)
     found: list[tuple[float, Start, RelativePose]] = []
     for two_views in compared:
-        each = _why_not_with(two_views, start, start.min_parallax_deg) or _reconstruct(
+        each = _why_not_with(two_views, start, least) or _reconstruct(
             pair, two_views, waiting, camera, parameters, most
         )
         if isinstance(each, str):
@@ -218,11 +244,11 @@ def _start_from(
         found.append((_misfit(each, telling, waiting, camera, parameters), each, two_views))
     if not found:
         return reason
-    least, best, two_views = min(found, key=lambda each: each[0])
+    least_misfit, best, two_views = min(found, key=lambda each: each[0])
     for misfit, other, _ in found:
-        if misfit < _AS_GOOD * least and not _agree(best, other):
+        if misfit < _AS_GOOD * least_misfit and not _agree(best, other):
             return "two motions explain the tracks alike"
-    reason = _why_not_with(two_views, start, least_deg)
+    reason = _why_not_with(two_views, start, wanted)
     if reason or most == len(shared):
         return reason or best
     return _reconstruct(pair, two_views, waiting, camera, parameters, len(shared))
@@ -234,25 +260,32 @@ def _agree(a: Start, b: Start) -> bool:
     return bool(ways[0] @ ways[1] > _ONE_WAY * np.prod(np.linalg.norm(ways, axis=1)))
 
 
-def _least_parallax_deg(waiting: list[WaitingFrame], start: StartParameters) -> float:
+def _wanted_parallax(waiting: list[WaitingFrame], start: StartParameters) -> _Parallax:
     """Under little parallax a start takes noise, and the readout of a rolling shutter, for shape;
-    but where tracks end soon there is never more."""
-    waited_s = 1e-9 * (waiting[-1].stamp_ns - waiting[0].stamp_ns)
-    return start.parallax_deg if waited_s < start.patient_s else start.min_parallax_deg
+    but where tracks end soon there is never more.  Straight ahead what is near leaves the image
+    first, so that most of what two views share is always far."""
+    if _waited_s(waiting) < start.patient_s:
+        return _Parallax(start.parallax_deg, 50.0)
+    percentile = 75.0 if waits_long(waiting, start) else 50.0
+    return _Parallax(start.min_parallax_deg, percentile)
 
 
-def _why_not_with(two_views: RelativePose, start: StartParameters, least_deg: float) -> str:
+def _waited_s(waiting: list[WaitingFrame]) -> float:
+    return 1e-9 * (waiting[-1].stamp_ns - waiting[0].stamp_ns)
+
+
+def _why_not_with(two_views: RelativePose, start: StartParameters, wanted: _Parallax) -> str:
     share = float(two_views.inliers.mean())
     if share < start.min_inlier_share:
         return f"too few tracks agree with one motion: {share:.0%} of {start.min_inlier_share:.0%}"
-    parallax = _parallax_deg(two_views)
-    if parallax < least_deg:
-        return _too_little(parallax, least_deg, "deg")
+    parallax = _parallax_deg(two_views, wanted.percentile)
+    if parallax < wanted.least_deg:
+        return _too_little(parallax, wanted.least_deg, "deg")
     return ""
 
 
-def _parallax_deg(two_views: RelativePose) -> float:
-    return float(np.degrees(np.median(two_views.parallax_rad[two_views.inliers])))
+def _parallax_deg(two_views: RelativePose, percentile: float) -> float:
+    return float(np.degrees(np.percentile(two_views.parallax_rad[two_views.inliers], percentile)))
 
 
 def _misfit(
