@@ -17,7 +17,7 @@ from running import command, in_this_process, pliant
 
 from pliant.bus.session import free_endpoint
 from pliant.errors import ResultError
-from pliant.viewers import rerun
+from pliant.viewers import rerun, rerun_data
 from pliant.viewers.rerun import RerunCanvas
 from pliant.viewers.rerun_data import RerunData
 from pliant.viewers.rerun_program import RerunProgram, listens
@@ -196,7 +196,9 @@ def test_other_users_and_sites_that_mean_this_machine_see_nothing() -> None:
         canvas.close()
 
 
-def test_a_browser_that_comes_late_gets_the_beginning_and_what_follows() -> None:
+def test_a_browser_that_comes_late_gets_the_beginning_and_what_follows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rr = pytest.importorskip("rerun")
     stream = rr.RecordingStream("late", recording_id="late")
     data = RerunData(stream, most_bytes=30_000)
@@ -217,6 +219,11 @@ def test_a_browser_that_comes_late_gets_the_beginning_and_what_follows() -> None
     later = data.since(parts[-1][0] + 1)
     assert later is not None
     assert b"/after" in later[-1][1]
+    monkeypatch.setattr(rerun_data, "_BATCH_BYTES", 10_000)
+    some = data.since(0)
+    assert some is not None
+    assert some == parts[: len(some)]  # a slow one holds no more than it is about to be sent
+    assert sum(len(part) for _, part in some[:-1]) < 10_000
     data.close()
     assert data.since(later[-1][0] + 1) is None
 

@@ -133,6 +133,22 @@ def test_counts_fall_only_with_a_new_incarnation() -> None:
     assert outbox.on_the_way() == 3
 
 
+def test_a_reader_that_starts_again_after_its_clock_was_set_back_is_heard() -> None:
+    """Nothing would ever tell its sender that it takes what is sent."""
+    outbox, peers = Outbox("t", ["a"], window=10), Peers("ingest", incarnation=5, needed=["a"])
+    for _ in range(5):
+        outbox.add(0, b"x")
+    tokens = {number: f"pliant/s/{token_key('a', number)}" for number in (7, 6)}
+    peers.on_token(tokens[7], alive=True, now=0.0)
+    outbox.credit("a", 7, 4, 2, peers.left("a"))
+    peers.on_token(tokens[6], alive=True, now=1.0)
+    assert not outbox.credit("a", 6, 3, 3, peers.left("a"))  # both are here
+    peers.on_token(tokens[7], alive=False, now=2.0)
+    assert outbox.credit("a", 6, 3, 3, peers.left("a"))
+    assert not outbox.credit("a", 7, 5, 5, peers.left("a"))  # comes late
+    assert (outbox.readers["a"].incarnation, outbox.readers["a"].taken) == (6, 3)
+
+
 def test_a_reader_that_makes_safe_seldom_bounds_messages_and_bytes() -> None:
     outbox = Outbox("t", ["disk"], window=100, windows={"disk": Window(messages=3, size=25)})
     outbox.add(0, b"0123456789")

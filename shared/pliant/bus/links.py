@@ -177,7 +177,8 @@ class OutLink:
             if ask > NOW or not shared.peers.is_known(reader, incarnation):
                 self.box.refused += 1
                 return
-            came_back = self.box.credit(reader, incarnation, taken, safe)
+            left = shared.peers.left(reader)
+            came_back = self.box.credit(reader, incarnation, taken, safe, left)
             asked = came_back or ask == NOW or (ask == IF_OLD and taken < self.sent_at_tick)
             if asked and taken < self.box.sent:
                 self.box.asking.add(reader)

@@ -89,16 +89,25 @@ class Outbox:
         """Go on from a number, as after a restart.  Nothing may have been added yet."""
         self.sent = sequence
 
-    def credit(self, name: str, incarnation: int, taken: int, safe: int) -> bool:
+    def credit(
+        self, name: str, incarnation: int, taken: int, safe: int, left: Collection[int] = ()
+    ) -> bool:
         """A reader's counts, which never fall but in another incarnation of it.
 
+        left: incarnations of it that are here no more.  A later start has a lower number where the
+        clock was set back, so it is one that has left which gives way.
         Returns whether the reader is another incarnation than before.
         """
         reader = self.readers.get(name)
-        if reader is None or incarnation < reader.incarnation:
+        if reader is None:
             return False
-        came_back = 0 <= reader.incarnation < incarnation
-        if incarnation > reader.incarnation:
+        before = reader.incarnation
+        if incarnation != before and incarnation in left:
+            return False  # what it said comes late
+        if incarnation < before and before not in left:
+            return False
+        came_back = 0 <= before != incarnation
+        if incarnation != before:
             reader.incarnation, reader.taken, reader.safe = incarnation, taken, min(safe, taken)
         else:
             reader.taken = max(reader.taken, taken)

@@ -111,6 +111,10 @@ class Peers:
         """Whether a service may speak as this incarnation: none was announced before, or this."""
         return incarnation in self.met.get(name, {incarnation})
 
+    def left(self, name: str) -> set[int]:
+        """Incarnations of a service that were here and are no more."""
+        return self.met.get(name, set()) - self.here.get(name, set())
+
     def seen(self, names: Iterable[str]) -> bool:
         """Whether all of them are here, or have been."""
         return all(self.here.get(name) or name in self.gone_since for name in names)

@@ -6,7 +6,10 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
+
 _TAKE_S = 0.1
+_BATCH_BYTES = 1 << 24
 
 
 class RerunData:
@@ -57,11 +60,13 @@ class RerunData:
             self._passing_bytes -= len(self._passing.popleft()[1])
 
     def since(self, number: int) -> list[tuple[int, bytes]] | None:
-        """Parts from this number on, each with its own.  Waits for one; None where none comes."""
+        """The next parts from this number on, each with its own: no more than a slow browser may
+        hold, which are not dropped meanwhile.  Waits for one; None where none comes."""
         with self._changed:
             self._changed.wait_for(lambda: self._is_over or self._parts > number)
             parts = [item for item in (*self._kept, *self._passing) if item[0] >= number]
-        return sorted(parts) or None
+        sizes = np.cumsum([len(part) for _, part in sorted(parts)])
+        return sorted(parts)[: int(np.searchsorted(sizes, _BATCH_BYTES)) + 1] or None
 
     def close(self) -> None:
         """Nothing more comes."""
