@@ -28,6 +28,8 @@ TOKEN_LEASE_S = 5.0 + 1e-3 * _PATIENCE_MS
 _LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103
 _SOCKET = "unixsock-stream"
 _FOLDER, _BUS = "pliant-", "bus"
+_NO_SHARED_MEMORY = "shm segment"
+"""What Zenoh says where /dev/shm is full, or missing."""
 _NO_SOCKET = "no Unix socket could be had: every user of this machine can reach the services"
 _MAX_BYTES = max(topic.max_bytes for topic in TOPICS) + (1 << 20)
 """Whoever announces more than our largest topic takes is cut off, before memory is taken for it."""
@@ -109,7 +111,7 @@ def open_session(endpoints: Sequence[str], identity: Identity | None = None) -> 
     config.insert_json5("connect/timeout_ms", str(int(CONNECT_TIMEOUT_S * 1000)))
     config.insert_json5("connect/exit_on_failure", "true")
     try:
-        return zenoh.open(config)
+        return _opened(config)
     except zenoh.ZError as error:
         raise BusError(
             f"cannot reach {', '.join(endpoints)} within {CONNECT_TIMEOUT_S:.0f} s: is the router "
@@ -133,12 +135,23 @@ def open_router(
     config.insert_json5("listen/exit_on_failure", "true")
     config.insert_json5("listen/timeout_ms", "0")
     try:
-        return zenoh.open(config)
+        return _opened(config)
     except zenoh.ZError as error:
         raise BusError(
             f"cannot listen on {', '.join(endpoints)}: is the port in use? Choose another with "
             f"--port ({_first_line(error)})"
         ) from None
+
+
+def _opened(config: zenoh.Config) -> zenoh.Session:
+    """A session; without shared memory where there is no room for any.  Raises ZError."""
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        if _NO_SHARED_MEMORY not in str(error):
+            raise
+    config.insert_json5("transport/shared_memory/enabled", "false")
+    return zenoh.open(config)
 
 
 def _set_endpoints(config: zenoh.Config, what: str, endpoints: Sequence[str]) -> None:
