@@ -8,6 +8,7 @@ the frames; what else moves it is told by how its end has moved, for what follow
 
 import heapq
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,8 +20,10 @@ from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
+from pliant.algorithms.mapping.frame_focal import refocused
 from pliant.algorithms.mapping.kept_map import Origin, keep, spans_of, take_in
 from pliant.algorithms.mapping.known_places import KnownPlaces, Meetings, join
+from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import Recognised
@@ -29,6 +32,7 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_guess
 from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held
 from pliant.algorithms.places import describe
 from pliant.algorithms.stages import StageTimer, no_stages
+from pliant.algorithms.tracks import FrameTracks
 
 
 class Atlas:
@@ -234,6 +238,11 @@ class Atlas:
             for loop in answer.loops:
                 self.active.join(loop)
         before, self.calibration = self.calibration, answer.calibration
+        if len(answer.refocus):
+            refocus = self._refocus(answer)
+            log_focal = before.log_focal + float(refocus[-1]) if answer.calibration.changes else 0.0
+            self.calibration = replace(self.calibration, log_focal=log_focal)
+            return [*moved, self._change_lens(self.active, before, refocus)]
         if not self.calibration.sees_like(before):
             return [*moved, self._change_lens(self.active, before)]
         if not before.readout:
@@ -241,11 +250,23 @@ class Atlas:
         self.active.segment.unroll(self.active.keyframes, self.calibration)
         return moved
 
-    def _change_lens(self, active: ActiveMap, before: SelfCalibration) -> Moved:
-        """Go on under the lens that is known now."""
+    def _refocus(self, answer: Answer) -> F64:
+        """(K,) by how much the log focal length of each keyframe changes: newer ones follow the
+        last that was asked for, and all lose theirs where it turns out to be the same for all."""
+        assert self.active is not None
+        assert answer.moves is not None
+        if not answer.calibration.changes:
+            return -np.array([keyframe.log_focal for keyframe in self.active.keyframes])
+        ids = [keyframe.id for keyframe in self.active.keyframes]
+        return np.interp(ids, answer.moves.keyframe_ids, answer.refocus)
+
+    def _change_lens(
+        self, active: ActiveMap, before: SelfCalibration, refocus: F64 | None = None
+    ) -> Moved:
+        """Go on under the lens that is known now.   refocus: as of ``see_by``."""
         newest = active.keyframes[-1]
         pose = newest.T_world_camera
-        see_by(active.segment, before.view, self.calibration)
+        see_by(active.segment, before.view, self.calibration, refocus)
         active.see_anew(self.calibration)
         self._earlier.see_by(before, self.calibration)
         self._adjusted = True  # readers have the points as the other lens had them
@@ -264,6 +285,15 @@ class Atlas:
         before = newest.T_world_camera
         self.active.begin_to_unroll(self.calibration)
         return [Moved(newest.T_world_camera @ inverse(before))]
+
+    def focus(self, motion: Motion, stamp_ns: int, tracks: FrameTracks) -> None:
+        """Find the focal length of a frame, where it changes, by its tracks."""
+        if self.active is None or not self._parameters.calibration.focal:
+            return
+        before = self.calibration
+        self.calibration = refocused(self.active, before, motion, stamp_ns, tracks)
+        if self.calibration.changes and not before.changes:
+            self.whole_map.due = 0.0  # how the map is bent is to be found at once
 
     def calibrate(self) -> list[Moved]:
         """Adjust the whole segment with its calibration where that is a guess, and due."""

@@ -6,7 +6,8 @@ would explain what it leaves: how much less one linear step would cost with them
 units of the variance of the residuals.  Errors of other kinds, of the rolling shutter for instance,
 look like a z that jumps from keyframe to keyframe; what a camera does lasts for a while.  So z must
 also vary by more than calibrations are believed, averaged over half a second; or else explain so
-much that nothing else does.
+much that nothing else does.  It is asked at each adjustment of all keyframes while the clip runs,
+since a bent map keeps only the observations that agree with it, and ``frame_focal`` says sooner.
 """
 
 from typing import NamedTuple
@@ -24,25 +25,33 @@ from pliant.algorithms.bundle.schur import gain_of_focal
 from pliant.algorithms.bundle.varying_focal import FocalWalk
 from pliant.algorithms.mapping.map_store import Keyframe
 
-_RATE = 0.05
+RATE = 0.05
 """Standard deviation of the log focal length a second later: weak beside what keyframes tell."""
 
-_SPREAD = 0.3
+SPREAD = 0.3
 """Of the log focal length in a clip."""
 
 _GAIN = 25.0
-"""Times what noise would gain by each focal length: real clips with one focal length gain up to 20,
+"""Times what noise would gain by each focal length: real clips with one focal length gain up to 21,
 zoomed ones from 30 on."""
 
 _CERTAIN = 50.0
 """As ``_GAIN``, from which on the range does not matter: stabilised clips gain from 100 on."""
 
-_RANGE = 2.0 * CalibrationUncertainty().focal
-"""Of the log focal length: two standard deviations of a calibration that is believed.  Errors of
-other kinds range over up to 1.4 % in real clips."""
+_RANGE = CalibrationUncertainty().focal
+"""Of the log focal length: a standard deviation of a calibration that is believed.  Where errors of
+other kinds gain more than 10 they range over up to 0.9 % in real clips."""
+
+_ALONE = 2.0
+"""Ranges from which on it changes still, whatever the gain: once focal lengths of their own hold a
+map together, errors of other kinds make them range over up to 1.6 %."""
 
 _ONE_STEP = 0.35
 """Share of the range that one step of the robust adjustment shows at least."""
+
+_PRINCIPAL_POINT = 0.01
+"""Standard deviation of the principal point of a lens that changes, as a share of the focal
+length."""
 
 _AVERAGED_S = 0.5
 _PERCENTILES = (5.0, 95.0)
@@ -57,7 +66,13 @@ def gaps_s(keyframes: list[Keyframe]) -> F64:
 
 def walk_from(start: F64, gaps: F64) -> FocalWalk:
     """The prior of the focal lengths of keyframes, and where they begin (M,)."""
-    return FocalWalk(gaps_s=gaps, rate=_RATE, spread=_SPREAD, start=start)
+    return FocalWalk(gaps_s=gaps, rate=RATE, spread=SPREAD, start=start)
+
+
+def with_principal_point(uncertainty: CalibrationUncertainty) -> CalibrationUncertainty:
+    """A lens that magnifies tells where its principal point is, and bends the map by it."""
+    width = max(uncertainty.principal_point, _PRINCIPAL_POINT)
+    return uncertainty.model_copy(update={"principal_point": width})
 
 
 def focal_range(log_focals: F64, gaps: F64) -> tuple[float, float]:
@@ -83,14 +98,15 @@ class Evidence(NamedTuple):
         """Whether an adjustment with these unknowns is worth its time."""
         return self.confirmed_by(self.log_focals, _ONE_STEP)
 
-    def confirmed_by(self, log_focals: F64, share: float = 1.0) -> bool:
+    def confirmed_by(self, log_focals: F64, share: float = 1.0, known: bool = False) -> bool:
         """Whether log focal lengths (M,) range over as much as changes do, or the gain is certain.
 
-        share: of that range.
+        share: of that range.   known: they are known to change, so that less will do.
         """
         low, high = focal_range(log_focals, self.gaps_s)
-        ranges = self.gain > _GAIN and high - low > share * _RANGE
-        return ranges or self.gain > _CERTAIN
+        gains, ranges = self.gain > _GAIN, (high - low) / _RANGE
+        changes = gains or ranges > _ALONE if known else gains and ranges > share
+        return changes or self.gain > _CERTAIN
 
 
 def evidence_of_change(
@@ -102,8 +118,9 @@ def evidence_of_change(
     told = 2 * len(problem.points_px) - 3 * len(problem.points_world) - 6 * M
     if M < 3 or told <= 0:
         return Evidence(0.0, np.zeros(M), gaps)
-    gain, step = gain_of_focal(
-        problem, found, parameters, uncertainty, walk_from(np.zeros(M), gaps)
-    )
+    # One focal length for all may be another one than was given: that is no change.
+    wide = with_principal_point(uncertainty)
+    wide = wide.model_copy(update={"focal": max(wide.focal, SPREAD)})
+    gain, step = gain_of_focal(problem, found, parameters, wide, walk_from(np.zeros(M), gaps))
     variance = 2.0 * found.final_cost / told
     return Evidence(gain / (M * variance) if variance > 0.0 else 0.0, step, gaps)

@@ -12,10 +12,15 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.problem import BundleProblem, BundleResult, shared_intrinsics
 from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import moved_px
+from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.changing_focal import evidence_of_change, gaps_s, walk_from
+from pliant.algorithms.mapping.changing_focal import (
+    evidence_of_change,
+    gaps_s,
+    walk_from,
+    with_principal_point,
+)
 from pliant.algorithms.mapping.directions import at_infinity
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
@@ -60,6 +65,10 @@ class ListedMap:
         if not len(self.log_focal):
             self.log_focal = np.zeros(len(self.T_world_camera))
             self.gaps_s = np.full(max(len(self.T_world_camera) - 1, 0), np.inf)
+
+    def see_by(self, view: CorrectedView) -> None:
+        """The pixels, which are those of the ideal camera of a view, become those of the image."""
+        self.px = view.magnified(view.seen(self.px), self.log_focal[self.camera])
 
     def most_seen(self, per_keyframe: int) -> "ListedMap":
         """With the fewest points, those that most keyframes see first, that leave every keyframe
@@ -173,7 +182,7 @@ def adjust_keyframes(
     """
     given, before = known, known.view
     seen = list_map(keyframes, points, known, parameters)
-    seen.px = before.magnified(before.seen(seen.px), seen.log_focal[seen.camera])
+    seen.see_by(before)
     if parameters.calibration.sigmas.any():
         seen.flow = readout_flow(
             seen.T_world_camera, motions, seen.xyz, seen.camera, seen.point, seen.px, before.camera
@@ -234,16 +243,16 @@ def adjust_listed(
         solve_schur, problem, bundle, uncertainty=uncertainty, start=start, with_covariance=True,
         doubled=True,
     )  # fmt: skip
-    walk, gaps = walk_from(seen.log_focal, seen.gaps_s), seen.gaps_s
-    known_to_change = varying and known.changes and uncertainty is not None
-    found = solve(walk=walk if known_to_change else None)
-    if varying and uncertainty is not None and not known_to_change:
-        evidence = evidence_of_change(problem, found, bundle, uncertainty, gaps)
-        if evidence.calls_for_more:
-            other = solve(walk=walk)
-            found = other if evidence.confirmed_by(other.log_focal) else found
-    if len(found.log_focal):
-        seen.log_focal = found.log_focal
+    found = solve()
+    if varying and uncertainty is not None:
+        evidence = evidence_of_change(problem, found, bundle, uncertainty, seen.gaps_s)
+        if known.changes or evidence.calls_for_more:
+            wide = with_principal_point(uncertainty)
+            other = solve(walk=walk_from(seen.log_focal, seen.gaps_s), uncertainty=wide)
+            confirmed = evidence.confirmed_by(other.log_focal, known=known.changes)
+            found = other if confirmed else found
+    if varying:
+        seen.log_focal = found.log_focal if len(found.log_focal) else 0.0 * seen.log_focal
     seen.xyz[chosen] = found.points_world
     seen.T_world_camera = found.T_world_camera
     return found

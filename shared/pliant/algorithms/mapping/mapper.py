@@ -147,6 +147,7 @@ class Mapper:
                 if not self.calibration.sees_like(before):
                     self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
             atlas.active.links.follow(extrema.ids, atlas.points)
+            atlas.focus(self._motion, stamp_ns, extrema)
         with self._timer("corrected view"):
             tracks = self.calibration.ideal(extrema)
         self._images = (grey, grey if colour is None else colour)
@@ -238,6 +239,8 @@ class Mapper:
         self._stamps_ns[frame] = stamp_ns
         self._keyframe_is_new = False
         if active is not None and not self._lost_frames:
+            active.links.follow(tracks.ids, active.points)
+            self.atlas.focus(self._motion, stamp_ns, tracks)
             found = pose_by_tracks(
                 active, self.calibration, self._motion, frame, stamp_ns, tracks, self._generator
             )

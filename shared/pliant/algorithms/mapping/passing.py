@@ -12,9 +12,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32
+from pliant.algorithms.bundle.focal_pose import refine_focal
 from pliant.algorithms.bundle.subspace import refine_pose
 from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.geometry import inverse
+from pliant.algorithms.mapping.changing_focal import RATE
 from pliant.algorithms.mapping.directions import MAPPED_SHARE
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import weigh
@@ -102,15 +104,18 @@ class PassedFrames:
             for each in self._frames
         ]
 
-    def focus(self, view: CorrectedView, keyframes: list[Keyframe]) -> None:
-        """The focal length changes as between the keyframes.   view: whose pixels they have."""
+    def focus(self, view: CorrectedView, keyframes: list[Keyframe], refocus: F64) -> None:
+        """Log focal lengths change as between the keyframes.
+
+        view: whose pixels they have.   refocus: (K,) change of each keyframe.
+        """
         numbers = [keyframe.frame for keyframe in keyframes]
-        log_focals = [keyframe.log_focal for keyframe in keyframes]
         for n, each in enumerate(self._frames):
-            log_focal = float(np.interp(each.frame, numbers, log_focals))
-            if log_focal != each.log_focal:
-                factors = np.full(len(each.rows), log_focal - each.log_focal)
+            change = float(np.interp(each.frame, numbers, refocus))
+            if change:
+                factors = np.full(len(each.rows), change)
                 points_px = moved_px(each.points_px, view, view, factors)
+                log_focal = each.log_focal + change
                 self._frames[n] = replace(each, points_px=points_px, log_focal=log_focal)
 
     def take_in(self, earlier: "PassedFrames") -> None:
@@ -161,10 +166,15 @@ def refined_poses(
         still &= points.state[each.rows] == MAPPED
         if still.sum() < max(limits.min_inliers, MAPPED_SHARE * len(still)):
             continue
-        points_px = each.points_px[still]
+        points_px, xyz = each.points_px[still], points.xyz[each.rows[still]]
+        start = keyframe.T_world_camera @ each.T_keyframe_camera
+        if seen_by.changes:
+            centre = seen_by.given.cx, seen_by.given.cy
+            change, _ = refine_focal(start, xyz, points_px, camera, centre, RATE)
+            factors = np.full(len(points_px), change)
+            points_px = moved_px(points_px, seen_by.view, seen_by.view, factors)
         T_world_camera, fits, information = refine_pose(
-            keyframe.T_world_camera @ each.T_keyframe_camera, points.xyz[each.rows[still]],
-            points_px, camera, parameters.bundle, inlier_px=limits.inlier_px,
+            start, xyz, points_px, camera, parameters.bundle, inlier_px=limits.inlier_px,
             weights=weigh(points_px, camera, seen_by.k_sigmas(parameters.calibration)),
         )  # fmt: skip
         inliers = int(np.count_nonzero(fits))

@@ -280,6 +280,7 @@ class Segment:
         Returns what is known now, and how what has been given up moves: None where that is nothing.
         """
         motions = self.path.motions(self.keyframes)
+        before = np.array([keyframe.log_focal for keyframe in self.keyframes])
         found, gone, moves = adjust_keyframes(
             self.keyframes, self.points, known, parameters, motions
         )
@@ -287,7 +288,8 @@ class Segment:
         self.unroll(self.keyframes, found)
         self.passed.seen_by(known.view, found.view)
         if found.changes:
-            self.passed.focus(found.view, self.keyframes)
+            after = np.array([keyframe.log_focal for keyframe in self.keyframes])
+            self.passed.focus(found.view, self.keyframes, after - before)
         if found.readout and not known.readout:
             self.passed.forget()
         if not self.thinned:
@@ -312,24 +314,34 @@ def _inverse_depths(rows: I32, state: U8, xyz: F64, T_world_camera: F64, depths:
                 depths[i] = 1.0 / depth
 
 
-def see_by(segment: Segment, before: CorrectedView, known: SelfCalibration) -> None:
+def see_by(
+    segment: Segment, before: CorrectedView, known: SelfCalibration, refocus: F64 | None = None
+) -> None:
     """Let a segment that was made in one view be as another camera sees it.
 
-    before: whose pixels its keyframes have.   known: of the camera by now.
+    before: whose pixels its keyframes have.   known: of the camera by now.   refocus: (K,) change
+    of the log focal length of each keyframe; None: of none.
     """
-    bend(segment, before, known.view)
-    for keyframe in segment.keyframes:
-        seen = moved_px(keyframe.points_px + keyframe.rolled_px, before, known.view)
-        keyframe.points_px = moved_px(keyframe.points_px, before, known.view)
+    bend(segment, before, known.view, refocus)
+    changes = np.zeros(len(segment.keyframes)) if refocus is None else refocus
+    for keyframe, change in zip(segment.keyframes, changes.tolist(), strict=True):
+        factors = np.full(len(keyframe.rows), change)
+        seen = moved_px(keyframe.points_px + keyframe.rolled_px, before, known.view, factors)
+        keyframe.points_px = moved_px(keyframe.points_px, before, known.view, factors)
         keyframe.rolled_px = seen - keyframe.points_px
+        keyframe.log_focal += change
     segment.passed.seen_by(before, known.view)
+    if refocus is not None:
+        segment.passed.focus(known.view, segment.keyframes, refocus)
     if known.readout:
         segment.unroll(segment.keyframes, known)
 
 
-def bend(segment: Segment, before: CorrectedView, after: CorrectedView) -> None:
+def bend(
+    segment: Segment, before: CorrectedView, after: CorrectedView, refocus: F64 | None = None
+) -> None:
     """Move the points to where another camera would have mapped what it sees at the same places of
-    the image, candidates with their provisional places among them."""
+    the image, candidates with their provisional places among them.   refocus: as of ``see_by``."""
     points, keyframes = segment.points, segment.keyframes
     used = slice(0, points.count)
     here = (points.state[used] != FREE) & (points.segment[used] == segment.id)
@@ -342,7 +354,8 @@ def bend(segment: Segment, before: CorrectedView, after: CorrectedView) -> None:
     in_host = _each(T_host_world, points.xyz[rows])
     ahead = in_host[:, 2] > _MIN_DEPTH
     rows, in_host = rows[ahead], in_host[ahead]
-    px = moved_px(before.camera.project(in_host).astype(np.float32), before, after)
+    px = before.camera.project(in_host).astype(np.float32)
+    px = moved_px(px, before, after, None if refocus is None else refocus[slots[ahead]])
     in_host[:, :2] = after.camera.normalise(px) * in_host[:, 2:]
     points.xyz[rows] = _each(T_world_host[ahead], in_host)
 

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
-from pliant.algorithms.bundle.problem import CalibrationUncertainty
+from pliant.algorithms.bundle.problem import BundleResult, CalibrationUncertainty
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.final_adjustment import (
     ListedMap,
@@ -45,6 +45,9 @@ _LEAST_TOLD = 0.2
 
 _GRAPH_SHARE = 0.1
 """Of the time that an adjustment takes: the graph of its keyframes."""
+
+
+_NONE: F64 = np.zeros(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,12 +81,14 @@ class Question:
 
 class Answer(NamedTuple):
     """How the map moves, None where it does not; the loops that were closed, whose points are to be
-    joined; what is known of the camera by now; how many loops the others contradict."""
+    joined; what is known of the camera by now; how many loops the others contradict; by how much
+    the log focal length of each keyframe changes, (0,) where it is the same for all."""
 
     moves: MapMoves | None
     loops: list[Loop]
     calibration: SelfCalibration
     refused: int
+    refocus: F64 = _NONE
 
 
 @dataclass(kw_only=True)
@@ -141,8 +146,7 @@ class WholeMap:
         seen = list_map(segment.keyframes, points, calibration, parameters)
         if not loops:
             seen = seen.most_seen(parameters.whole_map.points_per_keyframe)
-        seen.px = calibration.view.seen(seen.px)
-        seen.log_focal = np.zeros_like(seen.log_focal)  # the pixels are free of it
+        seen.see_by(calibration.view)
         if parameters.calibration.readout > 0.0 and not loops:
             seen.flow = readout_flow(
                 seen.T_world_camera, segment.path.motions(segment.keyframes), seen.xyz, seen.camera,
@@ -205,15 +209,17 @@ def find_moves(question: Question) -> Answer:
     seen = replace(question.seen, T_world_camera=before.copy(), xyz=xyz.copy())
     known, parameters = question.known, question.parameters
     found = adjust_listed(
-        seen, known, parameters, iterations=parameters.whole_map.iterations, start=known.in_use
-    )
-    after = _learned(known, found.correction, found.covariance, parameters.calibration)
+        seen, known, parameters, iterations=parameters.whole_map.iterations, start=known.in_use,
+        varying=True,
+    )  # fmt: skip
+    after = _learned(known, found, parameters.calibration)
     # A window that is half of the map does as well, unless it did not know the camera or the loops.
     bent = (known.readout == 0.0 and after.readout != 0.0) or not after.sees_like(known)
-    bent = bent or question.closed
+    refocus = seen.log_focal - question.seen.log_focal
+    bent = bent or question.closed or after.changes or bool(refocus.any())
     moving = bent or len(question.keyframe_ids) >= 2 * parameters.window.keyframes
     moves = _moves(question, seen, before, depths) if moving else None
-    return Answer(moves, [], after, 0)
+    return Answer(moves, [], after, 0, refocus if refocus.any() else _NONE)
 
 
 def _close(question: Question) -> Answer:
@@ -227,13 +233,17 @@ def _close(question: Question) -> Answer:
 
 
 def _learned(
-    known: SelfCalibration, correction: F64, covariance: F64, prior: CalibrationUncertainty
+    known: SelfCalibration, found: BundleResult, prior: CalibrationUncertainty
 ) -> SelfCalibration:
-    """What is known with what was found."""
+    """What is known with what was found.  Focal lengths that change are relative to a lens, which
+    then is the one that was found with them."""
+    correction, covariance = found.correction, found.covariance
+    changes = len(found.log_focal) > 0
     readout, sigma = float(correction[3]), float(np.sqrt(covariance[3, 3]))
     if known.readout == 0.0:
         readout, sigma = _without_prior(readout, sigma, prior)
-    if known.is_refuted(correction, covariance, prior):
+    known = replace(known, changes=changes)
+    if changes or known.is_refuted(correction, covariance, prior):
         known = known.with_lens(correction, covariance)
     return known.with_readout(readout, sigma)
 

@@ -1,0 +1,66 @@
+"""The focal length of each frame, where it changes during a clip (see ``changing_focal``).
+
+A frame that looks magnified against the map by far more than one step of the camera explains says
+at once that it changes, long before an adjustment of all keyframes would be due.  From then on each
+frame is seen by the focal length that its tracks tell, with a random walk from that of the frame
+before as its prior.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pliant.algorithms.bundle.focal_pose import refine_focal
+from pliant.algorithms.bundle.problem import CalibrationUncertainty
+from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.changing_focal import RATE, SPREAD
+from pliant.algorithms.mapping.localisation import Motion
+from pliant.algorithms.mapping.map_store import MAPPED
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.tracks import FrameTracks
+
+_AT_ONCE = 50.0
+"""Standard deviations of the magnification of one frame: real clips with one focal length have up
+to 33, zoomed ones from 70 on."""
+
+_LEAST = 2.0 * CalibrationUncertainty().focal
+"""Of the log magnification: two standard deviations of a calibration that is believed."""
+
+_LEAST_GAP_S = 1e-3
+
+
+def refocused(
+    active: ActiveMap,
+    calibration: SelfCalibration,
+    motion: Motion,
+    stamp_ns: int,
+    tracks: FrameTracks,
+) -> SelfCalibration:
+    """With the focal length of a frame, where it changes, by its tracks of mapped points.
+
+    tracks: of the rectified image.
+    """
+    linked, changes = active.linked(MAPPED), calibration.changes
+    if len(linked) < active.parameters.localisation.min_inliers:
+        return calibration
+    rows, predicted = active.links.rows[linked], motion.predictions(stamp_ns)[0]
+    points_px = calibration.frame_view.pixels(tracks.points_px[linked])
+    if calibration.readout:
+        rolled = active.segment.rolled(calibration, motion.velocity())
+        points_px = points_px - rolled.shifts(
+            points_px, active.segment.inverse_depths(rows, predicted)
+        )
+    given = calibration.given
+    change, sigma = refine_focal(
+        predicted, active.points.xyz[rows], points_px, active.camera, (given.cx, given.cy),
+        RATE * np.sqrt(max(motion.lost_s(stamp_ns), _LEAST_GAP_S)) if changes else SPREAD,
+    )  # fmt: skip
+    if not changes and not shows_at_once(change, sigma):
+        return calibration
+    active.seen_by = replace(calibration, changes=True, log_focal=calibration.log_focal + change)
+    return active.seen_by
+
+
+def shows_at_once(log_focal: float, sigma: float) -> bool:
+    """Whether the magnification of one frame against the map is certainly a change."""
+    return abs(log_focal) > max(_LEAST, _AT_ONCE * sigma)

@@ -1,0 +1,56 @@
+"""Pose and focal length of one frame: the Jacobian, what it recovers, and what holds it."""
+
+import numpy as np
+from mapping_scene import CAMERA
+
+from pliant.algorithms.bundle.focal_pose import UNKNOWNS, linearise, moved, refine_focal
+from pliant.algorithms.geometry import inverse, so3_exp
+
+CENTRE = (CAMERA.cx + 3.0, CAMERA.cy - 2.0)
+
+
+def scene(d, depth=4.0, noise_px=0.0):
+    """A pose, points about it and where an image magnified by e^d shows them."""
+    generator = np.random.default_rng(3)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = so3_exp(np.array([0.1, -0.2, 0.05]))
+    T_world_camera[:3, 3] = 0.3, -0.1, 0.2
+    lateral = generator.uniform(-1.0, 1.0, (200, 2))
+    local = np.column_stack([lateral, np.ones(200)]) * (2.0 + depth * generator.random((200, 1)))
+    world = local @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    px = CENTRE + np.exp(d) * (CAMERA.project(local) - CENTRE)
+    return T_world_camera, world, px + noise_px * generator.normal(size=px.shape)
+
+
+def test_the_jacobian_is_that_of_finite_differences():
+    T_world_camera, world, px = scene(0.02)
+    T, d, h = inverse(T_world_camera), 0.03, 1e-6
+
+    def predicted(step):
+        return px - linearise(moved(T, step), d + step[6], world, px, CAMERA, CENTRE)[0]
+
+    _, J = linearise(T, d, world, px, CAMERA, CENTRE)
+    for k, step in enumerate(h * np.eye(UNKNOWNS)):
+        expected = (predicted(step) - predicted(-step)) / (2.0 * h)
+        np.testing.assert_allclose(J[:, :, k], expected, rtol=1e-5, atol=1e-3)
+
+
+def test_it_finds_the_magnification_beside_a_wrong_pose_and_outliers():
+    T_world_camera, world, px = scene(0.02, noise_px=0.3)
+    px[::10] += 40.0
+    start = T_world_camera.copy()
+    start[:3, 3] += 0.02, -0.01, 0.02
+    found, sigma = refine_focal(start, world, px, CAMERA, CENTRE, 0.1)
+    assert abs(found - 0.02) < 4.0 * sigma
+    assert sigma < 1e-3
+
+
+def test_a_step_ahead_is_no_magnification_and_without_depth_the_prior_holds_it():
+    T_world_camera, world, px = scene(0.0)
+    ahead = T_world_camera.copy()
+    ahead[:3, 3] -= 0.05 * T_world_camera[:3, 2]
+    assert abs(refine_focal(ahead, world, px, CAMERA, CENTRE, 0.1)[0]) < 1e-5
+    T_world_camera, world, px = scene(0.02, depth=0.0)
+    start = T_world_camera.copy()
+    assert abs(refine_focal(start, world, px, CAMERA, CENTRE, 1e-6)[0]) < 1e-5
+    assert refine_focal(start, world[:0], px[:0], CAMERA, CENTRE, 0.1) == (0.0, np.inf)
