@@ -39,13 +39,14 @@ def refine_focal(
     centre: tuple[float, float],
     deviation: float,
 ) -> tuple[float, float]:
-    """The log d of the magnification of a frame, and its standard deviation by the residuals.
+    """The log d of the magnification of a frame, and its standard deviation by the residuals, as if
+    all points had been looked at.
 
     T_world_camera: (4, 4) to start from.  points_world: (N, 3).  points_px: (N, 2).  deviation:
     standard deviation of d.
     """
-    step = max(1, len(points_px) // _MOST)
-    some = points_world[::step], points_px[::step]
+    every = max(1, len(points_px) // _MOST)
+    some = points_world[::every], points_px[::every]
     T, d, H, residuals = inverse(T_world_camera), 0.0, np.eye(UNKNOWNS), np.zeros((1, 2))
     for sigma in _SIGMAS_PX:
         residuals, J = linearise(T, d, *some, camera, centre)
@@ -60,7 +61,7 @@ def refine_focal(
         step = np.linalg.solve(H, g)
         T, d = moved(T, step), d + float(step[6])
     variance = np.median((residuals**2).sum(axis=1)) / _MEDIAN_OF_TWO if len(residuals) else np.inf
-    return d, float(np.sqrt(variance * np.linalg.inv(H)[6, 6]))
+    return d, float(np.sqrt(variance / every * np.linalg.inv(H)[6, 6]))
 
 
 def linearise(
