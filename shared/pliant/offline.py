@@ -7,7 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pliant.algorithms.image.masks import clearance_in, filled
+from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.mapping.known_places import KnownPlaces
+from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.trial import mapper_for
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracking.tracker import ExtremaTracker
@@ -46,7 +49,9 @@ class Pipeline:
         config: Config,
         history: MapHistory,
         timers: Timers = Timers(),
+        places: KnownPlaces | None = None,
     ) -> None:
+        """places: where the camera may be recognised, instead of a mapper's own."""
         self.history = history
         self._timers = timers
         self._rectifier = Rectifier(calibration)
@@ -55,6 +60,8 @@ class Pipeline:
         self._mapper = mapper_for(
             camera, config.bundle_adjustment, config.seed, calibration.focal_sigma
         )
+        if places is not None and isinstance(self._mapper, Mapper):
+            self._mapper.atlas.places = places
         self._last = 0
 
     def take(self, source: SourceFrame) -> Frame:
@@ -82,6 +89,10 @@ class Pipeline:
         delta = self._mapper.finish(timer)
         self.history.apply(delta, frame=self._last, stamp_ns=0, final=True)
         return delta
+
+    def kept(self) -> list[KeptKeyframe]:
+        """The map as it is to be kept, once it is finished."""
+        return list(self._mapper.kept())
 
 
 def process(

@@ -108,7 +108,7 @@ class _Session:
         wrong = {
             each
             for poses in (self.history.causal, final)
-            for each in _wrong(poses, self.truth, apart_m)
+            for each in wrong_poses(poses, self.truth, apart_m)
         }
         assert isinstance(self.mapper.atlas.places, _Watched)
         return Run(
@@ -134,7 +134,7 @@ def run(deceiver: Deceiver, config: Config, seed: int) -> Iterator[tuple[str, Ru
         yield name, one.end(night, deceiver.apart_m)
 
 
-def _wrong(
+def wrong_poses(
     poses: dict[int, tuple[int, F64]], truth: dict[int, F64], apart_m: float
 ) -> Iterator[tuple[int, int]]:
     """Segments and their frames that are elsewhere."""

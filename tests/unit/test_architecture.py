@@ -50,6 +50,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         *{"config", "files", "staging", "map_history", "trajectory", "datasets", "arithmetic"},
     },
     "offline": {"datasets", "messages", "algorithms", "config", "map_history"},
+    "backwards": {"datasets", "messages", "algorithms", "config", "map_history", "errors"},
     "fusion": {"fusion", "algorithms", "errors", "map_history"},
 }
 # They import nothing of ours; ``pliant`` is of the top.

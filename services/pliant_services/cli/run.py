@@ -74,6 +74,10 @@ def run(
             "--light", help="A fifth of the tracks, less CPU, larger errors: for small computers."
         ),
     ] = False,
+    quality: Annotated[
+        Literal["normal", "high"],
+        _everyday(help="high: where the camera was lost, read the source again, backwards."),
+    ] = "normal",
     view: Annotated[
         Literal["window", "web"] | None, _everyday(help="Look on in Rerun (pliant view).")
     ] = None,
@@ -161,6 +165,8 @@ def run(
 
     pliant run dashcam.mp4 --mask bonnet.png
 
+    pliant run handheld.mp4 --quality high
+
     pliant run today.mp4 --calibration calib.yaml --map results/yesterday
 
     pliant run camera:0 --calibration calib.yaml --map results/office --localise --light
@@ -190,6 +196,8 @@ def run(
         raise typer.BadParameter("--poses needs a run from its beginning, and --resume goes on")
     if localise and known is None:
         raise typer.BadParameter("--localise needs --map: a result folder or its map.pliant")
+    if quality == "high" and (localise or profile != "rigid"):
+        raise typer.BadParameter("--quality high needs a map that grows, of --profile rigid")
     if known is not None and profile != "rigid":
         raise typer.BadParameter("--map needs --profile rigid: surfels keep no map")
     # A map that does not grow has no new surface.
@@ -215,6 +223,7 @@ def run(
         port=port,
         on_crash=on_crash,
         resume=resume,
+        quality=quality,
     )
     if quiet and (poses or view):
         raise typer.BadParameter("--quiet prints nothing: leave it, or --poses and --view")

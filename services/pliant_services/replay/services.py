@@ -6,7 +6,7 @@ one reads it: so memory stays that of one message, and nothing depends on timing
 
 import importlib
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -158,20 +158,29 @@ class Replay:
 
     def _copy(self, writer: RecordingWriter, failed: Event) -> None:
         """What the services do not touch: it makes the new recording one that can be replayed."""
-        for message in self._recorded.messages(*self._untouched()):
-            if failed.is_set():  # or interrupted
-                return
-            key = message.topic.key
-            if message.topic == topics.STREAM_END:
-                end = message.decode()
-                assert isinstance(end, StreamEnd)
-                key = end.topic
-            if key not in self.affected:
-                _write(writer, message)
+        copied(self._recorded, self._summary, self.affected, writer, failed.is_set)
 
-    def _untouched(self) -> list[Topic]:
-        found = (by_key(key) for key in self._summary.topics if key not in self.affected)
-        return [topics.STREAM_END, *(topic for topic in found if topic is not None)]
+
+def copied(
+    recording: Recording,
+    summary: Summary,
+    stale: Container[str],
+    writer: RecordingWriter,
+    stopped: Callable[[], bool] = lambda: False,
+) -> None:
+    """Write all topics of a recording, with their ends, but for those with stale keys."""
+    found = (by_key(key) for key in summary.topics if key not in stale)
+    wanted = [topics.STREAM_END, *(topic for topic in found if topic is not None)]
+    for message in recording.messages(*wanted):
+        if stopped():  # failed, or interrupted
+            return
+        key = message.topic.key
+        if message.topic == topics.STREAM_END:
+            end = message.decode()
+            assert isinstance(end, StreamEnd)
+            key = end.topic
+        if key not in stale:
+            _write(writer, message)
 
 
 def run_on(

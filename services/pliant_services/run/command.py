@@ -15,7 +15,7 @@ from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_files import file_and_camera
 from pliant.datasets.calibration_formats import UNDERSTOOD
 from pliant.datasets.rectifier import Rectifier
-from pliant.errors import CalibrationError, PliantError, ResultError
+from pliant.errors import CalibrationError, DatasetError, PliantError, ResultError
 from pliant.exit_codes import INTERRUPTED
 from pliant.files import make_folder, write_whole
 from pliant.fusion.memory import check_voxel_sizes
@@ -25,11 +25,9 @@ from pliant.recording.map_file import MapFile
 from pliant.results import earlier
 from pliant.results.folder import (
     CONFIG_NAME,
-    PAGE_NAME,
     RECORDING_NAME,
     STATE_FOLDER,
     discard,
-    files_of,
     files_read,
     folder_name,
     has_frames,
@@ -40,7 +38,6 @@ from pliant.results.folder import (
     written,
 )
 from pliant.results.locking import Held
-from pliant.wording import counted
 from pliant_services.nodes.ingest import plays_live
 from pliant_services.processes import BY_NAME, deformable_fleet, reads_depth
 from pliant_services.profiles import PROFILES
@@ -54,6 +51,7 @@ from pliant_services.run.resume import (
     resumed_map,
 )
 from pliant_services.run.spectators import Viewer, check_viewer, has_viewer
+from pliant_services.run.telling import tell
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.announced import announced
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
@@ -96,6 +94,10 @@ def run_pipeline(request: RunRequest) -> int:
                 code = _finish(output, interrupted=False, failure=None, resumed=True)
             else:
                 code = _run_into(output, request, viewer, held)
+            if request.quality == "high" and code != INTERRUPTED and held.path is not None:
+                from pliant_services.run.second_pass import second_pass  # it maps in this process
+
+                code = second_pass(held.path, request, code)
         if viewer is not None and code != INTERRUPTED:
             viewer.stay()  # the results are there
         return code
@@ -125,6 +127,11 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
         mask=request.mask,
     )
     check_start(dataset)
+    if request.quality == "high" and plays_live(dataset, config):
+        raise DatasetError(
+            f"{request.source}: --quality high reads a source twice, and what comes live comes "
+            "once: leave it, and run it on the recording"
+        )
     if request.force and not dataset.is_live:
         next(iter(dataset), None)  # what has no first frame costs no earlier result
     progress = Progress(dataset.frame_count)
@@ -301,8 +308,7 @@ def _finish(
         silent = KeyboardInterrupt() if interrupted else ResultError(f"{output}: no frame came")
         raise failure or silent
     # They load what a launcher that waits has no use for.
-    from pliant.export.export import exports_in
-    from pliant.results.verdict import grade, summary
+    from pliant.results.verdict import grade
     from pliant.results.write import write_results
 
     again = f"pliant run ... --output {output} --resume writes them"
@@ -317,36 +323,10 @@ def _finish(
         if isinstance(error, ResultError):
             raise ResultError(f"{error}: {again}") from None
         raise
-    with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
-        files = ", ".join(files_of(output, report))
-        print(f"results in {output}/ ({_sizes(output)}): {files}, {_recording_in(output)}")
-        print(f"to look at: {output / PAGE_NAME}, in a browser")
-        exports = ", ".join(exports_in(output))
-        if exports:
-            print(f"of the result before: {exports}: export again with --force")
-        for line in summary(report):
-            print(line)
+    tell(output, report)
     if failure is not None:
         raise failure
     return INTERRUPTED if interrupted else grade(report)
-
-
-def _sizes(output: Path) -> str:
-    """How much room all of a result folder takes, and its recording."""
-    from pliant.recording.summary import in_words
-
-    every = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
-    recorded = sum(path.stat().st_size for path in parts.parts_of(output / RECORDING_NAME))
-    return f"{in_words(every)}, of which the recording {in_words(recorded)}"
-
-
-def _recording_in(output: Path) -> str:
-    """The recording of a result folder by its name there: a file, or a folder of parts."""
-    path = output / RECORDING_NAME
-    if path.is_file():
-        return path.name
-    count = counted(len(parts.parts_of(path)), "part")
-    return f"{parts.folder_of_parts(path).name}/ ({count})"
 
 
 def _say_guess(calibration: Calibration, profile: str, progress: Progress) -> None:

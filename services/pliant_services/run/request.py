@@ -28,3 +28,4 @@ class RunRequest:
     poses: bool = False
     on_crash: Literal["stop", "restart"] = "stop"
     resume: bool = False
+    quality: Literal["normal", "high"] = "normal"

@@ -36,6 +36,7 @@ def run(
     every: int | None = None,
     sharpest: bool = False,
     light: bool = False,
+    quality: Literal["normal", "high"] = "normal",
     topic: str | None = None,
     max_size: int | None = None,
     mode: Literal["lossless", "live"] | None = None,
@@ -61,7 +62,8 @@ def run(
     whose black parts are ignored in all frames, or a folder of them; auto_mask: mask
     what never changes.    start, end: seconds after
     the first frame; every: one of so many frames; sharpest: of those, not the first.    light: a
-    fifth of the tracks.    max_size: pixels along the longer side.    map: of an earlier run, to go
+    fifth of the tracks.    quality: "high" reads the source again where the camera was lost.
+    max_size: pixels along the longer side.    map: of an earlier run, to go
     on in; localise: only to find the frames in it.    camera, depth, depth_frames: of the
     deformable profile.    settings: ``{"tracking.max_tracks": 5000}`` or
     ``["tracking.max_tracks=5000"]``.    quiet: print nothing.
@@ -78,8 +80,8 @@ def run(
         "output": folder, "force": force, "calibration": calibration, "fov": fov, "mask": mask,
         "no-auto-mask": not auto_mask,
         "start": start, "end": end, "every": every, "sharpest": sharpest, "light": light,
-        "topic": topic, "max-size": max_size, "mode": mode, "map": map, "localise": localise,
-        "profile": profile,
+        "quality": quality, "topic": topic, "max-size": max_size, "mode": mode, "map": map,
+        "localise": localise, "profile": profile,
         "camera": camera, "depth": depth, "depth-frames": depth_frames, "no-images": not images,
         "seed": seed, "poses": on_frame is not None,
     }  # fmt: skip

@@ -68,8 +68,9 @@ MAP_UPDATE = Topic("map/update", MapUpdate, per_frame=True, max_bytes=64 * _MIB,
 # One message, after the last frame: what is only known once nothing more can come.
 MAP_FINAL = Topic("map/final", MapUpdate, per_frame=False, max_bytes=512 * _MIB, viewed=256)
 KEYFRAME = Topic("map/keyframe", Keyframe, per_frame=True, max_bytes=64 * _MIB)
-# One message, after the last frame: the keyframes that were still in the window.
-KEYFRAME_FINAL = Topic("map/keyframe_final", Keyframe, per_frame=False, max_bytes=64 * _MIB)
+# One message, after the last frame: the keyframes that were still in the window, and all that a
+# second pass has made, with their images.
+KEYFRAME_FINAL = Topic("map/keyframe_final", Keyframe, per_frame=False, max_bytes=512 * _MIB)
 # After the last frame: the map with all that was known, for sessions to come.
 MAP_KEPT = Topic("map/kept", MapKeyframe, per_frame=False, max_bytes=64 * _MIB)
 # In live mode, what of the live mesh is told depends on what there was time for.

@@ -120,11 +120,29 @@ def _switch(made: Path, output: Path) -> None:
     _finish_switch(output)
 
 
+def replace_by(output: Path, made: Path) -> None:
+    """Replace a result by another one, whole, in a folder on the same file system that nobody
+    holds; who is killed has it done by the next one who takes the folder.  Raises ResultError."""
+    try:
+        sync_all(made)
+        made.rename(output / _SWITCHING)
+        sync(output)
+        _finish_switch(output)
+    except OSError as error:
+        raise _unwritable(output, error) from None
+
+
 def _finish_switch(output: Path) -> None:
     """Raises OSError."""
-    if is_folder(output / _SWITCHING):
-        move_all(output / _SWITCHING, output)
-        (output / _SWITCHING).rmdir()
+    new = output / _SWITCHING
+    if not is_folder(new):
+        return
+    if (new / RECORDING_NAME).exists():  # of another run: nothing of the one before stays
+        earlier.remove(output, _result_in(output))
+        (new / RECORDING_NAME).rename(output / RECORDING_NAME)
+        sync(output)
+    move_all(new, output)
+    new.rmdir()
 
 
 @contextmanager

@@ -53,6 +53,26 @@ def deceiving(
 
 
 @app.command()
+def second_pass(
+    sources: Sources,
+    frames: Annotated[int | None, typer.Option(help="The first frames [all].")] = None,
+    calibration: Annotated[Path | None, typer.Option(help="Of a video.")] = None,
+    overrides: Overrides = None,
+) -> None:
+    """What `--quality high` finds of what was lost, and what it costs, in this process.
+
+    scripts/bench second-pass path/to/tum_fr1_rpy_first360
+    """
+    from benchmarks.second_pass import measure
+    from pliant.config import load_config
+
+    found = measure(
+        sources, load_config(None, overrides or []), frames=frames, calibration=calibration
+    )
+    show(found)
+
+
+@app.command()
 def rough(
     folder: Annotated[Path, typer.Argument(help="Folder of sequences with a ground truth.")],
     only: Annotated[

@@ -1,0 +1,43 @@
+"""What a run says at its end: where its results are, and what they come to."""
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from pliant.recording import parts
+from pliant.results.folder import PAGE_NAME, RECORDING_NAME, files_of
+from pliant.wording import counted
+
+
+def tell(output: Path, report: dict[str, Any]) -> None:
+    """Say where the results are, and what they come to."""
+    from pliant.export.export import exports_in
+    from pliant.results.verdict import summary
+
+    with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
+        files = ", ".join(files_of(output, report))
+        print(f"results in {output}/ ({_sizes(output)}): {files}, {_recording_in(output)}")
+        print(f"to look at: {output / PAGE_NAME}, in a browser")
+        exports = ", ".join(exports_in(output))
+        if exports:
+            print(f"of the result before: {exports}: export again with --force")
+        for line in summary(report):
+            print(line)
+
+
+def _sizes(output: Path) -> str:
+    """How much room all of a result folder takes, and its recording."""
+    from pliant.recording.summary import in_words
+
+    every = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
+    recorded = sum(path.stat().st_size for path in parts.parts_of(output / RECORDING_NAME))
+    return f"{in_words(every)}, of which the recording {in_words(recorded)}"
+
+
+def _recording_in(output: Path) -> str:
+    """The recording of a result folder by its name there: a file, or a folder of parts."""
+    path = output / RECORDING_NAME
+    if path.is_file():
+        return path.name
+    count = counted(len(parts.parts_of(path)), "part")
+    return f"{parts.folder_of_parts(path).name}/ ({count})"

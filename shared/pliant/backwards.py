@@ -1,0 +1,274 @@
+"""A source read backwards, where its map was lost: the map reaches back from what came later.
+
+A camera is lost where it comes from known places to what it sees badly.  From the other side the
+same frames follow a map that is known already: what lies before the beginning of a map, and between
+two segments, is mapped from what came afterwards, and segments that see the same become one.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+from pliant.algorithms.arrays import F32, I64
+from pliant.algorithms.image.masks import clearance_in, filled
+from pliant.algorithms.kept_keyframe import KeptKeyframe
+from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.self_calibration import widened
+from pliant.algorithms.tracking.tracker import ExtremaTracker
+from pliant.config import Config
+from pliant.datasets.base import Dataset, SourceFrame
+from pliant.datasets.rectifier import Rectifier, rectified
+from pliant.errors import DatasetError
+from pliant.map_history import MapHistory
+from pliant.messages.types import Image
+
+_LEAD_S, _LEAD_FRAMES = 1.0, 5
+"""So much of what has poses is read on both sides of what has none: it takes a few keyframes to
+find the way into the map, and to prove that two segments are one."""
+
+_HELD_BYTES = 256 << 20
+"""Images that are held at a time: a source cannot be read backwards, so that it is read once, up to
+them, for each lot."""
+
+_JPEG_QUALITY = 95
+"""As that of other keyframes."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Frames that are read backwards, from the last to the first."""
+
+    first: int
+    last: int
+
+
+def lost_stretches(segments: Mapping[int, int], stamps_ns: Mapping[int, int]) -> list[Stretch]:
+    """Where frames have no pose before one that has, or segments follow each other; latest first.
+
+    segments: of the frames that have a pose.   stamps_ns: of all frames, which count from 0.
+    """
+    found: list[Stretch] = []
+    end = len(stamps_ns)
+    while end > 0:
+        end -= 1
+        here = segments.get(end)
+        if here is None or end == 0 or segments.get(end - 1) == here:
+            continue
+        before = next((f for f in range(end - 1, -1, -1) if f in segments), -1)
+        last = _beside(end, 1, segments, stamps_ns)
+        first = 0 if before < 0 else _beside(before, -1, segments, stamps_ns)
+        if found and last >= found[-1].first:
+            found[-1] = Stretch(first, found[-1].last)
+        else:
+            found.append(Stretch(first, last))
+    return found
+
+
+def _beside(
+    frame: int, step: int, segments: Mapping[int, int], stamps_ns: Mapping[int, int]
+) -> int:
+    """The last frame of those about one that follow it or go before it in its segment."""
+    at, count = frame, 0
+    while segments.get(at + step) == segments[frame]:
+        away_s = 1e-9 * abs(stamps_ns[at + step] - stamps_ns[frame])
+        count += 1
+        if away_s > _LEAD_S and count > _LEAD_FRAMES:
+            break
+        at += step
+    return at
+
+
+@dataclass(kw_only=True)
+class MadeKeyframe:
+    """A keyframe that was made: its image, a JPEG, the mask of that, the points
+    (N,) that it sees, by id, and where (N, 2) in the rectified image."""
+
+    jpeg: bytes = b""
+    mask: bytes = b""
+    point_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    points_px: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+
+
+@dataclass(kw_only=True)
+class Reached:
+    """What reading backwards came to, beside what the history tells.
+
+    kept: the whole map.   keyframes: that were made, by id.   joined: segments that have become
+    one.   last: the last update, which says what is known of the camera.
+    """
+
+    kept: list[KeptKeyframe] = field(default_factory=list[KeptKeyframe])
+    keyframes: dict[int, MadeKeyframe] = field(default_factory=dict[int, MadeKeyframe])
+    joined: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
+    last: MapDelta | None = None
+
+
+def reach_back(
+    dataset: Dataset,
+    config: Config,
+    known: Sequence[KeptKeyframe],
+    stretches: Sequence[Stretch],
+    history: MapHistory,
+) -> Reached:
+    """Read stretches of a source backwards, from which a map was made.
+
+    known: that map.   history: of it, which becomes that of both: frames that have a pose keep it
+    but for what moves the map.   Raises DatasetError where the source has changed.
+    """
+    rectifier = Rectifier(dataset.calibration)
+    camera = rectifier.camera
+    parameters = widened(config.bundle_adjustment, dataset.calibration.focal_sigma)
+    tracker = ExtremaTracker(camera.width, camera.height, config.tracking, config.seed)
+    mapper = Mapper(camera, parameters, config.seed, known=[_reversed(each) for each in known])
+    numbers = [n for each in stretches for n in range(each.last, each.first - 1, -1)]
+    room = max(1, _HELD_BYTES // (4 * camera.width * camera.height))
+    first_ns, found = history.stamps_ns[numbers[0]], Reached()
+    told = _Told(history, numbers, found)
+    for number, source in enumerate(_backwards(dataset, numbers, room)):
+        if source.stamp_ns != history.stamps_ns[source.index]:
+            raise DatasetError(f"{dataset.name}: has changed since it was read first")
+        image = rectified(source, rectifier)
+        if image.missing:
+            told.take(mapper.skip(number))
+            continue
+        stamp_ns, clearance = first_ns - image.stamp_ns, clearance_in(image.mask)
+        tracks = tracker.track(image.grey, stamp_ns, clearance=clearance)
+        colour = image.colour if image.colour.size else None
+        grey = filled(image.grey, clearance)
+        told.take(mapper.process(number, stamp_ns, tracks, grey, colour))
+        told.take_keyframes(mapper.publish_keyframes(), number, image, mapper.waiting_frames)
+    told.take(mapper.finish())
+    told.take_keyframes(mapper.publish_keyframes())
+    session = max(each.session for each in known)
+    for each in map(_reversed, mapper.kept()):
+        if each.session > session:  # it is of the same session as the first pass
+            each = replace(each, session=session, source_frame=numbers[each.source_frame])
+        found.kept.append(each)
+    return found
+
+
+class _Told:
+    """Folds what a mapper tells of frames that are numbered as they were read."""
+
+    def __init__(self, history: MapHistory, numbers: Sequence[int], found: Reached) -> None:
+        self._history, self._numbers, self._found = history, np.array(numbers, np.int64), found
+        self._placed = np.array(sorted(history.final()), np.int64)
+        self._images: dict[int, tuple[bytes, bytes]] = {}
+        self._made: dict[int, int] = {}
+
+    def take(self, delta: MapDelta) -> None:
+        """Take in an update."""
+        history, frames = self._history, delta.keyframe_frames.copy()
+        for row, (number, frame) in enumerate(
+            zip(delta.keyframe_ids.tolist(), frames.tolist(), strict=True)
+        ):
+            if frame >= 0:
+                self._made[number] = frame
+                frames[row] = self._numbers[frame]
+            elif number in history.keyframes:
+                frames[row] = history.keyframes[number].frame
+        posed = self._numbers[delta.pose_frames]
+        new = ~np.isin(posed, self._placed)
+        delta = replace(
+            delta, keyframe_frames=frames, pose_frames=posed[new],
+            pose_segments=delta.pose_segments[new], pose_keyframes=delta.pose_keyframes[new],
+            poses_keyframe_camera=delta.poses_keyframe_camera[new],
+            pose_inliers=delta.pose_inliers[new],
+        )  # fmt: skip
+        history.apply(delta, frame=int(self._numbers[0]), stamp_ns=0, final=True)
+        self._found.joined += [(gone, to) for gone, to in delta.joined.tolist()]
+        self._found.last = delta
+
+    def take_keyframes(
+        self,
+        delta: KeyframeDelta,
+        number: int = -1,
+        image: Image | None = None,
+        waiting: Sequence[int] = (),
+    ) -> None:
+        """Take in what is told of keyframes after a frame.   waiting: frames from which a map may
+        yet start."""
+        if image is not None:
+            self._images[number] = _as_jpeg(image)
+        made = {frame: keyframe for keyframe, frame in self._made.items()}
+        for frame in [frame for frame in self._images if frame in made]:
+            seen = self._found.keyframes.setdefault(made[frame], MadeKeyframe())
+            seen.jpeg, seen.mask = self._images.pop(frame)
+        self._images = {f: kept for f, kept in self._images.items() if f in waiting}
+        ends = np.cumsum(delta.counts)
+        for row, keyframe in enumerate(delta.keyframe_ids.tolist()):
+            told = slice(int(ends[row] - delta.counts[row]), int(ends[row]))
+            seen = self._found.keyframes.setdefault(keyframe, MadeKeyframe())
+            seen.point_ids, seen.points_px = delta.point_ids[told], delta.points_px[told]
+
+
+def final_update(before: MapHistory, after: MapHistory, last: MapDelta) -> MapDelta:
+    """What makes one history of another: all that the one has, and what it has no more.
+
+    last: says what is known of the camera, and which segments have become one.
+    """
+    frames, keyframes, points = after.frames, after.keyframes, after.points()
+    poses = [pose.pose_keyframe_camera for pose in frames.values()]
+    readout = [-1.0 if n == 3 else 1.0 for n in range(6)]
+    correction = zip(last.calibration_correction, readout, strict=False)
+    return replace(
+        last,
+        pose_frames=np.array(list(frames), np.int64),
+        pose_segments=np.array([pose.segment for pose in frames.values()], np.int32),
+        pose_keyframes=np.array([pose.keyframe for pose in frames.values()], np.int64),
+        poses_keyframe_camera=np.array(poses).reshape(-1, 7),
+        pose_inliers=np.array([pose.inliers for pose in frames.values()], np.int32),
+        keyframe_ids=np.array(list(keyframes), np.int64),
+        keyframe_frames=np.array([k.frame for k in keyframes.values()], np.int64),
+        keyframe_segments=np.array([k.segment for k in keyframes.values()], np.int32),
+        keyframe_poses=np.array([k.pose_world_camera for k in keyframes.values()]).reshape(-1, 7),
+        point_ids=points.ids,
+        point_segments=points.segments,
+        points_world=points.positions,
+        point_colours=points.colours,
+        point_keyframes=points.keyframes,
+        point_parallax_rad=points.parallax_rad,
+        point_sigmas=points.sigmas,
+        point_hosts=points.hosts,
+        removed_point_ids=np.setdiff1d(before.points().ids, points.ids),
+        moved_keyframes=np.zeros(0, np.int64),
+        moves=np.zeros((0, 8)),
+        same_places=np.array(after.same_places, np.int64).reshape(-1, 2),
+        calibration_correction=tuple(value * sign for value, sign in correction),
+        snapshot=True,
+    )
+
+
+def _as_jpeg(image: Image) -> tuple[bytes, bytes]:
+    pixels = image.colour[..., ::-1] if image.colour.size else image.grey
+    quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    return cv2.imencode(".jpg", pixels, quality)[1].tobytes(), image.mask
+
+
+def _backwards(dataset: Dataset, numbers: Sequence[int], room: int) -> Iterator[SourceFrame]:
+    """Frames by their numbers, which descend, ``room`` of them held at a time.
+
+    Raises DatasetError where the source does not have them any more.
+    """
+    for begin in range(0, len(numbers), room):
+        some = numbers[begin : begin + room]
+        wanted, found = set(some), dict[int, SourceFrame]()
+        for source in dataset:
+            if source.index in wanted:
+                found[source.index] = source
+            if source.index >= some[0]:
+                break
+        if len(found) < len(some):
+            raise DatasetError(f"{dataset.name}: has fewer frames than when it was read first")
+        yield from (found[number] for number in some)
+
+
+def _reversed(kept: KeptKeyframe) -> KeptKeyframe:
+    """As a camera has it whose time runs backwards: it moves the other way, and the rows of its
+    rolling shutter follow each other the other way."""
+    correction = kept.correction.copy()
+    correction[3] = -correction[3]
+    return replace(kept, correction=correction, motion=-kept.motion)
