@@ -156,6 +156,7 @@ class _Told:
     def __init__(self, history: MapHistory, numbers: Sequence[int], found: Reached) -> None:
         self._history, self._numbers, self._found = history, np.array(numbers, np.int64), found
         self._placed = np.array(sorted(history.final()), np.int64)
+        self._keyframes = {keyframe.frame for keyframe in history.keyframes.values()}
         self._images: dict[int, tuple[bytes, bytes]] = {}
         self._made: dict[int, int] = {}
 
@@ -167,7 +168,9 @@ class _Told:
         ):
             if frame >= 0:
                 self._made[number] = frame
-                frames[row] = self._numbers[frame]
+                # Of two keyframes of one frame the first stands for it.
+                made = int(self._numbers[frame])
+                frames[row] = -1 if made in self._keyframes else made
             elif number in history.keyframes:
                 frames[row] = history.keyframes[number].frame
         posed = self._numbers[delta.pose_frames]

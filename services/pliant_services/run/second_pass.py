@@ -45,12 +45,10 @@ from pliant.results.write import write_rigid_results
 from pliant.staging import staging
 from pliant.wording import counted
 from pliant_services.processes import BY_NAME
-from pliant_services.replay.services import affected, copied, record
+from pliant_services.replay.services import SECOND_PASS, affected, copied, record
 from pliant_services.run.request import RunRequest
 from pliant_services.run.telling import tell
 
-SECOND_PASS = "second_pass"
-"""The metadata record of a recording that has one."""
 _VERDICTS = (GOOD, DOUBTFUL, BAD)
 _MESHING = BY_NAME["meshing"]
 _LAST = (topics.MAP_FINAL, topics.KEYFRAME_FINAL, topics.MAP_KEPT)
