@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from pliant.errors import RecordingError, ResultError
 from pliant.files import make_folder
 from pliant.recording.parts import PART
 from pliant.results import earlier
-from pliant.results.folder import prepare, recorded_into, settle_killed, written
+from pliant.results.folder import prepare, recorded_into, replace_by, settle_killed, written
 from pliant_services.run import command as pipeline
 from pliant_services.run.command import RunRequest, run_pipeline
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
@@ -220,3 +221,52 @@ def test_a_full_disk_leaves_a_result_as_it_was(room: Path, monkeypatch: pytest.M
     with pytest.raises(ResultError, match="the disk is full"), written(room, force=True):
         prepare(room, CONFIG)
     assert contents(room) == before
+
+
+def test_a_kill_while_a_whole_result_takes_the_place_of_another_leaves_one_of_both(
+    result: Path, one_frame: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In parts before, in one file then; what is of no result stays."""
+    before, came, steps = contents(result), list[bool](), 0
+    after = {
+        **{name: before[name] for name in ("notes", "recovered.mcap", "my_segment_1.txt")},
+        "recording.mcap": one_frame,
+        "config.yaml": b"new",
+        "report.json": b"new",
+        "metadata.json": b"new",
+    }
+    while True:
+        output = Path(shutil.copytree(result, tmp_path / str(steps)))
+        made, left = output / ".partial-x" / "result", steps
+        make_folder(made / "logs")
+        (made / "recording.mcap").write_bytes(one_frame)
+        for name in ("config.yaml", "report.json", "logs/metadata.json"):
+            (made / name).write_text("new")
+
+        def counted(name: str) -> Callable[..., object]:
+            original = getattr(Path, name)
+
+            def step(*arguments: object, **options: object) -> object:
+                nonlocal left
+                left -= 1
+                if left < 0:
+                    raise KilledError
+                return original(*arguments, **options)
+
+            return step
+
+        with monkeypatch.context() as patch, suppress(KilledError):
+            for name in ("rename", "replace", "unlink", "rmdir"):
+                patch.setattr(Path, name, counted(name))
+            replace_by(output, made)
+        shutil.rmtree(output / ".partial-x")
+        settle_killed(output)
+        found = contents(output)
+        assert found in (before, after), steps
+        came.append(found == after)
+        if left >= 0:
+            break
+        steps += 1
+    assert came == sorted(came)
+    assert not came[0]
+    assert steps > 5
