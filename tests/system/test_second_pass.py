@@ -30,8 +30,9 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     shutil.copytree(builtin_folder(TINY), source)
     generator = np.random.default_rng(0)
     for path in sorted((source / "images").iterdir())[:LATE]:
-        shape = cv2.imread(str(path)).shape[:2]
-        cv2.imwrite(str(path), generator.integers(0, 256, shape, np.uint8))
+        image = cv2.imread(str(path))
+        assert image is not None
+        cv2.imwrite(str(path), generator.integers(0, 256, image.shape[:2], np.uint8))
     done = pliant("run", source, "--output", output)
     assert done.returncode == 0, done.stderr
     shutil.copytree(builtin_folder(TINY) / "images", source / "images", dirs_exist_ok=True)
