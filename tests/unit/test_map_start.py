@@ -199,6 +199,34 @@ def test_straight_ahead_a_quarter_of_the_tracks_is_enough_after_a_while(sigma: f
     assert not isinstance(found, str), found
 
 
+def test_tracks_that_end_too_soon_are_no_turn() -> None:
+    """At few images a second most live for two frames; from one to the next each motion is like a
+    turn, and no map begins with so few."""
+    random = np.random.default_rng(0)
+    points = random.uniform((-4.0, -2.0, 8.0), (4.0, 2.0, 8.2), (4000, 3))
+    waiting = [
+        frame_of(k, points, 0.6 * k * np.eye(3)[0], np.arange(len(points)) % 12 // 2 == k // 2, 0.1)
+        for k in range(12)
+    ]
+    seconds = [replace(each, stamp_ns=round(each.frame * 1e9)) for each in waiting]
+    assert find_start(seconds, CAMERA, MappingParameters()) == (
+        "too few tracks: 0 of 100 last for 3 frames"
+    )
+
+
+def test_among_many_frames_the_one_before_the_last_is_tried() -> None:
+    """Tracks that live for three frames are enough, however many frames wait."""
+    random = np.random.default_rng(0)
+    points = random.uniform((-6.0, -2.0, 3.0), (6.0, 2.0, 8.0), (6000, 3))
+    born = random.integers(0, 10, len(points))
+    waiting = [
+        frame_of(k, points, 0.15 * k * np.eye(3)[0], (born <= k) & (k < born + 3), 0.1)
+        for k in range(12)
+    ]
+    seconds = [replace(each, stamp_ns=round(each.frame * 1e9)) for each in waiting]
+    started(seconds)
+
+
 def test_it_reaches_back_to_frames_whose_tracks_have_ended() -> None:
     centres, waiting = ride(24, 0.06, life=8)
     start = started(waiting[-8:])

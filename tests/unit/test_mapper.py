@@ -220,7 +220,7 @@ def test_too_few_tracks_start_no_map_and_say_why():
     assert set(published.states) == {WAITING}
     assert published.reasons[0] == "too few frames: 1 of 3"
     assert published.reasons[-2].startswith("too few tracks:")
-    assert published.reasons[-2].endswith("of 100")
+    assert published.reasons[-2].endswith("of 100 last for 3 frames")
 
 
 def test_a_map_starts_after_a_long_rest():
@@ -252,7 +252,7 @@ def test_noise_and_empty_frames_start_no_map():
     assert all(published.reasons)
     published, _ = run([FrameExtrema.empty()] * 5)
     assert set(published.states) == {WAITING}
-    assert "too few tracks: 0 of 100" in published.reasons
+    assert "too few tracks: 0 of 100 last for 3 frames" in published.reasons
 
 
 def cut(poses, at):

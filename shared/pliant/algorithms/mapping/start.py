@@ -131,7 +131,8 @@ def why_no_start(
 
 def _why_not(pairs: list[_Pair], waiting: list[WaitingFrame], start: StartParameters) -> str:
     if not pairs:
-        return f"too few tracks: {_most_shared(waiting)} of {start.min_tracks}"
+        lasting = len(np.intersect1d(waiting[-_MIN_FRAMES].ids, waiting[-1].ids))
+        return f"too few tracks: {lasting} of {start.min_tracks} last for {_MIN_FRAMES} frames"
     if max(pair.residual_px for pair in pairs) < 2.0 * _NOISE_PX:
         return _no_parallax(pairs)
     return ""
@@ -146,7 +147,9 @@ def _pairs(
     """unknown: of the camera; None: a turn explains what it does with the camera as it is."""
     newest = waiting[-1]
     earlier = len(waiting) - 1
-    tried = np.unique(np.linspace(0, earlier - 1, min(earlier, _TRIED_REFERENCES)).astype(int))
+    tried = np.linspace(0, earlier - 1, min(earlier, _TRIED_REFERENCES)).astype(int)
+    tried[-1] = len(waiting) - _MIN_FRAMES  # what lives shorter starts nothing, and seems to turn
+    tried = np.unique(tried)
     shared: list[tuple[int, I64, I64]] = []
     for index in tried.tolist():
         _, a, b = np.intersect1d(
@@ -184,12 +187,6 @@ def _pairs(
 
 def _normalise(camera: PinholeCamera, points_px: F32) -> F64:
     return camera.normalise(points_px.astype(np.float64))
-
-
-def _most_shared(waiting: list[WaitingFrame]) -> int:
-    if len(waiting) < 2:
-        return 0
-    return len(np.intersect1d(waiting[0].ids, waiting[-1].ids, assume_unique=True))
 
 
 def _no_parallax(pairs: list[_Pair]) -> str:
