@@ -70,7 +70,7 @@ def test_what_is_open_stays_a_guess_for_the_next_run():
     guess = calibration_from_fov(640, 480, 60.0)
     assert found_calibration(run_with(guess, (0.2, 0.0, 0.0, 0.0), (0.004,) * 4)).focal_sigma == 0.0
     open_still = found_calibration(run_with(guess, (0.2, 0.0, 0.0, 0.0), (0.09,) * 4))
-    assert open_still.focal_sigma == 0.09
+    assert open_still.focal_sigma == pytest.approx(0.09, rel=0.01)
     # Of a wrong one the map is bent: what it found is but nearer.
     nearer = found_calibration(run_with(PINHOLE, (0.16, 0.0, 0.0, 0.0), (0.004,) * 4))
     assert nearer.focal_sigma == pytest.approx(0.16)
@@ -91,7 +91,7 @@ def test_one_line_says_what_was_found_or_what_leaves_it_open():
     ahead, round_about = path(0.1, (0.0, 0.0, 1.0)), path(1.0, (1.0, 0.0, 0.0))
     found = calibration_verdict(run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.004,) * 4), round_about)
     assert "was found" in found
-    assert "+-0.4 %" in found
+    assert "+-0.8 %" in found
     unknown = calibration_verdict(run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.09,) * 4), ahead)
     assert "stays unknown" in unknown
     assert "moves straight ahead and it turns by 6 degrees only" in unknown
@@ -101,7 +101,7 @@ def test_a_calibration_that_the_images_contradict_is_told_and_by_how_much():
     correction = (math.log(1.2), 0.0, 0.0, 0.0)
     told = calibration_verdict(run_with(PINHOLE, correction, (0.003,) * 4), {})
     assert "contradict" in told
-    assert "1.200 times what was given (+-0.3 %)" in told
+    assert "1.200 times what was given (+-0.8 %)" in told
     assert not calibration_verdict(run_with(PINHOLE, (0.008, 0.004, 0.0, 0.0), (1e-3,) * 4), {})
     assert not calibration_verdict(run_with(PINHOLE, correction, (0.2,) * 4), {})
 

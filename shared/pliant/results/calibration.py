@@ -28,6 +28,10 @@ _FITS = 10
 _KNOWN = 0.05
 """Standard deviation of the log focal length above which it counts as unknown."""
 
+_MODEL = 0.007
+"""Standard deviation of the log focal length by what no residual shows: errors that all tracks
+share, and a lens that is not quite of the model.  `scripts/bench coverage`."""
+
 _CONTRADICTED = 2.0
 """Standard deviations of the calibration's prior from which on the images contradict it."""
 
@@ -59,7 +63,7 @@ def found_calibration(run: Run) -> Calibration | None:
     if len(correction) < 3:
         return at_size(given, *size)
     found = _corrected(given, run.stream.camera, correction)
-    sigma = run.calibration_sigmas[0] if run.calibration_sigmas else 0.0
+    sigma = focal_sigma(run)
     sigma = max(sigma, abs(correction[0])) if _is_contradicted(run) else sigma
     usual = CalibrationUncertainty().focal
     if run.focal_range is not None:
@@ -69,6 +73,17 @@ def found_calibration(run: Run) -> Calibration | None:
         sigma = max(sigma, 0.5 * math.log(high / low))
     found = at_size(found, *size)
     return replace(found, focal_sigma=min(sigma, 1.0) if sigma > usual else 0.0)
+
+
+def focal_sigma(run: Run) -> float:
+    """Standard deviation of the log focal length that was found; 0 where none was."""
+    formal = run.calibration_sigmas[0] if run.calibration_sigmas else 0.0
+    return with_model_error(formal) if formal > 0.0 else 0.0
+
+
+def with_model_error(formal: float) -> float:
+    """Standard deviation of a log focal length, from that of an adjustment."""
+    return math.hypot(formal, _MODEL)
 
 
 def _corrected(
@@ -130,7 +145,8 @@ def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
     changes = focal_changes(run)
     if changes:
         return changes
-    known = f"{fov:.1f} degrees across, +-{100.0 * sigmas[0]:.1f} %"
+    sure = f"+-{100.0 * focal_sigma(run):.1f} %"
+    known = f"{fov:.1f} degrees across, {sure}"
     if run.stream.focal_sigma > 0.0:
         if sigmas[0] > _KNOWN:
             return f"the focal length stays unknown ({known}){_why(final)}: give --calibration"
@@ -139,7 +155,7 @@ def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
         return ""
     return (
         f"the images contradict the calibration: focal length {math.exp(correction[0]):.3f} times "
-        f"what was given (+-{100.0 * sigmas[0]:.1f} %), k1 {correction[1]:+.3f}, "
+        f"what was given ({sure}), k1 {correction[1]:+.3f}, "
         f"{_corner_px(camera, correction):.0f} px at the corner; run again with calibration.yaml"
     )
 

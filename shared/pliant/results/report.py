@@ -15,6 +15,7 @@ from pliant.results.calibration import (
     calibration_doubt,
     calibration_verdict,
     focal_changes,
+    focal_sigma,
 )
 from pliant.results.judgement import doubtful_frames, judge
 from pliant.results.mesh_files import mesh_report
@@ -183,15 +184,15 @@ def _known_map(run: Run, final: dict[int, Any]) -> dict[str, Any] | None:
 
 def _correction(run: Run) -> dict[str, float] | None:
     """What the last adjustment found wrong with the calibration; None if it was not asked."""
-    correction, sigmas = run.calibration_correction, run.calibration_sigmas
+    correction = run.calibration_correction
     if len(correction) < 3:
         return None
     s, k1, k2, a, b = parts_of(correction)
     readout = correction[3] if len(correction) > 3 else 0.0
     found = {"focal_factor": float(np.exp(s)), "k1": k1, "k2": k2, "readout": readout}
     found |= {"principal_x": a, "principal_y": b}
-    if sigmas:
-        found["focal_sigma"] = sigmas[0]
+    if run.calibration_sigmas:
+        found["focal_sigma"] = focal_sigma(run)
     if run.focal_range is not None:
         found["focal_factor_min"], found["focal_factor_max"] = (
             float(np.exp(s)) * each for each in run.focal_range

@@ -23,6 +23,21 @@ def unknown_lens(
     show(measure(sources, frames, overrides or []))
 
 
+@app.command()
+def coverage(
+    sources: Sources,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds, from 0.")] = 1,
+    frames: Annotated[int | None, typer.Option(min=2, help="First frames [all].")] = None,
+) -> None:
+    """Whether the focal length and the scale are as near as their standard deviations say.
+
+    scripts/bench coverage path/to/tsukuba150 built-in:room
+    """
+    from benchmarks.coverage import measure
+
+    show(measure(sources, range(seeds), frames))
+
+
 @app.command("any-size")
 def any_size(
     sources: Sources,
