@@ -47,21 +47,22 @@ def refine_focal(
     """
     every = max(1, len(points_px) // _MOST)
     some = points_world[::every], points_px[::every]
-    T, d, H, residuals = inverse(T_world_camera), 0.0, np.eye(UNKNOWNS), np.zeros((1, 2))
+    pose, d = inverse(T_world_camera), 0.0
+    normal, residuals = np.eye(UNKNOWNS), np.zeros((1, 2))
     for sigma in _SIGMAS_PX:
-        residuals, J = linearise(T, d, *some, camera, centre)
+        residuals, J = linearise(pose, d, *some, camera, centre)
         weights = 1.0 / (1.0 + (residuals**2).sum(axis=1) / sigma**2) ** 2
         weighted = (weights[:, None, None] * J).reshape(-1, UNKNOWNS)
-        H = weighted.T @ J.reshape(-1, UNKNOWNS)
+        normal = weighted.T @ J.reshape(-1, UNKNOWNS)
         g = weighted.T @ residuals.reshape(-1)
-        H[6, 6] += deviation**-2
+        normal[6, 6] += deviation**-2
         g[6] -= d * deviation**-2
-        H[np.diag_indices(6)] *= 1.0 + 1e-9
-        H[np.diag_indices(6)] += 1e-9
-        step = np.linalg.solve(H, g)
-        T, d = moved(T, step), d + float(step[6])
+        normal[np.diag_indices(6)] *= 1.0 + 1e-9
+        normal[np.diag_indices(6)] += 1e-9
+        step = np.linalg.solve(normal, g)
+        pose, d = moved(pose, step), d + float(step[6])
     variance = np.median((residuals**2).sum(axis=1)) / _MEDIAN_OF_TWO if len(residuals) else np.inf
-    return d, float(np.sqrt(variance / every * np.linalg.inv(H)[6, 6]))
+    return d, float(np.sqrt(variance / every * np.linalg.inv(normal)[6, 6]))
 
 
 def linearise(
@@ -72,10 +73,10 @@ def linearise(
 
     T: (4, 4) from the world to the camera.
     """
-    X = points_world @ T[:3, :3].T + T[:3, 3]
-    front = X[:, 2] > _MIN_DEPTH
-    X, seen = X[front], points_px[front]
-    x, y, iz = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2], 1.0 / X[:, 2]
+    in_camera = points_world @ T[:3, :3].T + T[:3, 3]
+    front = in_camera[:, 2] > _MIN_DEPTH
+    iz = 1.0 / in_camera[front, 2]
+    x, y = in_camera[front, 0] * iz, in_camera[front, 1] * iz
     F = np.exp(d) * np.array([camera.fx, camera.fy])
     c, zero = np.asarray(centre), np.zeros_like(x)
     from_centre = F * np.column_stack([x, y]) + np.exp(d) * ([camera.cx, camera.cy] - c)
@@ -83,10 +84,10 @@ def linearise(
         [iz, zero, -x * iz, -x * y, 1.0 + x * x, -y],
         [zero, iz, -y * iz, -1.0 - y * y, x * y, x],
     ])  # fmt: skip
-    J = np.empty((len(X), 2, UNKNOWNS))
+    J = np.empty((len(x), 2, UNKNOWNS))
     J[:, :, :6] = F[:, None] * rows.transpose(2, 0, 1)
     J[:, :, 6] = from_centre
-    return seen - (c + from_centre), J
+    return points_px[front] - (c + from_centre), J
 
 
 def moved(T: F64, step: F64) -> F64:
