@@ -5,7 +5,8 @@ import numpy as np
 from test_tracking import follow, motion, render
 
 from pliant.algorithms.arrays import U8
-from pliant.algorithms.mapping.map_store import UNLINKED, PointRows, TrackLinks
+from pliant.algorithms.mapping.covisibility import collect_garbage
+from pliant.algorithms.mapping.map_store import CANDIDATE, FREE, UNLINKED, PointRows, TrackLinks
 from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.state import load_state, save_state
 
@@ -59,3 +60,29 @@ def test_track_that_comes_back_has_its_point_again() -> None:
     links.rows[1] = rows[2]  # and that one has another track
     links.follow(np.array([10, 11, 12, 13, 20]), points)
     assert links.rows.tolist() == [rows[0], UNLINKED, UNLINKED, rows[3], rows[2]]
+
+
+def test_candidates_lost_at_once_wait_for_their_tracks() -> None:
+    """Most tracks of a fast camera are no points of the map yet: after a blurred frame they are what
+    there is for a pose."""
+    points, links = PointRows(), TrackLinks()
+    rows = points.allocate(6)
+    points.promote(rows[:1])
+    links.ids, links.rows = np.arange(6), rows.copy()
+    links.follow(np.array([5]), points)
+    collect_garbage(points, [], np.concatenate([links.rows, links.awaited()]), segment=0)
+    assert (points.state[rows[1:]] == CANDIDATE).all()
+    points.promote(rows[1:2])  # a point by what keyframes saw of it before
+    links.follow(np.array([0, 1, 2, 4, 5, 9]), points)
+    assert links.rows.tolist() == [*rows[[0, 1, 2, 4, 5]], UNLINKED]
+
+
+def test_candidates_lost_one_by_one_are_given_back() -> None:
+    points, links = PointRows(), TrackLinks()
+    rows = points.allocate(6)
+    links.ids, links.rows = np.arange(6), rows.copy()
+    links.follow(np.arange(4), points)
+    collect_garbage(points, [], np.concatenate([links.rows, links.awaited()]), segment=0)
+    assert points.state[rows].tolist() == [CANDIDATE] * 4 + [FREE] * 2
+    links.follow(np.arange(6), points)
+    assert links.rows.tolist() == [*rows[:4], UNLINKED, UNLINKED]

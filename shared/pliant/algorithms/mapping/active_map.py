@@ -343,8 +343,13 @@ class ActiveMap:
             self._place_directions()
 
     def collect_garbage(self) -> None:
-        """Give back the rows of dead candidates and of merged points."""
-        collect_garbage(self.points, self.keyframes, self.links.rows, self.segment.id)
+        """Give back the rows of dead candidates and of merged points.
+
+        Candidates live while their tracks may come back: after a blurred frame they are most of
+        what there is for a pose.
+        """
+        living = np.concatenate([self.links.rows, self.links.awaited()])
+        collect_garbage(self.points, self.keyframes, living, self.segment.id)
 
     def rebuild_window(self) -> None:
         """The newest keyframes move; older ones that see the same points are fixed."""

@@ -16,7 +16,11 @@ UNLINKED = -1
 """Row of a track that belongs to no point."""
 
 _KEPT_GONE = 20_000
-"""Tracks that have gone, whose points are remembered: bounds memory and time."""
+"""Tracks that have gone, whose rows are remembered: bounds memory and time."""
+
+_LOST_AT_ONCE = 0.5
+"""Share of the tracks that a frame loses at least where candidates are remembered, too, unless the
+one before has: elsewhere hardly a track comes back."""
 
 FREE, CANDIDATE, MAPPED, MERGED = 0, 1, 2, 3
 """State of a row: nothing, a track that still lacks parallax, a point of the map, the alias of
@@ -265,28 +269,32 @@ class TrackLinks:
 
     ids: (N,) ascending ids of the tracks.    rows: (N,) their rows, UNLINKED where they have none.
 
-    Tracks may be missing for some frames (``tracking.bridging``): points of the map are kept for
-    those that went last.
+    Tracks may be missing for some frames (``tracking.bridging``): rows are kept for those that went
+    last.
     """
 
     def __init__(self) -> None:
         self.ids: I64 = np.zeros(0, np.int64)
         self.rows: I32 = np.zeros(0, np.int32)
-        self._gone: I64 = np.zeros((0, 3), np.int64)  # id, row and point of tracks
+        self._gone: I64 = np.zeros((0, 3), np.int64)  # id, row and ``_identity`` of tracks
+        self._lost_at_once = False
 
     def follow(self, ids: I64, points: PointRows) -> None:
         """Go on to the tracks of the next frame: living tracks keep their rows, and those that come
-        back have their points again, where these are still in the map and without a track."""
+        back have theirs again, where these are still in the map and without a track."""
         before, rows = self.ids, np.full(len(ids), UNLINKED, np.int32)
         _carry_over(before, self.rows, ids, rows)
-        mapped = self.in_state(points.state, MAPPED)
-        gone = mapped[~np.isin(before[mapped], ids, assume_unique=True)]
+        gone = np.flatnonzero(~np.isin(before, ids, assume_unique=True) & (self.rows != UNLINKED))
+        at_once = len(gone) >= _LOST_AT_ONCE * max(len(before), 1)
+        if not at_once or self._lost_at_once:
+            gone = gone[points.state[self.rows[gone]] == MAPPED]
+        self._lost_at_once = at_once
         if len(before):
             old = np.flatnonzero(ids <= before[-1])
             back = old[~np.isin(ids[old], before, assume_unique=True)]
             self._take_back(ids, rows, back, points)
         row = self.rows[gone]
-        new = np.column_stack([before[gone], row, points.ids[row]])
+        new = np.column_stack([before[gone], row, _identity(points, row)])
         self._gone = np.concatenate([self._gone, new.astype(np.int64)])[-_KEPT_GONE:]
         self.ids, self.rows = ids, rows
 
@@ -298,16 +306,28 @@ class TrackLinks:
         known, last = np.unique(self._gone[::-1, 0], return_index=True)
         at = np.minimum(np.searchsorted(known, ids[back]), len(known) - 1)
         found = known[at] == ids[back]
-        back, (_, row, point) = back[found], self._gone[newest - last[at[found]]].T
-        usable = (points.ids[row] == point) & (points.state[row] == MAPPED)
+        back, (_, row, identity) = back[found], self._gone[newest - last[at[found]]].T
+        mapped, seen_first = points.state[row] == MAPPED, -1 - points.first_keyframe[row]
+        usable = (points.ids[row] == identity) & mapped
+        usable |= (seen_first == identity) & (mapped | (points.state[row] == CANDIDATE))
         usable &= ~np.isin(row, rows)
         back, row = back[usable], row[usable]
         _, first = np.unique(row, return_index=True)
         rows[back[first]] = row[first]
 
+    def awaited(self) -> I32:
+        """Rows of the candidates whose tracks may come back."""
+        return self._gone[self._gone[:, 2] < 0, 1].astype(np.int32)
+
     def in_state(self, state: U8, wanted: int) -> I64:
         """Indices of the tracks whose row has the wanted state.  state: of all rows."""
         return _in_state(self.rows, state, wanted)
+
+
+def _identity(points: PointRows, rows: I32) -> I64:
+    """What tells (n,) rows from what has them later: the id of a point; of a candidate, which has
+    none, -1 and less by the keyframe that saw it first."""
+    return np.where(points.ids[rows] >= 0, points.ids[rows], -1 - points.first_keyframe[rows])
 
 
 @kernel
