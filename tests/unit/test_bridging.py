@@ -63,8 +63,7 @@ def test_track_that_comes_back_has_its_point_again() -> None:
 
 
 def test_candidates_lost_at_once_wait_for_their_tracks() -> None:
-    """Most tracks of a fast camera are no points of the map yet: after a blurred frame they are what
-    there is for a pose."""
+    """After a blurred frame there may be little else for a pose of a fast camera."""
     points, links = PointRows(), TrackLinks()
     rows = points.allocate(6)
     points.promote(rows[:1])

@@ -111,7 +111,7 @@ def test_merged_rows_are_followed_as_numpy_would(seed, share):
 @given(st.lists(st.sets(st.integers(0, 40)), min_size=1, max_size=6))
 def test_links_follow_living_tracks_and_drop_dead_ones(frames):
     links, points, expected = TrackLinks(), PointRows(), {}
-    points.allocate(7 * 41)  # none of them is a point of the map, to which tracks may come back
+    points.free(points.allocate(7 * 41))  # tracks come back to nothing
     for alive in frames:
         ids = np.array(sorted(alive), np.int64)
         links.follow(ids, points)
