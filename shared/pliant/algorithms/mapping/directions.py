@@ -33,7 +33,14 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.bundle.projection import move_camera, solve_camera
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, UNLINKED, Keyframe, PointRows
+from pliant.algorithms.mapping.map_store import (
+    CANDIDATE,
+    MAPPED,
+    MAPPED_SHARE,
+    UNLINKED,
+    Keyframe,
+    PointRows,
+)
 from pliant.compiler.kernel import kernel
 
 _PRIOR_SHARE = 0.5
@@ -41,9 +48,6 @@ _PRIOR_SHARE = 0.5
 
 _FARTHEST = 0.02
 """Least inverse depth, as a share of the prior's: it stays before the camera."""
-
-MAPPED_SHARE = 0.25
-"""Share of what a frame sees under which points of the map alone do not carry its pose."""
 
 _COMMON_PX = 0.1
 """Error that all tracks may have in common: a gain within it is no sign of a translation."""

@@ -22,6 +22,9 @@ _LOST_AT_ONCE = 0.5
 """Share of the tracks that a frame loses at least where candidates are remembered, too, unless the
 one before has: elsewhere hardly a track comes back."""
 
+MAPPED_SHARE = 0.25
+"""Share of what a frame sees under which points of the map alone do not carry its pose."""
+
 FREE, CANDIDATE, MAPPED, MERGED = 0, 1, 2, 3
 """State of a row: nothing, a track that still lacks parallax, a point of the map, the alias of
 another row until the keyframes have been published."""
@@ -286,7 +289,9 @@ class TrackLinks:
         _carry_over(before, self.rows, ids, rows)
         gone = np.flatnonzero(~np.isin(before, ids, assume_unique=True) & (self.rows != UNLINKED))
         at_once = len(gone) >= _LOST_AT_ONCE * max(len(before), 1)
-        if not at_once or self._lost_at_once:
+        stay = rows[rows != UNLINKED]
+        mapped = np.count_nonzero(points.state[stay] == MAPPED)
+        if not at_once or self._lost_at_once or mapped >= MAPPED_SHARE * max(len(stay), 1):
             gone = gone[points.state[self.rows[gone]] == MAPPED]
         self._lost_at_once = at_once
         if len(before):

@@ -17,8 +17,7 @@ from pliant.algorithms.bundle.subspace import refine_pose
 from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.mapping.changing_focal import RATE
-from pliant.algorithms.mapping.directions import MAPPED_SHARE
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.map_store import MAPPED, MAPPED_SHARE, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import Path
