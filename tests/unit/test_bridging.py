@@ -85,3 +85,13 @@ def test_candidates_lost_one_by_one_are_given_back() -> None:
     assert points.state[rows].tolist() == [CANDIDATE] * 4 + [FREE] * 2
     links.follow(np.arange(6), points)
     assert links.rows.tolist() == [*rows[:4], UNLINKED, UNLINKED]
+
+
+def test_candidates_are_given_back_where_points_of_the_map_carry_the_pose() -> None:
+    points, links = PointRows(), TrackLinks()
+    rows = points.allocate(6)
+    points.promote(rows[4:])
+    links.ids, links.rows = np.arange(6), rows.copy()
+    links.follow(np.arange(4, 6), points)
+    collect_garbage(points, [], np.concatenate([links.rows, links.awaited()]), segment=0)
+    assert (points.state[rows[:4]] == FREE).all()

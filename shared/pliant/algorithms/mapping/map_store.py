@@ -20,7 +20,8 @@ _KEPT_GONE = 20_000
 
 _LOST_AT_ONCE = 0.5
 """Share of the tracks that a frame loses at least where candidates are remembered, too, unless the
-one before has: elsewhere hardly a track comes back."""
+one before has: elsewhere hardly a track comes back.  Nor are they where points of the map carry the
+pose alone: on a clip that loses half of its tracks by quick motion they made it a little worse."""
 
 MAPPED_SHARE = 0.25
 """Share of what a frame sees under which points of the map alone do not carry its pose."""
@@ -284,7 +285,10 @@ class TrackLinks:
 
     def follow(self, ids: I64, points: PointRows) -> None:
         """Go on to the tracks of the next frame: living tracks keep their rows, and those that come
-        back have theirs again, where these are still in the map and without a track."""
+        back have theirs again, where these are still in the map and without a track.
+
+        See ``_LOST_AT_ONCE`` for whose are kept.
+        """
         before, rows = self.ids, np.full(len(ids), UNLINKED, np.int32)
         _carry_over(before, self.rows, ids, rows)
         gone = np.flatnonzero(~np.isin(before, ids, assume_unique=True) & (self.rows != UNLINKED))
