@@ -115,7 +115,7 @@ def test_what_is_left_out_is_dark_to_the_eye(result: Path, bonnet: Path, tmp_pat
     assert good
     assert_dark_below(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)[:240], files[0])
     page = (result / "report.html").read_text(encoding="utf-8")
-    (clip,) = re.findall(r"data:image/webp;base64,([^\"]+)", page)
+    (clip,) = re.findall(r"<img [^>]*data:image/webp;base64,([^\"]+)", page)
     data = np.frombuffer(base64.b64decode(clip), np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
     assert_dark_below(np.asarray(image), files[0], image.shape[0] / 240)
