@@ -17,7 +17,7 @@ from benchmarks.table import markdown_header, markdown_row
 from pliant.datasets import open_source
 from pliant.datasets.base import Dataset
 from pliant.datasets.calibration import calibration_from_fov
-from pliant.errors import PliantError
+from pliant.errors import DatasetError, PliantError
 from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.exit_codes import DONE, INCOMPLETE
 from pliant.formats.trajectory_files import read_trajectory
@@ -61,7 +61,9 @@ def _focal(source: Dataset, seed: int, frames: int | None) -> tuple[float, float
 
 def _scale(name: str, source: Dataset, seed: int) -> tuple[float, float] | None:
     """Error and standard deviation, as shares; None where the source has no depth maps."""
-    if not any(frame.depth for frame in open_source(name, depth="first")):
+    try:
+        open_source(name, depth="first")
+    except DatasetError:
         return None
     with tempfile.TemporaryDirectory(prefix="pliant-coverage-") as made:
         folder = Path(made) / "result"
