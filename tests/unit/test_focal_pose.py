@@ -3,7 +3,8 @@
 import numpy as np
 from mapping_scene import CAMERA
 
-from pliant.algorithms.bundle.focal_pose import UNKNOWNS, linearise, moved, refine_focal
+from pliant.algorithms.bundle.focal_pose import UNKNOWNS, linearise, refine_focal
+from pliant.algorithms.bundle.projection import move_cameras
 from pliant.algorithms.geometry import inverse, so3_exp
 
 CENTRE = (CAMERA.cx + 3.0, CAMERA.cy - 2.0)
@@ -25,11 +26,14 @@ def scene(d, depth=4.0, noise_px=0.0):
 def test_the_jacobian_is_that_of_finite_differences():
     T_world_camera, world, px = scene(0.02)
     T, d, h = inverse(T_world_camera), 0.03, 1e-6
+    motion = np.concatenate([T[:3, :3].ravel(), T[:3, 3]])
+    lens = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, *CENTRE])
 
     def predicted(step):
-        return px - linearise(moved(T, step), d + step[6], world, px, CAMERA, CENTRE)[0]
+        (moved,) = move_cameras(motion[None], step[None, :6])
+        return px - linearise(moved, d + step[6], world, px, lens)[0]
 
-    _, J = linearise(T, d, world, px, CAMERA, CENTRE)
+    _, J = linearise(motion, d, world, px, lens)
     for k, step in enumerate(h * np.eye(UNKNOWNS)):
         expected = (predicted(step) - predicted(-step)) / (2.0 * h)
         np.testing.assert_allclose(J[:, :, k], expected, rtol=1e-5, atol=1e-3)

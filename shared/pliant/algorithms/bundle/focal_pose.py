@@ -17,8 +17,10 @@ differs across the image a magnification looks like a step ahead.
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
+from pliant.algorithms.bundle.projection import move_camera
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import inverse, so3_exp
+from pliant.algorithms.geometry import inverse
+from pliant.compiler.kernel import kernel
 
 _SIGMAS_PX = (8.0, 8.0, 2.0, 2.0)
 _MIN_DEPTH = 1e-6
@@ -46,12 +48,15 @@ def refine_focal(
     standard deviation of d.
     """
     every = max(1, len(points_px) // _MOST)
-    some = points_world[::every], points_px[::every]
-    pose, d = inverse(T_world_camera), 0.0
-    normal, residuals = np.eye(UNKNOWNS), np.zeros((1, 2))
+    world, px = points_world[::every], points_px[::every].astype(np.float64)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *centre])
+    T_camera_world = inverse(T_world_camera)
+    motion = np.concatenate([T_camera_world[:3, :3].ravel(), T_camera_world[:3, 3]])
+    d, normal, squared = 0.0, np.eye(UNKNOWNS), np.zeros(0)
     for sigma in _SIGMAS_PX:
-        residuals, J = linearise(pose, d, *some, camera, centre)
-        weights = 1.0 / (1.0 + (residuals**2).sum(axis=1) / sigma**2) ** 2
+        residuals, J = linearise(motion, d, world, px, lens)
+        squared = (residuals**2).sum(axis=1)
+        weights = 1.0 / (1.0 + squared / sigma**2) ** 2
         weighted = (weights[:, None, None] * J).reshape(-1, UNKNOWNS)
         normal = weighted.T @ J.reshape(-1, UNKNOWNS)
         g = weighted.T @ residuals.reshape(-1)
@@ -60,39 +65,40 @@ def refine_focal(
         normal[np.diag_indices(6)] *= 1.0 + 1e-9
         normal[np.diag_indices(6)] += 1e-9
         step = np.linalg.solve(normal, g)
-        pose, d = moved(pose, step), d + float(step[6])
-    variance = np.median((residuals**2).sum(axis=1)) / _MEDIAN_OF_TWO if len(residuals) else np.inf
+        move_camera(motion, step[:6], motion)
+        d += float(step[6])
+    variance = np.median(squared) / _MEDIAN_OF_TWO if len(squared) else np.inf
     return d, float(np.sqrt(variance / every * np.linalg.inv(normal)[6, 6]))
 
 
+@kernel
 def linearise(
-    T: F64, d: float, points_world: F64, points_px: F32, camera: PinholeCamera,
-    centre: tuple[float, float],
-) -> tuple[F64, F64]:  # fmt: skip
+    motion: F64, d: float, points_world: F64, points_px: F64, lens: F64
+) -> tuple[F64, F64]:
     """Residuals ``points_px - p`` (n, 2) and the Jacobian (n, 2, 7) of p, of points in front.
 
-    T: (4, 4) from the world to the camera.
+    motion: (12,) R_camera_world by rows, then t_camera_world.   lens: fx, fy, cx, cy and c.
     """
-    in_camera = points_world @ T[:3, :3].T + T[:3, 3]
-    front = in_camera[:, 2] > _MIN_DEPTH
-    iz = 1.0 / in_camera[front, 2]
-    x, y = in_camera[front, 0] * iz, in_camera[front, 1] * iz
-    F = np.exp(d) * np.array([camera.fx, camera.fy])
-    c, zero = np.asarray(centre), np.zeros_like(x)
-    from_centre = F * np.column_stack([x, y]) + np.exp(d) * ([camera.cx, camera.cy] - c)
-    rows = np.array([
-        [iz, zero, -x * iz, -x * y, 1.0 + x * x, -y],
-        [zero, iz, -y * iz, -1.0 - y * y, x * y, x],
-    ])  # fmt: skip
-    J = np.empty((len(x), 2, UNKNOWNS))
-    J[:, :, :6] = F[:, None] * rows.transpose(2, 0, 1)
-    J[:, :, 6] = from_centre
-    return points_px[front] - (c + from_centre), J
-
-
-def moved(T: F64, step: F64) -> F64:
-    """T (4, 4) after a step whose first six are (rho, theta)."""
-    after = np.eye(4)
-    after[:3, :3] = so3_exp(step[3:6]) @ T[:3, :3]
-    after[:3, 3] = so3_exp(step[3:6]) @ T[:3, 3] + step[:3]
-    return after
+    N = len(points_world)
+    residuals, J = np.empty((N, 2)), np.zeros((N, 2, UNKNOWNS))
+    magnified, n = np.exp(d), 0
+    for i in range(N):
+        X = np.empty(3)
+        for k in range(3):
+            X[k] = motion[9 + k]
+            for m in range(3):
+                X[k] += motion[3 * k + m] * points_world[i, m]
+        if X[2] <= _MIN_DEPTH:
+            continue
+        x, y, iz = X[0] / X[2], X[1] / X[2], 1.0 / X[2]
+        f, g = magnified * lens[0], magnified * lens[1]
+        J[n, 0, 0], J[n, 0, 2], J[n, 0, 3] = f * iz, -f * x * iz, -f * x * y
+        J[n, 0, 4], J[n, 0, 5] = f * (1.0 + x * x), -f * y
+        J[n, 1, 1], J[n, 1, 2], J[n, 1, 3] = g * iz, -g * y * iz, -g * (1.0 + y * y)
+        J[n, 1, 4], J[n, 1, 5] = g * x * y, g * x
+        J[n, 0, 6] = f * x + magnified * (lens[2] - lens[4])
+        J[n, 1, 6] = g * y + magnified * (lens[3] - lens[5])
+        residuals[n, 0] = points_px[i, 0] - lens[4] - J[n, 0, 6]
+        residuals[n, 1] = points_px[i, 1] - lens[5] - J[n, 1, 6]
+        n += 1
+    return residuals[:n], J[:n]

@@ -111,6 +111,7 @@ class Localiser:
         """As ``Mapper.only_localise``."""
         active, hanging, motion, found = self._map, self._hanging, self._motion, None
         if active is not None and motion is not None:
+            active.links.follow(tracks.ids, active.points)
             found = pose_by_tracks(
                 active, self.calibration, motion, frame, stamp_ns, tracks, self._generator
             )

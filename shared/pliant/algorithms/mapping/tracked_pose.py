@@ -42,9 +42,8 @@ def pose_by_tracks(
 ) -> Tracked | None:
     """Localise a frame where its tracks lead; None where too few do, as after a cut.
 
-    tracks: as the tracker gives them, of the rectified image.
+    tracks: as the tracker gives them, of the rectified image; ``active.links`` follow them.
     """
-    active.links.follow(tracks.ids, active.points)
     seen = calibration.ideal(FrameExtrema.without_maxima(tracks))
     located = localise(active, calibration, motion, stamp_ns, seen, None, generator)
     if located is None or not located.is_firm:
