@@ -1,8 +1,9 @@
 """A source read backwards, where its map was lost: the map reaches back from what came later.
 
-A camera is lost where it comes from known places to what it sees badly.  From the other side the
-same frames follow a map that is known already: what lies before the beginning of a map, and between
-two segments, is mapped from what came afterwards, and segments that see the same become one.
+Tracking is mostly lost on the way from a mapped place into a stretch that is hard to see.  Read
+backwards, the stretch is entered from frames that are mapped: what lies before the first frame of a
+map, or between two segments, is mapped from what came later, and segments that see the same become
+one.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

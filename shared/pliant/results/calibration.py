@@ -29,8 +29,8 @@ _KNOWN = 0.05
 """Standard deviation of the log focal length above which it counts as unknown."""
 
 _MODEL = 0.007
-"""Standard deviation of the log focal length by what no residual shows: errors that all tracks
-share, and a lens that is not quite of the model.  `scripts/bench coverage`."""
+"""Standard deviation of the log focal length by errors that leave no residual: those of all tracks
+alike, and of the lens model.  `scripts/bench coverage`."""
 
 _CONTRADICTED = 2.0
 """Standard deviations of the calibration's prior from which on the images contradict it."""

@@ -20,8 +20,8 @@ _KEPT_GONE = 20_000
 
 _LOST_AT_ONCE = 0.5
 """Share of the tracks that a frame loses at least where candidates are remembered, too, unless the
-one before has: elsewhere hardly a track comes back.  Nor are they where points of the map carry the
-pose alone: on a clip that loses half of its tracks by quick motion they made it a little worse."""
+one before has: elsewhere hardly a track comes back.  Nor are they where map points alone
+carry the pose: in quick motion they made it a little worse."""
 
 MAPPED_SHARE = 0.25
 """Share of what a frame sees under which points of the map alone do not carry its pose."""
