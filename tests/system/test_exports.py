@@ -196,6 +196,31 @@ def test_nerfstudio_gets_the_images_points_and_poses_of_the_colmap_model(
             np.testing.assert_allclose(pixels[row], seen, atol=1e-3)
 
 
+def test_a_splat_has_dense_points_for_every_trainer(
+    result: Path, model: Path, tmp_path: Path
+) -> None:
+    pycolmap: Any = import_module("pycolmap")
+    folder = export_result(result, "splat", tmp_path / "splat")
+    dense = read_ply(folder / "sparse" / "0" / "points3D.ply")
+    mesh = read_ply(result / "mesh.ply")
+    assert dense.normals is not None
+    lengths = np.linalg.norm(dense.normals, axis=1)
+    on_mesh = lengths > 0.5
+    np.testing.assert_allclose(lengths[on_mesh], 1.0, atol=1e-3)
+    assert set(map(tuple, dense.points[on_mesh].tolist())) <= set(map(tuple, mesh.points.tolist()))
+    assert 0.4 * len(mesh.points) < on_mesh.sum() <= 200_000
+    read, theirs = (pycolmap.Reconstruction(str(each / "sparse" / "0")) for each in (folder, model))
+    sparse = theirs.num_points3D()
+    assert read.num_points3D() == sparse + on_mesh.sum()
+    assert sum(len(p.track.elements) > 0 for p in read.points3D.values()) == sparse
+    said = json.loads((folder / "transforms.json").read_text())
+    assert (folder / said["ply_file_path"]).exists()
+    names = {Path(frame["file_path"]).name for frame in said["frames"]}
+    assert names == {each.name for each in (folder / "images").iterdir()}
+    assert names == {image.name for image in read.images.values()}
+    assert len(names) >= 4
+
+
 def test_depth_is_that_of_the_map_in_the_unit_that_is_said(
     result: Path, model: Path, tmp_path: Path
 ) -> None:

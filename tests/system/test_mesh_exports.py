@@ -12,6 +12,7 @@ from running import assert_one_line, in_this_process
 from pliant import open3d_library
 from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.errors import ResultError
+from pliant.export.crop import Box
 from pliant.export.export import export_result
 from pliant.export.textured import textured_mesh
 from pliant.formats.ply import read_ply
@@ -100,3 +101,49 @@ def test_without_open3d_s_libraries_one_line_says_what_to_install(
 def test_triangles_are_for_textured_meshes(result: Path, tmp_path: Path) -> None:
     with pytest.raises(ResultError, match="--triangles: tum has no such option, only glb and obj"):
         export_result(result, "tum", tmp_path / "poses.txt", triangles=500)
+
+
+def test_a_box_crops_meshes_and_points(result: Path, tmp_path: Path) -> None:
+    points = read_ply(result / "points.ply").points
+    low, high = np.quantile(points, (0.3, 0.7), axis=0)
+    box = Box(low=tuple(low.tolist()), high=tuple(high.tolist()))
+    cropped = read_ply(export_result(result, "ply", tmp_path / "points.ply", crop=box)).points
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    np.testing.assert_array_equal(np.sort(cropped, axis=0), np.sort(points[inside], axis=0))
+    recording = Recording(result / "recording.mcap")
+    low, high = np.quantile(read_ply(result / "mesh.ply").points, (0.2, 0.8), axis=0)
+    box = Box(low=tuple(low.tolist()), high=tuple(high.tolist()))
+    mesh = textured_mesh(recording, 8000, crop=box)
+    assert len(mesh.triangles) > 1000
+    slack = 0.02 * (high - low)  # decimation moves vertices
+    assert (mesh.positions >= low - slack).all()
+    assert (mesh.positions <= high + slack).all()
+    folder = export_result(result, "splat", tmp_path / "splat", crop=box)
+    dense = read_ply(folder / "sparse" / "0" / "points3D.ply").points
+    assert len(dense) > 1000
+    assert box.holds(dense).all()
+
+
+def test_an_empty_box_is_one_line_that_says_where_the_mesh_lies(
+    result: Path, tmp_path: Path
+) -> None:
+    box = Box(low=(1e3, 1e3, 1e3), high=(2e3, 2e3, 2e3))
+    for kind, what in (("glb", "triangle of the mesh"), ("ply", "point"), ("splat", "point")):
+        path = tmp_path / {"splat": "splat"}.get(kind, f"out.{kind}")
+        with pytest.raises(ResultError, match=rf"--crop 1000,.*: no {what} is inside; all lie"):
+            export_result(result, kind, path, crop=box)
+        assert not path.exists()
+    with pytest.raises(ResultError, match="only glb, obj, watertight, ply and splat"):
+        export_result(result, "tum", tmp_path / "poses.txt", crop=box)
+
+
+@pytest.mark.parametrize("crop", ["1,2,3", "a,0,0,1,1,1", "1,0,0,0,1,1", "nan,0,0,1,1,1"])
+def test_a_box_that_is_none_is_wrong_usage(result: Path, crop: str, tmp_path: Path) -> None:
+    output = tmp_path / "points.ply"
+    done = in_this_process("export", result, "--to", "ply", "--crop", crop, "--output", output)
+    assert done.returncode == 2
+    assert "--crop" in done.stderr
+    assert not output.exists()
+    box = "-1,-1,-9,1,1,9"  # begins like an option
+    done = in_this_process("export", result, "--to", "ply", "--crop", box, "--output", output)
+    assert done.returncode == 0

@@ -1,11 +1,15 @@
 """``pliant export``: a result as files for other programs."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pliant.export.kinds import KINDS
+from pliant.wording import shown
+
+if TYPE_CHECKING:
+    from pliant.export.crop import Box
 
 
 def export(
@@ -31,6 +35,14 @@ def export(
         bool,
         typer.Option("--clean", help="glb, obj: leave out pieces below 1 % of the largest one."),
     ] = False,
+    crop: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z,X,Y,Z",
+            help="glb, obj, watertight, ply, splat: only the surface or the points between two "
+            "corners of a box, in the frame and unit of mesh.ply.",
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
 ) -> None:
     """Write a run for other programs: viewers, trajectories, reconstructions, videos.
@@ -43,7 +55,11 @@ def export(
 
     pliant export results/room --to nerfstudio
 
+    pliant export results/room --to splat
+
     pliant export results/room --to glb
+
+    pliant export results/room --to glb --crop -1,-0.5,0,1,0.8,2.5
 
     pliant export results/cloth --to surface --every 10
 
@@ -56,6 +72,21 @@ def export(
 
     written = export_result(
         result, to, output, force=force, every=every, triangles=triangles, clean=clean,
+        crop=None if crop is None else _box(crop),
         progress=partial(tell_progress, f"{to}: image"),
     )  # fmt: skip
     typer.echo(str(written))
+
+
+def _box(text: str) -> "Box":
+    from pliant.export.crop import Box
+
+    try:
+        x, y, z, x_end, y_end, z_end = map(float, text.split(","))
+    except ValueError:
+        raise typer.BadParameter(
+            f"--crop {shown(text)}: expected XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX"
+        ) from None
+    if not (x < x_end and y < y_end and z < z_end):
+        raise typer.BadParameter(f"--crop {shown(text)}: the second corner exceeds the first one")
+    return Box(low=(x, y, z), high=(x_end, y_end, z_end))

@@ -12,6 +12,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
+from pliant.export.crop import Box
 from pliant.export.images import camera_of, make_folder
 from pliant.export.posed_images import (
     INLIER_PX,
@@ -20,11 +21,13 @@ from pliant.export.posed_images import (
     write_posed_images,
 )
 from pliant.formats.colmap import ColmapImage, write_colmap
+from pliant.map_history import Points
 from pliant.messages import topics
 from pliant.messages.types import Extrema
 from pliant.recording.reader import Recording
 from pliant.results.run import SeenKeyframe, read_run, seen_by_keyframes
 
+MODEL = "sparse/0"
 _SAME_PX = 0.1  # of a track that was observed, but for rounding
 
 
@@ -34,13 +37,33 @@ def colmap(recording: Recording, path: Path, folder: Path | None) -> None:
     run = read_run(recording.path)
     ideal = IdealCamera(run)
     images = write_posed_images(
-        recording, camera_of(recording), ideal, path / "images", mask_name="{}.png".format
+        recording, camera_of(recording), ideal, path / "images", mask_name=mask_name
     )
     points = run.history.points_in(ideal.segment)
+    model, kept = seen_model(recording, ideal, images, points)
+    make_folder(path / MODEL)
+    colours = np.asarray(points.colours[kept], np.uint8)
+    write_colmap(path / MODEL, ideal.camera, model, points.positions[kept], colours)
+
+
+def mask_name(name: str) -> str:
+    """COLMAP's file of the mask of an image."""
+    return f"{name}.png"
+
+
+def seen_model(
+    recording: Recording, ideal: IdealCamera, images: list[PosedImage], points: Points,
+    crop: Box | None = None,
+) -> tuple[list[ColmapImage], I64]:  # fmt: skip
+    """The images with the points that they see, and (K,) rows of the points that two of them see.
+
+    Points of an image are numbers of those rows.    crop: only points in this box.
+    """
     seen = seen_by_keyframes(recording, set(ideal.keyframes.values()))
     sights = _sights(recording, ideal, images, seen, points.ids, points.positions)
     counts = np.bincount(np.concatenate([rows for _, rows in sights]), minlength=len(points))
-    kept = np.flatnonzero(counts >= 2)
+    wanted = counts >= 2
+    kept = np.flatnonzero(wanted if crop is None else wanted & crop.holds(points.positions))
     number = np.full(len(points), -1, np.int64)
     number[kept] = np.arange(len(kept))
     model = [
@@ -52,9 +75,7 @@ def colmap(recording: Recording, path: Path, folder: Path | None) -> None:
         )
         for image, (pixels, rows) in zip(images, sights, strict=True)
     ]
-    make_folder(path / "sparse" / "0")
-    colours = np.asarray(points.colours[kept], np.uint8)
-    write_colmap(path / "sparse" / "0", ideal.camera, model, points.positions[kept], colours)
+    return model, kept
 
 
 def _sights(

@@ -11,6 +11,7 @@ from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.errors import PliantError, ResultError
 from pliant.export.colmap import colmap
+from pliant.export.crop import Box
 from pliant.export.depth import depth
 from pliant.export.images import camera_of, images, rectified_images
 from pliant.export.kinds import KINDS, OF_STILL_SCENES, OPTIONS
@@ -26,6 +27,7 @@ from pliant.export.overview import (
     overview_pictures,
     still_picture,
 )
+from pliant.export.splat import splat
 from pliant.export.surface_meshes import overlay_pictures, surfaces
 from pliant.export.textured import glb, obj
 from pliant.files import is_stream, make_folder
@@ -75,23 +77,24 @@ class RecordedFrame:
 def export_result(
     result: Path, to: str, output: Path | None, *, force: bool = False,
     every: int | None = None, triangles: int | None = None, clean: bool = False,
-    progress: Progress | None = None,
+    crop: Box | None = None, progress: Progress | None = None,
 ) -> Path:  # fmt: skip
     """Write one export of a result folder or a recording and return where.
 
     every: of surfaces, which frames.    triangles: most of a textured mesh.
-    clean: leave out its small pieces.
+    clean: leave out its small pieces.    crop: only the surface or the points in this box.
     progress: is told how many images have been read, and of how many.
 
     Raises ResultError for an unknown kind, and for what is there already unless ``force``.
     """
     if to not in EXPORTS:
         raise ResultError(f"--to {to}: choose {', '.join(EXPORTS)}")
-    options = {"every": every, "triangles": triangles, "clean": clean or None}
+    options = {"every": every, "triangles": triangles, "clean": clean or None, "crop": crop}
     given = {name: value for name, value in options.items() if value is not None}
     for option in given:
         if to not in OPTIONS[option]:
-            has = " and ".join(OPTIONS[option])
+            *others, last = OPTIONS[option]
+            has = f"{', '.join(others)} and {last}" if others else last
             raise ResultError(f"--{option}: {to} has no such option, only {has}")
     if not result.exists():
         raise ResultError(f"{result}: no such result folder or recording")
@@ -301,6 +304,7 @@ _WRITERS: dict[str, Export] = {
     "ply": ply,
     "colmap": colmap,
     "nerfstudio": nerfstudio,
+    "splat": splat,
     "depth": depth,
     "images": images,
     "glb": glb,

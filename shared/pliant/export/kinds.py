@@ -9,6 +9,7 @@ KINDS = {
     "ply": "points_longest.ply",
     "colmap": "colmap",
     "nerfstudio": "nerfstudio",
+    "splat": "splat",
     "depth": "depth",
     "images": "images",
     "glb": "mesh.glb",
@@ -25,6 +26,7 @@ OF_STILL_SCENES = (
     "ply",
     "colmap",
     "nerfstudio",
+    "splat",
     "depth",
     "glb",
     "obj",
@@ -33,5 +35,10 @@ OF_STILL_SCENES = (
     "overview",
 )
 """Kinds that are made of a map or mesh, which a run of the deformable profile has not."""
-OPTIONS = {"every": ("surface",), "triangles": ("glb", "obj"), "clean": ("glb", "obj")}
+OPTIONS = {
+    "every": ("surface",),
+    "triangles": ("glb", "obj"),
+    "clean": ("glb", "obj"),
+    "crop": ("glb", "obj", "watertight", "ply", "splat"),
+}
 """Which kinds have an option."""

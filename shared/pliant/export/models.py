@@ -7,6 +7,7 @@ import numpy as np
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.datasets.recorded_images import RecordedImages
 from pliant.errors import ResultError
+from pliant.export.crop import Box, cropped_mesh, rows_in
 from pliant.export.images import camera_of
 from pliant.export.watertight import watertight
 from pliant.formats.ply import read_ply, write_ply
@@ -71,23 +72,23 @@ def rerun(recording: Recording, path: Path, folder: Path | None) -> None:
         canvas.close()
 
 
-def ply(recording: Recording, path: Path, folder: Path | None) -> None:
-    """The points of the longest segment."""
+def ply(recording: Recording, path: Path, folder: Path | None, crop: Box | None = None) -> None:
+    """The points of the longest segment.  crop: those in this box."""
     history = read_run(recording.path).history
     points = history.points_in(history.longest_segment())
     if not len(points):
         raise ResultError(f"{recording.path}: the run has no map to export")
-    write_points(path, points)
+    write_points(path, points.select(rows_in(crop, points.positions)))
 
 
-def solid(recording: Recording, path: Path, folder: Path | None) -> None:
-    """The fine mesh of the longest segment, closed to a solid."""
+def solid(recording: Recording, path: Path, folder: Path | None, crop: Box | None = None) -> None:
+    """The fine mesh of the longest segment, closed to a solid.  crop: what lies in this box."""
     load_open3d()  # said before the work
     run = read_run(recording.path)
     mesh = mesh_of(run.mesh, run.history.longest_segment())
     if mesh is None or not len(mesh.triangles):
         raise ResultError(f"{recording.path}: there is no mesh in it: run its source again")
-    write_mesh(path, watertight(mesh))
+    write_mesh(path, watertight(cropped_mesh(mesh, crop)))
 
 
 def write_points(path: Path, points: Points) -> None:

@@ -11,6 +11,7 @@ https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 
 from pliant.export.images import camera_of
 from pliant.export.models import write_points
-from pliant.export.posed_images import IdealCamera, write_posed_images
+from pliant.export.posed_images import IdealCamera, PosedImage, write_posed_images
 from pliant.formats.text import write_bytes
 from pliant.recording.reader import Recording
 from pliant.results.run import read_run
@@ -33,6 +34,14 @@ def nerfstudio(recording: Recording, path: Path, folder: Path | None) -> None:
     ideal = IdealCamera(run)
     images = write_posed_images(recording, camera_of(recording), ideal, path / "images")
     write_points(path / _POINTS, run.history.points_in(ideal.segment))
+    write_transforms(path, ideal, images, _POINTS)
+
+
+def write_transforms(
+    path: Path, ideal: IdealCamera, images: list[PosedImage], points: str,
+    mask_name: Callable[[str], str] = str,
+) -> None:  # fmt: skip
+    """``transforms.json``.  points: file of the points.    mask_name: of an image, by its name."""
     camera = ideal.camera
     content: dict[str, Any] = {
         "camera_model": "OPENCV",
@@ -43,11 +52,11 @@ def nerfstudio(recording: Recording, path: Path, folder: Path | None) -> None:
         "cx": camera.cx + 0.5,
         "cy": camera.cy + 0.5,
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
-        "ply_file_path": _POINTS,
+        "ply_file_path": points,
         "frames": [
             {
                 "file_path": f"images/{image.name}",
-                **({"mask_path": f"masks/{image.name}"} if image.masked else {}),
+                **({"mask_path": f"masks/{mask_name(image.name)}"} if image.masked else {}),
                 "transform_matrix": (image.T_world_camera @ _OPENCV_OPENGL).tolist(),
             }
             for image in images

@@ -19,6 +19,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.image.duplicate_views import SHARPER
 from pliant.algorithms.image.masks import mask_image
 from pliant.algorithms.image.sharpness import sharpness
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame, motion_between
@@ -37,17 +38,19 @@ from pliant.results.run import Run
 
 INLIER_PX = 1.5
 """Of the mapper."""
-_KEYFRAME = 1.1
-"""A keyframe counts as so many times as sharp."""
 
 
 @dataclass(frozen=True)
 class PosedImage:
-    """A frame whose image was written.  T_world_camera: (4, 4).  masked: so was its mask."""
+    """A frame whose image was written.
+
+    T_world_camera: (4, 4).    masked: so was its mask.    sharpness: of the image.
+    """
 
     frame: int
     T_world_camera: F64
     masked: bool = False
+    sharpness: float = 0.0
 
     @property
     def name(self) -> str:
@@ -125,8 +128,9 @@ def write_posed_images(
     masks = folder.with_name("masks")
     written: list[PosedImage] = []
     for frame, _, pixels, used in _sharpest(recording, stream, ideal):
-        image = PosedImage(frame, ideal.poses[frame], used is not None)
-        write_png(folder / image.name, ideal.image(frame, pixels))
+        shown = ideal.image(frame, pixels)
+        image = PosedImage(frame, ideal.poses[frame], used is not None, sharpness(_grey(shown)))
+        write_png(folder / image.name, shown)
         if used is not None:
             make_folder(masks)
             mask = mask_image(used, partial(ideal.image, frame))
@@ -154,7 +158,7 @@ def _sharpest(
         if here != group and chosen is not None:
             yield chosen
             chosen = None
-        found = sharpness(_grey(image.pixels)) * (_KEYFRAME if frame in ideal.keyframes else 1.0)
+        found = sharpness(_grey(image.pixels)) * (SHARPER if frame in ideal.keyframes else 1.0)
         if chosen is None or found > best:
             group, best, chosen = here, found, image
     if chosen is not None:

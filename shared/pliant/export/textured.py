@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from pliant.errors import ResultError
+from pliant.export.crop import Box, cropped_mesh
 from pliant.export.images import make_folder
 from pliant.export.watertight import cleaned
 from pliant.formats.textured import TexturedMesh, write_glb, write_obj
@@ -20,26 +21,28 @@ _TEXELS = 2048
 
 def glb(
     recording: Recording, path: Path, folder: Path | None, triangles: int = TRIANGLES,
-    clean: bool = False,
+    clean: bool = False, crop: Box | None = None,
 ) -> None:  # fmt: skip
     """Binary glTF with the texture inside."""
-    write_glb(path, textured_mesh(recording, triangles, clean=clean))
+    write_glb(path, textured_mesh(recording, triangles, clean=clean, crop=crop))
 
 
 def obj(
     recording: Recording, path: Path, folder: Path | None, triangles: int = TRIANGLES,
-    clean: bool = False,
+    clean: bool = False, crop: Box | None = None,
 ) -> None:  # fmt: skip
     """A folder with ``mesh.obj``, ``mesh.mtl`` and ``mesh.png``."""
-    mesh = textured_mesh(recording, triangles, clean=clean)
+    mesh = textured_mesh(recording, triangles, clean=clean, crop=crop)
     make_folder(path)
     write_obj(path, mesh)
 
 
-def textured_mesh(recording: Recording, triangles: int, *, clean: bool = False) -> TexturedMesh:
+def textured_mesh(
+    recording: Recording, triangles: int, *, clean: bool = False, crop: Box | None = None
+) -> TexturedMesh:
     """The fine mesh of the longest segment, of at most so many triangles.
 
-    clean: without small pieces.
+    clean: without small pieces.    crop: only what lies in this box.
 
     Raises ResultError where there is none.
     """
@@ -49,5 +52,6 @@ def textured_mesh(recording: Recording, triangles: int, *, clean: bool = False) 
     fine = mesh_of(pieces, segment)
     if run.stream is None or fine is None or not len(fine.triangles):
         raise ResultError(f"{recording.path}: there is no mesh in it: run its source again")
+    fine = cropped_mesh(fine, crop)
     fine = cleaned(fine) if clean else fine
     return textured(fine, recording, run, run.stream, segment, triangles=triangles, texels=_TEXELS)

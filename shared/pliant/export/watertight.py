@@ -41,14 +41,7 @@ def cleaned(mesh: TriangleMesh) -> TriangleMesh:
     if not len(mesh.triangles):
         return mesh
     labels, areas = pieces(to_mesh(mesh))
-    triangles = mesh.triangles[(areas >= CRUMB * areas.max())[labels]]
-    kept, rows = np.unique(triangles, return_inverse=True)
-    return TriangleMesh(
-        positions=mesh.positions[kept],
-        normals=mesh.normals[kept],
-        colours=mesh.colours[kept],
-        triangles=rows.reshape(-1, 3).astype(np.int32),
-    )
+    return mesh.of_triangles((areas >= CRUMB * areas.max())[labels])
 
 
 def watertight(mesh: TriangleMesh) -> TriangleMesh:

@@ -56,6 +56,17 @@ class TriangleMesh:
     colours: Annotated[U8, Shape("V", 3)]
     triangles: Annotated[I32, Shape("T", 3)]
 
+    def of_triangles(self, kept: BoolArray) -> "TriangleMesh":
+        """Some of its triangles, kept: (T,), and the vertices that these have."""
+        triangles = self.triangles[kept]
+        used, corners = np.unique(triangles, return_inverse=True)
+        return TriangleMesh(
+            positions=self.positions[used],
+            normals=self.normals[used],
+            colours=self.colours[used],
+            triangles=corners.reshape(-1, 3).astype(np.int32),
+        )
+
 
 def pack(keys: I32) -> I64:
     """(N,) numbers in the order of the (N, 3) keys (by x, then y, then z)."""
