@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.geometry import so3_exp
-from pliant.algorithms.mapping.same_place import (
+from pliant.algorithms.mapping.similarity import (
     Pairs,
+    closed_form,
     moved,
     refine_similarity,
     residuals_of,
@@ -43,6 +44,34 @@ def test_derivatives_are_those_of_differences():
         step = h * np.eye(7)[k]
         forth, back = (residuals_of(moved(S, sign * step), pairs)[0] for sign in (1.0, -1.0))
         np.testing.assert_allclose(J[:, :, k], (forth - back) / (2.0 * h), atol=1e-7)
+
+
+def umeyama(source, target):
+    """(4, 4) by singular values."""
+    s, t = source - source.mean(axis=0), target - target.mean(axis=0)
+    U, D, Vt = np.linalg.svd(t.T @ s)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    S = np.eye(4)
+    S[:3, :3] = (D * signs).sum() / (s**2).sum() * (U * signs) @ Vt
+    S[:3, 3] = target.mean(axis=0) - S[:3, :3] @ source.mean(axis=0)
+    return S
+
+
+def test_triples_give_the_similarity_of_singular_values():
+    generator = np.random.default_rng(4)
+    source, target = generator.normal(size=(2, 200, 3, 3))
+    expected = [umeyama(*each) for each in zip(source, target, strict=True)]
+    np.testing.assert_allclose(closed_form(source, target), expected, atol=1e-9)
+
+
+def test_triples_without_extent_give_none():
+    generator = np.random.default_rng(4)
+    source, target = generator.normal(size=(2, 4, 3, 3))
+    source[0, 1] = source[0, 0]
+    target[1, 2] = target[1, 0]
+    source[2, 2] = 3.0 * source[2, 1] - 2.0 * source[2, 0]
+    expected = umeyama(source[3], target[3])
+    np.testing.assert_allclose(closed_form(source, target), expected[None], atol=1e-9)
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.5, 0.75])

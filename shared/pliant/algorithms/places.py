@@ -40,8 +40,10 @@ _SCALE_FACTOR = 1.2
 _LEVELS = 8
 """Of the pyramid: 3.6 times."""
 
-_FAST_THRESHOLD = 10
-"""Grey levels by which a corner differs; in half the light as well."""
+_FAST_THRESHOLD, _STRONG = 10, 20
+"""Grey levels by which a corner differs: the first in half the light as well.  Only the strongest
+are kept, so weak ones are not looked for in an image that has as many strong ones at its own scale
+alone: noise makes tens of thousands."""
 
 _MAX_BITS = 64
 """Of 256 by which descriptors of one corner may differ."""
@@ -81,9 +83,11 @@ class Features:
 
 def describe(grey: U8) -> Features:
     """Corners of an image (H, W), none where it shows nothing."""
+    fast = cv2.FastFeatureDetector_create(_STRONG)  # pyright: ignore[reportAttributeAccessIssue]
+    strong = fast.detect(grey, None)
     orb = cv2.ORB_create(  # pyright: ignore[reportAttributeAccessIssue]
         nfeatures=_FEATURES, scaleFactor=_SCALE_FACTOR, nlevels=_LEVELS,
-        fastThreshold=_FAST_THRESHOLD,
+        fastThreshold=_STRONG if len(strong) >= _FEATURES else _FAST_THRESHOLD,
     )  # fmt: skip
     corners, descriptors = orb.detectAndCompute(grey, None)
     if descriptors is None:
@@ -165,28 +169,27 @@ class PlaceIndex:
     """Features of places by their ids, and an inverted file of their words.
 
     ids: of each slot; slots are in the order in which places came.   sizes: words of each.
-    alive: whether it is still a place.   heads: newest entry of each word, -1 without one.
-    counts: how many entries each has.   entries: (capacity, 2) slot, and the entry before of the
-    same word.   used: how many there are.
+    alive: whether it is still a place.   starts: of each word, where in ``entries`` its slots are,
+    one after the other, so that a query waits for memory once a word.   counts: how many slots it
+    has; there is room for the power of two from there, and then it moves to where there is twice as
+    much.   entries: (capacity,).   used: how many of these are taken.
     """
 
     features: dict[int, Features] = field(default_factory=dict[int, Features])
     ids: list[int] = field(default_factory=list[int])
     sizes: list[int] = field(default_factory=list[int])
     alive: list[bool] = field(default_factory=list[bool])
-    heads: I32 = field(default_factory=lambda: np.full(_CHUNKS << _BITS, -1, np.int32))
+    starts: I32 = field(default_factory=lambda: np.zeros(_CHUNKS << _BITS, np.int32))
     counts: I32 = field(default_factory=lambda: np.zeros(_CHUNKS << _BITS, np.int32))
-    entries: I32 = field(default_factory=lambda: np.zeros((1 << 12, 2), np.int32))
+    entries: I32 = field(default_factory=lambda: np.zeros(1 << 12, np.int32))
     used: int = 0
 
     def add(self, place: int, features: Features) -> None:
         """Remember a new place."""
         words = words_of(features.descriptors)
-        while self.used + len(words) > len(self.entries):
+        while self.used + _room_for(words, self.counts) > len(self.entries):
             self.entries = np.concatenate([self.entries, np.zeros_like(self.entries)])
-        _enter(words, len(self.ids), self.heads, self.entries, self.used)
-        self.counts[words] += 1
-        self.used += len(words)
+        self.used = _enter(words, len(self.ids), self.starts, self.counts, self.entries, self.used)
         self.features[place] = features
         self.ids.append(place)
         self.sizes.append(len(words))
@@ -215,7 +218,7 @@ class PlaceIndex:
         alive = np.array(self.alive, np.bool_)
         words = words_of(features.descriptors)
         words = words[self.counts[words] < _COMMON + _COMMON_GROWTH * np.sqrt(len(scores))]
-        _score(words, self.heads, self.counts, self.entries, alive, scores)
+        _score(words, self.starts, self.counts, self.entries, alive, scores)
         # A place with many words shares some with every image.
         scores /= np.sqrt(np.maximum(np.array(self.sizes), 1))
         order: I64 = np.argsort(-scores, kind="stable")
@@ -223,27 +226,43 @@ class PlaceIndex:
 
 
 @kernel
-def _enter(words: I32, slot: int, heads: I32, entries: I32, used: int) -> None:
+def _room_for(words: I32, counts: I32) -> int:
+    """How many entries are taken when each of the words gets one more."""
+    room = 0
     for word in words:
-        entries[used, 0], entries[used, 1] = slot, heads[word]
-        heads[word] = used
-        used += 1
+        count = int(counts[word])
+        if count & (count - 1) == 0:
+            room += max(2 * count, 1)
+    return room
+
+
+@kernel
+def _enter(words: I32, slot: int, starts: I32, counts: I32, entries: I32, used: int) -> int:
+    """Add a slot to words, each once.  Returns how many entries are taken."""
+    for word in words:
+        count = int(counts[word])
+        if count & (count - 1) == 0:  # full
+            for k in range(count):
+                entries[used + k] = entries[starts[word] + k]
+            starts[word] = used
+            used += max(2 * count, 1)
+        entries[starts[word] + count] = slot
+        counts[word] = count + 1
+    return used
 
 
 @kernel
 def _score(
-    words: I32, heads: I32, counts: I32, entries: I32, alive: BoolArray, scores: F64
+    words: I32, starts: I32, counts: I32, entries: I32, alive: BoolArray, scores: F64
 ) -> None:
     """Add the squared log of how rare each word is to the places that have it."""
     for word in words:
-        entry = heads[word]
-        if entry < 0:
+        if counts[word] == 0:
             continue
         rarity = np.log((1.0 + scores.size) / counts[word])
-        while entry >= 0:
-            if alive[entries[entry, 0]]:
-                scores[entries[entry, 0]] += rarity * rarity
-            entry = entries[entry, 1]
+        for k in range(starts[word], starts[word] + counts[word]):
+            if alive[entries[k]]:
+                scores[entries[k]] += rarity * rarity
 
 
 def repeated_share(

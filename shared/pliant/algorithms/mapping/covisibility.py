@@ -6,7 +6,7 @@ work for a frame does not grow with the length of the run.
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, I64, U8
+from pliant.algorithms.arrays import F64, I32, I64, U8, BoolArray
 from pliant.algorithms.mapping.map_store import (
     CANDIDATE,
     MAPPED,
@@ -70,6 +70,17 @@ def rows_of(keyframes: list[Keyframe], rows: I32, capacity: int) -> I32:
     for keyframe in keyframes:
         marked[keyframe.rows] = True
     return np.flatnonzero(marked).astype(np.int32)
+
+
+@kernel
+def marks_fewer(marked: BoolArray, rows: I32, least: int) -> bool:
+    """Whether fewer than ``least`` of the rows are marked (capacity,)."""
+    count = 0
+    for i in range(rows.size):
+        count += int(marked[rows[i]])
+        if count >= least:
+            return False
+    return count < least
 
 
 @kernel

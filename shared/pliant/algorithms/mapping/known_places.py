@@ -24,6 +24,7 @@ from pliant.algorithms.geometry import matrix_to_similarity, move_by_similarity,
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.covisibility import marks_fewer
 from pliant.algorithms.mapping.kept_map import features_for
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
@@ -143,8 +144,7 @@ class Revisits:
                 (
                     old
                     for old in islice(places, _LOOKED_AT)
-                    if old.keyframe.id not in window
-                    and np.count_nonzero(mine[old.keyframe.rows]) < least
+                    if old.keyframe.id not in window and marks_fewer(mine, old.keyframe.rows, least)
                 ),
                 tries,
             )
@@ -370,6 +370,6 @@ def _showing_else(
     for place in places:
         shown[place.keyframe.rows] = True
     for place in ranked:
-        if np.count_nonzero(shown[place.keyframe.rows]) < least:
+        if marks_fewer(shown, place.keyframe.rows, least):
             shown[place.keyframe.rows] = True
             yield place
