@@ -19,6 +19,7 @@ from pliant.algorithms.mapping.directions import (
     placed_candidates,
     refine_pose_spread,
 )
+from pliant.algorithms.mapping.frame_pose import localise
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -300,3 +301,25 @@ def test_a_map_without_points_has_none_at_infinity():
     assert at_infinity(far[:3], np.zeros(3)).tolist() == [False, False, True]
     assert at_infinity(far, np.zeros(3)).tolist()[:2] == [False, False]
     assert at_infinity(np.zeros((0, 3)), np.zeros(3)).tolist() == []
+
+
+def test_candidates_that_helped_one_frame_are_not_missed_in_the_next():
+    """Else every frame whose points suffice again would be looked up in all places."""
+    frames = list(Scene.box().frames(sideways(31)))
+    mapper = Mapper(CAMERA, MappingParameters(), 0)
+    for frame, tracks in enumerate(frames[:30]):
+        mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+    active, calibration, last = mapper.atlas.active, mapper.calibration, mapper._motion
+    assert active is not None
+    active.links.follow(frames[30].ids, active.points)
+    seen = calibration.ideal(frames[30])
+
+    def is_firm(**tracked):
+        motion, generator = replace(last, **tracked), np.random.default_rng(0)
+        located = localise(active, calibration, motion, 30 * INTERVAL_NS, seen, None, generator)
+        assert located is not None
+        return located.is_firm
+
+    assert last.to_points > 300
+    assert is_firm(tracked=10 * last.to_points)
+    assert not is_firm(to_points=10 * last.to_points)

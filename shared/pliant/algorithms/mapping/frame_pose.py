@@ -135,8 +135,11 @@ def localise(
         inliers = int(located.inliers.sum())
         of_points = int(located.inliers[: len(linked) - len(directions)].sum())
         if of_points + _OF_DIRECTION * (inliers - of_points) >= limits.min_inliers:
-            if image is None or inliers >= _FEW * motion.tracked:
-                return Located(located.T_world_camera, inliers >= _FIRM * motion.tracked)
+            # What helps in one frame and not in the next has not been lost in between.
+            helped = len(directions) and active.candidates_agree
+            before = motion.tracked if helped else motion.to_points
+            if image is None or inliers >= _FEW * before:
+                return Located(located.T_world_camera, inliers >= _FIRM * before)
             proved = prove(
                 located.T_world_camera, active.nearby(), points, seen.maxima, image.whole,
                 active.camera, parameters, parameters.recovery.min_agreement,
@@ -273,6 +276,14 @@ def support_at(
     telling[_contradicting(active, T_world_camera, tracks.points_px)] = True
     tracked = len(rows) - len(found.rows)
     return support_of(points_px, inliers, tracked, tracks.points_px[telling], active.camera)
+
+
+def tracks_to_points(active: ActiveMap, T_world_camera: F64, tracks: FrameTracks) -> int:
+    """How many tracks lead on to points of the map that are where the pose has them."""
+    linked = active.linked(MAPPED)
+    xyz = active.points.xyz[active.links.rows[linked]]
+    errors = reprojection_errors(T_world_camera, xyz, tracks.points_px[linked], active.camera)
+    return int(np.count_nonzero(errors < active.parameters.localisation.inlier_px))
 
 
 def _settled(active: ActiveMap, motion: Motion, tracks: FrameTracks) -> BoolArray:

@@ -137,7 +137,8 @@ class Proved(NamedTuple):
 class Motion:
     """How the camera moved last: T_world_camera (4, 4) of two frames, the newer one last.
 
-    tracked: points that support the newer one and have tracks, as far as that is known.
+    tracked: points and helping candidates that support the newer one and have tracks, as far as
+    that is known.   to_points: tracks that lead from it to points of the map alone.
     unmapped_s: from the last frame that was mapped to the newer one.
     """
 
@@ -145,6 +146,7 @@ class Motion:
     stamps_ns: tuple[int, int]
     poses: tuple[F64, F64]
     tracked: int = 0
+    to_points: int = 0
     unmapped_s: float = 0.0
 
     @staticmethod
@@ -153,21 +155,29 @@ class Motion:
         twice = (T_world_camera, T_world_camera)
         return Motion(frames=(frame, frame), stamps_ns=(stamp_ns, stamp_ns), poses=twice)
 
-    def then(self, frame: int, stamp_ns: int, T_world_camera: F64, tracked: int = 0) -> "Motion":
+    def then(
+        self,
+        frame: int,
+        stamp_ns: int,
+        T_world_camera: F64,
+        tracked: int = 0,
+        to_points: int = 0,
+    ) -> "Motion":
         """The motion after one more pose."""
         return Motion(
             frames=(self.frames[1], frame),
             stamps_ns=(self.stamps_ns[1], stamp_ns),
             poses=(self.poses[1], T_world_camera),
             tracked=tracked,
+            to_points=to_points,
         )
 
     def then_unmapped(
-        self, frame: int, stamp_ns: int, T_world_camera: F64, tracked: int
+        self, frame: int, stamp_ns: int, T_world_camera: F64, tracked: int, to_points: int
     ) -> "Motion":
         """The motion after one more pose, of a frame that is not mapped."""
-        unmapped_s = self.unmapped_s + self.lost_s(stamp_ns)
-        return replace(self.then(frame, stamp_ns, T_world_camera, tracked), unmapped_s=unmapped_s)
+        after = self.then(frame, stamp_ns, T_world_camera, tracked, to_points)
+        return replace(after, unmapped_s=self.unmapped_s + self.lost_s(stamp_ns))
 
     def moved(self, S: F64) -> "Motion":
         """The motion after the world has moved by a similarity (4, 4)."""

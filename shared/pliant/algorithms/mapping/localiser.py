@@ -100,7 +100,9 @@ class Localiser:
             self._motion = Motion.at(frame, stamp_ns, located)
             self._changes.add_same_places([(self._hanging.id, -1)])
         else:
-            self._motion = self._motion.then(frame, stamp_ns, located, support.tracked)
+            self._motion = self._motion.then(
+                frame, stamp_ns, located, support.tracked, support.tracked
+            )
         self._changes.add_pose(frame, self._hanging, located, support.inliers)
         why = doubt(support, self._parameters.support)
         return self._publish(TRACKING, why, support.inliers, looks_anew=looks_anew)
@@ -118,7 +120,9 @@ class Localiser:
         if found is None or hanging is None or motion is None:
             return self.skip(frame, otherwise)
         T_world_camera, _, support = found
-        self._motion = motion.then_unmapped(frame, stamp_ns, T_world_camera, support.tracked)
+        self._motion = motion.then_unmapped(
+            frame, stamp_ns, T_world_camera, support.tracked, support.tracked
+        )
         self._changes.add_pose(frame, hanging, T_world_camera, support.inliers)
         return self._publish(TRACKING, doubt(support, self._parameters.support), support.inliers)
 

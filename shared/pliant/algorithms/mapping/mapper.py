@@ -29,6 +29,7 @@ from pliant.algorithms.mapping.frame_pose import (
     localise,
     reacquire_points,
     stand,
+    tracks_to_points,
 )
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.keyframes import keyframe_is_due
@@ -202,7 +203,10 @@ class Mapper:
             self._correct(active.segment, surplus, self.calibration)
         self._place_waiting(active, hanging, T_world_camera)
         self._lost_frames, self._waiting, self._images = 0, Waiting(), (None, None)
-        self._motion = self._motion.then(frame, stamp_ns, T_world_camera, support.tracked)
+        to_points = tracks_to_points(active, T_world_camera, tracks)
+        self._motion = self._motion.then(
+            frame, stamp_ns, T_world_camera, support.tracked, to_points
+        )
         self._add_pose(frame, hanging, T_world_camera, support.inliers)
         if hanging.frame == frame:
             atlas.ask(frame)
@@ -255,8 +259,9 @@ class Mapper:
         active.pass_by(frame, found.T_world_camera, found.tracks.points_px, Observations.none())
         self._place_waiting(active, hanging, found.T_world_camera)
         self._waiting = Waiting()
+        to_points = tracks_to_points(active, found.T_world_camera, found.tracks)
         self._motion = self._motion.then_unmapped(
-            frame, stamp_ns, found.T_world_camera, found.support.tracked
+            frame, stamp_ns, found.T_world_camera, found.support.tracked, to_points
         )
         self._add_pose(frame, hanging, found.T_world_camera, found.support.inliers)
         why = doubt(found.support, self._parameters.support)
@@ -361,6 +366,7 @@ class Mapper:
             stamps_ns=(stamps_ns[before.frame], stamps_ns[newest.frame]),
             poses=(before.T_world_camera, newest.T_world_camera),
             tracked=newest.inliers,
+            to_points=newest.inliers,
         )
         self.follow(self.atlas.begin_to_unroll())
         self._keyframe_ns = waiting.frames[-1].stamp_ns
