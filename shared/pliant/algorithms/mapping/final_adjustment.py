@@ -22,6 +22,7 @@ from pliant.algorithms.mapping.changing_focal import (
     with_principal_point,
 )
 from pliant.algorithms.mapping.directions import at_infinity
+from pliant.algorithms.mapping.focal_search import best_along_focal
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -239,6 +240,8 @@ def adjust_listed(
     uncertainty = known.prior(parameters.calibration, start) if uncertain else None
     kept = chosen[seen.point] & _spread_out(seen.point, counts, MOST_SEEN)
     problem = _problem(seen, chosen, kept, known.given)
+    if uncertainty is not None and known.is_guess:
+        problem, start = best_along_focal(problem, bundle, uncertainty, start)
     solve = partial(
         solve_schur, problem, bundle, uncertainty=uncertainty, start=start, with_covariance=True,
         doubled=True,
