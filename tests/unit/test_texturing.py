@@ -35,7 +35,7 @@ def shown(points: F32, triangles: I32) -> Any:
     colours = TexelColours(texels, points, triangles)
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     image = np.stack([u, v, np.full_like(u, 200)], axis=2).astype(np.uint8)
-    colours.add(image, CAMERA, np.eye(4))
+    colours.add(image, colours.depths(CAMERA, np.eye(4)), CAMERA, np.eye(4))
     return texels, colours.texture(np.full((len(texels.triangles), 3), GREY, np.uint8))
 
 
@@ -59,7 +59,8 @@ def test_what_hides_a_texel_gives_it_no_colour() -> None:
     turned = TRIANGLES[:, ::-1].copy()
     texels = find_texels(UVS[turned], SIZE)
     colours = TexelColours(texels, CORNERS, turned)
-    colours.add(np.full((160, 200, 3), 9, np.uint8), CAMERA, np.eye(4))
+    depths = colours.depths(CAMERA, np.eye(4))
+    colours.add(np.full((160, 200, 3), 9, np.uint8), depths, CAMERA, np.eye(4))
     assert (colours.texture(np.full((SIZE**2, 3), GREY, np.uint8)) == GREY).all()
 
 
@@ -68,10 +69,41 @@ def test_what_a_mask_covers_gives_a_texel_no_colour() -> None:
     colours = TexelColours(texels, CORNERS, TRIANGLES)
     used = np.ones((CAMERA.height, CAMERA.width), np.bool_)
     used[:, : CAMERA.width // 2] = False
-    colours.add(np.full((160, 200, 3), 9, np.uint8), CAMERA, np.eye(4), used)
+    depths = colours.depths(CAMERA, np.eye(4), used)
+    colours.add(np.full((160, 200, 3), 9, np.uint8), depths, CAMERA, np.eye(4))
     texture = colours.texture(np.full((SIZE**2, 3), GREY, np.uint8))
     assert (texture[:, : SIZE // 2 - 2] == GREY).all()
     assert (texture[2:-2, SIZE // 2 + 2 : -2] == 9).all()
+
+
+def colours_of(*views: tuple[int, float, float]) -> Any:
+    """The texture of the square by views from its front, each of one grey, a gain, a sharpness."""
+    texels = find_texels(UVS[TRIANGLES], SIZE)
+    colours = TexelColours(texels, CORNERS, TRIANGLES)
+    depths = colours.depths(CAMERA, np.eye(4))
+    for grey, gain, sharpness in views:
+        image = np.full((CAMERA.height, CAMERA.width, 3), grey, np.uint8)
+        gains = np.full(3, gain)
+        colours.add(image, depths, CAMERA, np.eye(4), gain=gains, sharpness=sharpness)
+    return colours.texture(np.full((len(texels.triangles), 3), GREY, np.uint8))
+
+
+def test_gains_divide_colours_and_the_sharpest_view_counts_most() -> None:
+    assert (colours_of((80, 0.8, 1.0), (120, 1.2, 1.0)) == 100).all()
+    assert (colours_of((60, 1.0, 1.0), (120, 1.0, 1.0)) == 90).all()
+    assert (colours_of((60, 1.0, 0.2), (120, 1.0, 0.6)) >= 119).all()
+
+
+def test_what_a_gain_would_saturate_darkens_the_texture() -> None:
+    assert (colours_of((200, 0.5, 1.0)) == 255).all()
+    texels = find_texels(UVS[TRIANGLES], SIZE)
+    colours = TexelColours(texels, CORNERS, TRIANGLES)
+    image = np.full((CAMERA.height, CAMERA.width, 3), 90, np.uint8)
+    image[:, CAMERA.width // 2 :] = 200
+    colours.add(image, colours.depths(CAMERA, np.eye(4)), CAMERA, np.eye(4), gain=np.full(3, 0.5))
+    texture = colours.texture(np.full((len(texels.triangles), 3), GREY, np.uint8))
+    assert (texture[:, : SIZE // 2 - 2] == 115).all()  # not 180: of 400 comes 255
+    assert (texture[:, SIZE // 2 + 2 :] == 255).all()
 
 
 def test_texels_off_the_mesh_have_the_colour_of_the_nearest_on_it() -> None:

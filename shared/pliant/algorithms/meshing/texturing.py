@@ -24,6 +24,8 @@ _DEPTH_TOLERANCE = 0.03
 """Share of its depth by which what a view sees may lie before or behind a texel."""
 _BORDER = 0.1
 """Share of the image at its border in which a view counts for less, so that no seam shows."""
+_SATURATED = 0.01
+"""Share of the texels that exposure may have saturate."""
 
 
 @dataclass(frozen=True)
@@ -159,9 +161,10 @@ def find_texels(uvs: F32, size: int) -> Texels:
 
 
 class TexelColours:
-    """The weighted mean of what views show of each texel: the nearest and straightest count most.
+    """The weighted mean of what views show of each texel: sharp, near and straight ones count most.
 
     points, triangles: (V, 3), (F, 3) of the mesh, which may hide itself.
+    positions, normals: (N, 3) of the texels.
     """
 
     def __init__(self, texels: Texels, points: F32, triangles: I32) -> None:
@@ -169,40 +172,51 @@ class TexelColours:
         turned = _turned(corners)
         length = np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
         self._texels = texels
-        self._positions = texels.interpolate(corners)
-        self._normals = (turned / length).astype(np.float32)[texels.triangles]
+        self.positions = texels.interpolate(corners)
+        self.normals = (turned / length).astype(np.float32)[texels.triangles]
         self._points = points
         self._triangles = triangles
         self._sums = np.zeros((len(texels.triangles), 4))
 
-    def add(
-        self,
-        image: U8,
-        camera: PinholeCamera,
-        T_world_camera: F64,
-        used: BoolArray | None = None,
-    ) -> None:
-        """A view.  image: (H, W, 3).  used: (H, W) which of it shows the mesh; None: all."""
+    def depths(
+        self, camera: PinholeCamera, T_world_camera: F64, used: BoolArray | None = None
+    ) -> F32:
+        """(H, W) of the mesh in a view, 0 for none.  used: (H, W) which of it shows the mesh."""
         depths = view_mesh(self._points, self._triangles, camera, T_world_camera).depths
-        if used is not None:
-            depths = np.where(used, depths, np.float32(0.0))
+        return depths if used is None else np.where(used, depths, np.float32(0.0))
+
+    def add(
+        self, image: U8, depths: F32, camera: PinholeCamera, T_world_camera: F64, *,
+        gain: F64 | None = None, sharpness: float = 1.0,
+    ) -> None:  # fmt: skip
+        """A view.  image: (H, W, 3).  depths: as ``depths`` gives them.
+
+        gain: (3,) exposure, by which the colours are divided; None: 1.    sharpness: of the image,
+        in any unit that all views have.
+        """
         _add_view(
-            self._positions, self._normals, np.ascontiguousarray(image), depths,
+            self.positions, self.normals, np.ascontiguousarray(image), depths,
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]), inverse(T_world_camera),
-            T_world_camera[:3, 3].copy(), self._sums,
+            T_world_camera[:3, 3].copy(), 1.0 / (np.ones(3) if gain is None else gain), sharpness,
+            self._sums,
         )  # fmt: skip
 
     def texture(self, otherwise: U8) -> U8:
         """(S, S, 3) texture; texels off the mesh have the colour of the nearest one on it.
 
-        otherwise: (N, 3) colours of texels that no view shows.
+        otherwise: (N, 3) colours of texels that no view shows.  All is darkened where gains would
+        have more than 1 % of the seen texels saturate.
         """
         weights = self._sums[:, 3:]
         seen = weights > 0.0
         mean = np.divide(self._sums[:, :3], weights, out=np.zeros((len(seen), 3)), where=seen)
         inside = self._texels.inside
         texture = np.zeros((*inside.shape, 3), np.uint8)
-        texture[inside] = np.where(seen, np.rint(mean), otherwise).astype(np.uint8)
+        colours = np.where(seen, mean, otherwise)
+        if seen.any():
+            bright = float(np.quantile(mean[seen[:, 0]].max(axis=1), 1.0 - _SATURATED))
+            colours *= min(1.0, 255.0 / max(bright, 1.0))
+        texture[inside] = np.rint(np.minimum(colours, 255.0)).astype(np.uint8)
         if not inside.any():
             return texture
         _, found = cv2.distanceTransformWithLabels(
@@ -245,8 +259,9 @@ def _next(corners: I64) -> I64:
 
 @kernel
 def _add_view(
-    positions: F32, normals: F32, image: U8, depths: F32, K: F64, T: F64, centre: F64, sums: F64
-) -> None:
+    positions: F32, normals: F32, image: U8, depths: F32, K: F64, T: F64, centre: F64,
+    factors: F64, sharpness: float, sums: F64,
+) -> None:  # fmt: skip
     height, width = depths.shape
     for n in range(len(positions)):
         x, y, z = positions[n, 0], positions[n, 1], positions[n, 2]
@@ -263,13 +278,13 @@ def _add_view(
         if cosine < _MIN_COSINE or not _is_seen(depths, u, v, c):
             continue
         share = min(u / width, v / height, 1.0 - u / width, 1.0 - v / height) / _BORDER
-        weight = (cosine / distance) ** 4 * min(share, 1.0)
+        weight = (sharpness * cosine / distance) ** 4 * min(share, 1.0)
         column, row = int(u), int(v)
         p, q = u - column, v - row
         for k in range(3):
             upper = (1.0 - p) * image[row, column, k] + p * image[row, column + 1, k]
             lower = (1.0 - p) * image[row + 1, column, k] + p * image[row + 1, column + 1, k]
-            sums[n, k] += weight * ((1.0 - q) * upper + q * lower)
+            sums[n, k] += weight * factors[k] * ((1.0 - q) * upper + q * lower)
         sums[n, 3] += weight
 
 
