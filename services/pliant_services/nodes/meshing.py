@@ -18,6 +18,7 @@ from pliant.algorithms.meshing.parameters import SurfaceParameters, TsdfParamete
 from pliant.algorithms.meshing.tsdf_volume import TsdfVolume
 from pliant.bus.base import Bus, join, receive, receive_one
 from pliant.config import Config
+from pliant.fusion.dense_depth import DenseDepths
 from pliant.fusion.keyframe_spool import KeyframeSpool
 from pliant.fusion.mesher import LiveChange, Mesher
 from pliant.messages import topics
@@ -94,3 +95,18 @@ def warm_up() -> None:
     volume.extract_all()
     keys = volume.remove(done.serial, found.depths, found.weights, colour, camera, pose)
     volume.extract(volume.affected(keys))
+    _warm_up_stereo(camera, points)
+
+
+def _warm_up_stereo(camera: PinholeCamera, points: SeenPoints) -> None:
+    """Sweep two keyframes side by side, and ask each for the other's depth."""
+    grey = np.full((camera.height, camera.width), 128, np.uint8)
+    with KeyframeSpool() as spool:
+        dense = DenseDepths(camera, SurfaceParameters().noise_px, spool)
+        for keyframe in range(2):
+            pose = np.eye(4)
+            pose[0, 3] = 0.2 * keyframe
+            dense.take(keyframe, pose, points.points_world, grey, grey > 0)
+        for keyframe in range(2):
+            dense.sweep(keyframe, points)
+        dense.with_sure_pixels(0, points)

@@ -5,11 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, I64
+from pliant.algorithms.arrays import F32, I64, U8
 from pliant.algorithms.meshing.rendering import DrawnTriangles
+from pliant.algorithms.stereo.views import DenseDepth
 
 _ID_BYTES = np.dtype(np.int64).itemsize
 _PIXEL_BYTES = 2 * np.dtype(np.float32).itemsize
+_LARGEST = 6e4
+"""In half precision."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,8 @@ class KeyframeSpool:
         self._masks: dict[int, _Place] = {}
         self._observations: dict[int, _Place] = {}
         self._surfaces: dict[int, _Place] = {}
+        self._greys: dict[int, _Place] = {}
+        self._depths: dict[int, _Place] = {}
 
     def __enter__(self) -> "KeyframeSpool":
         return self
@@ -60,6 +65,20 @@ class KeyframeSpool:
         corners = np.concatenate(columns, axis=1)
         count = np.int64(len(corners)).tobytes()
         self._put(self._surfaces, keyframe, count + corners.tobytes() + drawn.triangles.tobytes())
+
+    def put_grey(self, keyframe: int, grey: U8) -> None:
+        """Keep the image of a keyframe as its depth is swept: (H, W)."""
+        self._put(self._greys, keyframe, grey.tobytes())
+
+    def put_depth(self, keyframe: int, depth: DenseDepth) -> None:
+        """Keep the dense depth of a keyframe, inverse depths in float16, confidences in 1/255."""
+        w = depth.inverse_depths
+        # Whatever the scale of the map: half precision is coarse near 0 and ends at 65504.
+        unit = float(np.median(w[w > 0.0])) if (w > 0.0).any() else 1.0
+        shape = np.array(w.shape, np.int64).tobytes() + np.float64(unit).tobytes()
+        shares = np.minimum(w / np.float32(unit), np.float32(_LARGEST)).astype(np.float16)
+        levels = np.rint(255.0 * depth.confidences).astype(np.uint8)
+        self._put(self._depths, keyframe, shape + shares.tobytes() + levels.tobytes())
 
     def keyframes(self) -> list[int]:
         """Ids of the keyframes whose observations are here, ascending."""
@@ -94,6 +113,22 @@ class KeyframeSpool:
             points_px=corners[:, :2].copy(),
             inverse_depths=corners[:, 2].copy(),
             sigmas=corners[:, 3].copy(),
+        )
+
+    def grey(self, keyframe: int) -> U8:
+        """The image of a keyframe as its depth is swept, its rows behind each other: (H W,)."""
+        return np.frombuffer(self._read(self._greys[keyframe]), np.uint8)
+
+    def depth(self, keyframe: int) -> DenseDepth:
+        """The dense depth of a keyframe.  KeyError where that was not told."""
+        raw = self._read(self._depths[keyframe])
+        height, width = np.frombuffer(raw, np.int64, 2).tolist()
+        unit = np.frombuffer(raw, np.float64, 1, 16)[0]
+        shares = np.frombuffer(raw, np.float16, height * width, 24).reshape(height, width)
+        levels = np.frombuffer(raw, np.uint8, offset=24 + shares.nbytes).reshape(height, width)
+        return DenseDepth(
+            inverse_depths=shares.astype(np.float32) * np.float32(unit),
+            confidences=levels.astype(np.float32) / np.float32(255.0),
         )
 
     def _put(self, places: dict[int, _Place], keyframe: int, data: bytes) -> None:

@@ -9,16 +9,13 @@ observations and surfaces of all keyframes wait on disk.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 
-import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import CorrectedView, corrected_view, parts_of
+from pliant.algorithms.corrected_view import corrected_view, parts_of
 from pliant.algorithms.geometry import pose_to_matrix
-from pliant.algorithms.image.masks import unpacked
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
 from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, TriangleMesh
@@ -26,7 +23,9 @@ from pliant.algorithms.meshing.parameters import MeshingParameters
 from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.meshing.tsdf_volume import VolumeFullError
 from pliant.algorithms.stages import StageTimer, no_stages
+from pliant.fusion.dense_depth import DenseDepths
 from pliant.fusion.final_volume import FinalVolume
+from pliant.fusion.keyframe_images import colour_of, grey_of, unmasked, view_of
 from pliant.fusion.keyframe_spool import KeyframeSpool
 from pliant.fusion.live_mesh import LiveMesh, Sight
 from pliant.fusion.memory import too_fine
@@ -59,11 +58,6 @@ class FinalMesh:
     voxel_size: float
     keyframes: int
     mesh: TriangleMesh
-
-
-@lru_cache(maxsize=4)
-def _view(camera: PinholeCamera, correction: tuple[float, ...]) -> CorrectedView:
-    return CorrectedView(camera, correction)
 
 
 class Mesher:
@@ -278,11 +272,13 @@ class Mesher:
             level: FinalVolume(share * unit, self._camera, tsdf)
             for level, share in (("fine", tsdf.fine_voxel), ("coarse", tsdf.coarse_voxel))
         }
+        dense = self._dense(keyframes, timer)
         fused, problem = 0, ""
         for keyframe in keyframes:
             correction, pose = self._correction(keyframe), self._pose(keyframe)
             colour = self._colour(keyframe, correction)
-            surface = self._surfaces.surface(pose, self._seen(keyframe), timer)
+            seen = dense.with_sure_pixels(keyframe, self._seen(keyframe), timer)
+            surface = self._surfaces.surface(pose, seen, timer)
             if surface.depth_map is None or colour is None:
                 problem = f"keyframe {keyframe}: {surface.problem or _NO_IMAGE}"
                 continue
@@ -304,6 +300,25 @@ class Mesher:
                 mesh = volume.volume.extract_all()
             yield FinalMesh(segment, level, volume.volume.scale.voxel, fused, mesh)
 
+    def _dense(self, keyframes: list[int], timer: StageTimer) -> DenseDepths:
+        """The dense depths of the keyframes of a segment; none with the points alone."""
+        dense = DenseDepths(self._camera, self._parameters.surface.noise_px, self._spool)
+        if self._parameters.depth == "points":
+            return dense
+        for keyframe in keyframes:
+            with timer("dense images"):
+                view = view_of(self._camera, self._correction(keyframe))
+                colour = colour_of(self._spool.image(keyframe), view)
+                if colour is None:
+                    continue
+                used = unmasked(self._spool.mask(keyframe), view)
+                shown = view.shows if used is None else view.shows & used
+                points = self._seen(keyframe).points_world
+                dense.take(keyframe, self._pose(keyframe), points, grey_of(colour), shown)
+        for keyframe in keyframes:
+            dense.sweep(keyframe, self._seen(keyframe), timer)
+        return dense
+
     def _median_depth(self, keyframes: list[int]) -> float:
         """Of the points that the keyframes see, the median of their medians."""
         medians: list[float] = []
@@ -320,11 +335,8 @@ class Mesher:
         self, keyframe: int, depth_map: DepthMap, correction: tuple[float, ...]
     ) -> DepthMap:
         """Without what the mask of a keyframe covers."""
-        mask = self._spool.mask(keyframe)
-        if not mask:
-            return depth_map
-        shown = np.uint8(255) * unpacked(mask).astype(np.uint8)
-        return depth_map.within(_view(self._camera, correction).image(shown) == 255)
+        used = unmasked(self._spool.mask(keyframe), view_of(self._camera, correction))
+        return depth_map if used is None else depth_map.within(used)
 
     def _correction(self, keyframe: int) -> tuple[float, ...]:
         """What is left of that with which the segment of a keyframe was made."""
@@ -340,7 +352,7 @@ class Mesher:
         rows, points = self._map.points_of(ids)
         return SeenPoints(
             ids=points.ids,
-            points_px=_view(self._camera, self._correction(keyframe)).pixels(pixels[rows]),
+            points_px=view_of(self._camera, self._correction(keyframe)).pixels(pixels[rows]),
             points_world=points.positions,
             sigmas=np.asarray(points.sigmas, np.float32),
             keyframes=np.asarray(points.keyframes, np.int32),
@@ -348,13 +360,7 @@ class Mesher:
 
     def _colour(self, keyframe: int, correction: tuple[float, ...]) -> U8 | None:
         """(H, W, 3) RGB of a keyframe; None where its image is missing or broken."""
-        jpeg = self._spool.image(keyframe)
-        if not jpeg:
-            return None
-        pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
-        if pixels is None:
-            return None
-        return _view(self._camera, correction).image(np.asarray(pixels, np.uint8))
+        return colour_of(self._spool.image(keyframe), view_of(self._camera, correction))
 
     def _pass_over(self, keyframe: int, why: str) -> None:
         self.counts["without_surface"] += 1

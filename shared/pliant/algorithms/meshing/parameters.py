@@ -143,5 +143,10 @@ class MeshingParameters(Parameters):
         description="When a keyframe in the live mesh is put in again: as it leaves the window, "
         "or also where the whole map has moved it by a voxel since (the former is to compare).",
     )
+    depth: Literal["dense", "points"] = Field(
+        default="dense",
+        description="What the final mesh is made from: every pixel whose depth the images tell, "
+        "or the map's points alone, as the live mesh is.",
+    )
     surface: SurfaceParameters = SurfaceParameters()
     tsdf: TsdfParameters = TsdfParameters()

@@ -1,0 +1,62 @@
+"""Pixels whose depth is sure, as further points of a keyframe beside those of the map."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from pliant.algorithms.arrays import F64, Shape
+from pliant.algorithms.stereo.sweep import poses_of
+from pliant.algorithms.stereo.views import DenseDepth, StereoView, motion, parallax_px
+
+_STRIDE = 2
+"""Every so many rows and columns."""
+_MIN_SUPPORT = 5.0
+_CLEAR_PX = 2
+"""Pixels from a point of the map within which there is no other."""
+_MATCHING_PX = 0.5
+"""Standard deviation of a match, pixels of the swept view."""
+
+
+@dataclass(frozen=True)
+class SurePixels:
+    """points_px: in pixels of the swept view.    inverse_depths: along z."""
+
+    points_px: Annotated[F64, Shape("N", 2)]
+    inverse_depths: Annotated[F64, Shape("N")]
+
+
+def sure_pixels(depth: DenseDepth, points_px: F64) -> SurePixels:
+    """Pixels with much support away from the map's own points.
+
+    depth: as of ``consensus``.    points_px: (N, 2) the map's, in pixels of the view.
+    """
+    height, width = depth.confidences.shape
+    free = np.zeros((height, width), np.bool_)
+    free[::_STRIDE, ::_STRIDE] = True
+    at = np.rint(points_px[np.isfinite(points_px).all(axis=1)]).astype(np.int64)
+    for dv in range(-_CLEAR_PX, _CLEAR_PX + 1):
+        for du in range(-_CLEAR_PX, _CLEAR_PX + 1):
+            u, v = at[:, 0] + du, at[:, 1] + dv
+            inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+            free[v[inside], u[inside]] = False
+    sure = free & (depth.confidences > _MIN_SUPPORT)
+    v, u = np.nonzero(sure)
+    return SurePixels(
+        np.stack([u, v], axis=1).astype(np.float64),
+        depth.inverse_depths[sure].astype(np.float64),
+    )
+
+
+def matching_sigmas(pixels: SurePixels, view: StereoView, sources: Sequence[StereoView]) -> F64:
+    """(N,) standard deviations of inverse depths, as a share of them, times ``noise_px``.
+
+    Where a source sees the pixel move by p per unit of inverse depth, an error of e pixels in
+    matching is one of e / p in w: a share e / (p w).  Of the sources the median one counts.
+    """
+    moved = motion(view.camera, view.T_world_camera, poses_of(sources))
+    with np.errstate(all="ignore"):
+        slopes = parallax_px(moved, pixels.points_px, pixels.inverse_depths)
+        slope = np.median(np.nan_to_num(slopes), axis=0)
+        return _MATCHING_PX / (slope * pixels.inverse_depths)

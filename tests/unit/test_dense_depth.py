@@ -1,0 +1,126 @@
+"""Dense depth of keyframes in two passes: sure pixels beside the map's points, and on disk."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from stereo_scene import CAMERA, anchors, pose, true_depth_points, true_inverse, view
+
+from pliant.algorithms.arrays import BoolArray
+from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
+from pliant.algorithms.meshing.parameters import SurfaceParameters
+from pliant.algorithms.stereo.views import DenseDepth
+from pliant.fusion.dense_depth import DenseDepths
+from pliant.fusion.keyframe_spool import KeyframeSpool
+
+STEPS = tuple(range(-6, 12, 2))
+NOISE_PX = SurfaceParameters().noise_px
+
+
+def seen(step: int) -> SeenPoints:
+    """Points of the map, 100 of which this keyframe sees."""
+    found = anchors(step, count=100, noise=0.002)
+    rays = np.concatenate([CAMERA.normalise(found.points_px), np.ones((100, 1))], axis=1)
+    return SeenPoints(
+        ids=np.arange(100, dtype=np.int64) + 100 * (step + 10),
+        points_px=found.points_px.astype(np.float32),
+        points_world=transform(pose(step), rays / found.inverse_depths[:, None]),
+        sigmas=np.full(100, 0.002 / NOISE_PX, np.float32),
+        keyframes=np.full(100, 5, np.int32),
+    )
+
+
+def joined(hidden: BoolArray | None = None) -> dict[int, SeenPoints]:
+    """What each keyframe sees after both passes.  hidden: (H, W) what masks cover, in all."""
+    with KeyframeSpool() as spool:
+        dense = DenseDepths(CAMERA, NOISE_PX, spool)
+        for step in STEPS:
+            shown = np.ones((CAMERA.height, CAMERA.width), np.bool_)
+            shown = shown if hidden is None else ~hidden
+            dense.take(step, pose(step), true_depth_points(step), view(step).grey, shown)
+        for step in STEPS:
+            dense.sweep(step, seen(step))
+        return {step: dense.with_sure_pixels(step, seen(step)) for step in STEPS}
+
+
+@pytest.fixture(scope="module")
+def found() -> dict[int, SeenPoints]:
+    return joined()
+
+
+def test_sure_pixels_lie_on_the_surface_beside_the_points_of_the_map(
+    found: dict[int, SeenPoints],
+) -> None:
+    for step, points in found.items():
+        before = seen(step)
+        for field in dataclasses.fields(before):
+            np.testing.assert_array_equal(
+                getattr(points, field.name)[:100], getattr(before, field.name)
+            )
+        assert (np.diff(points.ids) > 0).all()
+        local = transform(inverse(pose(step)), points.points_world[100:])
+        np.testing.assert_allclose(CAMERA.project(local), points.points_px[100:], atol=1e-3)
+        u, v = np.rint(points.points_px[100:]).astype(int).T
+        error = np.abs(1.0 / local[:, 2] / true_inverse(step)[v, u] - 1.0)
+        if step == 2:  # in the middle of its neighbours
+            assert len(error) > 100
+            assert np.mean(error < 0.03) > 0.95
+            # A sigma is one: two thirds lie within it, but for what is no noise.
+            within = error < points.sigmas[100:] * NOISE_PX
+            assert np.mean(within) > 0.6
+    middle = [found[step].ids[100:] for step in (2, 4)]
+    assert not set(middle[0].tolist()) & set(middle[1].tolist())
+
+
+def test_with_sure_pixels_more_of_a_view_is_covered(found: dict[int, SeenPoints]) -> None:
+    covered = {}
+    for name, points in (("points", seen(2)), ("dense", found[2])):
+        surface = KeyframeSurfaces(CAMERA, SurfaceParameters()).surface(pose(2), points)
+        assert surface.depth_map is not None
+        depths = surface.depth_map.depths
+        right = np.abs(depths * true_inverse(2) - 1.0) < 0.02
+        covered[name] = float(np.mean(right & (depths > 0.0)))
+    assert covered["dense"] > covered["points"] + 0.02
+
+
+def test_the_same_bytes_again(found: dict[int, SeenPoints]) -> None:
+    for step, points in joined().items():
+        assert points.points_world.tobytes() == found[step].points_world.tobytes()
+        assert points.sigmas.tobytes() == found[step].sigmas.tobytes()
+
+
+def test_what_masks_cover_is_no_sure_pixel() -> None:
+    hidden = np.zeros((CAMERA.height, CAMERA.width), np.bool_)
+    hidden[:, 60:] = True
+    for points in joined(hidden).values():
+        assert not (points.points_px[100:, 0] >= 60).any()
+
+
+def test_a_keyframe_alone_or_with_a_broken_pose_keeps_its_points() -> None:
+    nowhere = pose(0)
+    nowhere[0, 3] = np.nan
+    shown = np.ones((CAMERA.height, CAMERA.width), np.bool_)
+    with KeyframeSpool() as spool:
+        dense = DenseDepths(CAMERA, NOISE_PX, spool)
+        dense.take(0, pose(0), true_depth_points(0), view(0).grey, shown)
+        dense.take(1, nowhere, true_depth_points(1), view(1).grey, shown)
+        dense.take(2, pose(2), np.full((5, 3), np.nan), view(2).grey, shown)
+        for keyframe in (0, 1, 2, 7):
+            dense.sweep(keyframe, seen(0))
+            assert len(dense.with_sure_pixels(keyframe, seen(0)).ids) == 100
+
+
+def test_depths_on_disk_have_half_precision_whatever_the_scale_of_the_map() -> None:
+    generator = np.random.default_rng(0)
+    with KeyframeSpool() as spool:
+        for keyframe, unit in enumerate((1e-6, 1.0, 1e6)):
+            w = np.float32(unit) * generator.uniform(0.05, 5.0, (6, 8)).astype(np.float32)
+            w[0, 0] = 0.0
+            depth = DenseDepth(w, generator.uniform(0.0, 1.0, (6, 8)).astype(np.float32))
+            spool.put_depth(keyframe, depth)
+            again = spool.depth(keyframe)
+            np.testing.assert_allclose(again.inverse_depths, w, rtol=6e-4)
+            np.testing.assert_allclose(again.confidences, depth.confidences, atol=0.5 / 255 + 1e-6)
+        spool.put_depth(9, DenseDepth(np.zeros((6, 8), np.float32), np.zeros((6, 8), np.float32)))
+        assert not spool.depth(9).inverse_depths.any()
