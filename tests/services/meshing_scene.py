@@ -1,5 +1,7 @@
 """A wall and a box before it, as the meshing service is told of them, and what it made of them."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -113,9 +115,11 @@ class Notes(SilentMonitor):
         self.again.append(counters["again"])
 
 
-def run(given: Inputs, monitor: Notes | None = None) -> dict[Topic, list[Header]]:
+def run(
+    given: Inputs, monitor: Notes | None = None, settings: Sequence[str] = ()
+) -> dict[Topic, list[Header]]:
     bus = ReplayBus(given)
-    meshing.run(bus, load_config(), monitor or Notes())
+    meshing.run(bus, load_config(None, settings), monitor or Notes())
     return bus.outputs
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from meshing_scene import (
@@ -69,6 +70,57 @@ def test_the_same_bytes_again(outputs: dict[Topic, list[Header]]) -> None:
     for topic in (topics.MESH_BLOCKS, topics.MESH_FINAL):
         before = [codec.encode(message) for message in outputs[topic]]
         assert [codec.encode(message) for message in again[topic]] == before
+
+
+def with_texture(given: Inputs) -> Inputs:
+    """Each keyframe shows the same waves on the wall and on the box."""
+    columns = np.arange(160)
+    for frame, told in enumerate(given[topics.KEYFRAME]):
+        assert isinstance(told, Keyframe)
+        rays = (columns - CAMERA.cx) / CAMERA.fx
+        x = np.where(np.abs(3.0 * rays + pose(frame)[0, 3]) < 0.7, 3.0, 4.0) * rays
+        x = x + pose(frame)[0, 3]
+        waves = 60.0 * np.sin(25.0 * x) + 40.0 * np.sin(41.0 * x + 1.0)
+        image = np.tile(np.rint(128.0 + waves).astype(np.uint8), (120, 1))
+        jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+        given[topics.KEYFRAME][frame] = replace(told, jpeg=jpeg)
+    return given
+
+
+def fewer_points(given: Inputs) -> Inputs:
+    """Every twelfth observation of each keyframe."""
+    for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
+        for row, told in enumerate(given[topic]):
+            assert isinstance(told, Keyframe)
+            keyframes = np.repeat(np.arange(len(told.counts)), told.counts)
+            kept = told.point_ids % 12 == 0
+            counts = np.bincount(keyframes[kept], minlength=len(told.counts)).astype(np.int32)
+            given[topic][row] = replace(
+                told, counts=counts, point_ids=told.point_ids[kept], points_px=told.points_px[kept]
+            )
+    return given
+
+
+def test_what_images_agree_on_is_in_the_final_mesh_and_not_in_the_live_one() -> None:
+    dense, points = (
+        run(with_texture(fewer_points(inputs())), settings=[f"meshing.depth={depth}"])
+        for depth in ("dense", "points")
+    )
+    assert [codec.encode(m) for m in dense[topics.MESH_BLOCKS]] == [
+        codec.encode(m) for m in points[topics.MESH_BLOCKS]
+    ]
+    found: list[int] = []
+    for made in (dense, points):
+        z = final(made, "fine").positions[:, 2]
+        distance = np.minimum(np.abs(z - 3.0), np.abs(z - 4.0))
+        found.append(int(np.count_nonzero(distance < 0.02)))
+    assert found[0] > 1.1 * found[1]
+
+
+def test_without_texture_the_mesh_is_that_of_the_points(outputs: dict[Topic, list[Header]]) -> None:
+    points = run(inputs(), settings=["meshing.depth=points"])
+    for level in ("fine", "coarse"):
+        assert codec.encode(final(points, level)) == codec.encode(final(outputs, level))
 
 
 def test_blocks_that_changed_make_the_live_mesh_and_the_others_bring_late_viewers_up_to_date(

@@ -12,10 +12,11 @@ from pliant.algorithms.stereo.views import DenseDepth, StereoView, motion, paral
 
 _STRIDE = 2
 """Every so many rows and columns."""
-_MIN_SUPPORT = 5.0
-_CLEAR_PX = 2
-"""Pixels from a point of the map within which there is no other."""
-_MATCHING_PX = 0.5
+_MIN_SUPPORT = 4.0
+"""As many confident views agree."""
+_CLEAR_PX = 4
+"""A match within so many pixels of a point of the map, in the same window, tells less than it."""
+_MATCHING_PX = 0.7
 """Standard deviation of a match, pixels of the swept view."""
 
 
