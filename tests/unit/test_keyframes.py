@@ -16,7 +16,8 @@ LIMITS = KeyframeParameters()
 def first_due(interval_s, share_after, flow=0.0):
     """How many frames after the last keyframe the next one is.   share_after(s): of its points."""
     for n in range(1, 1000):
-        overlap = Overlap(share_after(n * interval_s), flow, n * interval_s, interval_s)
+        share = share_after(n * interval_s)
+        overlap = Overlap(share, share, flow, n * interval_s, interval_s)
         if is_due(overlap, LIMITS):
             return n
     return None
@@ -43,6 +44,26 @@ def test_what_moves_a_little_needs_one_after_some_time():
     assert n == int(30 * LIMITS.max_s) + 1
 
 
+@pytest.mark.parametrize("interval_s", [1 / 60, 1 / 10])
+def test_tracks_that_noise_ends_need_one_only_once_the_camera_has_moved(interval_s):
+    """Or once few remain: their points are still in the image."""
+
+    def due(share, flow):
+        overlap = Overlap(share, 1.0, flow, 4.0 * interval_s, interval_s)
+        return is_due(overlap, LIMITS)
+
+    still, moved = 0.9 * LIMITS.telling_flow_px, 1.1 * LIMITS.telling_flow_px
+    assert not due(0.5, still)
+    assert due(0.5, moved)
+    assert due(0.3, still)
+    assert not due(0.8, moved)
+
+
+def test_a_view_that_turns_away_needs_one_however_many_tracks_are_left():
+    overlap = Overlap(0.5, 0.5, 0.0, 0.1, 1 / 30)
+    assert is_due(overlap, LIMITS)
+
+
 @pytest.mark.parametrize(("mapped", "due"), [(900, False), (60, True)])
 def test_tracks_of_noise_make_no_keyframes(monkeypatch, mapped, due):
     """Where most candidates end at once and points stay; few points are no measure."""
@@ -56,5 +77,6 @@ def test_tracks_of_noise_make_no_keyframes(monkeypatch, mapped, due):
         return (mapped, mapped, 0.0) if least == MAPPED else (2000, 5000, 0.0)
 
     monkeypatch.setattr(active.window, "flow_since_keyframe", shared)
+    monkeypatch.setattr(active.window, "in_view_since_keyframe", lambda: mapped)
     monkeypatch.setattr(keyframes, "directions_of", lambda active: np.arange(4000))
     assert keyframes.keyframe_is_due(active, 0.1, 0.01) == due

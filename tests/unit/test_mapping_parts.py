@@ -8,7 +8,12 @@ from hypothesis import strategies as st
 from mapping_scene import CAMERA, Scene, looking
 
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.mapping.covisibility import missing_rows, near_keyframes, rows_of
+from pliant.algorithms.mapping.covisibility import (
+    marks_fewer,
+    missing_rows,
+    near_keyframes,
+    rows_of,
+)
 from pliant.algorithms.mapping.localisation import locate, refine
 from pliant.algorithms.mapping.map_store import (
     CANDIDATE,
@@ -21,7 +26,11 @@ from pliant.algorithms.mapping.map_store import (
     PointRows,
     TrackLinks,
 )
-from pliant.algorithms.mapping.observation_table import forget_outliers, reprojection_errors
+from pliant.algorithms.mapping.observation_table import (
+    count_in_view,
+    forget_outliers,
+    reprojection_errors,
+)
 from pliant.algorithms.mapping.parameters import (
     LocalisationParameters,
     ReacquisitionParameters,
@@ -233,6 +242,20 @@ def test_errors_are_distances_to_projections():
     assert np.isinf(behind[0])
 
 
+def test_points_in_view_are_those_of_projections():
+    generator = np.random.default_rng(2)
+    xyz = generator.uniform((-6.0, -6.0, -4.0), (6.0, 6.0, 8.0), (900, 3))
+    rows = generator.choice(900, 400, replace=False).astype(np.int32)
+    T_camera_world = inverse(looking((0.3, -0.2, 0.5), (0.1, -0.3, 0.05)))
+    lens = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy], np.float32)
+    here = transform(T_camera_world, xyz[rows])
+    px = CAMERA.project(here[here[:, 2] > 0.0])
+    expected = ((px >= 0.0) & (px < (CAMERA.width, CAMERA.height))).all(axis=1).sum()
+    assert 20 < expected < 380
+    found = count_in_view(T_camera_world, rows, xyz, lens, CAMERA.width, CAMERA.height)
+    assert found == expected
+
+
 def test_cameras_forget_what_they_miss_and_what_lies_behind_them():
     scene = Scene.box(50)
     poses = np.array([looking((0.1, 0.0, 0.0)), looking((0.4, 0.1, 0.2), (0.0, 0.05, 0.0))])
@@ -317,3 +340,13 @@ def test_missing_points_are_mapped_have_no_track_and_wait_after_many_misses():
     assert missing_rows(rows, linked, state, misses, marks, 3).tolist() == [0]
     assert missing_rows(rows, linked, state, misses, marks, 5).tolist() == [0, 3]
     assert missing_rows(rows, linked[1:], state, misses, marks, 6).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5])
+def test_marks_are_counted_as_far_as_is_asked(share):
+    rng = np.random.default_rng(0)
+    marked = rng.random(4000) < share
+    rows = rng.choice(4000, 1500, replace=False).astype(np.int32)
+    count = np.count_nonzero(marked[rows])
+    for least in (0, 1, count, count + 1):
+        assert marks_fewer(marked, rows, least) == (count < least)

@@ -134,6 +134,22 @@ def flows(
 
 
 @kernel
+def count_in_view(
+    T_camera_world: F64, rows: I32, xyz: F64, lens: F32, width: int, height: int
+) -> int:
+    """How many points a camera (4, 4) has in its image.   rows: of ``xyz`` (capacity, 3)."""
+    T, count = T_camera_world, 0
+    for row in rows:
+        x, y, z = xyz[row, 0], xyz[row, 1], xyz[row, 2]
+        depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        if depth > 0.0:
+            u = lens[0] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / depth + lens[2]
+            v = lens[1] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / depth + lens[3]
+            count += 0.0 <= u < width and 0.0 <= v < height
+    return count
+
+
+@kernel
 def has_parallax(
     columns: I32,
     slot: int,

@@ -161,6 +161,19 @@ class KeyframeParameters(Parameters):
         description="A keyframe is due when fewer than this share of the last one's points would "
         "remain in the next frame",
     )
+    min_tracked_share: float = Field(
+        default=0.35,
+        ge=0.0,
+        le=1.0,
+        description="The same where the camera has hardly moved: while min_shared_share is in "
+        "view, tracks that noise has ended are no reason for a keyframe",
+    )
+    telling_flow_px: float = Field(
+        default=8.0,
+        gt=0.0,
+        description="The camera has hardly moved when the median point moved by less since the "
+        "last keyframe, beside the turn of the camera, px at 640x480",
+    )
     max_flow_px: float = Field(
         default=20.0,
         gt=0.0,

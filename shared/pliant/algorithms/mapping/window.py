@@ -7,12 +7,13 @@ from pliant.algorithms.bundle.problem import BundleResult, BundleWindow, shared_
 from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.bundle.subspace import solve_subspace
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import move_by_similarity
+from pliant.algorithms.geometry import inverse, move_by_similarity
 from pliant.algorithms.mapping.directions import at_infinity, place
 from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import (
     columns_in_state,
     count_cameras,
+    count_in_view,
     flows,
     forget_outliers,
     gather,
@@ -164,6 +165,15 @@ class Window:
         H = K @ turn @ np.linalg.inv(K)
         before, moved = flows(self.rows, self.points.state, least, self.u, self.v, self.seen, H)
         return len(moved), before, float(np.median(moved)) if len(moved) else 0.0
+
+    def in_view_since_keyframe(self) -> int:
+        """How many of the newest keyframe's mapped points the current frame has in its image."""
+        rows = self.rows[self.seen[-2] & (self.points.state[self.rows] == MAPPED)]
+        T_camera_world = inverse(self.T_world_camera[-1])
+        camera = self._camera
+        return count_in_view(
+            T_camera_world, rows, self.points.xyz, self.lens, camera.width, camera.height
+        )
 
     def triangulate(self, limits: PointParameters) -> None:
         """Make points of the candidates whose rays now meet under enough parallax."""
