@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
+from pliant.algorithms.arrays import F64
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.tracks import COASTING, FrameTracks
 from pliant.errors import ResultError
 from pliant.pictures.caption import with_caption
 from pliant.pictures.map import BACKGROUND, FOCAL, MapView, choose_view, render_map, turned
-from pliant.pictures.mesh import draw_mesh
+from pliant.pictures.mesh import draw_mesh, mesh_view
 from pliant.pictures.movie import beside, write_animation, write_image, write_movie
 from pliant.pictures.overlay import (
     OverlayFrame,
@@ -273,3 +274,51 @@ def test_a_wall_before_the_eye_is_of_one_colour_from_edge_to_edge() -> None:
     assert np.ptp(drawn.shaded[0, 0]) == 0
     behind = draw_mesh(replace(wall, normals=-wall.normals), view, size=(64, 51))
     assert (behind.shaded == BACKGROUND).all()
+
+
+def grid(corner: F64, one: F64, other: F64, normal: F64) -> TriangleMesh:
+    """A parallelogram of 20 x 20 cells."""
+    shares = np.linspace(0.0, 1.0, 21)
+    a, b = (each.ravel()[:, None] for each in np.meshgrid(shares, shares))
+    first = (np.arange(20)[:, None] * 21 + np.arange(20)).ravel()
+    halves = [np.stack([first, first + k, first + 22], axis=1) for k in (1, 21)]
+    return TriangleMesh(
+        positions=(corner + a * one + b * other).astype(np.float32),
+        normals=np.tile(normal, (441, 1)).astype(np.float32),
+        colours=np.full((441, 3), 200, np.uint8),
+        triangles=np.concatenate(halves).astype(np.int32),
+    )
+
+
+def filled(mesh: TriangleMesh, view: MapView) -> float:
+    """The share of a picture that shows the mesh."""
+    return float((draw_mesh(mesh, view, size=(160, 120)).colours != BACKGROUND).any(axis=2).mean())
+
+
+def path(z: float) -> F64:
+    """Cameras that look along z, y down."""
+    T = np.tile(np.eye(4), (5, 1, 1))
+    T[:, 0, 3], T[:, 2, 3] = np.linspace(-0.2, 0.2, 5), z
+    return T
+
+
+def test_a_mesh_is_seen_from_where_it_shows_its_front() -> None:
+    x, y, z = np.eye(3)
+    wall = grid(4.0 * z - y, 2.0 * z, 2.0 * y, -x)  # its back is to the usual view
+    usual = choose_view(wall.positions.astype(float), path(0.0))
+    assert filled(wall, usual) < 0.01
+    assert filled(wall, mesh_view(wall, path(0.0))) > 0.3
+
+
+def test_a_mesh_fills_the_picture_however_far_the_path_is() -> None:
+    x, y, z = np.eye(3)
+    floor = grid(y + 2.0 * z - 2.0 * x, 4.0 * x, 4.0 * z, -y)
+    for away in (0.0, -20.0):
+        assert filled(floor, mesh_view(floor, path(away))) > 0.35
+    assert filled(floor, choose_view(floor.positions.astype(float), path(-20.0))) < 0.1
+
+
+def test_a_mesh_without_triangles_has_a_view() -> None:
+    x, y, z = np.eye(3)
+    nothing = replace(grid(z, x, y, -z), triangles=np.zeros((0, 3), np.int32))
+    assert np.isfinite(mesh_view(nothing, path(0.0)).T_world_view).all()

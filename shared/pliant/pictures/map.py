@@ -1,5 +1,6 @@
 """A picture of a map: points as shaded splats and the camera's path, without any GUI library."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -61,6 +62,26 @@ def choose_view(
     distance: 1 fills the picture with most of the points and the path; less is closer.
     aspect: columns over rows.      swing_deg: they stay in it when it is ``turned`` so far.
     """
+    angles = ((azimuth_deg, elevation_deg),)
+    return views_from(
+        points, T_world_camera, angles, distance=distance, aspect=aspect, swing_deg=swing_deg
+    )[0]
+
+
+def views_from(
+    points: F64,
+    T_world_camera: F64,
+    angles_deg: Iterable[tuple[float, float]],
+    *,
+    distance: float = 1.0,
+    aspect: float = _ASPECT,
+    swing_deg: float = 0.0,
+    with_path: bool = True,
+) -> list[MapView]:
+    """As ``choose_view``, one for each azimuth and elevation.
+
+    with_path: frame them on the path, too; else on what is near to it.
+    """
     up = -T_world_camera[:, :3, 1].mean(axis=0)
     up = _unit(up, np.array([0.0, -1.0, 0.0]))
     forward = T_world_camera[:, :3, 2].mean(axis=0)
@@ -70,21 +91,32 @@ def choose_view(
     _, radius = _body(points, positions)
     ceiling = float((positions @ up).max()) + 0.25 * radius
     body, radius = _body(points[points @ up <= ceiling], positions)
+    if not with_path and len(body) > len(positions):
+        body = body[: -len(positions)]
     centre = 0.5 * (body.min(axis=0) + body.max(axis=0))
-    turned_by = np.radians(azimuth_deg)
-    level = np.cos(turned_by) * forward + np.sin(turned_by) * np.cross(up, forward)
-    elevation = np.radians(elevation_deg)
+    swings = np.radians(np.linspace(-swing_deg, swing_deg, 5 if swing_deg else 1))
+    body = np.concatenate([(body - centre) @ _about(up, swing).T + centre for swing in swings])
+    found: list[MapView] = []
+    for azimuth, elevation in angles_deg:
+        R = _looking(up, forward, np.radians(azimuth), np.radians(elevation))
+        eye = _eye(body, R, aspect)
+        away = max(float((centre - eye) @ R[:, 2]), radius)
+        middle = eye + away * R[:, 2]
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, middle - distance * away * R[:, 2]
+        found.append(
+            MapView(T_world_view=T, centre=middle, up=up, ceiling=ceiling, reach=2.3 * away)
+        )
+    return found
+
+
+def _looking(up: F64, forward: F64, azimuth: float, elevation: float) -> F64:
+    """(3, 3) R_world_view of an eye above, turned by the azimuth away from forward; radians."""
+    level = np.cos(azimuth) * forward + np.sin(azimuth) * np.cross(up, forward)
     direction = np.cos(elevation) * level - np.sin(elevation) * up
     right = _unit(np.asarray(np.cross(direction, up), np.float64), _any_normal(up))
-    T = np.eye(4)
-    T[:3, 0], T[:3, 1], T[:3, 2] = right, np.cross(direction, right), direction
-    angles = np.radians(np.linspace(-swing_deg, swing_deg, 5 if swing_deg else 1))
-    body = np.concatenate([(body - centre) @ _about(up, angle).T + centre for angle in angles])
-    eye = _eye(body, T[:3, :3], aspect)
-    away = max(float((centre - eye) @ direction), radius)
-    centre = eye + away * direction
-    T[:3, 3] = centre - distance * away * direction
-    return MapView(T_world_view=T, centre=centre, up=up, ceiling=ceiling, reach=2.3 * away)
+    down = np.asarray(np.cross(direction, right), np.float64)
+    return np.asarray(np.stack([right, down, direction], axis=1), np.float64)
 
 
 def turned(view: MapView, angle_deg: float) -> MapView:

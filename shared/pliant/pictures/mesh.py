@@ -9,8 +9,15 @@ from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.rendering import MeshView, view_mesh
-from pliant.pictures.map import BACKGROUND, FOCAL, MapView, choose_view, dimmed_behind
+from pliant.pictures.map import BACKGROUND, FOCAL, MapView, choose_view, dimmed_behind, views_from
 
+_DIRECTIONS_DEG = [(azimuth, up) for up in (25.0, 35.0, 50.0) for azimuth in range(-75, 76, 25)]
+"""Azimuth and elevation of the views of which one is chosen."""
+_SAMPLES = 10_000
+_CELLS = 60, 80
+"""Rows and columns of a coarse picture, by which views are compared."""
+_CELL_DEPTH = 0.03
+"""Share of its depth by which a surface that is seen extends in depth within a cell."""
 _SUPERSAMPLE = 2
 _BAND = 32
 """Rows that are drawn at a time: what is in between stays small, and in the processor's cache."""
@@ -38,8 +45,41 @@ class MeshPictures:
 
 
 def mesh_view(mesh: TriangleMesh, T_world_camera: F64) -> MapView:
-    """A view from above on a mesh and the path (N, 4, 4) from which it was seen."""
-    return choose_view(mesh.positions.astype(np.float64), T_world_camera)
+    """The view from above that shows most of a mesh, seen from a path (N, 4, 4).
+
+    Of some directions it is the one with the largest product of the share of the surface that is
+    seen and the share of the picture that it fills.
+    """
+    if not len(mesh.triangles):
+        return choose_view(mesh.positions.astype(np.float64), T_world_camera)
+    places, normals = _samples(mesh)
+    views = views_from(places, T_world_camera, _DIRECTIONS_DEG, with_path=False)
+    return max(views, key=lambda view: _shown(places, normals, view))
+
+
+def _samples(mesh: TriangleMesh) -> tuple[F64, F64]:
+    """(N, 3) places spread over the surface by area, and its normals there, of any length."""
+    normals = _outwards(mesh, mesh.positions[mesh.triangles].astype(np.float64))
+    ends = np.cumsum(np.linalg.norm(normals, axis=1))
+    at = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * ends[-1]
+    rows = np.minimum(np.searchsorted(ends, at), len(ends) - 1)
+    return mesh.positions[mesh.triangles[rows]].astype(np.float64).mean(axis=1), normals[rows]
+
+
+def _shown(places: F64, normals: F64, view: MapView) -> float:
+    """The share of samples that are seen, times the share of the picture's cells with any."""
+    rows, columns = _CELLS
+    rays = places - view.T_world_view[:3, 3]
+    local = rays @ view.T_world_view[:3, :3]
+    local = local[((normals * rays).sum(axis=1) < 0.0) & (local[:, 2] > 0.0)]
+    at = np.floor(local[:, :2] / local[:, 2:] * FOCAL * rows + (0.5 * columns, 0.5 * rows))
+    inside = np.all((at >= 0) & (at < (columns, rows)), axis=1)
+    cells = (at[inside] @ (1, columns)).astype(np.int64)
+    depths = local[inside, 2]
+    nearest = np.full(rows * columns, np.inf)
+    np.minimum.at(nearest, cells, depths)
+    seen = (depths < (1.0 + _CELL_DEPTH) * nearest[cells]).sum()
+    return float(seen / len(places) * np.isfinite(nearest).mean())
 
 
 def draw_mesh(
@@ -85,12 +125,16 @@ def _lit(normals: F32, colours: F32, edges: F32) -> tuple[F32, F32, F32]:
 
 def _towards(mesh: TriangleMesh, view: MapView) -> BoolArray:
     corners = mesh.positions[mesh.triangles].astype(np.float64)
+    rays = corners[:, 0] - view.T_world_view[:3, 3]
+    return (_outwards(mesh, corners) * rays).sum(axis=1) < 0.0
+
+
+def _outwards(mesh: TriangleMesh, corners: F64) -> F64:
+    """(F, 3) normals of the triangles, as long as twice their area.  corners: (F, 3, 3)."""
     edges = corners[:, 1:] - corners[:, :1]
     away = np.cross(edges[:, 0], edges[:, 1])
     # Which side is out is said by the normals, whatever the order of the corners.
-    away *= np.sign((away * mesh.normals[mesh.triangles[:, 0]]).sum(axis=1))[:, None]
-    rays = corners[:, 0] - view.T_world_view[:3, 3]
-    return (away * rays).sum(axis=1) < 0.0
+    return away * np.sign((away * mesh.normals[mesh.triangles[:, 0]]).sum(axis=1))[:, None]
 
 
 def _finish(planes: F32, covered: BoolArray) -> U8:
