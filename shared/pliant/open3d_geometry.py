@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, U8
+from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.open3d_library import load_open3d
 
@@ -42,12 +42,6 @@ def from_mesh(mesh: Any) -> TriangleMesh:
         colours=np.rint(np.clip(colours, 0.0, 255.0)).astype(np.uint8),
         triangles=np.asarray(mesh.triangles, np.int32),
     )
-
-
-def pieces(mesh: Any) -> tuple[I32, F64]:
-    """Of each triangle (T,) which connected piece it is of, and the area of each piece (P,)."""
-    labels, _, areas = mesh.cluster_connected_triangles()
-    return np.asarray(labels, np.int32), np.asarray(areas, np.float64)
 
 
 def _rows(open3d: Any, values: F64 | F32) -> Any:

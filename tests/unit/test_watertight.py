@@ -1,13 +1,16 @@
 """Solids from surfaces with a border, pieces that are left out, sheets that touch."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.algorithms.meshing.mesh_components import cleaned, components
 from pliant.algorithms.meshing.touching import taken_apart
 from pliant.errors import ResultError
-from pliant.export.watertight import cleaned, watertight
+from pliant.export.watertight import watertight
 from pliant.open3d_library import Open3dError, load_open3d
 
 CUBE = np.array(
@@ -180,7 +183,6 @@ def test_a_sphere_that_was_seen_from_within_closes_by_itself() -> None:
     np.testing.assert_allclose(np.linalg.norm(solid.positions, axis=1), 1.0, atol=0.03)
 
 
-@pytest.mark.usefixtures("open3d")
 def test_pieces_that_are_small_beside_the_largest_are_left_out() -> None:
     large, small = relief(40), relief(40)
     crumb = (small.positions * np.float32(0.05) + np.float32(2.0)).astype(np.float32)
@@ -193,6 +195,22 @@ def test_pieces_that_are_small_beside_the_largest_are_left_out() -> None:
     kept = cleaned(both)
     for name in ("positions", "normals", "colours", "triangles"):
         np.testing.assert_array_equal(getattr(kept, name), getattr(large, name))
+    none = replace(both, triangles=np.zeros((0, 3), np.int32))
+    assert cleaned(none) is none
+
+
+def test_components_are_those_of_a_search_from_node_to_node() -> None:
+    edges = np.random.default_rng(0).integers(0, 300, (180, 2))
+    label = np.full(300, -1)
+    for start in range(300):
+        found, label[start] = [start], start if label[start] < 0 else label[start]
+        while found:
+            node = found.pop()
+            near = np.concatenate([edges[edges[:, 0] == node, 1], edges[edges[:, 1] == node, 0]])
+            found += near[label[near] < 0].tolist()
+            label[near] = np.where(label[near] < 0, label[start], label[near])
+    expected = np.unique(label, return_inverse=True)[1]
+    np.testing.assert_array_equal(components(300, *edges.T.copy()), expected)
 
 
 @pytest.mark.usefixtures("open3d")

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.meshing.mesh_components import cleaned
 from pliant.config import Config, recorded_config
 from pliant.errors import RecordingError
-from pliant.export.watertight import WATERTIGHT_NAME, cleaned, watertight
+from pliant.export.watertight import WATERTIGHT_NAME, watertight
 from pliant.files import write_whole
 from pliant.fusion.memory import check_voxel_sizes
 from pliant.map_history import MapHistory
@@ -81,7 +82,7 @@ def run_mesh(
 
     clean: leave out small pieces.    close: write a watertight mesh, too.
     """
-    if clean or close:
+    if close:
         load_open3d()  # said before the work
     output = output or _beside(recording.resolve().parent)
     keep_apart(output, [recording, *parts_of(recording)])

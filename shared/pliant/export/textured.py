@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from pliant.algorithms.meshing.mesh_components import cleaned
 from pliant.errors import ResultError
 from pliant.export.crop import Box, cropped_mesh
 from pliant.export.images import make_folder
-from pliant.export.watertight import cleaned
 from pliant.formats.textured import TexturedMesh, write_glb, write_obj
 from pliant.messages import topics
 from pliant.messages.types import MeshPiece

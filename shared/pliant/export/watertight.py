@@ -1,4 +1,4 @@
-"""A mesh without its crumbs, and closed to a solid: Open3D's screened Poisson reconstruction.
+"""A mesh closed to a solid: Open3D's screened Poisson reconstruction.
 
 Kazhdan and Hoppe 2013.  A surface that was filmed has a border, where nobody looked any more, and
 its reconstruction goes on from there for ever.  So the solid is given an end: a box a little
@@ -14,15 +14,14 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I64, BoolArray
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.algorithms.meshing.mesh_components import cleaned
 from pliant.algorithms.meshing.touching import taken_apart
 from pliant.errors import ResultError
 from pliant.export.kinds import KINDS
-from pliant.open3d_geometry import from_mesh, pieces, to_cloud, to_mesh
+from pliant.open3d_geometry import from_mesh, to_cloud, to_mesh
 from pliant.open3d_library import load_open3d
 
 WATERTIGHT_NAME = KINDS["watertight"]
-CRUMB = 0.01
-"""Share of the largest piece's area below which a piece is left out."""
 _COARSE_DEPTH, _LEAST_DEPTH, _MOST_DEPTH = 7, 6, 9
 """Levels of the octree: cells have a share of 2^-depth of the cube."""
 _COARSE_CUBE, _CUBE = 1.5, 1.2
@@ -34,14 +33,6 @@ _BOX_SAMPLES = 96
 _RAYS = 7
 """From each sample of the box to places of the mesh; most of them tell on which side it is."""
 _BOX_COLOUR = (178, 178, 178)
-
-
-def cleaned(mesh: TriangleMesh) -> TriangleMesh:
-    """Without pieces that are small beside the largest.  Raises Open3dError."""
-    if not len(mesh.triangles):
-        return mesh
-    labels, areas = pieces(to_mesh(mesh))
-    return mesh.of_triangles((areas >= CRUMB * areas.max())[labels])
 
 
 def watertight(mesh: TriangleMesh) -> TriangleMesh:

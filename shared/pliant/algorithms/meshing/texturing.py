@@ -9,6 +9,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray, Shape
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
+from pliant.algorithms.meshing.mesh_components import components
 from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.compiler.kernel import kernel
 
@@ -81,36 +82,9 @@ def cut_apart(triangles: I32, patch: I64) -> tuple[I32, I64]:
     twin = first[at[half]]
     # A half edge starts where its twin ends: the corners there are one vertex.
     here, there = np.concatenate([half, _next(half)]), np.concatenate([_next(twin), twin])
-    vertex = _components(len(corners), here, there)
+    vertex = components(len(corners), here, there)
     _, some_corner = np.unique(vertex, return_index=True)
     return vertex.reshape(-1, 3).astype(np.int32), corners[some_corner]
-
-
-def _components(count: int, here: I64, there: I64) -> I64:
-    """(count,) the connected component of each node of a graph, numbered by their first nodes."""
-    _, component = np.unique(_roots(count, here, there), return_inverse=True)
-    return component.astype(np.int64)
-
-
-@kernel
-def _roots(count: int, here: I64, there: I64) -> I64:
-    """The least node that each is joined to, by halving the paths of a disjoint set."""
-    parent = np.arange(count)
-    for edge in range(len(here)):
-        one, other = here[edge], there[edge]
-        while parent[one] != one:
-            parent[one] = parent[parent[one]]
-            one = parent[one]
-        while parent[other] != other:
-            parent[other] = parent[parent[other]]
-            other = parent[other]
-        if one < other:
-            parent[other] = one
-        else:
-            parent[one] = other
-    for node in range(count):
-        parent[node] = parent[parent[node]]
-    return parent
 
 
 def make_atlas(corners: F32, cut: I32, size: int) -> F32:
@@ -122,7 +96,7 @@ def make_atlas(corners: F32, cut: I32, size: int) -> F32:
     across = np.stack([_axes(_turned(corners)) + 1, _axes(_turned(corners)) + 2], axis=1) % 3
     flat = np.take_along_axis(corners, across[:, None, :], axis=2).astype(np.float64)
     edges = cut.ravel().astype(np.int64), np.roll(cut, -1, axis=1).ravel().astype(np.int64)
-    label = _components(int(cut.max(initial=0)) + 1, *edges)
+    label = components(int(cut.max(initial=0)) + 1, *edges)
     count, piece = int(label.max()) + 1, label[cut[:, 0]]
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     np.minimum.at(low, piece, flat.min(axis=1))
