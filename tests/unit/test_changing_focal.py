@@ -107,4 +107,7 @@ def test_what_jumps_from_keyframe_to_keyframe_is_no_change_and_what_lasts_is():
     assert not Evidence(5.0, lasting, gaps).calls_for_more
     assert Evidence(30.0, lasting, gaps).confirmed_by(lasting)
     assert Evidence(200.0, jumping, gaps).confirmed_by(jumping)
+    # Focal lengths that are there may have run off: they stay only while they explain something.
+    assert not Evidence(13.0, 10.0 * lasting, gaps).confirmed_by(10.0 * lasting, known=True)
+    assert Evidence(30.0, jumping, gaps).confirmed_by(jumping, known=True)
     np.testing.assert_allclose(focal_range(lasting, gaps), (-0.015, 0.015), atol=1e-3)

@@ -17,7 +17,8 @@ from pliant.algorithms.geometry import (
     transform,
 )
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.final_adjustment import _spread_out
+from pliant.algorithms.mapping import whole_map
+from pliant.algorithms.mapping.final_adjustment import _spread_out, adjust_listed
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
@@ -134,6 +135,22 @@ def test_a_drifted_map_comes_back():
     np.testing.assert_array_equal(moves.keyframe_ids, ids)  # those in the window, too
     active.move(moves)
     assert error(active) < 0.1 * drifted
+
+
+def test_an_adjustment_that_comes_apart_moves_nothing(monkeypatch):
+    mapper, _, _ = fold(AT_THE_END, frames=120)
+    parameters = GROWING.model_copy(update={"window": WindowParameters(keyframes=3)})
+    mapper.whole_map.ask(120, mapper.atlas.active.segment, mapper.calibration, parameters)
+
+    def apart(seen, *arguments, **others):
+        found = adjust_listed(seen, *arguments, **others)
+        seen.T_world_camera = np.full_like(seen.T_world_camera, np.nan)
+        return found
+
+    monkeypatch.setattr(whole_map, "adjust_listed", apart)
+    answer = find_moves(mapper.whole_map.question)
+    assert answer.moves is None
+    assert answer.calibration is mapper.calibration
 
 
 def test_a_map_moves_as_little_as_it_can():

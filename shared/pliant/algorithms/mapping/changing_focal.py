@@ -42,10 +42,6 @@ _RANGE = CalibrationUncertainty().focal
 """Of the log focal length: a standard deviation of a calibration that is believed.  Where errors of
 other kinds gain more than 10 they range over up to 0.9 % in real clips."""
 
-_ALONE = 2.0
-"""Ranges from which on it changes still, whatever the gain: once focal lengths of their own hold a
-map together, errors of other kinds make them range over up to 1.6 %."""
-
 _ONE_STEP = 0.35
 """Share of the range that one step of the robust adjustment shows at least."""
 
@@ -101,12 +97,12 @@ class Evidence(NamedTuple):
     def confirmed_by(self, log_focals: F64, share: float = 1.0, known: bool = False) -> bool:
         """Whether log focal lengths (M,) range over as much as changes do, or the gain is certain.
 
-        share: of that range.   known: they are known to change, so that less will do.
+        share: of that range.   known: they were found to change, so that the gain decides: a map
+        that is held together by focal lengths of its own shows whatever range.
         """
         low, high = focal_range(log_focals, self.gaps_s)
-        gains, ranges = self.gain > _GAIN, (high - low) / _RANGE
-        changes = gains or ranges > _ALONE if known else gains and ranges > share
-        return changes or self.gain > _CERTAIN
+        ranges = known or (high - low) / _RANGE > share
+        return (self.gain > _GAIN and ranges) or self.gain > _CERTAIN
 
 
 def evidence_of_change(
