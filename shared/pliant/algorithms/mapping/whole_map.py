@@ -218,9 +218,12 @@ def find_moves(question: Question) -> Answer:
     refocus = seen.log_focal - question.seen.log_focal
     bent = bent or question.closed or after.changes or bool(refocus.any())
     moving = bent or len(question.keyframe_ids) >= 2 * parameters.window.keyframes
+    nothing = Answer(None, [], known, 0)  # of a map that has come apart, all would be lost
+    if not np.isfinite(seen.T_world_camera).all():
+        return nothing
     moves = _moves(question, seen, before, depths) if moving else None
     if moves is not None and not np.isfinite(moves.moves).all():
-        return Answer(None, [], known, 0)  # of a map that has come apart, all would be lost
+        return nothing
     return Answer(moves, [], after, 0, refocus if refocus.any() else _NONE)
 
 
