@@ -132,3 +132,15 @@ def test_blurred_keyframes_and_such_as_look_away_are_no_sources() -> None:
     assert choose_sources(views, 0, points, 2).tolist() == [1]
     behind = points * (1.0, 1.0, -1.0)
     assert choose_sources(views, 0, behind, 2).tolist() == []
+
+
+def test_of_many_keyframes_in_one_place_those_that_see_the_same_are_taken() -> None:
+    points = true_depth_points(0)
+    step = float(np.median(points[:, 2]))
+    views = viewpoints([0.0, *np.linspace(-0.9, 0.9, 300) * step])
+    views.T_world_camera[1:100, :3, :3] = np.diag([-1.0, 1.0, -1.0])  # they look away
+    chosen = choose_sources(views, 0, points, 6)
+    assert len(chosen) == 6
+    assert chosen.min() >= 100
+    angles = np.abs(views.T_world_camera[chosen, 0, 3]) / step
+    assert np.median(angles) < 0.2

@@ -36,10 +36,10 @@ def consensus(
     shape = view.grey.shape
     w, c = (np.zeros((len(others) + 1, *shape), np.float32) for _ in range(2))
     w[0], c[0] = own.inverse_depths, np.float32(_OWN) * own.confidences
-    maps = np.zeros((len(others), 2, *shape), np.float32)
+    maps = np.zeros((len(others), *shape, 2), np.float32)
     there = motion(view.camera, view.T_world_camera, poses_of(others))
     for j, (other, depth) in enumerate(zip(others, depths, strict=True)):
-        maps[j, 0], maps[j, 1] = depth.inverse_depths, depth.confidences
+        maps[j, ..., 0], maps[j, ..., 1] = depth.inverse_depths, depth.confidences
         back = motion(view.camera, other.T_world_camera, view.T_world_camera[None])
         _splat(
             maps[j], back.homographies[0].astype(np.float32),
@@ -57,14 +57,14 @@ def consensus(
 
 @kernel
 def _splat(depth: F32, A: F32, b: F32, w: F32, c: F32) -> None:
-    """Move (2, H, W) inverse depths and confidences to the nearest pixel of another view (H, W),
+    """Move (H, W, 2) inverse depths and confidences to the nearest pixel of another view (H, W),
     where the nearest surface stays."""
     height, width = w.shape
     half = np.float32(0.5)
     right, low = np.float32(width) - half, np.float32(height) - half
     for v in range(height):
         for u in range(width):
-            inverse_depth, confidence = depth[0, v, u], depth[1, v, u]
+            inverse_depth, confidence = depth[v, u, 0], depth[v, u, 1]
             if not (confidence > np.float32(0.0) and inverse_depth > np.float32(0.0)):
                 continue
             x, y, z = _moved(A, b, u, v, inverse_depth)
@@ -95,55 +95,58 @@ def _agree(
 ) -> None:
     """w, c: (N + 1, H, W) candidates and confidences in this view, 0 where there are none.
 
-    maps: (N, 2, H, W) the same in the neighbours' own views.
+    maps: (N, H, W, 2) the same in the neighbours' own views.
     """
     count, height, width = w.shape
     zero, one = np.float32(0.0), np.float32(1.0)
-    tolerance, front, through = np.float32(_TOLERANCE), np.float32(_FRONT), np.float32(_THROUGH)
-    values, weights = np.empty(count, np.float32), np.empty(count, np.float32)
-    scores = np.empty(count, np.float32)
+    tolerance, through = np.float32(_TOLERANCE), np.float32(_THROUGH)
+    scores = np.empty((count, width), np.float32)
     for v in range(height):
-        for u in range(width):
-            some = 0
+        for i in range(count):
+            scores[i, :] = zero
             for j in range(count):
-                if c[j, v, u] > zero:
-                    values[some], weights[some] = w[j, v, u], c[j, v, u]
-                    some += 1
-            for i in range(some):
-                score, reach = zero, tolerance * values[i]
-                for j in range(some):
-                    off = values[j] - values[i]
-                    if abs(off) < reach:
-                        score += weights[j] * (one - (off / reach) ** 2)
-                    elif off > zero:
-                        score -= front * weights[j]
-                scores[i] = score
+                _vote(w[i, v], w[j, v], c[j, v], scores[i])
+        for u in range(width):
             # Those that see through only lower a score: the most promising first, until none of
             # the rest can be better.
             best, chosen = zero, -1
-            for _ in range(some):
-                i = 0
-                for j in range(1, some):
-                    if scores[j] > scores[i]:
+            for _ in range(count):
+                i = -1
+                for j in range(count):
+                    if c[j, v, u] > zero and scores[j, u] > (scores[i, u] if i >= 0 else best):
                         i = j
-                if not scores[i] > best:
+                if i < 0:
                     break
-                score = scores[i] - through * _seen_through(
-                    values[i], u, v, maps, homographies, translations
+                score = scores[i, u] - through * _seen_through(
+                    w[i, v, u], u, v, maps, homographies, translations
                 )
-                scores[i] = zero
+                scores[i, u] = zero
                 if score > best:
                     best, chosen = score, i
             if chosen < 0:
                 continue
-            total, weight, reach = zero, zero, tolerance * values[chosen]
-            for j in range(some):
-                off = values[j] - values[chosen]
+            agreed = w[chosen, v, u]
+            total, weight, reach = zero, zero, tolerance * agreed
+            for j in range(count):
+                off = w[j, v, u] - agreed
                 if abs(off) < reach:
-                    share = weights[j] * (one - (off / reach) ** 2)
-                    total += share * values[j]
+                    share = c[j, v, u] * (one - (off / reach) * (off / reach))
+                    total += share * w[j, v, u]
                     weight += share
             found[v, u], support[v, u] = total / weight, weight
+
+
+@kernel
+def _vote(candidate: F32, w: F32, c: F32, scores: F32) -> None:
+    """What a row of depths w with confidences c, 0 where there are none, counts for one of
+    candidates; SIMD code, as pixels side by side do not wait for each other."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    tolerance, front = np.float32(_TOLERANCE), np.float32(_FRONT)
+    for u in range(len(scores)):
+        off, reach = w[u] - candidate[u], tolerance * candidate[u]
+        share = off / reach
+        against = -front * c[u] if off > zero else zero
+        scores[u] += c[u] * (one - share * share) if abs(off) < reach else against
 
 
 @kernel
@@ -151,7 +154,7 @@ def _seen_through(
     w: np.float32, u: int, v: int, maps: F32, homographies: F32, translations: F32
 ) -> np.float32:
     """Sum of the confidences of neighbours that see something behind a candidate."""
-    height, width = maps.shape[2:]
+    height, width = maps.shape[1:3]
     half, total = np.float32(0.5), np.float32(0.0)
     right, low = np.float32(width) - half, np.float32(height) - half
     for j in range(len(maps)):
@@ -159,7 +162,7 @@ def _seen_through(
         if not (z > np.float32(0.0) and -half <= x < right and -half <= y < low):
             continue
         at_u, at_v = int(x + half), int(y + half)
-        seen = maps[j, 0, at_v, at_u]
+        seen = maps[j, at_v, at_u, 0]
         if seen < (np.float32(1.0) - np.float32(_TOLERANCE)) * (w / z):
-            total += maps[j, 1, at_v, at_u]
+            total += maps[j, at_v, at_u, 1]
     return total

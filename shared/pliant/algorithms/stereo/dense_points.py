@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
+import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F64, Shape
@@ -34,14 +35,14 @@ def sure_pixels(depth: DenseDepth, points_px: F64) -> SurePixels:
     depth: as of ``consensus``.    points_px: (N, 2) the map's, in pixels of the view.
     """
     height, width = depth.confidences.shape
+    c = _CLEAR_PX
+    taken = np.zeros((height + 2 * c, width + 2 * c), np.uint8)
+    at = np.rint(points_px[np.isfinite(points_px).all(axis=1)]).astype(np.int64) + c
+    inside = (at >= 0).all(axis=1) & (at < (width + 2 * c, height + 2 * c)).all(axis=1)
+    taken[at[inside, 1], at[inside, 0]] = 1
+    around = np.asarray(cv2.dilate(taken, np.ones((2 * c + 1, 2 * c + 1), np.uint8)), np.uint8)
     free = np.zeros((height, width), np.bool_)
-    free[::_STRIDE, ::_STRIDE] = True
-    at = np.rint(points_px[np.isfinite(points_px).all(axis=1)]).astype(np.int64)
-    for dv in range(-_CLEAR_PX, _CLEAR_PX + 1):
-        for du in range(-_CLEAR_PX, _CLEAR_PX + 1):
-            u, v = at[:, 0] + du, at[:, 1] + dv
-            inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-            free[v[inside], u[inside]] = False
+    free[::_STRIDE, ::_STRIDE] = around[c : c + height : _STRIDE, c : c + width : _STRIDE] == 0
     sure = free & (depth.confidences > _MIN_SUPPORT)
     v, u = np.nonzero(sure)
     return SurePixels(

@@ -42,13 +42,13 @@ def matching_costs(
     offsets: (D,).    radius: of the square window, pixels.
     Of the images that show the pixel, the best two thirds count: the others may be occluded.
     """
-    costs = np.full((*reference.shape, len(offsets)), WORST, np.uint8)
+    costs = np.full((len(offsets), *reference.shape), WORST, np.uint8)
     if len(sources):
         _sweep(
             reference, _quads(sources), moved.homographies.astype(np.float32),
             moved.translations.astype(np.float32), base, offsets, radius, costs,
         )  # fmt: skip
-    return costs
+    return np.ascontiguousarray(costs.transpose(1, 2, 0))
 
 
 @kernel
@@ -69,7 +69,8 @@ def _sweep(
     shown = np.zeros((count, ring, width), np.uint8)
     sums = np.zeros((count, 3, width + 2 * radius), np.int32)
     each = np.empty((count, width), np.float32)
-    rows = np.empty((3, width), np.int32)
+    rows, used = np.empty((3, width), np.int32), np.empty(width, np.int32)
+    totals = np.empty(width, np.float32)
     places = (np.empty(width, np.int32), np.empty(width, np.float32), np.empty(width, np.float32))
     for d in range(len(offsets)):
         sums[:] = 0
@@ -98,7 +99,7 @@ def _sweep(
                     )  # fmt: skip
                 _correlate(sums[s], means[v], spreads[v], shown[s, v % ring], radius, rows, each[s])
             _sort(each)
-            _mean_of_best(each, costs[v, :, d])
+            _mean_of_best(each, used, totals, costs[d, v])
 
 
 @kernel
@@ -126,8 +127,9 @@ def _warp(
         x, y = (c0 * column + a0 + b0 * w) / z, (c1 * column + a1 + b1 * w) / z
         inside = (z > zero) & (x >= -half) & (x <= right + half) & (y >= -half) & (y <= low + half)
         shown[u] = inside
-        x, y = x if z > zero else zero, y if z > zero else zero
-        x, y = min(max(x, zero), right), min(max(y, zero), low)
+        # Compared so, what is no number becomes 0, too.
+        x, y = x if x > zero else zero, y if y > zero else zero
+        x, y = x if x < right else right, y if y < low else low
         i, j = min(np.int32(x), last_u), min(np.int32(y), last_v)
         right_shares[u], low_shares[u] = x - np.float32(i), y - np.float32(j)
         at[u] = np.int32(np.int32(j * across) + i)
@@ -205,7 +207,8 @@ def _correlate(
         spread = n * np.float32(of_ss[u]) - mean * mean + noise
         joint = n * np.float32(of_rs[u]) - means[u] * mean
         cost = one - joint / np.sqrt(spread * (spreads[u] + noise))
-        cost = min(max(cost, zero), one)
+        cost = cost if cost > zero else zero
+        cost = cost if cost < one else one
         out[u] = cost if shown[u] else outside
 
 
@@ -245,23 +248,34 @@ def _sort(each: F32) -> None:
             low, high = each[k], each[k + 1]
             for u in range(width):
                 a, b = low[u], high[u]
-                low[u], high[u] = min(a, b), max(a, b)
+                low[u], high[u] = a if a < b else b, b if a < b else a
 
 
 @kernel
-def _mean_of_best(each: F32, out: U8) -> None:
-    """The mean of the best two thirds of the sources that show a pixel, of (S, W) sorted costs."""
+def _mean_of_best(each: F32, used: I32, totals: F32, out: U8) -> None:
+    """The mean of the best two thirds of the sources that show a pixel, of (S, W) sorted costs.
+
+    used, totals: (W,) scratch.  All loops but the last are SIMD code: it writes far apart.
+    """
     count, width = each.shape
+    one, zero = np.float32(1.0), np.float32(0.0)
+    used[:] = 0
+    totals[:] = zero
+    for s in range(count):
+        row = each[s]
+        for u in range(width):
+            used[u] += np.int32(row[u] <= one)
     for u in range(width):
-        shown = 0
-        for s in range(count):
-            shown += each[s, u] <= np.float32(1.0)
-        used = (2 * shown + 2) // 3
-        total = np.float32(0.0)
-        for s in range(used):
-            total += each[s, u]
-        if used > 0:
-            out[u] = np.uint8(np.float32(WORST) * (total / np.float32(used)) + np.float32(0.5))
+        used[u] = np.int32(np.int32(2 * used[u] + 2) // np.int32(3))
+    for s in range(count):
+        row = each[s]
+        for u in range(width):
+            totals[u] += row[u] if np.int32(s) < used[u] else zero
+    for u in range(width):
+        mean = totals[u] / np.float32(max(used[u], np.int32(1)))
+        totals[u] = np.float32(WORST) * (mean if used[u] > 0 else one) + np.float32(0.5)
+    for u in range(width):
+        out[u] = np.uint8(totals[u])
 
 
 def inverse_depths_between(least: float, most: float, step: float, count: int) -> F64:

@@ -22,6 +22,7 @@ _MIN_ANGLE, _MAX_ANGLE = 0.03, 0.25
 _ANGLE_SPREAD = 0.5
 """Standard deviation of the logarithm of a good angle."""
 _MIN_OVERLAP = 0.2
+_MOST_CANDIDATES = 64
 _LIKE_RAD = 0.05
 """Two sources whose parallaxes differ by less say much the same."""
 _LIKE_COST = 0.7
@@ -70,6 +71,9 @@ def _scores(views: Viewpoints, row: int, points_world: F64) -> tuple[F64, F64]:
     near = np.flatnonzero((away > 0.5 * _MIN_ANGLE) & (away < 4.0 * _MAX_ANGLE))
     if not len(near):
         return score, parallax
+    # However many keyframes a place has, each costs the same.
+    promise = _goodness(away[near]) * (poses[near, :3, 2] @ poses[row, :3, 2])
+    near = near[np.sort(np.argsort(-promise, kind="stable")[:_MOST_CANDIDATES])]
     there = points_world - poses[near, None, :3, 3]  # (M, P, 3)
     in_camera = there @ poses[near, :3, :3]
     z = in_camera[..., 2]
@@ -87,9 +91,14 @@ def _scores(views: Viewpoints, row: int, points_world: F64) -> tuple[F64, F64]:
         if not _MIN_ANGLE <= angle <= _MAX_ANGLE:
             continue
         size_ratio = float(np.median(z[m, seen[m]] / depth[seen[m]]))
-        good = np.exp(-0.5 * (np.log(angle / _BEST_ANGLE) / _ANGLE_SPREAD) ** 2)
+        good = float(_goodness(np.array(angle)))
         j = near[m]
         sharp = min(1.0, views.sharpness[j] / max(views.sharpness[row], 1e-9))
         score[j] = overlap[m] * good * min(size_ratio, 1.0 / size_ratio) * sharp
     score[row] = 0.0
     return score, parallax
+
+
+def _goodness(angles: F64) -> F64:
+    """1 at the best angle, falling to either side."""
+    return np.exp(-0.5 * (np.log(angles / _BEST_ANGLE) / _ANGLE_SPREAD) ** 2)

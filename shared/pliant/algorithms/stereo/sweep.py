@@ -12,7 +12,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, U8, BoolArray, Shape
+from pliant.algorithms.arrays import F32, F64, I64, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.stereo.matching import WORST, inverse_depths_between, matching_costs
 from pliant.algorithms.stereo.semi_global import Penalties, Winners, best_steps
@@ -118,17 +118,25 @@ def pull_to_anchors(costs: U8, planes: F64, anchors: Anchors) -> None:
 
     planes: (D,) evenly spaced.  A point that is sure to a step counts 0.9, a worse one less.
     """
-    height, width, _ = costs.shape
-    step = planes[1] - planes[0]
     at = np.rint(anchors.points_px).astype(np.int64)
-    inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
-    for n in np.flatnonzero(inside):
-        spread = max(float(anchors.sigmas[n]), step)
+    _pull(costs, planes, at, anchors.inverse_depths, anchors.sigmas)
+
+
+@kernel
+def _pull(costs: U8, planes: F64, at: I64, inverse_depths: F64, sigmas: F64) -> None:
+    """at: (N, 2) pixels of the points, some of them perhaps outside."""
+    height, width, depths = costs.shape
+    step = planes[1] - planes[0]
+    for n in range(len(at)):
+        u, v = at[n, 0], at[n, 1]
+        if u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        spread = max(sigmas[n], step)
         share = _ANCHOR * step / spread
-        off = np.abs(planes - anchors.inverse_depths[n]) / (_UNSURE * spread)
-        column = costs[at[n, 1], at[n, 0]]
-        mixed = (1.0 - share) * column + share * WORST * np.minimum(off, 1.0)
-        costs[at[n, 1], at[n, 0]] = np.rint(mixed).astype(np.uint8)
+        for d in range(depths):
+            off = min(abs(planes[d] - inverse_depths[n]) / (_UNSURE * spread), 1.0)
+            mixed = (1.0 - share) * costs[v, u, d] + share * WORST * off
+            costs[v, u, d] = np.uint8(np.rint(mixed))
 
 
 def _costs(
@@ -209,8 +217,3 @@ def _median(values: F32, side: int) -> F32:
 
 def _nothing(shape: tuple[int, ...]) -> DenseDepth:
     return DenseDepth(np.zeros(shape, np.float32), np.zeros(shape, np.float32))
-
-
-def known(depth: DenseDepth) -> BoolArray:
-    """(H, W) where there is a depth at all."""
-    return (depth.inverse_depths > 0.0) & (depth.confidences > 0.0)
