@@ -84,6 +84,19 @@ def exported_models(
     show(measure(results))
 
 
+@app.command("held-out")
+def held_out(
+    results: Annotated[list[Path], typer.Argument(help="Result folders of runs.")],
+) -> None:
+    """The textured mesh beside frames that are no keyframes: ZNCC, holes, colours.
+
+    scripts/bench held-out results/room
+    """
+    from benchmarks.held_out import measure
+
+    show(measure(results))
+
+
 @app.command()
 def colmap(
     sources: Annotated[list[str], typer.Argument(help="Sequences with a ground truth.")],
