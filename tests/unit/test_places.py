@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from mapping_scene import CAMERA
 
-from pliant.algorithms import places
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.places import (
     Features,
@@ -54,21 +53,6 @@ def test_corners_are_found_again_where_the_camera_turned_and_came_nearer():
     assert np.count_nonzero(errors < 3.0) >= 40
     assert np.mean(errors < 3.0) > 0.7
     assert len(match(a, describe(noise(2)))) < 10
-
-
-def test_weak_corners_are_not_missed_where_strong_ones_abound(monkeypatch):
-    generator = np.random.default_rng(5)
-    grey = np.where(noise(5, 480, 640) > 127, 220, 30) + generator.normal(0.0, 6.0, (480, 640))
-    grey = grey.clip(0, 255).astype(np.uint8)
-    seen = describe(grey)
-    monkeypatch.setattr(places, "_STRONG", places._FAST_THRESHOLD)
-    every = describe(grey)
-
-    def rows(features: Features) -> list[bytes]:
-        return sorted(row.tobytes() for row in features.descriptors)
-
-    assert len(seen.descriptors) > 600
-    assert rows(seen) == rows(every)
 
 
 def test_an_image_of_nothing_has_no_corners():

@@ -40,10 +40,8 @@ _SCALE_FACTOR = 1.2
 _LEVELS = 8
 """Of the pyramid: 3.6 times."""
 
-_FAST_THRESHOLD, _STRONG = 10, 20
-"""Grey levels by which a corner differs: the first in half the light as well.  Only the strongest
-are kept, so weak ones are not looked for in an image that has as many strong ones at its own scale
-alone: noise makes tens of thousands."""
+_FAST_THRESHOLD = 10
+"""Grey levels by which a corner differs; in half the light as well."""
 
 _MAX_BITS = 64
 """Of 256 by which descriptors of one corner may differ."""
@@ -83,11 +81,9 @@ class Features:
 
 def describe(grey: U8) -> Features:
     """Corners of an image (H, W), none where it shows nothing."""
-    fast = cv2.FastFeatureDetector_create(_STRONG)  # pyright: ignore[reportAttributeAccessIssue]
-    strong = fast.detect(grey, None)
     orb = cv2.ORB_create(  # pyright: ignore[reportAttributeAccessIssue]
         nfeatures=_FEATURES, scaleFactor=_SCALE_FACTOR, nlevels=_LEVELS,
-        fastThreshold=_STRONG if len(strong) >= _FEATURES else _FAST_THRESHOLD,
+        fastThreshold=_FAST_THRESHOLD,
     )  # fmt: skip
     corners, descriptors = orb.detectAndCompute(grey, None)
     if descriptors is None:
