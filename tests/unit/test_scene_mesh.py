@@ -21,7 +21,7 @@ from pliant.fusion.live_mesh import LiveMesh
 from pliant.messages.mesh_pieces import split
 from pliant.messages.types import Header, MeshPiece, MeshUpdate
 from pliant.viewers.canvas import Canvas, Moment
-from pliant.viewers.scene_mesh import SceneMesh, some_triangles
+from pliant.viewers.scene_mesh import SceneMesh
 
 HEADER = Header(frame=0, stamp_ns=0, frame_id="world")
 AT = Moment(0, 0)
@@ -202,6 +202,6 @@ def test_the_mesh_of_a_world_that_goes_on_comes_back() -> None:
 
 def test_some_triangles_bring_their_vertices_along() -> None:
     _, mesh = pieces("fine", 3)
-    some = some_triangles(mesh, mesh.triangles[10:20])
+    some = mesh.of_triangles(slice(10, 20))
     assert list(rows(some)) == list(rows(mesh))[10:20]
     assert len(some.positions) <= 30

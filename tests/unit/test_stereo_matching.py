@@ -14,7 +14,6 @@ from pliant.algorithms.stereo.views import (
     motion,
     parallax_px,
     reduction,
-    sharpness,
     shrunk,
     shrunk_camera,
 )
@@ -187,8 +186,6 @@ def test_small_images_are_means_of_what_is_shown() -> None:
     assert small.shape == (3, 2)
     assert small[1, 0] == NOT_SHOWN
     assert small[2, 1] == np.floor(grey[8:12, 4:8].mean() + 0.5)
-    assert sharpness(small) > 0.0
-    assert sharpness(np.full((5, 5), 9, np.uint8)) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import transform
+from pliant.algorithms.image.sharpness import sharpness
 from pliant.algorithms.meshing.keyframe_surface import SeenPoints
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.stereo.consensus import consensus
@@ -23,7 +24,6 @@ from pliant.algorithms.stereo.views import (
     DenseDepth,
     StereoView,
     reduction,
-    sharpness,
     shrunk,
     shrunk_camera,
 )
@@ -64,10 +64,9 @@ class DenseDepths:
         usable = points_world[np.isfinite(points_world).all(axis=1)]
         if not (np.isfinite(T_world_camera).all() and len(usable)):
             return
-        small = shrunk(grey, shown, self._times)
-        self._spool.put_grey(keyframe, small)
+        self._spool.put_grey(keyframe, shrunk(grey, shown, self._times))
         some = usable[:: -(-len(usable) // SAMPLES)]
-        self._taken[keyframe] = _Taken(T_world_camera, some, sharpness(small))
+        self._taken[keyframe] = _Taken(T_world_camera, some, sharpness(grey))
 
     def sweep(self, keyframe: int, seen: SeenPoints, timer: StageTimer = no_stages) -> None:
         """The first pass, of one keyframe, when all are taken."""

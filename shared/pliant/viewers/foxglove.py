@@ -29,7 +29,6 @@ from pliant.pictures.map import PLACES_COLOUR
 from pliant.viewers.age_colours import age_buckets
 from pliant.viewers.canvas import Moment
 from pliant.viewers.point_blocks import PointBlocks
-from pliant.viewers.scene_mesh import some_triangles
 from pliant.viewers.surfel_quads import SurfelPicture
 
 _ROW = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
@@ -151,9 +150,7 @@ class FoxgloveFile:
         starts = range(0, len(mesh.triangles), _ENTITY_FACES)
         for part, first in enumerate(starts):
             update, entity = self._entity(at, segment, f"{name}/{part}")
-            _add_triangles(
-                entity, some_triangles(mesh, mesh.triangles[first : first + _ENTITY_FACES])
-            )
+            _add_triangles(entity, mesh.of_triangles(slice(first, first + _ENTITY_FACES)))
             self._write("/map/mesh", at, update, stamped=False)
         for part in range(len(starts), self._parts.get(name, 0)):
             update = self._kind("SceneUpdate")()

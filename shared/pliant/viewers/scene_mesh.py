@@ -1,8 +1,5 @@
 """The meshes of a run on a canvas: the live one as it grows, then the final one in its place."""
 
-import numpy as np
-
-from pliant.algorithms.arrays import I32
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh, no_blocks, unwelded
 from pliant.errors import MessageError
 from pliant.messages.mesh_pieces import PIECE_TRIANGLES, joined
@@ -84,21 +81,10 @@ class SceneMesh:
                 at,
                 max(0, self.segment),
                 name,
-                some_triangles(mesh, mesh.triangles[first : first + PIECE_TRIANGLES]),
+                mesh.of_triangles(slice(first, first + PIECE_TRIANGLES)),
             )
 
     def _clear(self, at: Moment) -> None:
         for name in (*self._drawn, *(f"live/{group}" for group in self._live.names())):
             self._canvas.mesh(at, max(0, self.segment), name, EMPTY)
         self._live, self._drawn = MeshGroups(), []
-
-
-def some_triangles(mesh: TriangleMesh, triangles: I32) -> TriangleMesh:
-    """Some of a mesh's triangles with the vertices that they use."""
-    used, corners = np.unique(triangles, return_inverse=True)
-    return TriangleMesh(
-        positions=mesh.positions[used],
-        normals=mesh.normals[used],
-        colours=mesh.colours[used],
-        triangles=corners.reshape(-1, 3).astype(np.int32),
-    )

@@ -97,8 +97,8 @@ class Evidence(NamedTuple):
     def confirmed_by(self, log_focals: F64, share: float = 1.0, known: bool = False) -> bool:
         """Whether log focal lengths (M,) range over as much as changes do, or the gain is certain.
 
-        share: of that range.   known: they were found to change, so that the gain decides: a map
-        that is held together by focal lengths of its own shows whatever range.
+        share: of that range.   known: they were found to change before, and the gain alone
+        decides: focal lengths that hold a map together may have drifted over any range.
         """
         low, high = focal_range(log_focals, self.gaps_s)
         ranges = known or (high - low) / _RANGE > share

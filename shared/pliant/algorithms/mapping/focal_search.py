@@ -1,10 +1,10 @@
 """Where an adjustment with an unknown focal length begins: the best along a line of focal lengths.
 
-A map bends with the focal length f it is made with: with f all depths, turns and, in a plane, its
-slope change together.  So the cost has a long curved valley along f, where damped Gauss-Newton
-steps, which change f and the map in a straight line, end far from the minimum: of a plane seen for
-a second they keep whatever f they begin with.  With f held the map has no such valley.  So f is
-stepped along the prior, the map adjusted at each, until both neighbours cost more.
+A change of the focal length f changes every depth, the rotations and the slope of a plane with it.
+So the cost has a long curved valley along f.  Damped Gauss-Newton steps are straight: they stop far
+from the minimum, and of a plane seen for a second they keep whatever f they begin with.  With f
+held there is no such valley.  So the map is adjusted at one held f after the other, in steps of the
+logarithm, downhill until the next one costs more.
 """
 
 from dataclasses import replace
@@ -37,8 +37,9 @@ def best_along_focal(
     held = uncertainty.model_copy(update={"focal": 0.0})
 
     def at(s: float, begun: BundleProblem, correction: F64) -> tuple[float, BundleProblem, F64]:
-        factors = np.where(np.arange(problem.intrinsics.shape[1]) < 2, np.exp(s), 1.0)
-        scaled = replace(begun, intrinsics=problem.intrinsics * factors)
+        intrinsics = problem.intrinsics.copy()
+        intrinsics[:, :2] *= np.exp(s)  # fx, fy
+        scaled = replace(begun, intrinsics=intrinsics)
         found = solve_schur(scaled, parameters, uncertainty=held, start=_with(correction, 0.0))
         cost = found.final_cost + 0.5 * (uncertainty.prior_px * s / uncertainty.focal) ** 2
         return cost, _moved(problem, found), _with(found.correction, s)

@@ -218,7 +218,7 @@ def find_moves(question: Question) -> Answer:
     refocus = seen.log_focal - question.seen.log_focal
     bent = bent or question.closed or after.changes or bool(refocus.any())
     moving = bent or len(question.keyframe_ids) >= 2 * parameters.window.keyframes
-    nothing = Answer(None, [], known, 0)  # of a map that has come apart, all would be lost
+    nothing = Answer(None, [], known, 0)  # poses that are not finite would spread to the whole map
     if not np.isfinite(seen.T_world_camera).all():
         return nothing
     moves = _moves(question, seen, before, depths) if moving else None

@@ -56,10 +56,9 @@ class TriangleMesh:
     colours: Annotated[U8, Shape("V", 3)]
     triangles: Annotated[I32, Shape("T", 3)]
 
-    def of_triangles(self, kept: BoolArray) -> "TriangleMesh":
-        """Some of its triangles, kept: (T,), and the vertices that these have."""
-        triangles = self.triangles[kept]
-        used, corners = np.unique(triangles, return_inverse=True)
+    def of_triangles(self, rows: BoolArray | slice) -> "TriangleMesh":
+        """Some of its triangles with the vertices that they use."""
+        used, corners = np.unique(self.triangles[rows], return_inverse=True)
         return TriangleMesh(
             positions=self.positions[used],
             normals=self.normals[used],

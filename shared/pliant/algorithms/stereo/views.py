@@ -121,14 +121,3 @@ def parallax_px(moved: Motion, pixels: F64, inverse_depths: F64) -> F64:
     depth = np.where(p[..., 2:] > 0.0, p[..., 2:], np.nan)
     slopes = (b[..., :2] - b[..., 2:] * p[..., :2] / depth) / depth
     return np.linalg.norm(slopes, axis=2)
-
-
-def sharpness(grey: U8) -> float:
-    """The mean change of grey from a pixel to the next, of those that are shown."""
-    values = grey.astype(np.float32)
-    total, count = 0.0, 0
-    for one, other in ((values[:, 1:], values[:, :-1]), (values[1:], values[:-1])):
-        both = (one != NOT_SHOWN) & (other != NOT_SHOWN)
-        total += float(np.abs(one - other)[both].sum())
-        count += int(np.count_nonzero(both))
-    return total / max(count, 1)
