@@ -23,7 +23,7 @@ def batch(
         typer.Option(help="Scheduler of Dask's, tcp://HOST:8786, whose workers run the clips."),
     ] = None,
 ) -> None:
-    """Run every clip of a folder; the same command again goes on after an interruption.
+    """Run every clip of a folder. After an interruption, repeat the command to resume.
 
     pliant batch clips --jobs 2
 

@@ -52,7 +52,7 @@ def evaluate(
         bool, typer.Option("--force", help="Replace an existing --json or --plot.")
     ] = False,
 ) -> None:
-    """Compare a result with the truth: ATE under Sim(3), RPE, success rate, final and causal.
+    """Compare a result with ground truth: ATE under Sim(3), RPE, success rate, final and online.
 
     pliant eval results/room --groundtruth built-in:room --tracks --map --mesh
 

@@ -26,7 +26,7 @@ def export(
         typer.Option("--output", "-o", help="Where to write [in the result folder]."),
     ] = None,
     every: Annotated[
-        int | None, typer.Option(min=1, help="surface: a mesh of every so-manyth frame [1].")
+        int | None, typer.Option(min=1, help="surface: write a mesh of every Nth frame [1].")
     ] = None,
     triangles: Annotated[
         int | None, typer.Option(min=100, help="glb, obj: most triangles of the mesh [40000].")

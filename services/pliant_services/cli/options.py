@@ -18,7 +18,7 @@ ConnectToo = Annotated[
     list[str] | None, typer.Option("--connect", help="Or a router endpoint, e.g. tcp/host:7447.")
 ]
 Running = Annotated[
-    Path | None, typer.Argument(help="Result folder of a run that goes on.", show_default=False)
+    Path | None, typer.Argument(help="Result folder of an active run.", show_default=False)
 ]
 TlsFolder = Annotated[
     Path | None, typer.Option("--tls", help="Folder that `pliant certs` made, for tls/ endpoints.")

@@ -20,7 +20,7 @@ def ros(
         float, typer.Option(min=0.0, help="Seconds to wait for a session that is to start.")
     ] = 0.0,
 ) -> None:
-    """Publish a run in ROS 2 while it goes on: poses, cloud, mesh, images.  It never slows a run.
+    """Publish an active run in ROS 2: poses, cloud, mesh, images.  It never slows a run.
 
     pliant ros results/room
 

@@ -136,7 +136,7 @@ def run(
     seed: Annotated[int | None, _settings(help="Seed of every random choice.")] = None,
     on_crash: Annotated[
         Literal["stop", "restart"],
-        _faults(help="A service that dies ends the run, or goes on where it was."),
+        _faults(help="What to do when a service dies: end the run, or restart the service."),
     ] = "stop",
     resume: Annotated[
         bool,

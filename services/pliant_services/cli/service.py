@@ -53,7 +53,7 @@ def service(
     ] = None,
     state: Annotated[
         Path | None,
-        typer.Option(help="Folder of checkpoints: a service that died goes on where it was."),
+        typer.Option(help="Folder of checkpoints, from which a restarted service resumes."),
     ] = None,
     tls: TlsFolder = None,
     alive: Annotated[
