@@ -117,6 +117,16 @@ def test_what_images_agree_on_is_in_the_final_mesh_and_not_in_the_live_one() -> 
     assert found[0] > 1.1 * found[1]
 
 
+def test_what_no_keyframe_has_a_surface_of_is_filled_faintly() -> None:
+    found: list[int] = []
+    for least in (0.01, 0.1):
+        settings = [f"meshing.tsdf.dense_min_weight={least}"]
+        z = final(run(with_texture(fewer_points(inputs())), settings=settings), "fine").positions
+        distance = np.minimum(np.abs(z[:, 2] - 3.0), np.abs(z[:, 2] - 4.0))
+        found.append(int(np.count_nonzero(distance < 0.02)))
+    assert found[0] > 1.02 * found[1]
+
+
 def test_without_texture_the_mesh_is_that_of_the_points(outputs: dict[Topic, list[Header]]) -> None:
     points = run(inputs(), settings=["meshing.depth=points"])
     for level in ("fine", "coarse"):

@@ -41,7 +41,11 @@ def joined(hidden: BoolArray | None = None) -> dict[int, SeenPoints]:
             dense.take(step, pose(step), true_depth_points(step), view(step).grey, shown)
         for step in STEPS:
             dense.sweep(step, seen(step))
-        return {step: dense.with_sure_pixels(step, seen(step)) for step in STEPS}
+        return {step: with_sure_pixels(dense, step, seen(step)) for step in STEPS}
+
+
+def with_sure_pixels(dense: DenseDepths, keyframe: int, points: SeenPoints) -> SeenPoints:
+    return dense.with_sure_pixels(keyframe, points, dense.agreed(keyframe))
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +112,7 @@ def test_a_keyframe_alone_or_with_a_broken_pose_keeps_its_points() -> None:
         dense.take(2, pose(2), np.full((5, 3), np.nan), view(2).grey, shown)
         for keyframe in (0, 1, 2, 7):
             dense.sweep(keyframe, seen(0))
-            assert len(dense.with_sure_pixels(keyframe, seen(0)).ids) == 100
+            assert len(with_sure_pixels(dense, keyframe, seen(0)).ids) == 100
 
 
 def test_depths_on_disk_have_half_precision_whatever_the_scale_of_the_map() -> None:

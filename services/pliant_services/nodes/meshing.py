@@ -15,6 +15,7 @@ import numpy as np
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
 from pliant.algorithms.meshing.parameters import SurfaceParameters, TsdfParameters
+from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.meshing.tsdf_volume import TsdfVolume
 from pliant.bus.base import Bus, join, receive, receive_one
 from pliant.config import Config
@@ -99,7 +100,7 @@ def warm_up() -> None:
 
 
 def _warm_up_stereo(camera: PinholeCamera, points: SeenPoints) -> None:
-    """Sweep two keyframes side by side, and ask each for the other's depth."""
+    """Sweep two keyframes side by side, ask each for the other's depth, and fill with it."""
     grey = np.full((camera.height, camera.width), 128, np.uint8)
     with KeyframeSpool() as spool:
         dense = DenseDepths(camera, SurfaceParameters().noise_px, spool)
@@ -109,4 +110,7 @@ def _warm_up_stereo(camera: PinholeCamera, points: SeenPoints) -> None:
             dense.take(keyframe, pose, points.points_world, grey, grey > 0)
         for keyframe in range(2):
             dense.sweep(keyframe, points)
-        dense.with_sure_pixels(0, points)
+        agreed = dense.agreed(0)
+        dense.with_sure_pixels(0, points, agreed)
+        nothing = np.zeros((camera.height, camera.width), np.float32)
+        dense.filled(DepthMap(nothing, nothing), agreed)

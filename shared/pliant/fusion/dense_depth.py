@@ -2,10 +2,9 @@
 
 Two passes over keyframes whose poses are final.  The first sweeps each with the images around it;
 what it finds waits on disk.  The second asks the neighbours of a keyframe whether they see the same
-surface, and takes the pixels that are sure beside the map's points.
+surface.  The pixels that are sure join the map's points; the others fill what is then left bare.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +14,11 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import transform
 from pliant.algorithms.image.sharpness import sharpness
 from pliant.algorithms.meshing.keyframe_surface import SeenPoints
+from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.stereo.consensus import consensus
 from pliant.algorithms.stereo.dense_points import matching_sigmas, sure_pixels
+from pliant.algorithms.stereo.filling import filled
 from pliant.algorithms.stereo.sources import SAMPLES, Viewpoints, choose_sources
 from pliant.algorithms.stereo.sweep import Anchors, swept_depth
 from pliant.algorithms.stereo.views import (
@@ -29,7 +30,7 @@ from pliant.algorithms.stereo.views import (
 )
 from pliant.fusion.keyframe_spool import KeyframeSpool
 
-_SOURCES, _NEIGHBOURS = 6, 12
+_SOURCES, _NEIGHBOURS = 4, 12
 """Keyframes with whose images one is swept, and whose depths are asked."""
 _FIRST_ID = 2**30
 """Of pixels as points: beyond all points of the map."""
@@ -80,22 +81,28 @@ class DenseDepths:
             depth = swept_depth(self._view(keyframe), sources, self._anchors(keyframe, seen))
         self._spool.put_depth(keyframe, depth)
 
-    def with_sure_pixels(
-        self, keyframe: int, seen: SeenPoints, timer: StageTimer = no_stages
-    ) -> SeenPoints:
-        """The second pass, of one keyframe: what it sees, and the pixels that are sure."""
+    def agreed(self, keyframe: int, timer: StageTimer = no_stages) -> DenseDepth | None:
+        """The second pass, of one keyframe: what its neighbours say of its depth; None: nothing."""
         around = self._around.get(keyframe, [])
         if not around:
-            return seen
+            return None
         with timer("dense consensus"):
-            view, views = self._view(keyframe), [self._view(other) for other in around]
+            views = [self._view(other) for other in around]
             depths = [self._spool.depth(other) for other in around]
-            agreed = consensus(view, self._spool.depth(keyframe), views, depths)
-            return self._joined(seen, view, agreed, views[:_SOURCES])
+            return consensus(self._view(keyframe), self._spool.depth(keyframe), views, depths)
 
-    def _joined(
-        self, seen: SeenPoints, view: StereoView, agreed: DenseDepth, sources: Sequence[StereoView]
+    def filled(self, depth_map: DepthMap, agreed: DenseDepth | None) -> DepthMap:
+        """The depth map of a keyframe, and what was agreed on where that shows nothing."""
+        return depth_map if agreed is None else filled(depth_map, agreed, self._times)
+
+    def with_sure_pixels(
+        self, keyframe: int, seen: SeenPoints, agreed: DenseDepth | None
     ) -> SeenPoints:
+        """What a keyframe sees, and the pixels that are sure."""
+        if agreed is None:
+            return seen
+        view = self._view(keyframe)
+        sources = [self._view(other) for other in self._around[keyframe][:_SOURCES]]
         sure = sure_pixels(agreed, self._small(seen.points_px.astype(np.float64)))
         count = len(sure.inverse_depths)
         rays = np.ones((count, 3))

@@ -268,6 +268,8 @@ class Mesher:
     ) -> Iterator[FinalMesh]:
         unit = self._median_depth(keyframes)
         tsdf = self._parameters.tsdf
+        if self._parameters.depth == "dense":
+            tsdf = tsdf.model_copy(update={"min_weight": tsdf.dense_min_weight})
         volumes = {
             level: FinalVolume(share * unit, self._camera, tsdf)
             for level, share in (("fine", tsdf.fine_voxel), ("coarse", tsdf.coarse_voxel))
@@ -277,12 +279,14 @@ class Mesher:
         for keyframe in keyframes:
             correction, pose = self._correction(keyframe), self._pose(keyframe)
             colour = self._colour(keyframe, correction)
-            seen = dense.with_sure_pixels(keyframe, self._seen(keyframe), timer)
+            agreed = dense.agreed(keyframe, timer)
+            seen = dense.with_sure_pixels(keyframe, self._seen(keyframe), agreed)
             surface = self._surfaces.surface(pose, seen, timer)
             if surface.depth_map is None or colour is None:
                 problem = f"keyframe {keyframe}: {surface.problem or _NO_IMAGE}"
                 continue
-            depth_map = self._within(keyframe, surface.depth_map, correction)
+            depth_map = dense.filled(surface.depth_map, agreed)
+            depth_map = self._within(keyframe, depth_map, correction)
             for level, volume in volumes.items():
                 with timer(f"final {level} fusion"):
                     volume.put(depth_map, colour, pose)

@@ -120,6 +120,12 @@ class TsdfParameters(Parameters):
         description="Voxels whose weights sum to less are not meshed: one sight, face on, weighs 1 "
         "where its depth is certain, 0.5 where it may be 1 % off, 0.1 where it may be 3 % off.",
     )
+    dense_min_weight: float = Field(
+        default=0.01,
+        ge=0.0,
+        description="The same for meshing.depth=dense, which fills with a weight of 0.01 what no "
+        "keyframe has a surface of.",
+    )
     free_space: bool = Field(
         default=True, description="What a keyframe sees through counts against surface there."
     )
