@@ -27,7 +27,6 @@ LATER = {
     "redkitchen.md",
     "results.md",
     "ros.md",
-    "sources.md",
     "surfels.md",
     "viewing.md",
 }
