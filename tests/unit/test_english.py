@@ -25,7 +25,6 @@ LATER = {
     "redkitchen.md",
     "results.md",
     "surfels.md",
-    "viewing.md",
 }
 PAGES = [
     page
