@@ -124,7 +124,7 @@ def test_what_no_keyframe_has_a_surface_of_is_filled_faintly() -> None:
         z = final(run(with_texture(fewer_points(inputs())), settings=settings), "fine").positions
         distance = np.minimum(np.abs(z[:, 2] - 3.0), np.abs(z[:, 2] - 4.0))
         found.append(int(np.count_nonzero(distance < 0.02)))
-    assert found[0] > 1.02 * found[1]
+    assert found[0] > 1.06 * found[1]  # 1.02 by what is seen faintly
 
 
 def test_without_texture_the_mesh_is_that_of_the_points(outputs: dict[Topic, list[Header]]) -> None:

@@ -31,21 +31,17 @@ def seen(step: int) -> SeenPoints:
     )
 
 
-def joined(hidden: BoolArray | None = None) -> dict[int, SeenPoints]:
+def joined(hidden: BoolArray | None = None, workers: int = 3) -> dict[int, SeenPoints]:
     """What each keyframe sees after both passes.  hidden: (H, W) what masks cover, in all."""
     with KeyframeSpool() as spool:
-        dense = DenseDepths(CAMERA, NOISE_PX, spool)
+        dense = DenseDepths(CAMERA, NOISE_PX, spool, workers)
         for step in STEPS:
             shown = np.ones((CAMERA.height, CAMERA.width), np.bool_)
             shown = shown if hidden is None else ~hidden
             dense.take(step, pose(step), true_depth_points(step), view(step).grey, shown)
-        for step in STEPS:
-            dense.sweep(step, seen(step))
-        return {step: with_sure_pixels(dense, step, seen(step)) for step in STEPS}
-
-
-def with_sure_pixels(dense: DenseDepths, keyframe: int, points: SeenPoints) -> SeenPoints:
-    return dense.with_sure_pixels(keyframe, points, dense.agreed(keyframe))
+        dense.sweep((step, seen(step)) for step in STEPS)
+        agreements = zip(STEPS, dense.agreed(STEPS), strict=True)
+        return {k: dense.with_sure_pixels(k, seen(k), agreed) for k, agreed in agreements}
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +84,8 @@ def test_with_sure_pixels_more_of_a_view_is_covered(found: dict[int, SeenPoints]
     assert covered["dense"] > covered["points"] + 0.02
 
 
-def test_the_same_bytes_again(found: dict[int, SeenPoints]) -> None:
-    for step, points in joined().items():
+def test_the_same_bytes_with_any_number_of_threads(found: dict[int, SeenPoints]) -> None:
+    for step, points in joined(workers=1).items():
         assert points.points_world.tobytes() == found[step].points_world.tobytes()
         assert points.sigmas.tobytes() == found[step].sigmas.tobytes()
 
@@ -110,9 +106,10 @@ def test_a_keyframe_alone_or_with_a_broken_pose_keeps_its_points() -> None:
         dense.take(0, pose(0), true_depth_points(0), view(0).grey, shown)
         dense.take(1, nowhere, true_depth_points(1), view(1).grey, shown)
         dense.take(2, pose(2), np.full((5, 3), np.nan), view(2).grey, shown)
-        for keyframe in (0, 1, 2, 7):
-            dense.sweep(keyframe, seen(0))
-            assert len(with_sure_pixels(dense, keyframe, seen(0)).ids) == 100
+        keyframes = (0, 1, 2, 7)
+        dense.sweep((keyframe, seen(0)) for keyframe in keyframes)
+        for keyframe, agreed in zip(keyframes, dense.agreed(keyframes), strict=True):
+            assert len(dense.with_sure_pixels(keyframe, seen(0), agreed).ids) == 100
 
 
 def test_depths_on_disk_have_half_precision_whatever_the_scale_of_the_map() -> None:

@@ -108,9 +108,8 @@ def _warm_up_stereo(camera: PinholeCamera, points: SeenPoints) -> None:
             pose = np.eye(4)
             pose[0, 3] = 0.2 * keyframe
             dense.take(keyframe, pose, points.points_world, grey, grey > 0)
-        for keyframe in range(2):
-            dense.sweep(keyframe, points)
-        agreed = dense.agreed(0)
+        dense.sweep((keyframe, points) for keyframe in range(2))
+        (agreed,) = dense.agreed([0])
         dense.with_sure_pixels(0, points, agreed)
         nothing = np.zeros((camera.height, camera.width), np.float32)
         dense.filled(DepthMap(nothing, nothing), agreed)

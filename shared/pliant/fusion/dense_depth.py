@@ -5,6 +5,7 @@ what it finds waits on disk.  The second asks the neighbours of a keyframe wheth
 surface.  The pixels that are sure join the map's points; the others fill what is then left bare.
 """
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,7 @@ from pliant.algorithms.stereo.views import (
     shrunk_camera,
 )
 from pliant.fusion.keyframe_spool import KeyframeSpool
+from pliant.fusion.parallel import in_order, processors
 
 _SOURCES, _NEIGHBOURS = 4, 12
 """Keyframes with whose images one is swept, and whose depths are asked."""
@@ -43,13 +45,26 @@ class _Taken:
     sharpness: float
 
 
+@dataclass(frozen=True)
+class _Swept:
+    """around: the keyframes beside it, the most telling first."""
+
+    keyframe: int
+    around: list[int]
+    depth: DenseDepth
+
+
 class DenseDepths:
     """The keyframes of one segment.  Images and depths wait in the spool.
 
-    noise_px: of the map's observations, in whose unit sigmas are.
+    noise_px: of the map's observations, in whose unit sigmas are.    workers: threads of a pass;
+    with any number of them the bytes are the same.
     """
 
-    def __init__(self, camera: PinholeCamera, noise_px: float, spool: KeyframeSpool) -> None:
+    def __init__(
+        self, camera: PinholeCamera, noise_px: float, spool: KeyframeSpool,
+        workers: int | None = None,
+    ) -> None:  # fmt: skip
         self._whole = camera
         self._times = reduction(camera)
         self._camera = shrunk_camera(camera, self._times)
@@ -58,6 +73,7 @@ class DenseDepths:
         self._taken: dict[int, _Taken] = {}
         self._around: dict[int, list[int]] = {}
         self._turn = 0
+        self._workers = processors() if workers is None else workers
 
     def take(self, keyframe: int, T_world_camera: F64, points_world: F64, grey: U8,
              shown: BoolArray) -> None:  # fmt: skip
@@ -69,27 +85,28 @@ class DenseDepths:
         some = usable[:: -(-len(usable) // SAMPLES)]
         self._taken[keyframe] = _Taken(T_world_camera, some, sharpness(grey))
 
-    def sweep(self, keyframe: int, seen: SeenPoints, timer: StageTimer = no_stages) -> None:
-        """The first pass, of one keyframe, when all are taken."""
-        if keyframe not in self._taken:
-            return
-        with timer("dense sources"):
-            around = self._neighbours(keyframe)
-            self._around[keyframe] = around
-            sources = [self._view(other) for other in around[:_SOURCES]]
-        with timer("dense sweep"):
-            depth = swept_depth(self._view(keyframe), sources, self._anchors(keyframe, seen))
-        self._spool.put_depth(keyframe, depth)
+    def sweep(self, seen: Iterable[tuple[int, SeenPoints]], timer: StageTimer = no_stages) -> None:
+        """The first pass, when all are taken: of keyframes and what each sees."""
+        known = ((keyframe, points) for keyframe, points in seen if keyframe in self._taken)
+        results = in_order(self._swept, known, self._workers)
+        while True:
+            with timer("dense sweep"):
+                swept = next(results, None)
+            if swept is None:
+                return
+            self._around[swept.keyframe] = swept.around
+            self._spool.put_depth(swept.keyframe, swept.depth)
 
-    def agreed(self, keyframe: int, timer: StageTimer = no_stages) -> DenseDepth | None:
-        """The second pass, of one keyframe: what its neighbours say of its depth; None: nothing."""
-        around = self._around.get(keyframe, [])
-        if not around:
-            return None
-        with timer("dense consensus"):
-            views = [self._view(other) for other in around]
-            depths = [self._spool.depth(other) for other in around]
-            return consensus(self._view(keyframe), self._spool.depth(keyframe), views, depths)
+    def agreed(
+        self, keyframes: Sequence[int], timer: StageTimer = no_stages
+    ) -> Iterator[DenseDepth | None]:
+        """The second pass, of each keyframe in turn, when the first one is done: what it and its
+        neighbours agree on; None: nothing."""
+        results = in_order(self._agreed, keyframes, self._workers)
+        for _ in keyframes:
+            with timer("dense consensus"):
+                agreed = next(results)
+            yield agreed
 
     def filled(self, depth_map: DepthMap, agreed: DenseDepth | None) -> DepthMap:
         """The depth map of a keyframe, and what was agreed on where that shows nothing."""
@@ -121,6 +138,21 @@ class DenseDepths:
             sigmas=np.concatenate([seen.sigmas, sigmas.astype(np.float32)]),
             keyframes=np.concatenate([seen.keyframes, keyframes]),
         )
+
+    def _swept(self, told: tuple[int, SeenPoints]) -> _Swept:
+        keyframe, seen = told
+        around = self._neighbours(keyframe)
+        sources = [self._view(other) for other in around[:_SOURCES]]
+        depth = swept_depth(self._view(keyframe), sources, self._anchors(keyframe, seen))
+        return _Swept(keyframe, around, depth)
+
+    def _agreed(self, keyframe: int) -> DenseDepth | None:
+        around = self._around.get(keyframe, [])
+        if not around:
+            return None
+        views = [self._view(other) for other in around]
+        depths = [self._spool.depth(other) for other in around]
+        return consensus(self._view(keyframe), self._spool.depth(keyframe), views, depths)
 
     def _neighbours(self, keyframe: int) -> list[int]:
         known = list(self._taken)

@@ -2,6 +2,7 @@
 
 import tempfile
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 
@@ -25,10 +26,14 @@ class _Place:
 
 
 class KeyframeSpool:
-    """A temporary file; the last that was told of a keyframe counts.  A context manager."""
+    """A temporary file; the last that was told of a keyframe counts.  A context manager.
+
+    Threads may read at the same time.
+    """
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile(prefix="pliant-keyframes-")  # noqa: SIM115
+        self._lock = Lock()  # between seeking and reading
         self._images: dict[int, _Place] = {}
         self._masks: dict[int, _Place] = {}
         self._observations: dict[int, _Place] = {}
@@ -45,7 +50,8 @@ class KeyframeSpool:
     @property
     def size_bytes(self) -> int:
         """Size of the file."""
-        return self._file.seek(0, 2)
+        with self._lock:
+            return self._file.seek(0, 2)
 
     def put_image(self, keyframe: int, jpeg: bytes) -> None:
         """Keep the image of a keyframe."""
@@ -134,13 +140,15 @@ class KeyframeSpool:
     def _put(self, places: dict[int, _Place], keyframe: int, data: bytes) -> None:
         """In the place of what was told before, where there is room."""
         old = places.get(keyframe)
-        if old is not None and len(data) <= old.room:
-            self._file.seek(old.offset)
-            places[keyframe] = _Place(old.offset, len(data), old.room)
-        else:
-            places[keyframe] = _Place(self._file.seek(0, 2), len(data), len(data))
-        self._file.write(data)
+        with self._lock:
+            if old is not None and len(data) <= old.room:
+                self._file.seek(old.offset)
+                places[keyframe] = _Place(old.offset, len(data), old.room)
+            else:
+                places[keyframe] = _Place(self._file.seek(0, 2), len(data), len(data))
+            self._file.write(data)
 
     def _read(self, place: _Place) -> bytes:
-        self._file.seek(place.offset)
-        return self._file.read(place.size)
+        with self._lock:
+            self._file.seek(place.offset)
+            return self._file.read(place.size)

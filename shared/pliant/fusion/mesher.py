@@ -276,10 +276,10 @@ class Mesher:
         }
         dense = self._dense(keyframes, timer)
         fused, problem = 0, ""
-        for keyframe in keyframes:
+        agreements = dense.agreed(keyframes, timer)
+        for keyframe, agreed in zip(keyframes, agreements, strict=True):
             correction, pose = self._correction(keyframe), self._pose(keyframe)
             colour = self._colour(keyframe, correction)
-            agreed = dense.agreed(keyframe, timer)
             seen = dense.with_sure_pixels(keyframe, self._seen(keyframe), agreed)
             surface = self._surfaces.surface(pose, seen, timer)
             if surface.depth_map is None or colour is None:
@@ -319,8 +319,7 @@ class Mesher:
                 shown = view.shows if used is None else view.shows & used
                 points = self._seen(keyframe).points_world
                 dense.take(keyframe, self._pose(keyframe), points, grey_of(colour), shown)
-        for keyframe in keyframes:
-            dense.sweep(keyframe, self._seen(keyframe), timer)
+        dense.sweep(((keyframe, self._seen(keyframe)) for keyframe in keyframes), timer)
         return dense
 
     def _median_depth(self, keyframes: list[int]) -> float:
