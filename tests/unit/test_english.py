@@ -18,7 +18,6 @@ LATER = {
     "architecture.md",
     "deployment.md",
     "experiments.md",
-    "faults.md",
     "meshing.md",
     "places.md",
     "recording.md",
