@@ -16,7 +16,6 @@ ROOT = Path(__file__).parents[2]
 LATER = {
     "CHANGELOG.md",
     "architecture.md",
-    "deployment.md",
     "experiments.md",
     "meshing.md",
     "places.md",
