@@ -16,6 +16,7 @@ from pliant.algorithms.arrays import F32, I64
 from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.self_calibration import widened
 from pliant.algorithms.tracking.tracker import ExtremaTracker
@@ -139,7 +140,7 @@ def reach_back(
         tracks = tracker.track(image.grey, stamp_ns, clearance=clearance)
         colour = image.colour if image.colour.size else None
         grey = filled(image.grey, clearance)
-        told.take(mapper.process(number, stamp_ns, tracks, grey, colour))
+        told.take(mapper.process(Frame(number, stamp_ns, tracks, grey, colour)))
         told.take_keyframes(mapper.publish_keyframes(), number, image, mapper.waiting_frames)
     told.take(mapper.finish())
     told.take_keyframes(mapper.publish_keyframes())

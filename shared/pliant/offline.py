@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.known_places import KnownPlaces
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.trial import mapper_for
@@ -24,7 +25,7 @@ from pliant.messages.types import Image
 
 
 @dataclass(frozen=True)
-class Frame:
+class MappedFrame:
     """What one frame led to."""
 
     image: Image
@@ -64,7 +65,7 @@ class Pipeline:
             self._mapper.atlas.places = places
         self._last = 0
 
-    def take(self, source: SourceFrame) -> Frame:
+    def take(self, source: SourceFrame) -> MappedFrame:
         """Track and map the next frame."""
         image = rectified(source, self._rectifier)
         if image.missing:
@@ -76,13 +77,13 @@ class Pipeline:
                 image.grey, image.stamp_ns, self._timers.tracking, clearance
             )
             colour = image.colour if image.colour.size else None
-            delta = self._mapper.process(
-                image.frame, image.stamp_ns, tracks, filled(image.grey, clearance), colour,
-                self._timers.bundle_adjustment,
-            )  # fmt: skip
+            frame = Frame(
+                image.frame, image.stamp_ns, tracks, filled(image.grey, clearance), colour
+            )
+            delta = self._mapper.process(frame, self._timers.bundle_adjustment)
         self.history.apply(delta, frame=image.frame, stamp_ns=image.stamp_ns)
         self._last = image.frame
-        return Frame(image, tracks, delta)
+        return MappedFrame(image, tracks, delta)
 
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
@@ -101,7 +102,7 @@ def process(
     history: MapHistory,
     *,
     timers: Timers = Timers(),
-) -> Iterator[Frame]:
+) -> Iterator[MappedFrame]:
     """Track and map every frame of a source; ``history`` is complete once the iterator ends."""
     pipeline = Pipeline(dataset.calibration, config, history, timers)
     for source in dataset:

@@ -9,6 +9,7 @@ from benchmarks.deceiving_scenes import CAMERA, Film, Way, furniture, room_with
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.geometry import align_umeyama, inverse, so3_log, transform
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.tracking.maxima import maxima_of
 from pliant.algorithms.tracking.tracker import ExtremaTracker
@@ -38,7 +39,7 @@ class Mapped:
         mapper = Mapper(self._camera, config.bundle_adjustment, config.seed)
         for k, (grey, _) in enumerate(views):
             stamp_ns = round(k * 1e9 / CAMERA.fps)
-            mapper.process(k, stamp_ns, tracker.track(grey, stamp_ns), grey, None)
+            mapper.process(Frame(k, stamp_ns, tracker.track(grey, stamp_ns), grey))
             mapper.publish_keyframes()
         mapper.finish()
         self._atlas = mapper.atlas

@@ -15,6 +15,7 @@ from benchmarks.deceiving_scenes import CAMERA, Deceiver, Film, Way, doors, floo
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.known_places import KnownPlaces
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.mapper import Mapper
@@ -93,7 +94,7 @@ class _Session:
         frame, self._next = self._next, self._next + 1
         stamp_ns = round(frame * 1e9 / CAMERA.fps)
         tracks = self.tracker.track(grey, stamp_ns)
-        delta = self.mapper.process(frame, stamp_ns, tracks, grey, None)
+        delta = self.mapper.process(Frame(frame, stamp_ns, tracks, grey))
         self.mapper.publish_keyframes()
         self.history.apply(delta, frame=frame, stamp_ns=stamp_ns)
         self.joined += len(delta.joined)

@@ -13,6 +13,7 @@ from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import align_umeyama, inverse, pose_to_matrix, so3_log, transform
 from pliant.algorithms.kept_keyframe import KeptKeyframe
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.tracking.tracker import ExtremaTracker
@@ -74,7 +75,7 @@ class Source:
             tracks = tracker.track(image.grey, image.stamp_ns)
             tracked = time.process_time()
             last, colour = image.frame, image.colour if image.colour.size else None
-            delta = mapper.process(last, image.stamp_ns, tracks, image.grey, colour)
+            delta = mapper.process(Frame(last, image.stamp_ns, tracks, image.grey, colour))
             mapper.publish_keyframes()
             spent[0] += tracked - begin
             spent[1] += time.process_time() - tracked

@@ -11,6 +11,7 @@ from benchmarks.table import markdown
 from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, pose_to_matrix, so3_log, transform
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.relocalisation import Recognised
@@ -46,7 +47,7 @@ class _Run:
             image = rectified(frame, rectifier)
             tracks = tracker.track(image.grey, image.stamp_ns)
             last = image.frame
-            delta = self.mapper.process(last, image.stamp_ns, tracks, image.grey, None)
+            delta = self.mapper.process(Frame(last, image.stamp_ns, tracks, image.grey))
             self.mapper.publish_keyframes()
             history.apply(delta, frame=last, stamp_ns=image.stamp_ns)
             if last % _EVERY == 0:

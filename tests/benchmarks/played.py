@@ -10,6 +10,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import align_umeyama
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.known_places import KnownPlaces
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.mapper import Mapper
@@ -127,7 +128,7 @@ class Reel:
             stamp_ns = int(self.stamps_ns[number]) if on_and_on else number * self.step_ns
             begin = time.process_time()
             tracks = tracker.track(image.grey, stamp_ns)
-            delta = mapper.process(number, stamp_ns, tracks, image.grey, colour)
+            delta = mapper.process(Frame(number, stamp_ns, tracks, image.grey, colour))
             mapper.publish_keyframes()
             spent += time.process_time() - begin
             history.apply(delta, frame=number, stamp_ns=stamp_ns)

@@ -9,6 +9,7 @@ from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.mapping import final_adjustment, frame_focal
 from pliant.algorithms.mapping.changing_focal import Evidence, focal_range
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.frame_focal import shows_at_once
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.mapper import Mapper
@@ -34,7 +35,7 @@ def run(factors, calibration=None):
     online = np.zeros(FRAMES)
     for frame, tracks in enumerate(Scene.box(death=0.02).frames(poses)):
         seen = magnified(tracks, factors[frame])
-        published.apply(mapper.process(frame, frame * INTERVAL_NS, seen, None, None))
+        published.apply(mapper.process(Frame(frame, frame * INTERVAL_NS, seen)))
         online[frame] = mapper.calibration.log_focal + mapper.calibration.correction[0]
     final = mapper.finish()
     published.apply(final)

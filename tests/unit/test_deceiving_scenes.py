@@ -8,6 +8,7 @@ from test_meetings import PARAMETERS, along, film
 from test_recovery import dark, textures
 from test_relocalisation import Film
 
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.tracks import FrameExtrema
 
@@ -52,7 +53,7 @@ def run(shots: Film) -> tuple[Published, int, Mapper]:
     """What a run publishes, how many segments have been joined, and the mapper."""
     mapper, published, joined = Mapper(CAMERA, PARAMETERS, 0), Published(), 0
     for k, (tracks, grey) in enumerate(shots):
-        delta = mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
+        delta = mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey))
         mapper.publish_keyframes()
         published.apply(delta)
         joined += len(delta.joined)

@@ -19,6 +19,7 @@ from pliant.algorithms.mapping.directions import (
     placed_candidates,
     refine_pose_spread,
 )
+from pliant.algorithms.mapping.frame import Frame, IdealFrame
 from pliant.algorithms.mapping.frame_pose import localise
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
@@ -217,12 +218,12 @@ def test_a_full_turn_on_the_spot_stays_in_one_map(axis):
 def test_a_direction_tells_half_of_what_a_point_does(count, state):
     *frames, last = surroundings().frames(full_turn((0, 1, 0))[:65])
     mapper = Mapper(CAMERA, MappingParameters(), 0)
-    states = [mapper.process(k, k * INTERVAL_NS, t, None, None).state for k, t in enumerate(frames)]
+    states = [mapper.process(Frame(k, k * INTERVAL_NS, t)).state for k, t in enumerate(frames)]
     assert states[-1] == TRACKING
     shared = np.flatnonzero(np.isin(last.ids, frames[-1].ids))[:count]
     few = {name: getattr(last, name)[shared] for name in ("ids", "points_px", "ages", "kappas")}
     left = replace(last, **few, states=last.states[shared], maxima=last.maxima[:0])
-    delta = mapper.process(len(frames), len(frames) * INTERVAL_NS, left, None, None)
+    delta = mapper.process(Frame(len(frames), len(frames) * INTERVAL_NS, left))
     assert delta.state == state
 
 
@@ -241,7 +242,7 @@ def test_frames_that_turned_before_the_map_started_get_poses():
 def test_directions_move_with_the_map_and_are_where_an_adjustment_leaves_it():
     mapper = Mapper(CAMERA, MappingParameters(), 0)
     for frame, tracks in enumerate(Scene.box(death=0.1).frames(sideways(45))):
-        mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+        mapper.process(Frame(frame, frame * INTERVAL_NS, tracks))
     active = mapper.atlas.active
     last, points = active.keyframes[-1], active.points
     rows = active.window.rows[placed_candidates(points, active.window.rows)]
@@ -278,7 +279,7 @@ def test_a_point_that_an_adjustment_takes_to_infinity_is_a_direction_again():
     """Of the map that remains every point has a place, and its track tells of turns."""
     mapper, published = Mapper(CAMERA, MappingParameters(), 0), Published()
     for frame, tracks in enumerate(Scene.box(death=0.02).frames(sideways(60))):
-        published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+        published.apply(mapper.process(Frame(frame, frame * INTERVAL_NS, tracks)))
         if frame == 30:
             points, active = mapper.atlas.points, mapper.atlas.active
             seen = active.window.current_rows()
@@ -308,15 +309,15 @@ def test_candidates_that_helped_one_frame_are_not_missed_in_the_next():
     frames = list(Scene.box().frames(sideways(31)))
     mapper = Mapper(CAMERA, MappingParameters(), 0)
     for frame, tracks in enumerate(frames[:30]):
-        mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+        mapper.process(Frame(frame, frame * INTERVAL_NS, tracks))
     active, calibration, last = mapper.atlas.active, mapper.calibration, mapper._motion
     assert active is not None
     active.links.follow(frames[30].ids, active.points)
-    seen = calibration.ideal(frames[30])
+    frame = IdealFrame.of(Frame(30, 30 * INTERVAL_NS, frames[30]), calibration)
 
     def is_firm(**tracked):
         motion, generator = replace(last, **tracked), np.random.default_rng(0)
-        located = localise(active, calibration, motion, 30 * INTERVAL_NS, seen, None, generator)
+        located = localise(active, motion, frame, generator)
         assert located is not None
         return located.is_firm
 

@@ -16,6 +16,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.kept_keyframe import MAP_VERSION, KeptKeyframe
 from pliant.algorithms.map_delta import TRACKING, WAITING
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.kept_map import check, take_in
 from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.map_store import MAPPED, PointRows
@@ -88,7 +89,7 @@ def test_another_session_goes_on_in_the_map(
     told: list[int] = []
     places: list[list[int]] = []
     for k, (tracks, grey) in enumerate(shots):
-        delta = mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
+        delta = mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey))
         places += delta.same_places.tolist()
         history.apply(delta, frame=k, stamp_ns=k)
         published.apply(delta)
@@ -158,7 +159,7 @@ def test_frames_are_localised_and_nothing_is_mapped(
     for k, (tracks, grey) in enumerate(shots):
         if k == 10:  # it may be started again
             localiser = load_state(save_state(localiser))
-        delta = localiser.process(k, k * INTERVAL_NS, tracks, grey, None)
+        delta = localiser.process(Frame(k, k * INTERVAL_NS, tracks, grey))
         assert len(delta.same_places) == (k == 1)
         published.apply(delta)
         assert not len(localiser.publish_keyframes().keyframe_ids)
@@ -189,7 +190,7 @@ def test_few_tracks_that_lead_on_need_no_look_at_the_whole_map(
         all_of = {field.name: getattr(tracks, field.name) for field in fields(FrameTracks)}
         some = {name: each[few] for name, each in all_of.items() if len(each) == len(few)}
         seen = replace(tracks, **some)
-        delta = localiser.process(k, k * INTERVAL_NS, seen, grey, None)
+        delta = localiser.process(Frame(k, k * INTERVAL_NS, seen, grey))
         assert delta.state == TRACKING
         assert delta.inliers > 5 * len(seen.ids)
     assert len(shots) == len(poses)
@@ -219,7 +220,7 @@ def test_frames_of_a_rolling_shutter_are_localised_as_if_taken_at_once(
         assert localiser.calibration.readout == known
         for k, tracks in enumerate(frames):
             image = grey if k == 0 else None
-            published.apply(localiser.process(k, k * INTERVAL_NS, tracks, image, None))
+            published.apply(localiser.process(Frame(k, k * INTERVAL_NS, tracks, image)))
         assert published.states == [TRACKING] * len(poses)
         errors.append(trajectory_error(published, poses)[0])
     assert errors[1] < 0.3 * errors[0]

@@ -5,6 +5,7 @@ import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 
 from pliant.algorithms.mapping import keyframes
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.keyframes import Overlap, is_due
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
@@ -69,7 +70,7 @@ def test_tracks_of_noise_make_no_keyframes(monkeypatch, mapped, due):
     """Where most candidates end at once and points stay; few points are no measure."""
     mapper = Mapper(CAMERA, MappingParameters(), 0)
     for frame, tracks in enumerate(Scene.box().frames(sideways(30))):
-        mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+        mapper.process(Frame(frame, frame * INTERVAL_NS, tracks))
     active = mapper.atlas.active
     assert active is not None
 

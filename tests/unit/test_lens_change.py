@@ -11,6 +11,7 @@ from pliant.algorithms.corrected_view import moved_px
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.first_map import WaitingFrame
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -30,7 +31,7 @@ OTHER = KNOWN.with_lens(FOUND, COVARIANCE)
 def active():
     mapper = Mapper(CAMERA, MappingParameters(), 0)
     for k, tracks in enumerate(Scene.box().frames(sideways(30))):
-        mapper.process(k, k * INTERVAL_NS, tracks, None, None)
+        mapper.process(Frame(k, k * INTERVAL_NS, tracks))
     return mapper.atlas.active
 
 

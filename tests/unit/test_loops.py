@@ -12,6 +12,7 @@ from test_whole_map import error_of, similarity
 from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.mapping.final_adjustment import ListedMap
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.loops import Loop, close_loops
 from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
@@ -54,7 +55,7 @@ def drifted_once(world):
     scene, frames = world
     mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
     for k, tracks in enumerate(frames[: 2 * AWAY]):
-        published.apply(mapper.process(k, k * INTERVAL_NS, tracks, None, None))
+        published.apply(mapper.process(Frame(k, k * INTERVAL_NS, tracks)))
     active = mapper.atlas.active
     ids = np.array([keyframe.id for keyframe in active.keyframes])
     drift = np.array([similarity(1.005**k, (0, 1e-3 * k, 0), (0, 0, 0)) for k in range(len(ids))])
@@ -146,7 +147,7 @@ def test_the_map_goes_on_and_readers_have_it(drifted):
     mapper.atlas.ask(2 * AWAY - 1)
     for k in range(2 * AWAY, 2 * AWAY + 10):
         mapper = load_state(save_state(mapper))
-        delta = mapper.process(k, k * INTERVAL_NS, frames[k], None, None)
+        delta = mapper.process(Frame(k, k * INTERVAL_NS, frames[k]))
         published.apply(delta)
         mapper.publish_keyframes()
         told += delta.same_places.tolist()
@@ -231,7 +232,7 @@ def test_a_place_that_looks_alike_is_too_far_for_drift(world):
     _, frames = world
     mapper = Mapper(CAMERA, PARAMETERS, 0)
     for k, tracks in enumerate(frames[:AWAY]):
-        mapper.process(k, k * INTERVAL_NS, tracks, None, None)
+        mapper.process(Frame(k, k * INTERVAL_NS, tracks))
     active, points = mapper.atlas.active, mapper.atlas.points
     first, last = active.keyframes[0], active.keyframes[-1]
     S = first.T_world_camera @ inverse(last.T_world_camera)

@@ -9,6 +9,7 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 from pliant.algorithms.arrays import check_arrays
 from pliant.algorithms.geometry import align_umeyama, move_by_similarity, pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -66,7 +67,7 @@ class Published:
 def run(frames, parameters=PARAMETERS, seed=0):
     mapper, published, deltas = Mapper(CAMERA, parameters, seed), Published(), []
     for frame, tracks in enumerate(frames):
-        deltas.append(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+        deltas.append(mapper.process(Frame(frame, frame * INTERVAL_NS, tracks)))
         published.apply(deltas[-1])
     deltas.append(mapper.finish())
     published.apply(deltas[-1])
@@ -99,7 +100,7 @@ def test_points_are_told_again_only_where_they_are_known_otherwise():
         return dict(zip(delta.point_ids.tolist(), rows, strict=True))
 
     for frame, tracks in enumerate(Scene.box(death=0.02, noise_px=0.3).frames(sideways(60))):
-        delta = mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+        delta = mapper.process(Frame(frame, frame * INTERVAL_NS, tracks))
         is_keyframe = mapper.publish_keyframes().new >= 0
         if (active := mapper.atlas.active) is None:
             continue
@@ -192,7 +193,7 @@ def test_a_late_reader_catches_up_by_the_snapshots():
     mapper, late = Mapper(CAMERA, parameters, 0), Published()
     poses = sideways(42)
     for frame, tracks in enumerate(Scene.box().frames(poses)):
-        delta = mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+        delta = mapper.process(Frame(frame, frame * INTERVAL_NS, tracks))
         if frame >= 39:
             for name in ("pose_frames", "removed_point_ids"):
                 assert getattr(delta, name).ndim == 1
@@ -328,7 +329,7 @@ def test_frames_that_are_passed_over_get_no_pose_and_the_next_one_goes_on():
     mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
     for frame, tracks in enumerate(Scene.box().frames(poses)):
         if frame % 3 == 0:
-            published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+            published.apply(mapper.process(Frame(frame, frame * INTERVAL_NS, tracks)))
             continue
         delta = mapper.skip(frame, "no time")
         assert (delta.reason, delta.inliers, len(delta.pose_frames)) == ("no time", 0, 0)
@@ -348,10 +349,10 @@ def test_frames_that_are_not_mapped_get_poses_by_their_tracks(mapper_of):
     mapper, published = mapper_of(CAMERA, PARAMETERS, 0), Published()
     for frame, tracks in enumerate(Scene.box().frames(poses)):
         if frame % 4 == 0:
-            published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+            published.apply(mapper.process(Frame(frame, frame * INTERVAL_NS, tracks)))
             continue
         began = mapper.point_count > 0
-        delta = mapper.only_localise(frame, frame * INTERVAL_NS, tracks, "no time")
+        delta = mapper.only_localise(Frame.of_tracks(frame, frame * INTERVAL_NS, tracks), "no time")
         assert (frame in delta.pose_frames.tolist()) == (delta.reason != "no time") == began
         assert len(delta.point_ids) == 0 or delta.snapshot
         assert not began or frame not in delta.keyframe_frames.tolist()
@@ -369,10 +370,10 @@ def test_a_frame_that_no_tracks_place_waits_for_the_next_mapped_one():
     mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
     for frame, tracks in enumerate(Scene.box().frames(poses)):
         if frame not in (30, 31):
-            published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+            published.apply(mapper.process(Frame(frame, frame * INTERVAL_NS, tracks)))
             continue
         few = FrameExtrema.of(first(tracks, 40), tracks.maxima)
-        delta = mapper.only_localise(frame, frame * INTERVAL_NS, few, "no time")
+        delta = mapper.only_localise(Frame.of_tracks(frame, frame * INTERVAL_NS, few), "no time")
         assert (delta.state, delta.reason, len(delta.pose_frames)) == (TRACKING, "no time", 0)
         published.apply(delta)
     published.apply(mapper.finish())
@@ -391,9 +392,9 @@ def test_a_lost_camera_is_not_found_by_frames_that_are_not_mapped():
     frames = list(Scene.box().frames(sideways(44)))
     mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
     for frame, tracks in enumerate(frames[:30]):
-        published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
-    assert mapper.process(30, 30 * INTERVAL_NS, FrameExtrema.empty(), None, None).state == LOST
-    delta = mapper.only_localise(31, 31 * INTERVAL_NS, frames[31], "no time")
+        published.apply(mapper.process(Frame(frame, frame * INTERVAL_NS, tracks)))
+    assert mapper.process(Frame(30, 30 * INTERVAL_NS, FrameExtrema.empty())).state == LOST
+    delta = mapper.only_localise(Frame.of_tracks(31, 31 * INTERVAL_NS, frames[31]), "no time")
     assert (delta.state, delta.reason, len(delta.pose_frames)) == (LOST, "no time", 0)
 
 
@@ -401,8 +402,8 @@ def test_a_frame_without_pixels_leaves_the_state_as_it_was():
     mapper = Mapper(CAMERA, PARAMETERS, 0)
     assert mapper.skip(0).state == WAITING
     for k, tracks in enumerate(Scene.box().frames(sideways(20))):
-        state = mapper.process(k, k * INTERVAL_NS, tracks, None, None).state
+        state = mapper.process(Frame(k, k * INTERVAL_NS, tracks)).state
     assert state == TRACKING
     assert mapper.skip(20).state == TRACKING
-    assert mapper.process(21, 21 * INTERVAL_NS, FrameExtrema.empty(), None, None).state == LOST
+    assert mapper.process(Frame(21, 21 * INTERVAL_NS, FrameExtrema.empty())).state == LOST
     assert mapper.skip(22).state == LOST

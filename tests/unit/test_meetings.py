@@ -12,6 +12,7 @@ from test_recovery import dark, picture, textures
 
 from pliant.algorithms.geometry import align_umeyama, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -59,7 +60,7 @@ def run(shots, restored=()):
     for k, (tracks, grey) in enumerate(shots):
         if k in restored:
             mapper = load_state(save_state(mapper))
-        delta = mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
+        delta = mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey))
         mapper.publish_keyframes()
         deltas.append(delta)
         published.apply(delta)
@@ -220,7 +221,7 @@ def followed(shots, strays):
     """As ``run``, without the end.   strays: frames after which the segment strays."""
     mapper, history = Mapper(CAMERA, PARAMETERS, 0), MapHistory()
     for k, (tracks, grey) in enumerate(shots):
-        delta = mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
+        delta = mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey))
         mapper.publish_keyframes()
         history.apply(delta, frame=k, stamp_ns=k)
         if k in strays:

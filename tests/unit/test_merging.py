@@ -14,6 +14,7 @@ from test_relocalisation import Film
 from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import TRACKING
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.kept_map import corrected_as
 from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.mapper import Mapper
@@ -36,7 +37,7 @@ NIGHT = [dark(FrameExtrema.empty())] * 40
 def mapped(shots: Film) -> list[MapKeyframe]:
     mapper = Mapper(CAMERA, PARAMETERS, 0)
     for k, (tracks, grey) in enumerate(shots):
-        mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
+        mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey))
         mapper.publish_keyframes()
     mapper.finish()
     return messages(mapper)
@@ -112,7 +113,7 @@ def test_frames_of_either_find_themselves_in_it(one: Merged) -> None:
     for poses in (FIRST[:3], SECOND[:3]):
         localiser = Localiser(CAMERA, PARAMETERS, 0, known=one.keyframes)
         for k, (tracks, grey) in enumerate(film(WALL, SQUARES, poses, 5)):
-            delta = localiser.process(k, k * INTERVAL_NS, tracks, grey, None)
+            delta = localiser.process(Frame(k, k * INTERVAL_NS, tracks, grey))
             assert (delta.state, delta.segment) == (TRACKING, 0)
 
 

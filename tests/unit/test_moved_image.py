@@ -5,9 +5,10 @@ from mapping_scene import CAMERA
 
 from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.image.moved_image import MovedImage, moved_image
-from pliant.algorithms.mapping.frame_pose import image_of_tracks
+from pliant.algorithms.mapping.frame import Frame, IdealFrame
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.tracks import FrameExtrema
 
 WIDTH, HEIGHT = 640, 480
 
@@ -46,20 +47,21 @@ def test_an_image_is_where_lens_and_shutter_have_moved_the_tracks():
     known = SelfCalibration(CAMERA, correction, np.zeros((6, 6)))
     motion = np.array([0.01, -0.02, 0.0, 0.03, 0.0, 0.01])
     rolled = RolledFrame(known.view, 0.3, motion, 0.2)
-    found, lens = (image_of_tracks(known, each, smooth) for each in (rolled, None))
-    assert found is not None
-    assert lens is not None
-    np.testing.assert_array_equal(lens.whole, known.view.image(smooth))
+    lens = IdealFrame.of(Frame(0, 0, FrameExtrema.empty(), smooth), known)
+    found = lens.to_global_shutter(rolled, np.zeros(0))
+    assert found.colours is not None
+    np.testing.assert_array_equal(found.colours.whole, found.image)
+    np.testing.assert_array_equal(lens.image, known.view.image(smooth))
     at_once = RolledFrame(CorrectedView(known.view.camera, ()), 0.3, motion, 0.2)
-    one_by_one = at_once.image(lens.whole)
+    one_by_one = at_once.image(lens.image)
     inner = (slice(20, -20), slice(20, -20))
-    assert np.abs(found.whole[inner].astype(int) - one_by_one[inner]).max() <= 2
-    assert np.abs(found.whole[inner].astype(int) - smooth[inner]).max() > 20
+    assert np.abs(found.image[inner].astype(int) - one_by_one[inner]).max() <= 2
+    assert np.abs(found.image[inner].astype(int) - smooth[inner]).max() > 20
     seen = rng.uniform((99, 99), (CAMERA.width - 99, CAMERA.height - 99), (500, 2))
     px = seen.astype(np.float32)
     ideal = known.view.pixels(px)
     at = ideal - rolled.shifts(ideal)
     back = [cv2.remap(p, at[:, :1], at[:, 1:], cv2.INTER_LINEAR) for p in rolled.places]
     np.testing.assert_allclose(np.hstack(back), px, atol=0.02)
-    assert image_of_tracks(known, None, None) is None
+    assert not IdealFrame.of(Frame.of_tracks(0, 0, FrameExtrema.empty()), known).has_image
     assert CorrectedView(CAMERA, ()).move is None

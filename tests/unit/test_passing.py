@@ -6,6 +6,7 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 
 from pliant.algorithms.geometry import align_umeyama, inverse, pose_to_matrix, transform
 from pliant.algorithms.mapping import passing
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.map_store import CANDIDATE, Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -86,7 +87,7 @@ def test_a_camera_that_stands_still_keeps_no_more_and_more(monkeypatch):
     mapper = Mapper(CAMERA, impatient(PARAMETERS), seed=0)
     kept = []
     for k, tracks in enumerate(Scene.box().frames(poses)):
-        mapper.process(k, k * INTERVAL_NS, tracks, None, None)
+        mapper.process(Frame(k, k * INTERVAL_NS, tracks))
         active = mapper.atlas.active
         kept.append(sum(len(each.rows) for each in active.segment.passed._frames) if active else 0)
     assert 1000 < max(kept) <= 2000
@@ -96,7 +97,7 @@ def test_frames_between_keyframes_gain_from_the_whole_map():
     poses = sideways(20)
     mapper, history = Mapper(CAMERA, impatient(PARAMETERS), seed=0), MapHistory()
     for k, tracks in enumerate(Scene.box().frames(poses)):
-        delta = mapper.process(k, k * INTERVAL_NS, tracks, None, None)
+        delta = mapper.process(Frame(k, k * INTERVAL_NS, tracks))
         history.apply(delta, frame=k, stamp_ns=k * INTERVAL_NS)
     hanging = dict(history.frames)
     history.apply(mapper.finish(), frame=len(poses) - 1, stamp_ns=0, final=True)

@@ -11,6 +11,7 @@ from test_mapper import Published, trajectory_error
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.map_delta import LOST, TRACKING
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.localisation import Motion, search_radius_px
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, RecoveryParameters
@@ -89,7 +90,7 @@ def test_the_map_goes_on_after_frames_that_show_nothing_of_it(seen, spoil, count
     blind = range(20, 20 + count)
     for k, (tracks, grey) in enumerate(zip(frames, images, strict=True)):
         now = spoil(tracks) if k in blind else (anew(tracks) if k > blind[0] else tracks, grey)
-        published.apply(mapper.process(k, k * INTERVAL_NS, now[0], now[1], None))
+        published.apply(mapper.process(Frame(k, k * INTERVAL_NS, now[0], now[1])))
     published.apply(mapper.finish())
     assert [k for k, state in enumerate(published.states) if state == LOST] == list(blind)
     assert set(range(len(poses))) - set(published.poses) == set(blind)
@@ -105,11 +106,11 @@ def test_another_place_is_not_taken_for_the_map(seen):
     squares = textures(len(elsewhere.points))[::-1]
     mapper, published = Mapper(CAMERA, MappingParameters(), 0), Published()
     for k in range(22):
-        published.apply(mapper.process(k, k * INTERVAL_NS, frames[k], images[k], None))
+        published.apply(mapper.process(Frame(k, k * INTERVAL_NS, frames[k], images[k])))
     after = list(elsewhere.frames(poses))
     for k, tracks in enumerate(after):
         grey = picture(elsewhere, squares, poses[k])
-        delta = mapper.process(22 + k, (22 + k) * INTERVAL_NS, anew(tracks), grey, None)
+        delta = mapper.process(Frame(22 + k, (22 + k) * INTERVAL_NS, anew(tracks), grey))
         published.apply(delta)
     segments = [segment for _, (_, _, segment) in sorted(published.poses.items())]
     assert segments == [0] * 22 + [1] * len(after)
@@ -125,10 +126,10 @@ def test_the_map_does_not_go_on_by_fewer_points_than_it_starts_with(seen, every,
     kept = [each if i % every == 0 else flat for i, each in enumerate(textures(500))]
     mapper = Mapper(CAMERA, limits, 0)
     for k in range(20):
-        mapper.process(k, k * INTERVAL_NS, frames[k], images[k], None)
-    assert mapper.process(20, 20 * INTERVAL_NS, *dark(frames[20]), None).state == LOST
+        mapper.process(Frame(k, k * INTERVAL_NS, frames[k], images[k]))
+    assert mapper.process(Frame(20, 20 * INTERVAL_NS, *dark(frames[20]))).state == LOST
     grey = picture(scene, kept, poses[21])
-    found = mapper.process(21, 21 * INTERVAL_NS, anew(frames[21]), grey, None)
+    found = mapper.process(Frame(21, 21 * INTERVAL_NS, anew(frames[21]), grey))
     assert found.state == state
     assert every > 1 or found.inliers >= limits.start.min_points
 
@@ -151,8 +152,8 @@ def test_a_few_tracks_that_a_cut_has_left_place_no_camera():
         mapper, published = Mapper(CAMERA, MappingParameters(), 0), Published()
         for k, tracks in enumerate(frames):
             grey = picture(scene, squares, poses[k])
-            published.apply(mapper.process(k, k * INTERVAL_NS, tracks, grey, None))
-        published.apply(mapper.process(len(frames), len(frames) * INTERVAL_NS, *shot, None))
+            published.apply(mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey)))
+        published.apply(mapper.process(Frame(len(frames), len(frames) * INTERVAL_NS, *shot)))
         seen[what] = published
     assert seen["something else"].states[-1] == LOST
     assert len(frames) not in seen["something else"].poses

@@ -10,6 +10,7 @@ from test_recovery import dark, picture, textures
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.map_delta import LOST, TRACKING, MapMoves
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, WholeMapParameters
 from pliant.algorithms.mapping.relocalisation import Place
@@ -41,7 +42,7 @@ def known() -> tuple[Scene, list[np.ndarray]]:
 def run(shots: Film, mapper: Mapper | None = None, first: int = 0) -> tuple[Published, Mapper]:
     mapper, published = mapper or Mapper(CAMERA, MappingParameters(), 0), Published()
     for k, (tracks, grey) in enumerate(shots, first):
-        published.apply(mapper.process(k, k * INTERVAL_NS, tracks, grey, None))
+        published.apply(mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey)))
         mapper.publish_keyframes()
     return published, mapper
 

@@ -7,6 +7,7 @@ from test_mapper import Published, trajectory_error
 from test_recovery import picture, textures
 
 from pliant.algorithms.mapping import known_places
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.known_places import Comparisons, Revisits
 from pliant.algorithms.mapping.map_store import Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
@@ -172,7 +173,7 @@ def test_the_mapper_closes_a_loop_that_it_sees(killed):
         if killed and mapper.whole_map.closing:
             mapper = load_state(save_state(mapper))
         grey = picture(scene, squares, poses[k])
-        delta = mapper.process(k, k * INTERVAL_NS, tracks, grey, None)
+        delta = mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey))
         published.apply(delta)
         moved.append(len(delta.moved_keyframes))
     assert sum(count > 0 for count in moved) >= 1

@@ -10,6 +10,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import align_umeyama, inverse, so3_exp
 from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.mapper import Mapper
@@ -210,7 +211,7 @@ class Shaken:
             Scene.box().frames(self.poses, later=self.at, readout=self.readout)
         ):
             tracks.append(some)
-            delta = mapper.process(frame, frame * INTERVAL_NS, some, None, None)
+            delta = mapper.process(Frame(frame, frame * INTERVAL_NS, some))
             history.apply(delta, frame=frame, stamp_ns=frame)
             keyframes.append(mapper.publish_keyframes())
         return mapper, history, tracks, keyframes

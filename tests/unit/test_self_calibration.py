@@ -10,6 +10,7 @@ from test_mapper import Published, trajectory_error
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.map_delta import TRACKING, WAITING
 from pliant.algorithms.mapping import start, trial
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import widened
@@ -26,7 +27,7 @@ def guessed(factor):
 def run(frames, factor, parameters=PARAMETERS):
     mapper, published = mapper_for(guessed(factor), parameters, 0, GUESS_SIGMA), Published()
     for frame, tracks in enumerate(frames):
-        published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+        published.apply(mapper.process(Frame(frame, frame * INTERVAL_NS, tracks)))
     final = mapper.finish()
     return published.apply(final), final
 
@@ -71,7 +72,7 @@ def test_a_trial_begins_though_two_motions_are_alike_which_wrong_focal_lengths_m
     published, calibrated = run(frames, 0.65)[0], Published()
     mapper = Mapper(CAMERA, PARAMETERS, 0)
     for frame, tracks in enumerate(frames):
-        calibrated.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+        calibrated.apply(mapper.process(Frame(frame, frame * INTERVAL_NS, tracks)))
     assert "two motions" in calibrated.reasons[-1]
     assert "focal length is known to" in published.reasons[-2]  # before the end
 
@@ -80,7 +81,7 @@ def test_keyframes_tell_the_pixels_of_the_image_not_of_the_camera_that_was_found
     _, frames = turning
     mapper = mapper_for(guessed(0.65), PARAMETERS, 0, GUESS_SIGMA)
     for frame, tracks in enumerate(frames):
-        mapper.process(frame, frame * INTERVAL_NS, tracks, None, None)
+        mapper.process(Frame(frame, frame * INTERVAL_NS, tracks))
     final = mapper.finish()
     told = mapper.publish_keyframes()
     frame_of = dict(zip(final.keyframe_ids.tolist(), final.keyframe_frames.tolist(), strict=True))

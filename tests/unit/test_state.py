@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from pliant import __version__
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.tracking.parameters import TrackingParameters
@@ -155,7 +156,9 @@ def test_tracker_and_mapper_go_on_as_if_nothing_had_been() -> None:
         def step(tracker: ExtremaTracker, mapper: Mapper, image=image) -> tuple[bytes, bytes]:
             header = Header(frame=image.frame, stamp_ns=image.stamp_ns, frame_id="world")
             tracks = tracker.track(image.grey, image.stamp_ns)
-            delta = mapper.process(image.frame, image.stamp_ns, tracks, image.grey, image.colour)
+            delta = mapper.process(
+                Frame(image.frame, image.stamp_ns, tracks, image.grey, image.colour)
+            )
             return (
                 codec.encode(Extrema.of(header, tracks)),
                 codec.encode(MapUpdate.of(header, delta)),

@@ -8,9 +8,10 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 from test_mapper import run, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING
-from pliant.algorithms.mapping.frame_pose import doubt, support_of
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, SupportParameters
+from pliant.algorithms.mapping.pose_quality import doubt, support_of
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.map_history import FramePose, MapHistory
 from pliant.messages.types import PASSED_OVER
@@ -72,7 +73,7 @@ def test_a_large_moving_thing_is_told_of():
             kept = {name: getattr(tracks, name) for name in vars(tracks)}
             maxima = np.column_stack([points_px, tracks.kappas])
             now = FrameExtrema(**{**kept, "points_px": points_px, "maxima": maxima})
-            delta = mapper.process(k, k * INTERVAL_NS, now, None, None)
+            delta = mapper.process(Frame(k, k * INTERVAL_NS, now))
             if delta.state == TRACKING:
                 reasons.setdefault(other, []).append(delta.reason)
     assert not any(reasons[False])

@@ -13,6 +13,7 @@ from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.mapping import thinning
 from pliant.algorithms.mapping.atlas import Atlas
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.map_store import FREE, MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
@@ -223,7 +224,7 @@ def test_the_map_keeps_its_size_where_the_camera_comes_back():
     mapper, published = Mapper(CAMERA, MappingParameters(window=room), 0), Published()
     rows, most = [], 0
     for frame, tracks in enumerate(Scene.box(death=0.01).frames(poses)):
-        published.apply(mapper.process(frame, frame * INTERVAL_NS, tracks, None, None))
+        published.apply(mapper.process(Frame(frame, frame * INTERVAL_NS, tracks)))
         mapper.publish_keyframes()
         if mapper.atlas.active is not None:
             most = max(most, observations_of([mapper.atlas.active.segment]))
@@ -255,7 +256,7 @@ def along(poses, window):
         px = tracks.points_px + generator.normal(0.0, 0.3, tracks.points_px.shape)
         seen = replace(tracks, points_px=px.astype(np.float32))
         thinned = mapper.atlas.active is not None and mapper.atlas.active.segment.thinned
-        delta = mapper.process(frame, frame * INTERVAL_NS, seen, None, None)
+        delta = mapper.process(Frame(frame, frame * INTERVAL_NS, seen))
         published.apply(delta)
         moved += [delta.moved_keyframes] if thinned and len(delta.moved_keyframes) else []
     published.apply(mapper.finish())

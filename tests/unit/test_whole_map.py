@@ -19,6 +19,7 @@ from pliant.algorithms.geometry import (
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping import whole_map
 from pliant.algorithms.mapping.final_adjustment import _spread_out, adjust_listed
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
@@ -69,7 +70,7 @@ def fold(parameters, *, frames=FRAMES, camera=CAMERA, poses=None, beside=False, 
         if beside:
             asking.ask(mapper.whole_map)
             asking.answer(mapper.whole_map, frame)
-        deltas.append(mapper.process(frame, frame * 33_000_000, some, None, None))
+        deltas.append(mapper.process(Frame(frame, frame * 33_000_000, some)))
         history.apply(deltas[-1], frame=frame, stamp_ns=frame)
     return mapper, deltas, history
 
@@ -205,7 +206,7 @@ def test_at_the_end_the_beginning_is_where_it_was(lost):
     mapper.follow([mapper.atlas.move(far)])
     if lost:
         for frame in range(FRAMES, FRAMES + 60):
-            delta = mapper.process(frame, frame * 33_000_000, FrameExtrema.empty(), None, None)
+            delta = mapper.process(Frame(frame, frame * 33_000_000, FrameExtrema.empty()))
             history.apply(delta, frame=frame, stamp_ns=frame)
         assert mapper.atlas.active is None
     frame = deltas[-1].pose_frames[-1]

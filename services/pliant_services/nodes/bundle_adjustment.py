@@ -27,6 +27,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.image.masks import filled
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.map_store import Keyframe as KeyframeOfMap
@@ -87,7 +88,8 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
             delta = mapper.skip(tracks.frame, PASSED_OVER)
         elif image.unmapped:
             with monitor.stage("tracked pose"):
-                delta = mapper.only_localise(tracks.frame, tracks.stamp_ns, tracks, PASSED_OVER)
+                frame = Frame.of_tracks(tracks.frame, tracks.stamp_ns, tracks)
+                delta = mapper.only_localise(frame, PASSED_OVER)
         else:
             beside.answer(mapper.whole_map, tracks.frame)
             colour = image.colour if image.colour.size else None
@@ -95,7 +97,8 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
             grey = filled(image.grey, covered)
             with monitor.stage("maxima"):
                 seen = FrameExtrema.of(tracks, maxima_of(grey, config.tracking, covered))
-            delta = mapper.process(tracks.frame, tracks.stamp_ns, seen, grey, colour, monitor.stage)
+            frame = Frame(tracks.frame, tracks.stamp_ns, seen, grey, colour)
+            delta = mapper.process(frame, monitor.stage)
         bus.publish(topics.MAP_UPDATE, _update(tracks, delta))
         keyframes = mapper.publish_keyframes()
         if tracks.frame in delta.keyframe_frames:
@@ -211,7 +214,7 @@ def warm_up() -> None:
             maxima=np.column_stack([px, kappas]),
             dominant_flow=np.eye(2, 3),
         )
-        mapper.process(frame, 33_333_333 * frame, tracks, grey, colour)
+        mapper.process(Frame(frame, 33_333_333 * frame, tracks, grey, colour))
     none = np.zeros((0, 2), np.int64)
     loop = Loop(old=0, new=5, S_old_new=np.eye(4), rows=none.astype(np.int32), ids=none)
     mapper.whole_map.loops.append(loop)

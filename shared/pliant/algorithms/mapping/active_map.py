@@ -4,9 +4,8 @@ import bisect
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
+from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.covisibility import (
     MAX_MISSES,
@@ -17,6 +16,7 @@ from pliant.algorithms.mapping.covisibility import (
     rows_of,
 )
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
+from pliant.algorithms.mapping.frame import IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.map_store import (
     CANDIDATE,
@@ -97,14 +97,8 @@ class ActiveMap:
         """Those of the segment, oldest first."""
         return self.segment.keyframes
 
-    def begin(
-        self,
-        start: Start,
-        waiting: list[WaitingFrame],
-        grey: U8 | None,
-        colours: MovedImage | None,
-    ) -> None:
-        """Take over a start.  The images are those of the newest of the waiting frames."""
+    def begin(self, start: Start, waiting: list[WaitingFrame], latest: IdealFrame) -> None:
+        """Take over a start.   latest: the newest of the waiting frames, with its image."""
         newest = waiting[-1]
         rows = self.points.allocate(len(start.ids))
         self.points.segment[rows] = self.segment.id
@@ -115,8 +109,8 @@ class ActiveMap:
         self.links.ids, self.links.rows = start.ids, rows
         self.links.follow(newest.ids, self.points)
         self._link_new_tracks(newest.points_px)
-        self._paint(rows, start.newest_px, colours)
-        self._paint(self.links.rows, newest.points_px, colours)
+        self._paint(rows, start.newest_px, latest)
+        self._paint(self.links.rows, newest.points_px, latest)
         self.points.kappas[self.links.rows] = newest.kappas
         frames = {frame.frame: frame for frame in waiting}
         for k, number in enumerate(start.frames.tolist()):
@@ -133,7 +127,7 @@ class ActiveMap:
             )  # fmt: skip
         for keyframe in self.keyframes[: -self.parameters.window.keyframes - 1]:
             self.segment.leave_window(keyframe)  # one more leaves with each that comes
-        self._settle(self.keyframes[-1], grey)
+        self._settle(self.keyframes[-1], latest)
 
     def linked(self, state: int) -> I64:
         """Indices of the living tracks whose row has the given state."""
@@ -201,27 +195,29 @@ class ActiveMap:
         distance_b = np.linalg.norm(self.points.xyz[b] - centre, axis=1)
         return np.abs(distance_a - distance_b) < _SAME_DEPTH_SHARE * distance_b
 
-    def observed(self, points_px: F32, found: Observations, directions: I64) -> tuple[I32, F32]:
+    def observed(self, placed: PlacedFrame, directions: I64) -> tuple[I32, F32]:
         """Rows and pixels of the points that place the current frame."""
-        linked = np.concatenate([self.linked(MAPPED), directions])
-        rows = np.concatenate([self.links.rows[linked], found.rows])
-        return rows, np.concatenate([points_px[linked], found.points_px])
+        return self._observed(placed, np.concatenate([self.linked(MAPPED), directions]))
 
-    def see(self, T_world_camera: F64, points_px: F32, found: Observations) -> None:
+    def see(self, placed: PlacedFrame) -> None:
         """Put the current frame into the window."""
-        self.window.see(T_world_camera, *self._seen(points_px, found))
+        self.window.see(placed.T_world_camera, *self._seen(placed))
 
-    def pass_by(self, frame: int, T_world_camera: F64, points_px: F32, found: Observations) -> None:
+    def pass_by(self, placed: PlacedFrame) -> None:
         """The current frame is no keyframe: it hangs on the last one."""
-        seen = self._seen(points_px, found)
-        log_focal = self.seen_by.log_focal
-        self.segment.passed.add(frame, self.keyframes[-1], T_world_camera, *seen, log_focal)
+        self.segment.passed.add(
+            placed.frame.number, self.keyframes[-1], placed.T_world_camera, *self._seen(placed),
+            self.seen_by.log_focal,
+        )  # fmt: skip
 
-    def _seen(self, points_px: F32, found: Observations) -> tuple[I32, F32]:
+    def _seen(self, placed: PlacedFrame) -> tuple[I32, F32]:
         """Rows and pixels of all points and candidates that the current frame sees."""
-        linked = self.links.rows != UNLINKED
-        rows = np.concatenate([self.links.rows[linked], found.rows])
-        return rows, np.concatenate([points_px[linked], found.points_px])
+        return self._observed(placed, np.flatnonzero(self.links.rows != UNLINKED))
+
+    def _observed(self, placed: PlacedFrame, tracks: I64) -> tuple[I32, F32]:
+        found, points_px = placed.found, placed.frame.tracks.points_px
+        rows = np.concatenate([self.links.rows[tracks], found.rows])
+        return rows, np.concatenate([points_px[tracks], found.points_px])
 
     def join(self, loop: Loop) -> None:
         """Points that a loop has shown to be the same become one, as far as they still exist."""
@@ -237,49 +233,35 @@ class ActiveMap:
         once[first] = rows[first]
         self.links.rows[linked] = once
 
-    def insert_keyframe(
-        self,
-        frame: int,
-        stamp_ns: int,
-        T_world_camera: F64,
-        points_px: F32,
-        rolled_px: F32,
-        found: Observations,
-        grey: U8 | None,
-        colours: MovedImage | None,
-        turned: bool,
-    ) -> Keyframe:
-        """Make the frame a keyframe and adjust the window.
-
-        points_px, rolled_px: of all living tracks.   found: points that it sees without a track.
-        grey: (H, W), with all of it where the tracks are.   turned: whether it stands where the
-        last one does.
-        """
+    def insert_keyframe(self, placed: PlacedFrame) -> Keyframe:
+        """Make the current frame a keyframe and adjust the window."""
+        frame, found = placed.frame, placed.found
+        points_px = frame.tracks.points_px
         new = self._link_new_tracks(points_px)
-        self._paint(self.links.rows[new], points_px[new], colours)
+        self._paint(self.links.rows[new], points_px[new], frame)
         keyframe = self._append_keyframe(
-            frame,
-            stamp_ns,
-            T_world_camera,
+            frame.number,
+            frame.stamp_ns,
+            placed.T_world_camera,
             np.concatenate([self.links.rows, found.rows]),
             np.concatenate([points_px, found.points_px]),
-            np.concatenate([rolled_px, found.rolled_px]),
+            np.concatenate([frame.rolled_px, found.rolled_px]),
         )
-        keyframe.turned = turned
-        self._settle(keyframe, grey)
+        keyframe.turned = placed.turned
+        self._settle(keyframe, frame)
         return keyframe
 
-    def _settle(self, newest: Keyframe, grey: U8 | None) -> None:
+    def _settle(self, newest: Keyframe, frame: IdealFrame) -> None:
         """Adjust the window after a keyframe has come to it."""
         self.collect_garbage()
         self.rebuild_window()
         self.window.triangulate(self.parameters.point)
         self._adjust_window()
         self._place_directions()
-        if grey is not None:
+        if frame.has_image:
             mapped = self.points.state[newest.rows] == MAPPED
             rows, points_px = newest.rows[mapped], newest.points_px[mapped]
-            cut_patches(grey, points_px, rows, self.points.patches)
+            cut_patches(frame.image, points_px, rows, self.points.patches)
             self.points.patch_keyframe[rows] = newest.id
 
     def _adjust_window(self) -> None:
@@ -300,7 +282,8 @@ class ActiveMap:
         self.points.first_keyframe[rows] = self.next_keyframe_id
         return new
 
-    def _paint(self, rows: I32, points_px: F32, image: MovedImage | None) -> None:
+    def _paint(self, rows: I32, points_px: F32, frame: IdealFrame) -> None:
+        image = frame.colours
         if image is not None and image.pixels.size:
             self.points.colours[rows] = image.colours(points_px)
 

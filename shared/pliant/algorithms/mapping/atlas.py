@@ -14,12 +14,12 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
+from pliant.algorithms.mapping.frame import IdealFrame
 from pliant.algorithms.mapping.frame_focal import refocused
 from pliant.algorithms.mapping.kept_map import Origin, keep, spans_of, take_in
 from pliant.algorithms.mapping.known_places import KnownPlaces, Meetings, join
@@ -101,19 +101,18 @@ class Atlas:
         start: Start,
         calibration: SelfCalibration,
         waiting: list[WaitingFrame],
-        grey: U8 | None,
-        colours: MovedImage | None,
+        latest: IdealFrame,
     ) -> ActiveMap:
-        """A segment begins.  calibration: as the start tells it.   The images are those of the
-        newest of the frames that waited."""
+        """A segment begins.  calibration: as the start tells it.   latest: the newest of the frames
+        that waited, with its image."""
         self.calibration = calibration
         active = self._enter(Segment(id=self._next_segment, points=self.points))
         self._next_segment += 1
         self._forget_questions()
-        active.begin(start, waiting, grey, colours)
+        active.begin(start, waiting, latest)
         self._adjusted = True  # not all of its keyframes are in the window
         self.calibrate()
-        self.remember(active.keyframes[-1], grey)
+        self.remember(active.keyframes[-1], latest, is_confirmed=False)
         return active
 
     def _enter(self, segment: Segment) -> ActiveMap:
@@ -170,21 +169,20 @@ class Atlas:
         if self._adjusts:
             self.active.segment.path.add(frame, keyframe, T_world_camera, inliers)
 
-    def remember(self, keyframe: Keyframe, grey: U8 | None, maxima: F32 | None = None) -> None:
+    def remember(self, keyframe: Keyframe, frame: IdealFrame, *, is_confirmed: bool = True) -> None:
         """A new keyframe is a place to come back to, and may be one that was seen before.
 
-        grey (H, W), maxima (M, 3): of its image, the latter None at a start, which nothing has
-        confirmed.
+        is_confirmed: not at a start.
         """
-        if grey is None or self.active is None:
+        if not frame.has_image or self.active is None:
             return
         segment, view = self.active.segment, self.calibration.view
-        seen, earlier = describe(grey), self._earlier.like(self.calibration)
+        seen, earlier = describe(frame.image), self._earlier.like(self.calibration)
         self.whole_map.loops += self.places.compare(
             keyframe, seen, segment,
             earlier if self._adjusts else [], view, self._parameters,
             loops=self._adjusts and not self.whole_map.closing,
-            image=None if maxima is None else (maxima, grey),
+            image=(frame.tracks.maxima, frame.image) if is_confirmed else None,
         )  # fmt: skip
         self.places.remember(keyframe, seen, [segment, *earlier], view)
 

@@ -1,22 +1,15 @@
-"""The pose of a frame in the map, and whether what supports it is the world.
+"""The pose of a frame in the map.
 
 The pose comes from the tracks that the frame shares with the map, then from points that are found
 again, then it is adjusted together with the window (VITAMIN-E section 3.2, Eq. 6).
-
-A few dozen inliers always agree with some motion, and those of a large moving object agree well.
-What does not belong to them shows it: parts of the image where tracks live on and no point of the
-map is, or where no depth lets tracks be where the pose has them.  They are counted by area, so that
-the texture of a thing does not decide how large it is.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
-from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.image.moved_image import MovedImage
+from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.directions import (
     Spread,
@@ -25,6 +18,7 @@ from pliant.algorithms.mapping.directions import (
     placed_candidates,
     spread_of,
 )
+from pliant.algorithms.mapping.frame import IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.localisation import (
     Localisation,
     Motion,
@@ -38,13 +32,10 @@ from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
     PointParameters,
-    SupportParameters,
 )
+from pliant.algorithms.mapping.pose_quality import support_of
 from pliant.algorithms.mapping.reacquisition import reacquire
-from pliant.algorithms.mapping.rolling_shutter import RolledFrame
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.tracks import FrameExtrema, FrameTracks
-from pliant.compiler.kernel import kernel
+from pliant.algorithms.tracks import FrameTracks
 
 _AGREEING = 0.5
 """Share of the points of the map that place a frame alone and still fit once candidates help: with
@@ -64,38 +55,12 @@ _FEW, _FIRM = 0.05, 0.2
 """Of the tracks that led to the last frame: where a film is cut, 0.3 to 2 % agree on a pose by
 chance, and 9 % where the views overlap; the fastest turns with blur leave 11 to 20 %."""
 
-_COLUMNS, _LINES = 8, 6
-"""Cells of the image: each is for a pose, against it, or shows too little."""
-
-_LEAST_SEEN = 5
-"""Tracks without which a cell says nothing."""
-
-_AGAINST = 0.2
-"""A cell is against a pose with fewer inliers than this share of its tracks."""
-
 
 class Located(NamedTuple):
     """T_world_camera of a frame.   is_firm: so much leads there that the view has not been cut."""
 
     T_world_camera: F64
     is_firm: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class Support:
-    """What there is for a pose.
-
-    inliers: points where the pose shows them.   tracked: those that tracks lead on to the next
-    frame.   share: of the points seen.   contrary: share of the
-    cells with tracks in which hardly any point is where the pose shows it.   spread: standard
-    deviation of the inliers as a share of width or height, whichever is less.
-    """
-
-    inliers: int
-    tracked: int
-    share: float
-    contrary: float
-    spread: float
 
 
 def directions_of(active: ActiveMap) -> I64:
@@ -105,13 +70,7 @@ def directions_of(active: ActiveMap) -> I64:
 
 
 def localise(
-    active: ActiveMap,
-    calibration: SelfCalibration,
-    motion: Motion,
-    stamp_ns: int,
-    seen: FrameExtrema,
-    image: MovedImage | None,
-    generator: np.random.Generator,
+    active: ActiveMap, motion: Motion, frame: IdealFrame, generator: np.random.Generator
 ) -> Located | None:
     """The frame from the tracks of mapped points, or else from the map's points in the image; None
     where both fail.
@@ -119,16 +78,16 @@ def localise(
     Few tracks prove nothing by themselves: where the view changes at once, those that some extremum
     carries on have all been moved alike, as if by a camera.
     """
-    points, parameters = active.points, active.parameters
-    predictions = motion.predictions(stamp_ns)
+    points, parameters, tracks = active.points, active.parameters, frame.tracks
+    predictions = motion.predictions(frame.stamp_ns)
     active.candidates_agree = True
     directions = directions_of(active)
     linked = np.concatenate([active.linked(MAPPED), directions])
     limits = parameters.localisation
     if len(linked) >= limits.min_inliers:
-        rows, points_px = active.links.rows[linked], seen.points_px[linked]
-        if calibration.readout:
-            rolled = active.segment.rolled(calibration, motion.velocity())
+        rows, points_px = active.links.rows[linked], tracks.points_px[linked]
+        if frame.calibration.readout:
+            rolled = active.segment.rolled(frame.calibration, motion.velocity())
             depths = active.segment.inverse_depths(rows, predictions[0])
             points_px = points_px - rolled.shifts(points_px, depths)
         located = _by_tracks(active, predictions, rows, points_px, directions, generator)
@@ -138,18 +97,18 @@ def localise(
             # What helps in one frame and not in the next has not been lost in between.
             helped = len(directions) and active.candidates_agree
             before = motion.tracked if helped else motion.to_points
-            if image is None or inliers >= _FEW * before:
+            if not frame.has_image or inliers >= _FEW * before:
                 return Located(located.T_world_camera, inliers >= _FIRM * before)
             proved = prove(
-                located.T_world_camera, active.nearby(), points, seen.maxima, image.whole,
+                located.T_world_camera, active.nearby(), points, tracks.maxima, frame.image,
                 active.camera, parameters, parameters.recovery.min_agreement,
             )  # fmt: skip
             if proved is not None:
                 return Located(proved.T_world_camera, True)
-    if image is None:
+    if not frame.has_image:
         return None
     recovered = recover(
-        motion, stamp_ns, active.nearby(), points, seen.maxima, image.whole, active.camera,
+        motion, frame.stamp_ns, active.nearby(), points, tracks.maxima, frame.image, active.camera,
         parameters, generator,
     )  # fmt: skip
     return None if recovered is None else Located(recovered, True)
@@ -183,106 +142,89 @@ def _by_tracks(
     return together
 
 
-def at_once(
-    active: ActiveMap,
-    calibration: SelfCalibration,
-    T_world_camera: F64,
-    motion: F64,
-    seen: FrameExtrema,
-) -> tuple[FrameExtrema, RolledFrame]:
-    """The tracks of a frame with this pose and motion (6,), had it been taken at once."""
-    rolled = active.segment.rolled(calibration, motion)
+def to_global_shutter(
+    active: ActiveMap, motion: Motion, frame: IdealFrame, T_world_camera: F64
+) -> IdealFrame:
+    """The frame at this pose, had all its rows been taken at once.  motion: before it."""
+    if not frame.calibration.readout:
+        return frame
+    velocity = motion.velocity_at(frame.number, T_world_camera)
+    rolled = active.segment.rolled(frame.calibration, velocity)
     depths = active.segment.inverse_depths(active.links.rows, T_world_camera)
-    maxima = seen.maxima.copy()
-    maxima[:, :2] -= rolled.shifts(np.ascontiguousarray(maxima[:, :2]))
-    points_px = seen.points_px - rolled.shifts(seen.points_px, depths)
-    return replace(seen, points_px=points_px, maxima=maxima), rolled
+    return frame.to_global_shutter(rolled, depths)
 
 
-def reacquire_points(
-    active: ActiveMap,
-    frame: int,
-    T_world_camera: F64,
-    tracks: FrameExtrema,
-    seen: F32,
-    grey: U8 | None,
-    rolled: RolledFrame | None,
-) -> tuple[F64, Observations]:
-    """Find points without a track among the maxima, and refine the pose with them.
-
-    seen: (M, 3) maxima of the tracks where grey shows them, see ``reacquire``.
-    """
-    points, parameters = active.points, active.parameters
+def reacquire_points(active: ActiveMap, frame: IdealFrame, T_world_camera: F64) -> PlacedFrame:
+    """Find points without a track among the maxima, and refine the pose with them."""
+    placed = PlacedFrame(frame=frame, T_world_camera=T_world_camera)
+    points, parameters, tracks = active.points, active.parameters, frame.tracks
     if not parameters.reacquisition.enabled:
-        return T_world_camera, Observations.none()
+        return placed
     reacquired = reacquire(
-        T_world_camera, active.missing(frame), points, tracks.maxima, seen, grey, active.camera,
-        parameters.reacquisition,
+        T_world_camera, active.missing(frame.number), points, tracks.maxima,
+        frame.given.extrema.maxima, frame.given.grey, active.camera, parameters.reacquisition,
     )  # fmt: skip
     found = active.take_over(reacquired, tracks)
-    if rolled is not None:
+    if frame.rolled is not None:
         depths = active.segment.inverse_depths(found.rows, T_world_camera)
-        points_px, rolled_px = rolled.found(found.points_px, depths)
+        points_px, rolled_px = frame.rolled.found(found.points_px, depths)
         found = Observations(rows=found.rows, points_px=points_px, rolled_px=rolled_px)
-    T_world_camera = refine_by_all(active, T_world_camera, tracks, found)
+    placed = refine_by_all(active, replace(placed, found=found))
     linked = active.linked(MAPPED)
     points.kappas[active.links.rows[linked]] = tracks.kappas[linked]
-    return T_world_camera, found
+    return placed
 
 
-def refine_by_all(
-    active: ActiveMap, T_world_camera: F64, tracks: FrameTracks, found: Observations
-) -> F64:
+def refine_by_all(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     """The pose by its tracks and the points found without one, from close by."""
     directions = directions_of(active)
-    rows, points_px = active.observed(tracks.points_px, found, directions)
-    return refine(
-        T_world_camera, active.points.xyz[rows], points_px, active.camera,
+    rows, points_px = active.observed(placed, directions)
+    located = refine(
+        placed.T_world_camera, active.points.xyz[rows], points_px, active.camera,
         active.parameters.localisation, near=True, spread=_spread(active, rows, directions),
-    ).T_world_camera  # fmt: skip
+    )  # fmt: skip
+    return replace(placed, T_world_camera=located.T_world_camera)
 
 
-def adjust(
-    active: ActiveMap,
-    motion: Motion,
-    T_world_camera: F64,
-    found: Observations,
-    tracks: FrameTracks,
-) -> tuple[F64, Support]:
-    """Eq. 6 over the window and this frame.  Returns its pose, and what there is for it."""
-    points, parameters, camera = active.points, active.parameters, active.camera
-    linked = active.linked(MAPPED)
-    xyz = points.xyz[active.links.rows[linked]]
-    errors = reprojection_errors(T_world_camera, xyz, tracks.points_px[linked], camera)
+def adjust(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFrame:
+    """Eq. 6 over the window and this frame.  motion: before it."""
+    judge_tracks(active, placed)
+    active.see(placed)
+    if active.parameters.window.sweeps > 0 and not len(directions_of(active)):
+        placed = replace(placed, T_world_camera=active.window.sweep_current(active.parameters))
+    return supported(active, motion, placed)
+
+
+def judge_tracks(active: ActiveMap, placed: PlacedFrame) -> None:
+    """Take tracks from the points of the map that they miss again and again."""
+    linked, errors = _track_errors(active, placed)
     active.judge_tracks(linked, errors)
-    active.see(T_world_camera, tracks.points_px, found)
-    if parameters.window.sweeps > 0 and not len(directions_of(active)):
-        T_world_camera = active.window.sweep_current(parameters)
-    return T_world_camera, support_at(active, motion, T_world_camera, found, tracks)
 
 
-def support_at(
-    active: ActiveMap,
-    motion: Motion,
-    T_world_camera: F64,
-    found: Observations,
-    tracks: FrameTracks,
-) -> Support:
-    """What there is for a pose of the frame.  motion: before it."""
-    rows, points_px = active.observed(tracks.points_px, found, directions_of(active))
+def _track_errors(active: ActiveMap, placed: PlacedFrame) -> tuple[I64, F32]:
+    """Indices of the tracks of points of the map, and by how many px they miss these."""
+    linked = active.linked(MAPPED)
+    xyz = active.points.xyz[active.links.rows[linked]]
+    points_px = placed.frame.tracks.points_px[linked]
+    return linked, reprojection_errors(placed.T_world_camera, xyz, points_px, active.camera)
+
+
+def supported(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFrame:
+    """With what there is for its pose.  motion: before it."""
+    T_world_camera, tracks = placed.T_world_camera, placed.frame.tracks
+    rows, points_px = active.observed(placed, directions_of(active))
     errors = reprojection_errors(T_world_camera, active.points.xyz[rows], points_px, active.camera)
     inliers = errors < active.parameters.localisation.inlier_px
     telling = _settled(active, motion, tracks)
     telling[_contradicting(active, T_world_camera, tracks.points_px)] = True
-    tracked = len(rows) - len(found.rows)
-    return support_of(points_px, inliers, tracked, tracks.points_px[telling], active.camera)
+    tracked = len(rows) - len(placed.found.rows)
+    support = support_of(points_px, inliers, tracked, tracks.points_px[telling], active.camera)
+    return replace(placed, support=support)
 
 
-def tracks_to_points(active: ActiveMap, T_world_camera: F64, tracks: FrameTracks) -> int:
+def tracks_to_points(active: ActiveMap, placed: PlacedFrame) -> int:
     """How many tracks lead on to points of the map that are where the pose has them."""
-    linked = active.linked(MAPPED)
-    xyz = active.points.xyz[active.links.rows[linked]]
-    errors = reprojection_errors(T_world_camera, xyz, tracks.points_px[linked], active.camera)
+    _, errors = _track_errors(active, placed)
     return int(np.count_nonzero(errors < active.parameters.localisation.inlier_px))
 
 
@@ -307,37 +249,25 @@ def _contradicting(active: ActiveMap, T_world_camera: F64, points_px: F32) -> I6
     return candidates[off > _OFF * active.parameters.localisation.inlier_px]
 
 
-def image_of_tracks(
-    calibration: SelfCalibration, rolled: RolledFrame | None, pixels: U8 | None
-) -> MovedImage | None:
-    """A rectified image (H, W) or (H, W, 3) with all of it where the tracks of the frame are, which
-    are of the camera found so far.   rolled: and have been taken ``at_once``."""
-    if pixels is None:
-        return None
-    return MovedImage(pixels, calibration.frame_view.move if rolled is None else rolled.places)
-
-
-def stand(
-    active: ActiveMap, T_world_camera: F64, found: Observations, tracks: FrameTracks
-) -> tuple[F64, bool]:
-    """Whether the frame stands where the last keyframe does, and its pose then."""
+def stand(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
+    """Whether the frame stands where the last keyframe does, with its pose then."""
     if active.segment.resumes:
-        return T_world_camera, False  # nobody knows where it was before
+        return placed  # nobody knows where it was before
     points, parameters = active.points, active.parameters
     candidates = placed_candidates(points, active.links.rows)
-    rows, points_px = active.observed(tracks.points_px, found, candidates)
-    T_standing = T_world_camera
+    rows, points_px = active.observed(placed, candidates)
+    T_standing = placed.T_world_camera
     for every in (max(1, len(rows) // _TELLING), 1):  # a few tell of most that they moved
         some = np.arange(0, len(rows), every)
         located = refine(
-            T_world_camera, points.xyz[rows[some]], points_px[some], active.camera,
+            placed.T_world_camera, points.xyz[rows[some]], points_px[some], active.camera,
             parameters.localisation, near=True,
             spread=spread_of(points, rows[some], active.keyframes[-1]),
         )  # fmt: skip
         if not located.stands:
-            return T_world_camera, False
+            return placed
         T_standing = located.T_world_camera
-    return T_standing, True
+    return replace(placed, T_world_camera=T_standing, turned=True)
 
 
 def _spread(active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
@@ -350,46 +280,3 @@ def limits_of_points(inliers: int, parameters: MappingParameters) -> PointParame
     if inliers >= parameters.start.min_points:
         return parameters.point
     return parameters.point.model_copy(update={"min_observations": 2})
-
-
-def support_of(
-    points_px: F32, inliers: BoolArray, tracked: int, telling_px: F32, camera: PinholeCamera
-) -> Support:
-    """points_px: (N, 2) of the points seen, of which ``inliers`` (N,) fit.   tracked: so many, the
-    first, have tracks.   telling_px: (M, 2) of the tracks that belong to points if the pose is
-    right, or contradict it.
-    """
-    count = int(np.count_nonzero(inliers))
-    fitting = points_px[inliers]
-    width, height = camera.width, camera.height
-    supported, tracks = _per_cell(fitting, width, height), _per_cell(telling_px, width, height)
-    telling = tracks >= _LEAST_SEEN
-    size = np.array([width, height])
-    return Support(
-        inliers=count,
-        tracked=int(np.count_nonzero(inliers[:tracked])),
-        share=count / max(len(points_px), 1),
-        contrary=float((supported < _AGAINST * tracks)[telling].mean()) if telling.any() else 0.0,
-        spread=float(np.min(fitting.std(axis=0) / size)) if count else 0.0,
-    )
-
-
-def doubt(support: Support, parameters: SupportParameters) -> str:
-    """Why the pose may not be that of the camera in the world; "" where nothing speaks for it."""
-    if support.contrary > parameters.max_contrary_share:
-        return f"doubtful: {support.contrary:.0%} of the image moves otherwise"
-    if support.share < parameters.min_share:
-        return f"doubtful: {support.share:.0%} of the points seen are where the pose has them"
-    if support.spread < parameters.min_spread:
-        return "doubtful: all that is seen of the map lies in one place of the image"
-    return ""
-
-
-@kernel
-def _per_cell(points_px: F32, width: int, height: int) -> I64:
-    counts = np.zeros(_COLUMNS * _LINES, np.int64)
-    for i in range(points_px.shape[0]):
-        column = min(max(int(points_px[i, 0] * _COLUMNS / width), 0), _COLUMNS - 1)
-        line = min(max(int(points_px[i, 1] * _LINES / height), 0), _LINES - 1)
-        counts[line * _COLUMNS + column] += 1
-    return counts

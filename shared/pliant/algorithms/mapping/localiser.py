@@ -6,38 +6,31 @@ Nothing is triangulated or adjusted.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
-from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
-from pliant.algorithms.mapping.frame_pose import (
-    Support,
-    at_once,
-    doubt,
-    image_of_tracks,
-    localise,
-    reacquire_points,
-    support_of,
-)
+from pliant.algorithms.mapping.frame import Frame, IdealFrame, PlacedFrame
+from pliant.algorithms.mapping.frame_pose import localise, reacquire_points, to_global_shutter
 from pliant.algorithms.mapping.kept_map import known_camera, take_in
 from pliant.algorithms.mapping.known_places import KnownPlaces
 from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.pose_quality import doubt, support_of
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import Recognised, is_same_pose
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 
 _LOOK_TURN_RAD = np.radians(5.0)
 _LOOK_SHIFT = 0.05
@@ -74,57 +67,43 @@ class Localiser:
         self._motion: Motion | None = None
         self._looked_from: F64 = np.eye(4)
 
-    def process(
-        self,
-        frame: int,
-        stamp_ns: int,
-        extrema: FrameExtrema,
-        grey: U8 | None,
-        colour: U8 | None,
-        timer: StageTimer = no_stages,
-    ) -> MapDelta:
-        """Find a frame in the map.  stamp_ns, grey, colour: as of ``Mapper.process``."""
-        tracks = self.calibration.ideal(extrema)
-        image = image_of_tracks(self.calibration, None, grey)
+    def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
+        """Find a frame in the map."""
+        ideal = IdealFrame.of(frame, self.calibration)
         if self._map is not None:
-            self._map.links.follow(tracks.ids, self._points)
-        located = self._locate(stamp_ns, tracks, image, timer)
+            self._map.links.follow(frame.extrema.ids, self._points)
+        located = self._locate(ideal, timer)
         if located is None or self._map is None or self._hanging is None:
             return self._publish(LOST if self._map else WAITING, "not recognised in the map", 0)
         with timer("reacquisition"):
             looks_anew = self._look_from(self._map, located)
-            located, support = self._find(self._map, frame, located, tracks, extrema.maxima, grey)
-        if support.inliers < self._parameters.localisation.min_inliers:
-            return self._publish(LOST, f"lost: {support.inliers} points of the map are seen", 0)
+            placed = self._find(self._map, ideal, located)
+        inliers = placed.support.inliers
+        if inliers < self._parameters.localisation.min_inliers:
+            return self._publish(LOST, f"lost: {inliers} points of the map are seen", 0)
         if self._motion is None:
-            self._motion = Motion.at(frame, stamp_ns, located)
+            self._motion = Motion.at(frame.number, frame.stamp_ns, placed.T_world_camera)
             self._changes.add_same_places([(self._hanging.id, -1)])
         else:
+            tracked = placed.support.tracked
             self._motion = self._motion.then(
-                frame, stamp_ns, located, support.tracked, support.tracked
+                frame.number, frame.stamp_ns, placed.T_world_camera, tracked, tracked
             )
-        self._changes.add_pose(frame, self._hanging, located, support.inliers)
-        why = doubt(support, self._parameters.support)
-        return self._publish(TRACKING, why, support.inliers, looks_anew=looks_anew)
+        return self._publish_placed(self._hanging, placed, looks_anew=looks_anew)
 
-    def only_localise(
-        self, frame: int, stamp_ns: int, tracks: FrameTracks, otherwise: str
-    ) -> MapDelta:
+    def only_localise(self, frame: Frame, otherwise: str) -> MapDelta:
         """As ``Mapper.only_localise``."""
         active, hanging, motion, found = self._map, self._hanging, self._motion, None
         if active is not None and motion is not None:
-            active.links.follow(tracks.ids, active.points)
-            found = pose_by_tracks(
-                active, self.calibration, motion, frame, stamp_ns, tracks, self._generator
-            )
+            active.links.follow(frame.extrema.ids, active.points)
+            found = pose_by_tracks(active, self.calibration, motion, frame, self._generator)
         if found is None or hanging is None or motion is None:
-            return self.skip(frame, otherwise)
-        T_world_camera, _, support = found
+            return self.skip(frame.number, otherwise)
+        tracked = found.support.tracked
         self._motion = motion.then_unmapped(
-            frame, stamp_ns, T_world_camera, support.tracked, support.tracked
+            frame.number, frame.stamp_ns, found.T_world_camera, tracked, tracked
         )
-        self._changes.add_pose(frame, hanging, T_world_camera, support.inliers)
-        return self._publish(TRACKING, doubt(support, self._parameters.support), support.inliers)
+        return self._publish_placed(hanging, found)
 
     def recognise(self, maxima: F32, grey: U8, generator: np.random.Generator) -> Recognised | None:
         """Where an image (H, W) of the ideal camera, with its maxima (M, 3) of curvature, is seen
@@ -165,23 +144,18 @@ class Localiser:
         """None are made."""
         return KeyframeChanges(self._points).publish(None, self.calibration)
 
-    def _locate(
-        self, stamp_ns: int, tracks: FrameExtrema, image: MovedImage | None, timer: StageTimer
-    ) -> F64 | None:
+    def _locate(self, frame: IdealFrame, timer: StageTimer) -> F64 | None:
         there = None
         if self._map is not None and self._motion is not None:
             with timer("localisation"):
-                located = localise(
-                    self._map, self.calibration, self._motion, stamp_ns, tracks, image,
-                    self._generator,
-                )  # fmt: skip
+                located = localise(self._map, self._motion, frame, self._generator)
             there = None if located is None else located.T_world_camera
             if located is not None and located.is_firm:
                 return there
-        if image is None:
+        if not frame.has_image:
             return there
         with timer("places"):
-            found = self.recognise(tracks.maxima, image.whole, self._generator)
+            found = self.recognise(frame.tracks.maxima, frame.image, self._generator)
         if found is None:
             return there
         if there is not None and self._map is not None:
@@ -191,7 +165,7 @@ class Localiser:
         self._hanging, self._motion = found.keyframe, None
         segment = next(each for each in self._segments if each.id == found.keyframe.segment)
         self._map = ActiveMap(segment, 0, self.calibration, self._parameters)
-        self._map.links.follow(tracks.ids, self._points)
+        self._map.links.follow(frame.tracks.ids, self._points)
         self._map.look_around(found.T_world_camera)
         self._looked_from = found.T_world_camera
         return found.T_world_camera
@@ -213,36 +187,31 @@ class Localiser:
         self._looked_from = T_world_camera
         return True
 
-    def _find(
-        self,
-        active: ActiveMap,
-        frame: int,
-        T_world_camera: F64,
-        tracks: FrameExtrema,
-        maxima: F32,
-        grey: U8 | None,
-    ) -> tuple[F64, Support]:
-        """The pose by all points that are found again, and what there is for it.
-
-        maxima: (M, 3) of the tracks, where grey shows them.
-        """
-        parameters, camera, rolled = self._parameters, active.camera, None
-        if self.calibration.readout and self._motion is not None:
-            velocity = self._motion.velocity_at(frame, T_world_camera)
-            tracks, rolled = at_once(active, self.calibration, T_world_camera, velocity, tracks)
-        T_world_camera, found = reacquire_points(
-            active, frame, T_world_camera, tracks, maxima, grey, rolled
-        )
+    def _find(self, active: ActiveMap, frame: IdealFrame, T_world_camera: F64) -> PlacedFrame:
+        """The pose by all points that are found again, and what there is for it."""
+        parameters, camera = self._parameters, active.camera
+        if self._motion is not None:
+            frame = to_global_shutter(active, self._motion, frame, T_world_camera)
+        placed = reacquire_points(active, frame, T_world_camera)
         linked = active.linked(MAPPED)
-        rows, points_px = active.observed(tracks.points_px, found, np.zeros(0, np.int64))
-        errors = reprojection_errors(T_world_camera, self._points.xyz[rows], points_px, camera)
+        rows, points_px = active.observed(placed, np.zeros(0, np.int64))
+        xyz = self._points.xyz[rows]
+        errors = reprojection_errors(placed.T_world_camera, xyz, points_px, camera)
         active.judge_tracks(linked, errors[: len(linked)])
         interval_s = 0.0 if self._motion is None else self._motion.interval_s()
-        settled = tracks.ages * interval_s >= parameters.support.settled_s
+        settled = frame.tracks.ages * interval_s >= parameters.support.settled_s
         inliers = errors < parameters.localisation.inlier_px
-        return T_world_camera, support_of(
-            points_px, inliers, len(linked), tracks.points_px[settled], camera
-        )
+        settled_px = frame.tracks.points_px[settled]
+        support = support_of(points_px, inliers, len(linked), settled_px, camera)
+        return replace(placed, support=support)
+
+    def _publish_placed(
+        self, hanging: Keyframe, placed: PlacedFrame, *, looks_anew: bool = False
+    ) -> MapDelta:
+        support = placed.support
+        self._changes.add_pose(placed.frame.number, hanging, placed.T_world_camera, support.inliers)
+        why = doubt(support, self._parameters.support)
+        return self._publish(TRACKING, why, support.inliers, looks_anew=looks_anew)
 
     def _publish(
         self, state: int, reason: str, inliers: int, *, looks_anew: bool = False

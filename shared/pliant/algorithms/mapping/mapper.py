@@ -5,36 +5,33 @@ and bundle adjustment on every frame by the subspace Gauss-Newton method; on top
 over the window at keyframes and re-acquisition of points that lost their track.
 """
 
-import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, U8
+from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.exposure import flaw_of
-from pliant.algorithms.image.moved_image import MovedImage
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.atlas import Atlas
 from pliant.algorithms.mapping.first_map import Start
+from pliant.algorithms.mapping.frame import Frame, IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.frame_pose import (
-    Located,
     adjust,
-    at_once,
-    doubt,
-    image_of_tracks,
     limits_of_points,
     localise,
     reacquire_points,
     stand,
+    to_global_shutter,
     tracks_to_points,
 )
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.keyframes import keyframe_is_due
 from pliant.algorithms.mapping.localisation import Motion
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, Observations
+from pliant.algorithms.mapping.map_store import MAPPED, Keyframe
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import (
     STANDING_ROOMS,
@@ -42,6 +39,7 @@ from pliant.algorithms.mapping.passing import (
     refined_poses,
     smoothed_poses,
 )
+from pliant.algorithms.mapping.pose_quality import doubt
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved, Segment
@@ -51,7 +49,6 @@ from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses, returned_poses
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 
 _LEAST_LOST = 3
 """Frames without a pose before a map is given up, however long that takes: of a time lapse."""
@@ -82,14 +79,12 @@ class Mapper:
         self.atlas = Atlas(calibration, parameters, known)
         self._parameters = parameters
         self._generator = np.random.default_rng(seed)
-        self._timer: StageTimer = no_stages
         self._changes = MapChanges()
         last = known[-1].id if known else -1
         self._keyframe_changes = KeyframeChanges(self.atlas.points, after=last)
         self._waiting = Waiting()
         self._stamps_ns: dict[int, int] = {}  # of the frames
         self._motion = Motion.at(0, 0, np.eye(4))  # in the segment that the camera is in
-        self._images: tuple[U8 | None, U8 | None] = (None, None)  # of the newest that waits
         self._lost_frames = 0
         self._keyframe_ns = 0
         self._keyframe_is_new = False
@@ -126,91 +121,94 @@ class Mapper:
         """As of the atlas."""
         return self.atlas.kept()
 
-    def process(
-        self,
-        frame: int,
-        stamp_ns: int,
-        extrema: FrameExtrema,
-        grey: U8 | None,
-        colour: U8 | None,
-        timer: StageTimer = no_stages,
-    ) -> MapDelta:
-        """Localise a frame and let the map grow.
-
-        stamp_ns: when it was taken, increasing.    grey: (H, W).    colour: (H, W, 3) RGB.
-        """
-        self._timer, atlas = timer, self.atlas
-        self._stamps_ns[frame] = stamp_ns
-        if atlas.active is not None:
-            with self._timer("whole map"):
-                before = self.calibration
-                self.follow(atlas.catch_up(frame))
-                if not self.calibration.sees_like(before):
-                    self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
-            atlas.active.links.follow(extrema.ids, atlas.points)
-            atlas.focus(self._motion, stamp_ns, extrema)
-        with self._timer("corrected view"):
-            tracks = self.calibration.ideal(extrema)
-        self._images = (grey, grey if colour is None else colour)
-        seen, rolled, image = tracks, None, image_of_tracks(self.calibration, None, grey)
-        located = self._locate(frame, stamp_ns, seen, image)
-        active = atlas.active
+    def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
+        """Localise a frame and let the map grow."""
+        ideal = self._catch_up(frame, timer)
+        located = self._locate(ideal, timer)
+        active = self.atlas.active
         if active is None:
-            return self._wait(frame, stamp_ns, tracks)
+            return self._wait(ideal, timer)
         if located is None:
-            return self._lost(active, frame, stamp_ns, seen)
-        with self._timer("reacquisition"):
-            if self.calibration.readout:
-                velocity = self._motion.velocity_at(frame, located)
-                tracks, rolled = at_once(active, self.calibration, located, velocity, seen)
-            T_world_camera, found = reacquire_points(
-                active, frame, located, tracks, extrema.maxima, grey, rolled
-            )
-        with self._timer("subspace adjustment"):
-            T_world_camera, support = adjust(active, self._motion, T_world_camera, found, tracks)
-        with self._timer("triangulation"):
-            active.window.triangulate(limits_of_points(support.inliers, self._parameters))
-        hanging = active.keyframes[-1]
-        age_s = 1e-9 * (stamp_ns - self._keyframe_ns)
-        interval_s = self._motion.unmapped_s + self._motion.lost_s(stamp_ns)
-        self._keyframe_is_new = keyframe_is_due(active, age_s, interval_s)
+            return self._lost(active, ideal)
+        with timer("reacquisition"):
+            ideal = to_global_shutter(active, self._motion, ideal, located)
+            placed = reacquire_points(active, ideal, located)
+        with timer("subspace adjustment"):
+            placed = adjust(active, self._motion, placed)
+        with timer("triangulation"):
+            limits = limits_of_points(placed.support.inliers, self._parameters)
+            active.window.triangulate(limits)
+        self._keyframe_is_new = self._keyframe_is_due(active, frame.stamp_ns)
         if self._keyframe_is_new:
-            with self._timer("keyframe"):
-                T_world_camera, turned = stand(active, T_world_camera, found, tracks)
-                image, colours = (
-                    image_of_tracks(self.calibration, rolled, each) for each in self._images
-                )
-                shown = None if image is None else image.whole
-                if rolled is not None:
-                    active.segment.unroll(active.window.keyframes, self.calibration)
-                hanging = active.insert_keyframe(
-                    frame, stamp_ns, T_world_camera, tracks.points_px,
-                    seen.points_px - tracks.points_px, found, shown, colours, turned,
-                )  # fmt: skip
-            self.follow(atlas.calibrate())
-            T_world_camera = hanging.T_world_camera
-            self._keyframe_ns = stamp_ns
-            if self._recognised is not None:
-                self._changes.add_same_places([(self._recognised, hanging.id)])
-                self._recognised = None
-            with self._timer("places"):
-                atlas.remember(hanging, shown, tracks.maxima)
+            placed = self._insert_keyframe(active, placed, timer)
         else:
-            active.pass_by(frame, T_world_camera, tracks.points_px, found)
-        with self._timer("passed frames"):
+            active.pass_by(placed)
+        with timer("passed frames"):
             rooms = 1 if self._keyframe_is_new else STANDING_ROOMS
             surplus = active.segment.passed.take_surplus(self._parameters, rooms)
             self._correct(active.segment, surplus, self.calibration)
-        self._place_waiting(active, hanging, T_world_camera)
-        self._lost_frames, self._waiting, self._images = 0, Waiting(), (None, None)
-        to_points = tracks_to_points(active, T_world_camera, tracks)
-        self._motion = self._motion.then(
-            frame, stamp_ns, T_world_camera, support.tracked, to_points
+        self._lost_frames = 0
+        self._go_on_from(active, placed, self._motion.then)
+        if self._keyframe_is_new:
+            self.atlas.ask(frame.number)
+        return self._publish_placed(placed)
+
+    def _catch_up(self, frame: Frame, timer: StageTimer) -> IdealFrame:
+        """Take over what has been found of map and camera, by which the frame is corrected."""
+        atlas = self.atlas
+        self._stamps_ns[frame.number] = frame.stamp_ns
+        if atlas.active is not None:
+            with timer("whole map"):
+                before = self.calibration
+                self.follow(atlas.catch_up(frame.number))
+                if not self.calibration.sees_like(before):
+                    self._waiting = self._waiting.seen_by(before.view, self.calibration.view)
+            atlas.active.links.follow(frame.extrema.ids, atlas.points)
+            atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
+        with timer("corrected view"):
+            return IdealFrame.of(frame, self.calibration)
+
+    def _keyframe_is_due(self, active: ActiveMap, stamp_ns: int) -> bool:
+        age_s = 1e-9 * (stamp_ns - self._keyframe_ns)
+        interval_s = self._motion.unmapped_s + self._motion.lost_s(stamp_ns)
+        return keyframe_is_due(active, age_s, interval_s)
+
+    def _insert_keyframe(
+        self, active: ActiveMap, placed: PlacedFrame, timer: StageTimer
+    ) -> PlacedFrame:
+        """Make the frame a keyframe.  Returns it where the window has moved it."""
+        frame = placed.frame
+        with timer("keyframe"):
+            placed = stand(active, placed)
+            if frame.rolled is not None:
+                active.segment.unroll(active.window.keyframes, self.calibration)
+            keyframe = active.insert_keyframe(placed)
+        self.follow(self.atlas.calibrate())
+        self._keyframe_ns = frame.stamp_ns
+        if self._recognised is not None:
+            self._changes.add_same_places([(self._recognised, keyframe.id)])
+            self._recognised = None
+        with timer("places"):
+            self.atlas.remember(keyframe, frame)
+        return replace(placed, T_world_camera=keyframe.T_world_camera)
+
+    def _go_on_from(
+        self, active: ActiveMap, placed: PlacedFrame, then: Callable[..., Motion]
+    ) -> None:
+        """The frame has its pose: so have those that waited for it, and the next goes on there."""
+        keyframe, number = active.keyframes[-1], placed.frame.number
+        T_world_camera, support = placed.T_world_camera, placed.support
+        self._place_waiting(active, keyframe, T_world_camera)
+        self._waiting = Waiting()
+        to_points = tracks_to_points(active, placed)
+        self._motion = then(
+            number, placed.frame.stamp_ns, T_world_camera, support.tracked, to_points
         )
-        self._add_pose(frame, hanging, T_world_camera, support.inliers)
-        if hanging.frame == frame:
-            atlas.ask(frame)
-        return self._publish(TRACKING, doubt(support, self._parameters.support), support.inliers)
+        self._add_pose(number, keyframe, T_world_camera, support.inliers)
+
+    def _publish_placed(self, placed: PlacedFrame) -> MapDelta:
+        why = doubt(placed.support, self._parameters.support)
+        return self._publish(TRACKING, why, placed.support.inliers)
 
     def follow(self, moved: list[Moved]) -> None:
         """The map has moved under the camera, and readers are told."""
@@ -231,41 +229,26 @@ class Mapper:
         state = LOST if self._lost_frames else TRACKING
         return self._publish(WAITING if self.atlas.active is None else state, reason, 0)
 
-    def only_localise(
-        self, frame: int, stamp_ns: int, tracks: FrameTracks, otherwise: str
-    ) -> MapDelta:
+    def only_localise(self, frame: Frame, otherwise: str) -> MapDelta:
         """Localise a frame in the map as it stands, by its tracks: there is no time to map it.
 
         One that finds no pose waits until the next mapped frame has one.  otherwise: the reason
         that it is published with.
         """
         active, found = self.atlas.active, None
-        self._stamps_ns[frame] = stamp_ns
+        self._stamps_ns[frame.number] = frame.stamp_ns
         self._keyframe_is_new = False
         if active is not None and not self._lost_frames:
-            active.links.follow(tracks.ids, active.points)
-            self.atlas.focus(self._motion, stamp_ns, tracks)
-            found = pose_by_tracks(
-                active, self.calibration, self._motion, frame, stamp_ns, tracks, self._generator
-            )
+            active.links.follow(frame.extrema.ids, active.points)
+            self.atlas.focus(self._motion, frame.stamp_ns, frame.extrema)
+            found = pose_by_tracks(active, self.calibration, self._motion, frame, self._generator)
         if active is None or found is None:
-            seen = self.calibration.ideal(FrameExtrema.without_maxima(tracks))
-            self._images = (None, None)
-            self._waiting = self._waiting.then(
-                frame, stamp_ns, seen, self._camera, self._parameters
-            )
-            return self.skip(frame, otherwise)
-        hanging = active.keyframes[-1]
-        active.pass_by(frame, found.T_world_camera, found.tracks.points_px, Observations.none())
-        self._place_waiting(active, hanging, found.T_world_camera)
-        self._waiting = Waiting()
-        to_points = tracks_to_points(active, found.T_world_camera, found.tracks)
-        self._motion = self._motion.then_unmapped(
-            frame, stamp_ns, found.T_world_camera, found.support.tracked, to_points
-        )
-        self._add_pose(frame, hanging, found.T_world_camera, found.support.inliers)
-        why = doubt(found.support, self._parameters.support)
-        return self._publish(TRACKING, why, found.support.inliers)
+            ideal = IdealFrame.of(frame, self.calibration)
+            self._waiting = self._waiting.then(ideal, self._camera, self._parameters)
+            return self.skip(frame.number, otherwise)
+        active.pass_by(found)
+        self._go_on_from(active, found, self._motion.then_unmapped)
+        return self._publish_placed(found)
 
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """What is still to be corrected at the end of the stream."""
@@ -315,18 +298,18 @@ class Mapper:
         """Numbers of the frames from which a map may yet start."""
         return [waiting.frame for waiting in self._waiting.frames]
 
-    def _wait(self, frame: int, stamp_ns: int, tracks: FrameExtrema) -> MapDelta:
-        self._waiting = self._waiting.then(frame, stamp_ns, tracks, self._camera, self._parameters)
-        with self._timer("start"):
+    def _wait(self, frame: IdealFrame, timer: StageTimer) -> MapDelta:
+        self._waiting = self._waiting.then(frame, self._camera, self._parameters)
+        with timer("start"):
             begun = self._begin_where_possible(self._parameters)
         if isinstance(begun, str):
-            return self._publish(WAITING, self._flaw(tracks) or begun, 0)
+            return self._publish(WAITING, self._flaw(frame) or begun, 0)
         return self._publish(TRACKING, "", begun)
 
-    def _flaw(self, tracks: FrameExtrema) -> str:
-        """Why the newest image has fewer tracks than a map starts with, if that shows."""
-        grey, few = self._images[0], len(tracks.ids) < self._parameters.start.min_tracks
-        return flaw_of(grey) if grey is not None and few else ""
+    def _flaw(self, frame: IdealFrame) -> str:
+        """Why the image has fewer tracks than a map starts with, if that shows."""
+        few = len(frame.tracks.ids) < self._parameters.start.min_tracks
+        return flaw_of(frame.given.grey) if frame.given.grey is not None and few else ""
 
     def start_at_last(self) -> bool:
         """Begin a map with what there is, since nothing more comes.  Whether there is a map."""
@@ -337,21 +320,14 @@ class Mapper:
     def _begin_where_possible(self, parameters: MappingParameters) -> int | str:
         """The inliers of the newest frame of the map that starts; or why none does."""
         found = find_start_of(self._waiting.frames, self.calibration, parameters)
-        if isinstance(found, str):
-            return found
-        grey, colours = (image_of_tracks(self.calibration, None, each) for each in self._images)
-        return self._begin(*found, None if grey is None else grey.whole, colours)
+        return found if isinstance(found, str) else self._begin(*found)
 
-    def _begin(
-        self,
-        start: Start,
-        calibration: SelfCalibration,
-        grey: U8 | None,
-        colours: MovedImage | None,
-    ) -> int:
+    def _begin(self, start: Start, calibration: SelfCalibration) -> int:
         """Let the map start, and give poses to the frames that waited, backwards."""
-        waiting, self._waiting, self._images = self._waiting, Waiting(), (None, None)
-        active = self.atlas.begin(start, calibration, waiting.frames, grey, colours)
+        waiting, self._waiting = self._waiting, Waiting()
+        assert waiting.newest is not None
+        latest = IdealFrame.of(waiting.newest, self.calibration)
+        active = self.atlas.begin(start, calibration, waiting.frames, latest)
         placed = list(
             earlier_poses(
                 start, active.keyframes, waiting, self._camera, self._parameters.localisation
@@ -373,37 +349,25 @@ class Mapper:
         self._keyframe_is_new = True
         return newest.inliers
 
-    def _locate(
-        self, frame: int, stamp_ns: int, tracks: FrameExtrema, image: MovedImage | None
-    ) -> F64 | None:
+    def _locate(self, frame: IdealFrame, timer: StageTimer) -> F64 | None:
         """T_world_camera of the frame where it goes on, or else where it was seen before."""
         active, located = self.atlas.active, None
         if active is not None:
-            with self._timer("localisation"):
-                located = localise(
-                    active, self.calibration, self._motion, stamp_ns, tracks, image, self._generator
-                )
+            with timer("localisation"):
+                located = localise(active, self._motion, frame, self._generator)
             if located is not None and located.is_firm:
                 return located.T_world_camera
-        with self._timer("places"):
-            return self._recognise(frame, stamp_ns, tracks, image, located)
+        with timer("places"):
+            return self._recognise(frame, None if located is None else located.T_world_camera)
 
-    def _recognise(
-        self,
-        frame: int,
-        stamp_ns: int,
-        tracks: FrameExtrema,
-        image: MovedImage | None,
-        located: Located | None,
-    ) -> F64 | None:
+    def _recognise(self, frame: IdealFrame, there: F64 | None) -> F64 | None:
         """T_world_camera in the segment that the image shows, which then goes on.
 
-        located: where a few tracks lead, which counts where the image shows no other place.
+        there: where a few tracks lead, which counts where the image shows no other place.
         """
-        there = None if located is None else located.T_world_camera
-        if image is None:
+        if not frame.has_image:
             return there
-        found = self.atlas.recognise(image.whole, tracks.maxima, self._generator)
+        found = self.atlas.recognise(frame.image, frame.tracks.maxima, self._generator)
         if found is None:
             return there
         keyframe, pose = found.keyframe, found.T_world_camera
@@ -415,10 +379,10 @@ class Mapper:
             return there
         if self.atlas.active is not None:
             self._keyframe_changes.settle(self.atlas.active.keyframes)
-        self.atlas.go_on(found.keyframe, tracks.ids)
-        self._motion = Motion.at(frame, stamp_ns, found.T_world_camera)
-        self._recognised = found.keyframe.id
-        return found.T_world_camera
+        self.atlas.go_on(keyframe, frame.tracks.ids)
+        self._motion = Motion.at(frame.number, frame.stamp_ns, pose)
+        self._recognised = keyframe.id
+        return pose
 
     def _place_waiting(self, active: ActiveMap, keyframe: Keyframe, T_world_camera: F64) -> None:
         """The camera was lost, and has been found: so are the frames between that follow what it
@@ -434,17 +398,17 @@ class Mapper:
         for each in placed:
             self._add_pose(each.frame, keyframe, each.T_world_camera, each.inliers)
 
-    def _lost(self, active: ActiveMap, frame: int, stamp_ns: int, tracks: FrameExtrema) -> MapDelta:
+    def _lost(self, active: ActiveMap, frame: IdealFrame) -> MapDelta:
         """The frame has no pose.  After some time without one the segment is closed.
 
         Frames are kept meanwhile, so that a new segment has the poses of those that are its own.
         """
         seen = len(active.linked(MAPPED))
-        reason = f"lost: the pose of frame {frame} is not supported, {seen} mapped tracks"
+        reason = f"lost: the pose of frame {frame.number} is not supported, {seen} mapped tracks"
         self._lost_frames += 1
-        self._waiting = self._waiting.then(frame, stamp_ns, tracks, self._camera, self._parameters)
-        delta = self._publish(LOST, self._flaw(tracks) or reason, 0)
-        long = self._motion.lost_s(stamp_ns) > self._parameters.localisation.max_lost_s
+        self._waiting = self._waiting.then(frame, self._camera, self._parameters)
+        delta = self._publish(LOST, self._flaw(frame) or reason, 0)
+        long = self._motion.lost_s(frame.stamp_ns) > self._parameters.localisation.max_lost_s
         if long and self._lost_frames >= _LEAST_LOST:
             self._keyframe_changes.settle(active.keyframes)
             self.atlas.leave()
@@ -453,7 +417,6 @@ class Mapper:
 
     def _publish(self, state: int, reason: str, inliers: int, snapshot: bool = False) -> MapDelta:
         # Now and then everything active is published, for those who came late.
-        self._timer = no_stages  # the frame is done: nothing of its caller stays with the map
         self._published_frames += 1
         snapshot = snapshot or self._published_frames % self._parameters.snapshot_frames == 0
         # Between keyframes points are new; how they move is told with the next one.
@@ -476,7 +439,7 @@ class Mapper:
         delta = self.calibration.published_with(delta)
         if snapshot and self.calibration.changes:
             made = [k for segment, _ in self.atlas.everything() for k in segment.keyframes]
-            delta = dataclasses.replace(
+            delta = replace(
                 delta,
                 focal_keyframes=np.array([keyframe.id for keyframe in made], np.int64),
                 log_focals=np.array([keyframe.log_focal for keyframe in made]),

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.first_map import keep_waiting
+from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.mapper import Mapper
@@ -24,21 +24,21 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import is_guess, widened
 from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 
 _KNOWN = 0.01
 """Standard deviation of the log focal length under which a map can begin for good."""
 
 
 class _Taken(NamedTuple):
-    """What came of a frame."""
+    """A frame that has been mapped on trial, or has only been localised."""
 
-    frame: int
-    stamp_ns: int
-    tracks: FrameExtrema
-    grey: U8 | None
-    colour: U8 | None
+    frame: Frame
     is_mapped: bool = True
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the frame."""
+        return self.frame.stamp_ns
 
 
 class TrialMapper:
@@ -63,41 +63,30 @@ class TrialMapper:
         self._on_trial = True
         self._first: int | None = None
 
-    def process(
-        self,
-        frame: int,
-        stamp_ns: int,
-        tracks: FrameExtrema,
-        grey: U8 | None,
-        colour: U8 | None,
-        timer: StageTimer = no_stages,
-    ) -> MapDelta:
+    def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
         """As ``Mapper.process``."""
-        delta = self._mapper.process(frame, stamp_ns, tracks, grey, colour, timer)
+        delta = self._mapper.process(frame, timer)
         if not self._on_trial:
             return delta
-        taken = _Taken(frame, stamp_ns, tracks, grey, colour)
+        taken = _Taken(frame)
         kept = keep_waiting(self._taken, taken, self._anew[1].start)
         uncertain = float(self._mapper.calibration.sigmas[0])
         if delta.state == TRACKING:
             if self._first is None:
                 self._first = int(delta.pose_frames.min())
-            if uncertain < _KNOWN or kept[0].frame > self._first:
+            if uncertain < _KNOWN or kept[0].frame.number > self._first:
                 self._taken.append(taken)
                 return self._begin(timer)
         self._taken = kept
         reason = delta.reason or f"the focal length is known to {100.0 * uncertain:.1f} %"
         return _nothing(delta, reason)
 
-    def only_localise(
-        self, frame: int, stamp_ns: int, tracks: FrameTracks, otherwise: str
-    ) -> MapDelta:
+    def only_localise(self, frame: Frame, otherwise: str) -> MapDelta:
         """As ``Mapper.only_localise``; a trial goes on until the next frame that is mapped."""
-        delta = self._mapper.only_localise(frame, stamp_ns, tracks, otherwise)
+        delta = self._mapper.only_localise(frame, otherwise)
         if not self._on_trial:
             return delta
-        extrema = FrameExtrema.without_maxima(tracks)
-        self._taken.append(_Taken(frame, stamp_ns, extrema, None, None, is_mapped=False))
+        self._taken.append(_Taken(frame, is_mapped=False))
         return _nothing(delta, otherwise)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
@@ -109,7 +98,7 @@ class TrialMapper:
     def waiting_frames(self) -> list[int]:
         """As ``Mapper.waiting_frames``."""
         if self._on_trial:
-            return [taken.frame for taken in self._taken]
+            return [taken.frame.number for taken in self._taken]
         return self._mapper.waiting_frames
 
     @property
@@ -157,8 +146,8 @@ class TrialMapper:
 
     def _again(self, taken: _Taken, timer: StageTimer) -> MapDelta:
         if taken.is_mapped:
-            return self._mapper.process(*taken[:-1], timer)
-        return self._mapper.only_localise(taken.frame, taken.stamp_ns, taken.tracks, "")
+            return self._mapper.process(taken.frame, timer)
+        return self._mapper.only_localise(taken.frame, "")
 
 
 def mapper_for(

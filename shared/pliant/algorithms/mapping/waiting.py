@@ -15,11 +15,11 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.epipolar import rotation_between
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame, keep_waiting
+from pliant.algorithms.mapping.frame import Frame, IdealFrame
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.parameters import LocalisationParameters, MappingParameters
 from pliant.algorithms.mapping.passing import EarlierPose
-from pliant.algorithms.tracks import FrameTracks
 
 _SAMPLE = 400
 """Tracks that tell a rotation."""
@@ -63,35 +63,33 @@ def turn_between(
 class Waiting:
     """Frames from which a map may yet start, and the turns of all since the last that was placed.
 
-    turns: one for each of the frames but the newest, and for earlier ones.
+    turns: one for each of the frames but the newest, and for earlier ones.   newest: with image.
     """
 
     frames: list[WaitingFrame] = field(default_factory=list[WaitingFrame])
     turns: list[Turn] = field(default_factory=list[Turn])
+    newest: Frame | None = None
 
     def then(
-        self,
-        frame: int,
-        stamp_ns: int,
-        tracks: FrameTracks,
-        camera: PinholeCamera,
-        parameters: MappingParameters,
+        self, frame: IdealFrame, camera: PinholeCamera, parameters: MappingParameters
     ) -> "Waiting":
         """With one frame more."""
+        tracks = frame.tracks
         newest = WaitingFrame(
-            frame=frame, stamp_ns=stamp_ns, ids=tracks.ids, points_px=tracks.points_px,
-            kappas=tracks.kappas,
+            frame=frame.number, stamp_ns=frame.stamp_ns, ids=tracks.ids,
+            points_px=tracks.points_px, kappas=tracks.kappas,
         )  # fmt: skip
         turns = self.turns
         if self.frames:
             turn = turn_between(self.frames[-1], newest, camera, parameters.localisation)
             turns = [*turns[1 - _KEPT_TURNS :], turn]
-        return Waiting(keep_waiting(self.frames, newest, parameters.start), turns)
+        frames = keep_waiting(self.frames, newest, parameters.start)
+        return Waiting(frames, turns, frame.given)
 
     def seen_by(self, before: CorrectedView, after: CorrectedView) -> "Waiting":
         """With the pixels of another ideal camera."""
         frames = [replace(f, points_px=moved_px(f.points_px, before, after)) for f in self.frames]
-        return Waiting(frames, self.turns)
+        return replace(self, frames=frames)
 
 
 def earlier_poses(
