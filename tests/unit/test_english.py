@@ -18,8 +18,6 @@ LATER = {
     "experiments.md",
     "meshing.md",
     "places.md",
-    "recording.md",
-    "redkitchen.md",
     "results.md",
     "surfels.md",
 }
