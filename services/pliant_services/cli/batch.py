@@ -9,18 +9,21 @@ import typer
 def batch(
     context: typer.Context,
     folder: Annotated[
-        Path, typer.Argument(help="Videos, sequences, bags, side by side.", show_default=False)
+        Path,
+        typer.Argument(
+            help="Folder that contains the videos, sequences and bags.", show_default=False
+        ),
     ],
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="Folder of the result folders [results/<folder>]."),
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Runs at a time; each takes 2 cores [1].")
+        int | None, typer.Option(min=1, help="Number of parallel runs; each uses 2 cores [1].")
     ] = None,
     dask: Annotated[
         str | None,
-        typer.Option(help="Scheduler of Dask's, tcp://HOST:8786, whose workers run the clips."),
+        typer.Option(help="Dask scheduler, tcp://HOST:8786, whose workers run the clips."),
     ] = None,
 ) -> None:
     """Run every clip of a folder. After an interruption, repeat the command to resume.
@@ -31,7 +34,7 @@ def batch(
 
     pliant batch clips --dask tcp://rack.local:8786
 
-    Options of `pliant run` come after the folder, and go to each run.
+    Options of `pliant run` follow the folder, and apply to each run.
     """
     from pliant.results.folder import folder_name
     from pliant_services.batch import command

@@ -8,41 +8,53 @@ import typer
 
 def calibrate(
     source: Annotated[
-        str, typer.Argument(help="Video, folder of images, bag: as for run.", show_default=False)
+        str,
+        typer.Argument(
+            help="Video, folder of images or bag, as in `pliant run`.", show_default=False
+        ),
     ] = "",
     board: Annotated[
         str | None,
         typer.Option(
             help="KIND:COLUMNSxROWS[:SQUARE_MM[:MARKER_MM[:DICTIONARY]]]: charuco:7x10 or "
-            "chessboard:10x7, counted in squares. Without one the scene itself has to tell."
+            "chessboard:10x7, counted in squares. Without a board, the scene calibrates the "
+            "camera."
         ),
     ] = None,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="The calibration; a picture goes beside it.")
+        Path,
+        typer.Option(
+            "--output", "-o", help="Calibration file to write; a picture is written next to it."
+        ),
     ] = Path("calib.yaml"),
-    force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing output.")] = False,
     lens: Annotated[
         Literal["radtan", "fisheye"],
-        typer.Option(help="With a board: k1 k2 p1 p2 k3, or k1 to k4 of a very wide lens."),
+        typer.Option(
+            help="With a board: pinhole-radtan (k1 k2 p1 p2 k3), or fisheye (k1 to k4) for a very "
+            "wide lens."
+        ),
     ] = "radtan",
     fov: Annotated[
-        float | None, typer.Option(help="Without a board: a first guess, degrees across.")
+        float | None,
+        typer.Option(help="Without a board: initial horizontal field of view in degrees."),
     ] = None,
     topic: Annotated[
-        str, typer.Option(help="The images of an MCAP file or ROS bag that has several.")
+        str, typer.Option(help="Image topic, for an MCAP file or ROS bag with several.")
     ] = "",
     mask: Annotated[
         Path | None,
         typer.Option(
-            help="Image whose black parts are ignored in all frames, or a folder of them."
+            help="Mask image: black parts are ignored in all frames; or a folder with a mask per "
+            "frame."
         ),
     ] = None,
     print_board: Annotated[
         Path | None,
-        typer.Option(help="Write the board as a PDF in its true size [charuco:7x10:25]."),
+        typer.Option(help="Write the board as a PDF in true size [charuco:7x10:25]."),
     ] = None,
 ) -> None:
-    """Find the camera of a video: focal length, centre, distortion, and how sure they are.
+    """Calibrate the camera of a video: focal length, centre, distortion, and their uncertainty.
 
     pliant calibrate --print-board board.pdf
 

@@ -7,17 +7,17 @@ import typer
 
 
 def certs(
-    folder: Annotated[Path, typer.Argument(help="Where they go; what is there is kept.")],
+    folder: Annotated[Path, typer.Argument(help="Output folder; existing certificates are kept.")],
     hosts: Annotated[
         list[str] | None,
         typer.Option("--host", help="Name or address of the router's machine; may be repeated."),
     ] = None,
     authority: Annotated[
         Path | None,
-        typer.Option(help="Folder of the key that signs them; by default FOLDER-authority."),
+        typer.Option(help="Folder of the signing key; by default FOLDER-authority."),
     ] = None,
     session: Annotated[
-        str, typer.Option(help="The only session that they are good for [any].")
+        str, typer.Option(help="The only session for which the certificates are valid [any].")
     ] = "",
 ) -> None:
     """Make certificates for the router, every service and the operator.
@@ -26,8 +26,8 @@ def certs(
 
     pliant certs lab-certs --session lab --authority certs-authority
 
-    Give each machine ca.pem and the two files of each service that it runs.  The key that signs
-    lies in a folder of its own: it is needed for nothing else, and stays here.
+    Give each machine ca.pem and the two files of each service that it runs.  The signing key
+    is in a separate folder; keep it on this machine.
     """
     from pliant.bus.session import session_name
     from pliant_services.security.access import NAMES

@@ -9,11 +9,12 @@ import typer
 def config(
     file: Annotated[Path | None, typer.Option("--config", help="A YAML file to check.")] = None,
     overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE over the file; may be repeated.")
+        list[str] | None,
+        typer.Option("--set", help="KEY=VALUE overrides the file; may be repeated."),
     ] = None,
-    explain: Annotated[bool, typer.Option("--explain", help="Say what each key means.")] = False,
+    explain: Annotated[bool, typer.Option("--explain", help="Explain each key.")] = False,
 ) -> None:
-    """Print the resolved configuration as YAML, or an error line for what is wrong with it.
+    """Print the resolved configuration as YAML, or one line for its first error.
 
     pliant config
 

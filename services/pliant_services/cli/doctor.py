@@ -36,7 +36,7 @@ class Finding:
 
 
 def doctor() -> None:
-    """Check the installation and say for each finding what to do.
+    """Check the installation, and print a fix for each problem.
 
     pliant doctor
     """

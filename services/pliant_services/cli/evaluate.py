@@ -10,7 +10,7 @@ def evaluate(
     results: Annotated[
         list[Path],
         typer.Argument(
-            help="Result folders (or trajectory files); several give mean and deviation."
+            help="Result folders (or trajectory files); several give mean and standard deviation."
         ),
     ],
     groundtruth: Annotated[
@@ -18,7 +18,8 @@ def evaluate(
     ],
     times: Annotated[Path | None, typer.Option(help="times.txt of a KITTI ground truth.")] = None,
     frames: Annotated[
-        int | None, typer.Option(help="Frames of the sequence, where no report.json says.")
+        int | None,
+        typer.Option(help="Number of frames of the sequence, if there is no report.json."),
     ] = None,
     offset: Annotated[
         str,
@@ -28,26 +29,33 @@ def evaluate(
         ),
     ] = "",
     tracks: Annotated[
-        bool, typer.Option("--tracks", help="Tracks of the recording against true depth.")
+        bool, typer.Option("--tracks", help="Compare the tracks of the recording with exact depth.")
     ] = False,
     points: Annotated[
-        bool, typer.Option("--map", help="The map's points against true depth.")
+        bool, typer.Option("--map", help="Compare the map's points with exact depth.")
     ] = False,
     mesh: Annotated[
-        bool, typer.Option("--mesh", help="The mesh against true depth maps at the keyframes.")
+        bool,
+        typer.Option(
+            "--mesh", help="Compare the mesh with ground-truth depth maps at the keyframes."
+        ),
     ] = False,
     scan: Annotated[
         Path | None,
-        typer.Option(help="The mesh against a scan in the world of the true poses (PLY)."),
+        typer.Option(
+            help="Compare the mesh with a scan (PLY) in the frame of the ground-truth poses."
+        ),
     ] = None,
     surfels: Annotated[
         bool,
-        typer.Option("--surfels", help="Surfels against the source's depth, or exact surfaces."),
+        typer.Option(
+            "--surfels", help="Compare surfels with the source's depth, or with exact surfaces."
+        ),
     ] = False,
     plot: Annotated[
-        Path | None, typer.Option(help="PNG of the error over time (needs matplotlib).")
+        Path | None, typer.Option(help="Write a PNG of the error over time (needs matplotlib).")
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write every figure as JSON.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write all figures as JSON.")] = None,
     force: Annotated[
         bool, typer.Option("--force", help="Replace an existing --json or --plot.")
     ] = False,

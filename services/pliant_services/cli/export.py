@@ -23,29 +23,31 @@ def export(
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Where to write [in the result folder]."),
+        typer.Option("--output", "-o", help="Output file or folder [in the result folder]."),
     ] = None,
     every: Annotated[
         int | None, typer.Option(min=1, help="surface: write a mesh of every Nth frame [1].")
     ] = None,
     triangles: Annotated[
-        int | None, typer.Option(min=100, help="glb, obj: most triangles of the mesh [40000].")
+        int | None, typer.Option(min=100, help="glb, obj: maximum number of triangles [40000].")
     ] = None,
     clean: Annotated[
         bool,
-        typer.Option("--clean", help="glb, obj: leave out pieces below 1 % of the largest one."),
+        typer.Option(
+            "--clean", help="glb, obj: remove pieces below 1 % of the area of the largest."
+        ),
     ] = False,
     crop: Annotated[
         str | None,
         typer.Option(
             metavar="X,Y,Z,X,Y,Z",
-            help="glb, obj, watertight, ply, splat: only the surface or the points between two "
-            "corners of a box, in the frame and unit of mesh.ply.",
+            help="glb, obj, watertight, ply, splat: keep only the surface or the points in the "
+            "box between two corners, in the frame and unit of mesh.ply.",
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing output.")] = False,
 ) -> None:
-    """Write a run for other programs: viewers, trajectories, reconstructions, videos.
+    """Export a run for other programs: viewers, trajectories, reconstructions, videos.
 
     pliant export results/room --to overlay
 

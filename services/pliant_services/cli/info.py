@@ -9,10 +9,10 @@ import typer
 def info(
     recording: Annotated[Path, typer.Argument(help="A recording or a result folder.")],
     config: Annotated[
-        bool, typer.Option("--config", help="Print the configuration that it was made with.")
+        bool, typer.Option("--config", help="Print the configuration of the run.")
     ] = False,
 ) -> None:
-    """Say what a recording holds: duration, topics, sizes, gaps, and whether it is whole.
+    """Show the content of a recording: duration, topics, sizes, gaps, and whether it is complete.
 
     pliant info results/room
 

@@ -5,9 +5,7 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Maps that are kept: map.pliant."
-)
+app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Saved maps (map.pliant).")
 
 
 @app.callback()
@@ -19,7 +17,7 @@ def _maps() -> None:
 def info(
     path: Annotated[Path, typer.Argument(help="A result folder or its map.pliant.")],
 ) -> None:
-    """Sessions, segments, keyframes, points, camera and size of a map; whether it is whole.
+    """Show and check a map: sessions, segments, keyframes, points, camera and size.
 
     pliant map info results/office
     """
@@ -32,11 +30,11 @@ def info(
 @app.command()
 def merge(
     first: Annotated[Path, typer.Argument(help="A result folder or its map.pliant.")],
-    second: Annotated[Path, typer.Argument(help="Another one, of places that the first shows.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="File of the one map.")],
-    force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
+    second: Annotated[Path, typer.Argument(help="A second map with places of the first.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Map file to write.")],
+    force: Annotated[bool, typer.Option("--force", help="Replace existing output.")] = False,
 ) -> None:
-    """One map of two that show the same places, in the world and at the scale of the first.
+    """Merge two maps that show the same places, in the frame and at the scale of the first.
 
     pliant map merge results/monday results/tuesday --output results/office.pliant
     """

@@ -11,23 +11,27 @@ def mesh(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Result folder [<result>_mesh].")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write into an existing folder.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Overwrite the results in an existing folder.")
+    ] = False,
     when_over: Annotated[
         bool,
-        typer.Option(
-            "--when-over", help="Wait for the end of the session that writes there; once only."
-        ),
+        typer.Option("--when-over", help="Wait until the session that writes there has ended."),
     ] = False,
     clean: Annotated[
-        bool, typer.Option("--clean", help="Leave out pieces below 1 % of the largest one's area.")
+        bool, typer.Option("--clean", help="Remove pieces below 1 % of the area of the largest.")
     ] = False,
     watertight: Annotated[
         bool,
-        typer.Option("--watertight", help="Write mesh_watertight.ply, too: a solid for printers."),
+        typer.Option(
+            "--watertight", help="Also write mesh_watertight.ply, a solid for 3D printers."
+        ),
     ] = False,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", help="KEY=VALUE over the recorded configuration; may be repeated."),
+        typer.Option(
+            "--set", help="KEY=VALUE overrides the recorded configuration; may be repeated."
+        ),
     ] = None,
 ) -> None:
     """Make the mesh of a recorded run again: mesh.ply, mesh_coarse.ply and their pictures.

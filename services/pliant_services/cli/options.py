@@ -15,13 +15,14 @@ Connect = Annotated[
     list[str], typer.Option("--connect", help="Router endpoint, e.g. tcp/host:7447.")
 ]
 ConnectToo = Annotated[
-    list[str] | None, typer.Option("--connect", help="Or a router endpoint, e.g. tcp/host:7447.")
+    list[str] | None,
+    typer.Option("--connect", help="Router endpoint, instead of a result: e.g. tcp/host:7447."),
 ]
 Running = Annotated[
     Path | None, typer.Argument(help="Result folder of an active run.", show_default=False)
 ]
 TlsFolder = Annotated[
-    Path | None, typer.Option("--tls", help="Folder that `pliant certs` made, for tls/ endpoints.")
+    Path | None, typer.Option("--tls", help="Folder made by `pliant certs`, for tls/ endpoints.")
 ]
 
 

@@ -13,7 +13,7 @@ def recover(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
-    """Keep everything that is intact of a damaged recording, and say what is missing.
+    """Recover the intact part of a damaged recording, and report the missing part.
 
     pliant recover results/room
 

@@ -9,7 +9,7 @@ import typer
 def render(
     name: Annotated[str, typer.Argument(help="built-in:room, built-in:tabletop, ...")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder to copy it to [the cache].")
+        Path | None, typer.Option("--output", "-o", help="Output folder [the cache].")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing folder.")] = False,
 ) -> None:

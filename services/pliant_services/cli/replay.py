@@ -11,43 +11,58 @@ from pliant_services.cli.options import TlsFolder
 
 def replay(
     recording: Annotated[Path, typer.Argument(help="A recording or a result folder.")],
-    rate: Annotated[str, typer.Option(help="Times the pace of capture, e.g. 0.5, or max.")] = "1",
-    start: Annotated[float, typer.Option(min=0.0, help="First second that is played.")] = 0.0,
-    end: Annotated[float | None, typer.Option(min=0.0, help="Last second [the end].")] = None,
-    topics: Annotated[str, typer.Option(help="Only these, separated by commas [all].")] = "",
+    rate: Annotated[str, typer.Option(help="Speed relative to capture, e.g. 0.5, or max.")] = "1",
+    start: Annotated[
+        float, typer.Option(min=0.0, help="Start at this second of the recording.")
+    ] = 0.0,
+    end: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop at this second [the end].")
+    ] = None,
+    topics: Annotated[str, typer.Option(help="Topics to play, separated by commas [all].")] = "",
     readers: Annotated[
         str,
-        typer.Option(help="Services that are waited for and get every message, e.g. tracking."),
+        typer.Option(help="Services to wait for; they receive every message, e.g. tracking."),
     ] = "",
-    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
+    loop: Annotated[
+        bool, typer.Option("--loop", help="Play again from the start at the end.")
+    ] = False,
     connect: Annotated[
-        list[str] | None, typer.Option("--connect", help="A router [one of our own].")
+        list[str] | None, typer.Option("--connect", help="Router to connect to [start one].")
     ] = None,
     tls: TlsFolder = None,
-    session: Annotated[str, typer.Option(help="Name of the session that is played.")] = "replay",
+    session: Annotated[str, typer.Option(help="Name of the session to play.")] = "replay",
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Port of our own router [a free one].")
+        int | None, typer.Option(min=1, max=65535, help="Port of the started router [a free one].")
     ] = None,
     services: Annotated[
-        str, typer.Option("--services", help="Run these on it, separated by commas [all recorded].")
+        str,
+        typer.Option(
+            "--services",
+            help="Run these services on the recording, separated by commas [all recorded].",
+        ),
     ] = "",
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Result folder [<result>_replay].")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write into an existing folder.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Overwrite the results in an existing folder.")
+    ] = False,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", help="KEY=VALUE over the recorded configuration; may be repeated."),
+        typer.Option(
+            "--set", help="KEY=VALUE overrides the recorded configuration; may be repeated."
+        ),
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Compare with what was recorded; exit 1 if it differs.")
+        bool,
+        typer.Option("--check", help="Compare with the recorded messages; exit 1 if they differ."),
     ] = False,
     tolerance: Annotated[
         list[str] | None,
-        typer.Option(help="FIELD=X: numbers of the field may differ by X; may be repeated."),
+        typer.Option(help="FIELD=X: values of this field may differ by X; may be repeated."),
     ] = None,
 ) -> None:
-    """Play a recording on the bus as if live; or run services again on what was recorded.
+    """Play a recording on the bus as if live, or run services again on the recorded messages.
 
     pliant replay results/room --rate 0.5 --start 10
 

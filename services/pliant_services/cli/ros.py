@@ -15,9 +15,9 @@ def ros(
     router: Annotated[
         str, typer.Option(help="Router of rmw_zenoh (ros2 run rmw_zenoh_cpp rmw_zenohd).")
     ] = "tcp/localhost:7447",
-    name: Annotated[str, typer.Option(help="What all topics but /tf begin with.")] = "/pliant",
+    name: Annotated[str, typer.Option(help="Prefix of all topics except /tf.")] = "/pliant",
     patience: Annotated[
-        float, typer.Option(min=0.0, help="Seconds to wait for a session that is to start.")
+        float, typer.Option(min=0.0, help="Seconds to wait for a session to start.")
     ] = 0.0,
 ) -> None:
     """Publish an active run in ROS 2: poses, cloud, mesh, images.  It never slows a run.

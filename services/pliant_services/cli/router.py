@@ -13,19 +13,19 @@ def router(
     ] = None,
     tls: Annotated[
         Path | None,
-        typer.Option(help="Folder that `pliant certs` made: who may publish what, by certificate."),
+        typer.Option(
+            help="Folder made by `pliant certs`; each certificate permits certain topics."
+        ),
     ] = None,
     sessions: Annotated[
         list[str] | None,
         typer.Option(
             "--session",
-            help="With --tls: a session with certificates of its own (pliant certs --session); may "
-            "be repeated [certificates are good for all sessions].",
+            help="With --tls: session with its own certificates (pliant certs --session); may be "
+            "repeated [certificates are valid for all sessions].",
         ),
     ] = None,
-    once: Annotated[
-        bool, typer.Option("--once", help="Leave when the first session is over.")
-    ] = False,
+    once: Annotated[bool, typer.Option("--once", help="Exit after the first session.")] = False,
 ) -> None:
     """Run a router until Ctrl-C.  Services on any machine connect to it.
 

@@ -33,107 +33,119 @@ def run(
     output: Annotated[
         Path | None, _everyday("--output", "-o", help="Result folder [results/<source>].")
     ] = None,
-    force: Annotated[bool, _everyday("--force", help="Write into an existing folder.")] = False,
+    force: Annotated[
+        bool, _everyday("--force", help="Overwrite the results in an existing folder.")
+    ] = False,
     calibration: Annotated[
-        Path | None, _everyday(help="Calibration of a video, a camera or bare images.")
+        Path | None, _everyday(help="Calibration file for a video, a camera or images.")
     ] = None,
     fov: Annotated[
-        float | None, _everyday(help="Horizontal field of view in degrees, for a first try.")
+        float | None,
+        _everyday(help="Horizontal field of view in degrees, if there is no calibration."),
     ] = None,
     mask: Annotated[
         Path | None,
-        _everyday(help="Image whose black parts are ignored in all frames, or a folder of them."),
+        _everyday(
+            help="Mask image: black parts are ignored in all frames; or a folder with a mask per "
+            "frame."
+        ),
     ] = None,
     auto_mask: Annotated[
         bool,
         _everyday(
             "--auto-mask/--no-auto-mask",
-            help="Mask borders and overlays that never change, without --mask.",
+            help="Without --mask, mask borders and overlays that never change.",
         ),
     ] = True,
     start: Annotated[
-        float | None, _everyday(min=0.0, help="Begin so many seconds after the first frame.")
+        float | None, _everyday(min=0.0, help="Start this many seconds after the first frame.")
     ] = None,
     end: Annotated[
-        float | None, _everyday(min=0.0, help="End so many seconds after the first frame.")
+        float | None, _everyday(min=0.0, help="End this many seconds after the first frame.")
     ] = None,
-    every: Annotated[int | None, _everyday(min=1, help="Take one of so many frames [1].")] = None,
+    every: Annotated[int | None, _everyday(min=1, help="Process every Nth frame [1].")] = None,
     sharpest: Annotated[
-        bool, _everyday("--sharpest", help="With --every: the sharpest of them, not the first.")
+        bool,
+        _everyday(
+            "--sharpest", help="With --every: choose the sharpest of each N frames, not the first."
+        ),
     ] = False,
     poses: Annotated[
         bool,
         _everyday(
             "--poses",
-            help="Print each pose as it is known: pose FRAME SECONDS tx ty tz qx qy qz qw.",
+            help="Print each online pose: pose FRAME SECONDS tx ty tz qx qy qz qw.",
         ),
     ] = False,
     light: Annotated[
         bool,
         _everyday(
-            "--light", help="A fifth of the tracks, less CPU, larger errors: for small computers."
+            "--light",
+            help="Use a fifth of the tracks: less CPU, larger errors. For slow computers.",
         ),
     ] = False,
     quality: Annotated[
         Literal["normal", "high"],
-        _everyday(help="high: where the camera was lost, read the source again, backwards."),
+        _everyday(
+            help="high: read the source a second time, backwards, where the camera was lost."
+        ),
     ] = "normal",
     view: Annotated[
-        Literal["window", "web"] | None, _everyday(help="Look on in Rerun (pliant view).")
+        Literal["window", "web"] | None, _everyday(help="Watch live in Rerun (see pliant view).")
     ] = None,
     quiet: Annotated[
-        bool, _everyday("--quiet", "-q", help="Print errors alone; the exit code tells the rest.")
+        bool, _everyday("--quiet", "-q", help="Print errors only; the exit code reports success.")
     ] = False,
     topic: Annotated[
-        str, _source(help="The images of an MCAP file, bag or ros:HOST that has several.")
+        str, _source(help="Image topic, for an MCAP file, bag or ros:HOST with several.")
     ] = "",
     max_size: Annotated[
         int | None,
-        _source(min=1, help="Pixels along the longer side [what the details need]."),
+        _source(
+            min=1, help="Maximum pixels along the longer side [chosen by the level of detail]."
+        ),
     ] = None,
     mode: Annotated[
         Literal["lossless", "live"] | None,
-        _source(help="Nobody drops a frame, or the newest wins [live for a camera]."),
+        _source(help="Process every frame, or drop old ones [live for a camera]."),
     ] = None,
     known: Annotated[
         Path | None,
-        _maps("--map", help="Go on in the map of an earlier run: its folder or map.pliant."),
+        _maps("--map", help="Extend the map of an earlier run: its folder or map.pliant."),
     ] = None,
     localise: Annotated[
-        bool, _maps("--localise", help="Find each frame in that map, and map nothing.")
+        bool, _maps("--localise", help="Only localise in that map; do not extend it.")
     ] = False,
     profile: Annotated[
         Literal["rigid", "deformable"],
-        _deforming(help="A rigid scene's map, or surfels on a surface that deforms."),
+        _deforming(help="Map a rigid scene, or track surfels on a deforming surface."),
     ] = "rigid",
     camera: Annotated[
         Literal["static", "moving"] | None,
-        _deforming(help="deformable: whether the camera stands still [surfels.camera]."),
+        _deforming(help="deformable: whether the camera is static [surfels.camera]."),
     ] = None,
     depth: Annotated[
         Literal["sensor", "map", "flat"] | None,
         _deforming(
-            help="deformable: where surfels start: on depth maps of the source, on our own map of "
-            "a scene that holds still at first, or on a plane [surfels.depth_from]."
+            help="deformable: initial depth of surfels: depth maps of the source, Pliant's own "
+            "map of an initially static scene, or a plane [surfels.depth_from]."
         ),
     ] = None,
     depth_frames: Annotated[
         Literal["first", "all"] | None,
-        _deforming(help="deformable: depth maps that are used [ingest.depth]."),
+        _deforming(help="deformable: which depth maps to use [ingest.depth]."),
     ] = None,
-    images: Annotated[
-        bool, _recording("--images/--no-images", help="Record the images, too.")
-    ] = True,
+    images: Annotated[bool, _recording("--images/--no-images", help="Record the images.")] = True,
     save: Annotated[
-        Path | None, _recording(help="What a viewer sees, as an .rrd file of Rerun's.")
+        Path | None, _recording(help="Save the viewer's data as a Rerun file (.rrd).")
     ] = None,
     config_file: Annotated[
-        Path | None, _settings("--config", help="YAML file over the defaults.")
+        Path | None, _settings("--config", help="YAML file that overrides the defaults.")
     ] = None,
     overrides: Annotated[
-        list[str] | None, _settings("--set", help="KEY=VALUE over the file; may be repeated.")
+        list[str] | None, _settings("--set", help="KEY=VALUE overrides the file; may be repeated.")
     ] = None,
-    seed: Annotated[int | None, _settings(help="Seed of every random choice.")] = None,
+    seed: Annotated[int | None, _settings(help="Seed of all random choices.")] = None,
     on_crash: Annotated[
         Literal["stop", "restart"],
         _faults(help="What to do when a service dies: end the run, or restart the service."),
@@ -142,7 +154,7 @@ def run(
         bool,
         _faults(
             "--resume",
-            help="Take up a run again that was cut off (power, kill), with --on-crash restart.",
+            help="Resume an interrupted run (power cut, kill) that used --on-crash restart.",
         ),
     ] = False,
     port: Annotated[

@@ -23,25 +23,29 @@ def scale(
         typer.Option(
             "--points",
             metavar="X,Y,Z X,Y,Z METRES",
-            help="Two points of the map and how far apart they are: report.html picks them.",
+            help="Two points of the map and their distance; pick the points in report.html.",
         ),
     ] = None,
     marker: Annotated[
         float | None,
         typer.Option(
-            "--marker", metavar="METRES", help="Side of the ArUco or AprilTag markers in view."
+            "--marker",
+            metavar="METRES",
+            help="Side length of the ArUco or AprilTag markers in view.",
         ),
     ] = None,
     depth: Annotated[
         str | None,
         typer.Option(
-            "--depth", metavar="SOURCE", help="The run's source, if depth or stereo is there."
+            "--depth",
+            metavar="SOURCE",
+            help="Source of the run, if it has depth maps or a stereo pair.",
         ),
     ] = None,
 ) -> None:
-    """Make a result metric: its files, later exports of it, and runs that go on in its map.
+    """Make a result metric: its files, its later exports, and runs that extend its map.
 
-    Exports made before stay in the old unit: those in its folder are named, to be made again.
+    Earlier exports stay in the old unit; those in its folder are listed, so you can repeat them.
 
     pliant scale results/desk --marker 0.08
 

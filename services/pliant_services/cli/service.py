@@ -20,36 +20,36 @@ def service(
     name: Annotated[str, typer.Argument(help=f"One of {_NAMES}.")],
     connect: Connect,
     session: Annotated[str, typer.Option(help="Name of the session to join.")] = "default",
-    profile: Annotated[
-        str, typer.Option(help=f"Which services the session has: {_PROFILES}.")
-    ] = "points",
+    profile: Annotated[str, typer.Option(help=f"Profile of the session: {_PROFILES}.")] = "points",
     config_file: Annotated[Path | None, typer.Option("--config", help="YAML file.")] = None,
     overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE over the file; may be repeated.")
+        list[str] | None,
+        typer.Option("--set", help="KEY=VALUE overrides the file; may be repeated."),
     ] = None,
-    source: Annotated[str, typer.Option(help="ingest: where frames come from.")] = "",
+    source: Annotated[str, typer.Option(help="ingest: source of the frames.")] = "",
     calibration: Annotated[
         Path | None, typer.Option(help="ingest: calibration of a video or camera.")
     ] = None,
     fov: Annotated[
         float | None, typer.Option(help="ingest: horizontal field of view in degrees.")
     ] = None,
-    mask: Annotated[
-        Path | None, typer.Option(help="ingest: what of the images is ignored, as in `pliant run`.")
-    ] = None,
+    mask: Annotated[Path | None, typer.Option(help="ingest: mask, as in `pliant run`.")] = None,
     known: Annotated[
-        Path | None, typer.Option("--map", help="ingest: a map of earlier sessions to go on in.")
+        Path | None, typer.Option("--map", help="ingest: map of earlier sessions to extend.")
     ] = None,
-    topic: Annotated[str, typer.Option(help="ingest: the images of a file with several.")] = "",
+    topic: Annotated[str, typer.Option(help="ingest: image topic, for a file with several.")] = "",
     output: Annotated[Path | None, typer.Option(help="recorder: the MCAP file to write.")] = None,
     metadata: Annotated[
         Path | None, typer.Option(help="recorder: JSON of metadata records to keep.")
     ] = None,
     results: Annotated[
-        bool, typer.Option("--results", help="recorder: at the end write the results beside it.")
+        bool,
+        typer.Option(
+            "--results", help="recorder: write the results next to the recording at the end."
+        ),
     ] = False,
     patience: Annotated[
-        float | None, typer.Option(help="Seconds that peers may be away [bus.patience_s].")
+        float | None, typer.Option(help="Seconds to wait for absent peers [bus.patience_s].")
     ] = None,
     state: Annotated[
         Path | None,
@@ -60,13 +60,13 @@ def service(
         Path | None, typer.Option(help="File to touch once a second, for health checks.")
     ] = None,
     fleet: Annotated[
-        str, typer.Option(hidden=True, help="The services themselves, from a launcher.")
+        str, typer.Option(hidden=True, help="All services of the session, set by a launcher.")
     ] = "",
     with_launcher: Annotated[
         bool, typer.Option(hidden=True, help="End when standard input closes.")
     ] = False,
     delays_ms: Annotated[
-        float, typer.Option(hidden=True, help="Delay messages at random, for tests.")
+        float, typer.Option(hidden=True, help="Delay messages randomly, for tests.")
     ] = 0.0,
 ) -> None:
     """Run one service until its inputs end.

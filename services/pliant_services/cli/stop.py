@@ -14,7 +14,7 @@ def stop(
     wait: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for its end.")] = 60.0,
     tls: TlsFolder = None,
 ) -> None:
-    """End the source after the frame at hand; the others follow once they have read everything.
+    """End the source after the current frame; the other services end once they have read all of it.
 
     pliant stop results/room
 

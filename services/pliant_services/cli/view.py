@@ -19,17 +19,21 @@ def view(
     ] = None,
     session: Annotated[str, typer.Option(help="Name of the session at --connect.")] = "",
     tls: TlsFolder = None,
-    web: Annotated[bool, typer.Option("--web", help="In a browser instead of a window.")] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Show in a browser instead of a window.")
+    ] = False,
     web_port: Annotated[
         int | None,
-        typer.Option(min=1, max=65535, help="Port of --web [9090, or one that is free]."),
+        typer.Option(min=1, max=65535, help="Port of --web [9090, or a free one]."),
     ] = None,
-    save: Annotated[Path | None, typer.Option(help="Into an .rrd file instead.")] = None,
+    save: Annotated[
+        Path | None, typer.Option(help="Write an .rrd file instead of opening a window.")
+    ] = None,
     open3d: Annotated[
-        bool, typer.Option("--open3d", help="A result in Open3D's window, without Rerun.")
+        bool, typer.Option("--open3d", help="Show a result in Open3D's window, without Rerun.")
     ] = False,
     patience: Annotated[
-        float, typer.Option(hidden=True, help="Seconds to wait for a session that is to start.")
+        float, typer.Option(hidden=True, help="Seconds to wait for a session to start.")
     ] = 0.0,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
