@@ -31,7 +31,7 @@ _ROOMS = (
 )
 _CLASSES = {
     *("ExtremaTracker", "BriefExtractor"),
-    *("Mapper", "Atlas", "ActiveMap", "PointRows", "Window", "Path", "TrackLinks", "TrialMapper"),
+    *("Mapper", "Atlas", "ActiveMap", "Landmarks", "Window", "Path", "TrackLinks", "TrialMapper"),
     *("EarlierSegments", "Localiser", "MapChanges", "KeyframeChanges"),
     *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
 }

@@ -12,7 +12,8 @@ from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, pose_to_matrix, so3_log, transform
 from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.relocalisation import Recognised
 from pliant.algorithms.places import describe

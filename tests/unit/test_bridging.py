@@ -6,7 +6,8 @@ from test_tracking import follow, motion, render
 
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.mapping.covisibility import collect_garbage
-from pliant.algorithms.mapping.map_store import CANDIDATE, FREE, UNLINKED, PointRows, TrackLinks
+from pliant.algorithms.mapping.landmarks import CANDIDATE, FREE, Landmarks
+from pliant.algorithms.mapping.track_links import UNLINKED, TrackLinks
 from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.state import load_state, save_state
 
@@ -50,7 +51,7 @@ def test_tracks_are_the_same_after_a_restart_within_the_blur() -> None:
 
 
 def test_track_that_comes_back_has_its_point_again() -> None:
-    points, links = PointRows(), TrackLinks()
+    points, links = Landmarks(), TrackLinks()
     rows = points.allocate(4)
     points.promote(rows[:3])
     links.ids, links.rows = np.array([10, 11, 12, 13]), rows.copy()
@@ -64,7 +65,7 @@ def test_track_that_comes_back_has_its_point_again() -> None:
 
 def test_candidates_lost_at_once_wait_for_their_tracks() -> None:
     """After a blurred frame there may be little else for a pose of a fast camera."""
-    points, links = PointRows(), TrackLinks()
+    points, links = Landmarks(), TrackLinks()
     rows = points.allocate(6)
     points.promote(rows[:1])
     links.ids, links.rows = np.arange(6), rows.copy()
@@ -77,7 +78,7 @@ def test_candidates_lost_at_once_wait_for_their_tracks() -> None:
 
 
 def test_candidates_lost_one_by_one_are_given_back() -> None:
-    points, links = PointRows(), TrackLinks()
+    points, links = Landmarks(), TrackLinks()
     rows = points.allocate(6)
     links.ids, links.rows = np.arange(6), rows.copy()
     links.follow(np.arange(4), points)
@@ -88,7 +89,7 @@ def test_candidates_lost_one_by_one_are_given_back() -> None:
 
 
 def test_candidates_are_given_back_where_points_of_the_map_carry_the_pose() -> None:
-    points, links = PointRows(), TrackLinks()
+    points, links = Landmarks(), TrackLinks()
     rows = points.allocate(6)
     points.promote(rows[4:])
     links.ids, links.rows = np.arange(6), rows.copy()

@@ -11,7 +11,7 @@ from pliant.algorithms.mapping import final_adjustment, frame_focal
 from pliant.algorithms.mapping.changing_focal import Evidence, focal_range
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.frame_focal import shows_at_once
-from pliant.algorithms.mapping.map_store import Keyframe
+from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import PassedFrames

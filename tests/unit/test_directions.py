@@ -21,7 +21,7 @@ from pliant.algorithms.mapping.directions import (
 )
 from pliant.algorithms.mapping.frame import Frame, IdealFrame
 from pliant.algorithms.mapping.frame_pose import localise
-from pliant.algorithms.mapping.map_store import MAPPED
+from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 

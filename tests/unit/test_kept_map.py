@@ -18,8 +18,8 @@ from pliant.algorithms.kept_keyframe import MAP_VERSION, KeptKeyframe
 from pliant.algorithms.map_delta import TRACKING, WAITING
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.kept_map import check, take_in
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.localiser import Localiser
-from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
@@ -229,7 +229,7 @@ def test_frames_of_a_rolling_shutter_are_localised_as_if_taken_at_once(
 
 def test_another_camera_sees_the_map_with_its_own_calibration(kept: list[MapKeyframe]) -> None:
     other = PinholeCamera(width=800, height=600, fx=700.0, fy=690.0, cx=390.0, cy=310.0)
-    points = PointRows()
+    points = Landmarks()
     known = SelfCalibration.of(other, PARAMETERS.calibration)
     (segment,) = take_in(kept, points, known)
     for keyframe in segment.keyframes:

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 
-from pliant.algorithms.mapping import keyframes
+from pliant.algorithms.mapping import keyframe_rule
 from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.keyframes import Overlap, is_due
-from pliant.algorithms.mapping.map_store import MAPPED
+from pliant.algorithms.mapping.keyframe_rule import Overlap, is_due
+from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import KeyframeParameters, MappingParameters
 
@@ -79,5 +79,5 @@ def test_tracks_of_noise_make_no_keyframes(monkeypatch, mapped, due):
 
     monkeypatch.setattr(active.window, "flow_since_keyframe", shared)
     monkeypatch.setattr(active.window, "in_view_since_keyframe", lambda: mapped)
-    monkeypatch.setattr(keyframes, "directions_of", lambda active: np.arange(4000))
-    assert keyframes.keyframe_is_due(active, 0.1, 0.01) == due
+    monkeypatch.setattr(keyframe_rule, "directions_of", lambda active: np.arange(4000))
+    assert keyframe_rule.keyframe_is_due(active, 0.1, 0.01) == due

@@ -12,7 +12,7 @@ from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.first_map import WaitingFrame
 from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.map_store import MAPPED
+from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import Path

@@ -7,7 +7,8 @@ from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.final_adjustment import list_map
-from pliant.algorithms.mapping.map_store import Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.observation_table import weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.segment import Segment
@@ -46,7 +47,7 @@ def test_what_the_lens_may_move_is_noise_beside_a_pixel():
     ],
 )
 def test_an_adjustment_of_k1_lets_more_of_the_image_count(uncertain, covariance, sigmas):
-    points = PointRows()
+    points = Landmarks()
     rows = points.allocate(3)
     points.promote(rows)
     keyframe = Keyframe(
@@ -63,7 +64,7 @@ def test_an_adjustment_of_k1_lets_more_of_the_image_count(uncertain, covariance,
 
 
 def test_the_window_counts_as_much_as_is_known_of_its_camera():
-    points = PointRows()
+    points = Landmarks()
     rows = points.allocate(3)
     given = SelfCalibration.of(CAMERA, CalibrationUncertainty())
     active = ActiveMap(Segment(id=0, points=points), 0, given, MappingParameters())

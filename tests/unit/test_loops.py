@@ -13,8 +13,8 @@ from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.mapping.final_adjustment import ListedMap
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.loops import Loop, close_loops
-from pliant.algorithms.mapping.map_store import MAPPED, PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -112,7 +112,7 @@ def close(mapper):
 
 
 def test_of_a_loop_that_waits_points_may_go_and_their_rows_be_of_others():
-    points = PointRows()
+    points = Landmarks()
     rows = points.allocate(6)
     points.promote(rows)
     pairs = rows.reshape(3, 2)

@@ -14,18 +14,16 @@ from pliant.algorithms.mapping.covisibility import (
     near_keyframes,
     rows_of,
 )
-from pliant.algorithms.mapping.localisation import locate, refine
-from pliant.algorithms.mapping.map_store import (
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import (
     CANDIDATE,
     FREE,
     MAPPED,
     MERGED,
     PATCH_SIDE,
-    UNLINKED,
-    Keyframe,
-    PointRows,
-    TrackLinks,
+    Landmarks,
 )
+from pliant.algorithms.mapping.localisation import locate, refine
 from pliant.algorithms.mapping.observation_table import (
     count_in_view,
     forget_outliers,
@@ -36,10 +34,11 @@ from pliant.algorithms.mapping.parameters import (
     ReacquisitionParameters,
 )
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, cut_patches, reacquire
+from pliant.algorithms.mapping.track_links import UNLINKED, TrackLinks
 
 
 def test_rows_are_reused_and_ids_never():
-    points = PointRows()
+    points = Landmarks()
     first = points.allocate(3)
     points.promote(first)
     points.free(first[1:2])
@@ -53,7 +52,7 @@ def test_rows_are_reused_and_ids_never():
 
 
 def test_rows_grow_and_keep_what_they_hold():
-    points = PointRows()
+    points = Landmarks()
     rows = points.allocate(10)
     points.xyz[rows] = np.arange(30).reshape(10, 3)
     more = points.allocate(5000)
@@ -64,7 +63,7 @@ def test_rows_grow_and_keep_what_they_hold():
 
 
 def test_of_a_row_merged_twice_the_last_holds_and_it_goes_once():
-    points = PointRows()
+    points = Landmarks()
     rows = points.allocate(4)
     points.promote(rows)
     points.published_xyz[rows] = 0.0
@@ -79,7 +78,7 @@ def test_of_a_row_merged_twice_the_last_holds_and_it_goes_once():
 
 
 def test_observations_of_merged_rows_become_one():
-    points = PointRows()
+    points = Landmarks()
     points.allocate(6)
     points.alias[5] = 2
     keyframe = Keyframe(
@@ -98,7 +97,7 @@ def test_observations_of_merged_rows_become_one():
 @given(seed=st.integers(0, 2**31), share=st.floats(0.0, 1.0))
 def test_merged_rows_are_followed_as_numpy_would(seed, share):
     rng = np.random.default_rng(seed)
-    points = PointRows()
+    points = Landmarks()
     points.allocate(40)
     merged = rng.random(40) < share
     merged[7] = False
@@ -119,7 +118,7 @@ def test_merged_rows_are_followed_as_numpy_would(seed, share):
 @settings(max_examples=50)
 @given(st.lists(st.sets(st.integers(0, 40)), min_size=1, max_size=6))
 def test_links_follow_living_tracks_and_drop_dead_ones(frames):
-    links, points, expected = TrackLinks(), PointRows(), {}
+    links, points, expected = TrackLinks(), Landmarks(), {}
     points.free(points.allocate(7 * 41))  # tracks come back to nothing
     for alive in frames:
         ids = np.array(sorted(alive), np.int64)
@@ -158,7 +157,7 @@ def texture(seed=0):
 
 def mapped(xyz, grey):
     """Points at (N, 3), with the patches that an image shows of them."""
-    points = PointRows()
+    points = Landmarks()
     rows = points.allocate(len(xyz))
     points.xyz[rows], points.kappas[rows] = xyz, 10.0
     cut_patches(grey, CAMERA.project(np.abs(xyz)).astype(np.float32), rows, points.patches)

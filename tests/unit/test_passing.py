@@ -7,7 +7,8 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 from pliant.algorithms.geometry import align_umeyama, inverse, pose_to_matrix, transform
 from pliant.algorithms.mapping import passing
 from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.map_store import CANDIDATE, Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import CANDIDATE, Landmarks
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import PassedFrames, refined_poses
@@ -23,7 +24,7 @@ TRUE = looking((0.3, 0.1, 0.05), (0.0, 0.02, 0.01))
 @pytest.fixture
 def points():
     """A map of 200 points."""
-    points = PointRows()
+    points = Landmarks()
     rows = points.allocate(200)
     points.xyz[rows] = np.random.default_rng(0).uniform((-2, -1, 4), (2, 1, 8), (200, 3))
     points.promote(rows)

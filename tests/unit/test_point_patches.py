@@ -8,7 +8,8 @@ import pytest
 from mapping_scene import looking
 
 from pliant.algorithms.geometry import move_by_similarity, transform
-from pliant.algorithms.mapping.map_store import Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.point_patches import look_alike
 from pliant.algorithms.mapping.reacquisition import cut_patches
 
@@ -65,7 +66,7 @@ WORLD = looking((0.3, -1.0, 0.2), (0.3, -0.2, 0.1)) @ np.diag([1.7, 1.7, 1.7, 1.
     ids=["the same", "aside", "turned", "upside down", "closer", "far and turned"],
 )
 def test_what_is_the_same_looks_alike_from_elsewhere(wall, there):
-    points = PointRows()
+    points = Landmarks()
     old = seen_from(AHEAD, wall, points, np.eye(4))
     new = seen_from(there, wall, points, WORLD)
     S_old_new = np.linalg.inv(WORLD)
@@ -80,7 +81,7 @@ def test_what_is_the_same_looks_alike_from_elsewhere(wall, there):
 
 def test_a_patch_is_as_the_last_keyframe_saw_it_that_sees_the_point(wall):
     """Also where the place is an earlier one."""
-    points, closer = PointRows(), looking((0.0, 0.0, 0.9), (0.0, 0.0, 0.6))
+    points, closer = Landmarks(), looking((0.0, 0.0, 0.9), (0.0, 0.0, 0.6))
     first = seen_from(AHEAD, wall, points, np.eye(4))
     seen = seen_from(closer, wall, points, np.eye(4), id=1)
     last = replace(seen, rows=first.rows)
@@ -95,7 +96,7 @@ def test_a_patch_is_as_the_last_keyframe_saw_it_that_sees_the_point(wall):
 
 
 def test_what_is_flat_or_was_seen_at_the_border_looks_like_nothing(wall):
-    points = PointRows()
+    points = Landmarks()
     old = seen_from(AHEAD, wall, points, np.eye(4))
     rows = np.column_stack([old.rows, old.rows])
     assert look_alike(np.eye(4), rows, [old], [old], points, MIN_ZNCC).all()
@@ -104,7 +105,7 @@ def test_what_is_flat_or_was_seen_at_the_border_looks_like_nothing(wall):
 
 
 def test_a_wrong_scale_matters_not_where_both_cameras_stand_at_one_place(wall):
-    points = PointRows()
+    points = Landmarks()
     old, new = (seen_from(AHEAD, wall, points, world) for world in (np.eye(4), WORLD))
     S_old_new = np.linalg.inv(WORLD)
     at = WORLD[:3, 3]  # of the new camera

@@ -8,8 +8,9 @@ from test_recovery import picture, textures
 
 from pliant.algorithms.mapping import known_places
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.known_places import Comparisons, Revisits
-from pliant.algorithms.mapping.map_store import Keyframe, PointRows
+from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -28,7 +29,7 @@ COUNT, EACH = 20, 50
 @pytest.fixture
 def segment():
     """Keyframes that share no points with each other, which lie 4 units ahead of each."""
-    points = PointRows()
+    points = Landmarks()
     keyframes = []
     for number in range(COUNT):
         rows = points.allocate(EACH)

@@ -8,8 +8,9 @@ from mapping_scene import CAMERA, looking
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.mapping import known_places, relocalisation
+from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.known_places import KnownPlaces
-from pliant.algorithms.mapping.map_store import Keyframe, PointRows
+from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import Place, Recognised, relocalise
 from pliant.algorithms.mapping.segment import Segment
@@ -22,7 +23,7 @@ NO_MAXIMA, DARK = np.zeros((0, 3), np.float32), np.zeros((CAMERA.height, CAMERA.
 EACH = 50
 
 
-def keyframes(points: PointRows, count: int) -> list[Keyframe]:
+def keyframes(points: Landmarks, count: int) -> list[Keyframe]:
     """Every second one sees what the one before saw; their points lie 4 units ahead."""
     made: list[Keyframe] = []
     for number in range(count):
@@ -52,7 +53,7 @@ def ask(
     of its own.   first: places that look most like the frame; the others are elsewhere.
     repeated: share of the corners that the image shows again.   places_with_corners: of those said,
     all if None; the others are poses that points alone may tell."""
-    points = PointRows()
+    points = Landmarks()
     places = [
         Place(keyframe=k, corners=NOTHING, segment=[k])
         for k in keyframes(points, 1 + max(said))
@@ -142,7 +143,7 @@ def test_points_that_prove_another_pose_about_one_decide(
 
 
 def test_places_elsewhere_are_asked_where_one_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
-    own, points, asked = KnownPlaces(), PointRows(), list[int]()
+    own, points, asked = KnownPlaces(), Landmarks(), list[int]()
     known = keyframes(points, 12)
 
     def query(*_: object) -> list[int]:

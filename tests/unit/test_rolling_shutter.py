@@ -11,8 +11,8 @@ from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import align_umeyama, inverse, so3_exp
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.localisation import Motion
-from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame, readout_flow

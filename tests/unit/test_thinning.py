@@ -14,7 +14,8 @@ from pliant.algorithms.mapping import thinning
 from pliant.algorithms.mapping.atlas import Atlas
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.map_store import FREE, MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import FREE, MAPPED, Landmarks
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -44,7 +45,7 @@ def keyframe(number: int, rows: list[int]) -> Keyframe:
 
 
 def segment(seen: list[list[int]]) -> Segment:
-    points = PointRows()
+    points = Landmarks()
     rows = points.allocate(1 + max(max(rows) for rows in seen))
     points.promote(rows)
     points.first_keyframe[rows] = [
@@ -65,7 +66,7 @@ def limits(room: int, least: int) -> WindowParameters:
 
 
 def test_rows_of_points_that_went_are_free() -> None:
-    points = PointRows()
+    points = Landmarks()
     rows = points.allocate(6)
     points.promote(rows[:5])  # the last one is a candidate
     points.cull(rows[[0, 4]])
@@ -170,7 +171,7 @@ def test_a_segment_that_is_left_keeps_what_is_not_published_yet() -> None:
 
 def test_two_segments_that_become_one_have_not_been_adjusted_as_one() -> None:
     """Nothing of it is settled, so that nothing goes before its adjustment."""
-    points = PointRows()
+    points = Landmarks()
     goes_on, rests = (Segment(id=i, points=points, keyframes=[keyframe(i, [])]) for i in (1, 0))
     goes_on.adjusted = 1
     goes_on.take_in(rests, 0)

@@ -9,7 +9,8 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import matrix_to_pose
 from pliant.algorithms.map_delta import TRACKING, MapDelta, MapMoves
-from pliant.algorithms.mapping.map_store import Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.publication import MapChanges
 from pliant.map_history import MapHistory
 from pliant.messages import topics
@@ -55,7 +56,7 @@ def keyframe(number: int, segment: int, x: float) -> Keyframe:
 def update(changes: MapChanges, segment: int, keyframes: list[Keyframe], **others: Any) -> MapDelta:
     delta = changes.publish(
         state=TRACKING, reason="", segment=segment, inliers=99, keyframes=keyframes,
-        points=PointRows(), rows=np.zeros(0, np.int32), centre=np.zeros(3), snapshot=True,
+        points=Landmarks(), rows=np.zeros(0, np.int32), centre=np.zeros(3), snapshot=True,
     )  # fmt: skip
     return replace(delta, **others)
 

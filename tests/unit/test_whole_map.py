@@ -20,7 +20,7 @@ from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping import whole_map
 from pliant.algorithms.mapping.final_adjustment import _spread_out, adjust_listed
 from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.map_store import MAPPED
+from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,

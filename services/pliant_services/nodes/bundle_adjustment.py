@@ -28,10 +28,10 @@ from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.image.masks import filled
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.keyframe import Keyframe as KeyframeOfMap
+from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.loops import Loop
-from pliant.algorithms.mapping.map_store import Keyframe as KeyframeOfMap
-from pliant.algorithms.mapping.map_store import PointRows
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, WindowParameters
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
@@ -226,7 +226,7 @@ def warm_up() -> None:
         id=0, frame=0, segment=0, T_world_camera=np.eye(4), rows=np.zeros(1, np.int32),
         points_px=px[:1], rolled_px=px[:1],
     )  # fmt: skip
-    keyframe.follow_aliases(PointRows())
+    keyframe.follow_aliases(Landmarks())
     assert mapper.atlas.active is not None
     segment, none = mapper.atlas.active.segment, np.zeros(0, np.int32)
     thin(segment, 1000, WindowParameters(kept_per_keyframe=1), none, whole=1)

@@ -26,7 +26,7 @@ class KeptKeyframe:
     seen_ids, seen_px, rolled_px: points of the map that it sees, where, and by how much farther a
     rolling shutter had moved them.
     corners_px, descriptors: of its ORB features; none where it is no place.
-    point_ids ... point_patches: of the points that hang on it, as in ``PointRows``; S x S
+    point_ids ... point_patches: of the points that hang on it, as in ``Landmarks``; S x S
     grey levels of a patch.
     """
 

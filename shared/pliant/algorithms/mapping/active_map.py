@@ -17,20 +17,15 @@ from pliant.algorithms.mapping.covisibility import (
 )
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.frame import IdealFrame, PlacedFrame
+from pliant.algorithms.mapping.keyframe import Keyframe, Observations
+from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED
 from pliant.algorithms.mapping.loops import Loop
-from pliant.algorithms.mapping.map_store import (
-    CANDIDATE,
-    MAPPED,
-    UNLINKED,
-    Keyframe,
-    Observations,
-    TrackLinks,
-)
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, Reacquired, cut_patches
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.thinning import thin
+from pliant.algorithms.mapping.track_links import UNLINKED, TrackLinks
 from pliant.algorithms.mapping.window import Window
 from pliant.algorithms.tracks import FrameExtrema
 

@@ -22,9 +22,10 @@ from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.frame import IdealFrame
 from pliant.algorithms.mapping.frame_focal import refocused
 from pliant.algorithms.mapping.kept_map import Origin, keep, spans_of, take_in
+from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.known_places import KnownPlaces, Meetings, join
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.localisation import Motion
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import Recognised
 from pliant.algorithms.mapping.segment import Moved, Segment, see_by
@@ -48,7 +49,7 @@ class Atlas:
         known: Sequence[KeptKeyframe] = (),
     ) -> None:
         """known: a map of earlier sessions; what is new is numbered on."""
-        self.points = PointRows()
+        self.points = Landmarks()
         self.calibration = calibration
         self.active: ActiveMap | None = None
         self.segment = -1

@@ -23,7 +23,7 @@ from pliant.algorithms.bundle.problem import (
 )
 from pliant.algorithms.bundle.schur import gain_of_focal
 from pliant.algorithms.bundle.varying_focal import FocalWalk
-from pliant.algorithms.mapping.map_store import Keyframe
+from pliant.algorithms.mapping.keyframe import Keyframe
 
 RATE = 0.05
 """Standard deviation of the log focal length a second later: weak beside what keyframes tell."""

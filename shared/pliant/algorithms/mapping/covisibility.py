@@ -7,13 +7,8 @@ work for a frame does not grow with the length of the run.
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64, U8, BoolArray
-from pliant.algorithms.mapping.map_store import (
-    CANDIDATE,
-    MAPPED,
-    MERGED,
-    Keyframe,
-    PointRows,
-)
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED, MERGED, Landmarks
 from pliant.compiler.kernel import kernel
 
 MAX_MISSES = 8
@@ -23,7 +18,7 @@ _RETRY_FRAMES = 8
 """Frames between two searches for a point that waits."""
 
 
-def focus_of(keyframe: Keyframe, points: PointRows) -> F64:
+def focus_of(keyframe: Keyframe, points: Landmarks) -> F64:
     """(3,) the point on the axis of a keyframe at the median depth of what it sees, or NaN."""
     rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
     centre, axis = keyframe.T_world_camera[:3, 3], keyframe.T_world_camera[:3, 2]
@@ -52,7 +47,7 @@ def near_keyframes(keyframes: list[Keyframe], T_world_camera: F64, count: int) -
     return [keyframes[i] for i in np.sort(order).tolist()]
 
 
-def most_shared(older: list[Keyframe], moving: list[Keyframe], points: PointRows) -> list[Keyframe]:
+def most_shared(older: list[Keyframe], moving: list[Keyframe], points: Landmarks) -> list[Keyframe]:
     """Older keyframes that share points with the moving ones, those that share most first."""
     marked = np.zeros(len(points.state), np.bool_)
     for keyframe in moving:
@@ -105,7 +100,7 @@ def missing_rows(rows: I32, linked: I32, state: U8, misses: U8, marks: I64, fram
 
 
 def collect_garbage(
-    points: PointRows, keyframes: list[Keyframe], linked: I32, segment: int
+    points: Landmarks, keyframes: list[Keyframe], linked: I32, segment: int
 ) -> None:
     """Give back the rows of dead candidates and of merged points.
 

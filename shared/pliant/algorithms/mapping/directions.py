@@ -33,14 +33,9 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.bundle.projection import move_camera, solve_camera
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.mapping.map_store import (
-    CANDIDATE,
-    MAPPED,
-    MAPPED_SHARE,
-    UNLINKED,
-    Keyframe,
-    PointRows,
-)
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED, MAPPED_SHARE, Landmarks
+from pliant.algorithms.mapping.track_links import UNLINKED
 from pliant.compiler.kernel import kernel
 
 _PRIOR_SHARE = 0.5
@@ -74,17 +69,17 @@ class Spread:
     standing: F64
 
 
-def spread_of(points: PointRows, rows: I32, last: Keyframe) -> Spread:
+def spread_of(points: Landmarks, rows: I32, last: Keyframe) -> Spread:
     """How uncertain the rows are, for a camera that may stand where the last keyframe does."""
     return Spread(vectors=points.spread[rows], standing=last.T_world_camera[:3, 3])
 
 
-def placed_candidates(points: PointRows, rows: I32) -> I64:
+def placed_candidates(points: Landmarks, rows: I32) -> I64:
     """Indices of the rows, UNLINKED among them, that are candidates with a provisional place."""
     return _placed(rows, points.state, points.spread)[0]
 
 
-def helping_candidates(points: PointRows, rows: I32) -> I64:
+def helping_candidates(points: Landmarks, rows: I32) -> I64:
     """As ``placed_candidates``; none where so many of the rows are mapped that they suffice."""
     others, mapped = _placed(rows, points.state, points.spread)
     return others if mapped < MAPPED_SHARE * (mapped + len(others)) else others[:0]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.map_store import PointRows
+from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.parameters import MappingParameters, WindowParameters
 from pliant.algorithms.mapping.segment import Segment, see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
@@ -67,7 +67,7 @@ class EarlierSegments:
                 return segment.id
         raise ValueError(f"keyframe {keyframe} is in no earlier segment")
 
-    def share_room(self, points: PointRows, limits: WindowParameters) -> int:
+    def share_room(self, points: Landmarks, limits: WindowParameters) -> int:
         """Observations that the segment that the camera is in may have.
 
         At least half of all that there is room for: the others are thinned beyond the rest, each to

@@ -23,7 +23,8 @@ from pliant.algorithms.mapping.changing_focal import (
 )
 from pliant.algorithms.mapping.directions import at_infinity
 from pliant.algorithms.mapping.focal_search import best_along_focal
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import readout_flow
@@ -167,7 +168,7 @@ def moves_between(keyframe_ids: I64, before: F64, after: F64, scales: F64) -> Ma
 
 def adjust_keyframes(
     keyframes: list[Keyframe],
-    points: PointRows,
+    points: Landmarks,
     known: SelfCalibration,
     parameters: MappingParameters,
     motions: F64,
@@ -263,7 +264,7 @@ def adjust_listed(
 
 def list_map(
     keyframes: list[Keyframe],
-    points: PointRows,
+    points: Landmarks,
     known: SelfCalibration,
     parameters: MappingParameters,
 ) -> ListedMap:
@@ -342,7 +343,7 @@ def _problem(
 def _forget_outliers(
     seen: ListedMap,
     keyframes: list[Keyframe],
-    points: PointRows,
+    points: Landmarks,
     camera: PinholeCamera,
     outlier_px: float,
 ) -> BoolArray:
@@ -359,7 +360,7 @@ def _forget_outliers(
 
 
 def _update_statistics(
-    seen: ListedMap, good: BoolArray, count: I64, points: PointRows, camera: PinholeCamera
+    seen: ListedMap, good: BoolArray, count: I64, points: Landmarks, camera: PinholeCamera
 ) -> None:
     """Keyframes, parallax and uncertainty of the points, as ``MapDelta`` defines them."""
     rows, N = seen.rows, len(seen.rows)

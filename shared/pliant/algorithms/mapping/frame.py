@@ -7,7 +7,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.image.moved_image import MovedImage
-from pliant.algorithms.mapping.map_store import Observations
+from pliant.algorithms.mapping.keyframe import Observations
 from pliant.algorithms.mapping.pose_quality import Support
 from pliant.algorithms.mapping.rolling_shutter import RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration

@@ -14,8 +14,8 @@ from pliant.algorithms.bundle.focal_pose import refine_focal
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.changing_focal import RATE, SPREAD
+from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.localisation import Motion
-from pliant.algorithms.mapping.map_store import MAPPED
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.tracks import FrameTracks
 

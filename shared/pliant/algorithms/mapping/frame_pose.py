@@ -19,6 +19,8 @@ from pliant.algorithms.mapping.directions import (
     spread_of,
 )
 from pliant.algorithms.mapping.frame import IdealFrame, PlacedFrame
+from pliant.algorithms.mapping.keyframe import Observations
+from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.localisation import (
     Localisation,
     Motion,
@@ -27,7 +29,6 @@ from pliant.algorithms.mapping.localisation import (
     recover,
     refine,
 )
-from pliant.algorithms.mapping.map_store import MAPPED, UNLINKED, Observations
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
@@ -35,6 +36,7 @@ from pliant.algorithms.mapping.parameters import (
 )
 from pliant.algorithms.mapping.pose_quality import support_of
 from pliant.algorithms.mapping.reacquisition import reacquire
+from pliant.algorithms.mapping.track_links import UNLINKED
 from pliant.algorithms.tracks import FrameTracks
 
 _AGREEING = 0.5

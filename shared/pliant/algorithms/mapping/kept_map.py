@@ -19,7 +19,8 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view, moved_px
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.mapping.covisibility import focus_of
-from pliant.algorithms.mapping.map_store import MAPPED, PATCH_SIDE, Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import MAPPED, PATCH_SIDE, Landmarks
 from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
@@ -118,7 +119,7 @@ def keep(
 
 
 def take_in(
-    kept: Sequence[KeptKeyframe], points: PointRows, calibration: SelfCalibration
+    kept: Sequence[KeptKeyframe], points: Landmarks, calibration: SelfCalibration
 ) -> list[Segment]:
     """The segments of a kept map, their points in rows that are new; those without a point are
     left out.
@@ -227,7 +228,7 @@ def _inverse_distance(keyframes: list[Keyframe]) -> float:
     return 1.0
 
 
-def _put(points: PointRows, rows: I32, kept: KeptKeyframe, calibration: SelfCalibration) -> None:
+def _put(points: Landmarks, rows: I32, kept: KeptKeyframe, calibration: SelfCalibration) -> None:
     points.state[rows] = MAPPED
     points.ids[rows] = kept.point_ids
     points.segment[rows] = kept.segment

@@ -26,8 +26,9 @@ from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.covisibility import marks_fewer
 from pliant.algorithms.mapping.kept_map import features_for
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.loops import Loop
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import (
     Place,
@@ -104,7 +105,7 @@ class Revisits:
         self,
         new: Place,
         places: Iterable[Place],
-        points: PointRows,
+        points: Landmarks,
         camera: PinholeCamera,
         parameters: MappingParameters,
         comparisons: Comparisons,
@@ -167,7 +168,7 @@ class Revisits:
         return [*agreeing, loop]
 
 
-def _agree(one: Loop, other: Loop, new: Place, points: PointRows) -> bool:
+def _agree(one: Loop, other: Loop, new: Place, points: Landmarks) -> bool:
     """Whether two loops take what the new keyframe sees to the same place."""
     keyframe = new.keyframe
     between: F64 = np.linalg.inv(other.S_old_new) @ one.S_old_new
@@ -199,7 +200,7 @@ class Meetings:
         new: Place,
         places: Iterable[Place],
         elsewhere: Callable[[int], Iterable[Place]],
-        points: PointRows,
+        points: Landmarks,
         camera: PinholeCamera,
         parameters: MappingParameters,
         comparisons: Comparisons,
@@ -284,7 +285,7 @@ class KnownPlaces:
         grey: U8,
         maxima: F32,
         segments: list[Segment],
-        points: PointRows,
+        points: Landmarks,
         calibration: SelfCalibration,
         parameters: MappingParameters,
         generator: np.random.Generator,
@@ -363,7 +364,7 @@ class KnownPlaces:
 
 
 def _showing_else(
-    ranked: Iterable[Place], places: list[Place], points: PointRows, least: int
+    ranked: Iterable[Place], places: list[Place], points: Landmarks, least: int
 ) -> Iterator[Place]:
     """The next places that show hardly a point, fewer than ``least``, of those before."""
     shown = np.zeros(len(points.state), np.bool_)

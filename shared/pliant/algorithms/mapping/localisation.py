@@ -19,7 +19,7 @@ from pliant.algorithms.bundle.subspace import refine_pose
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, move_by_similarity, so3_exp, so3_log
 from pliant.algorithms.mapping.directions import Spread, refine_pose_spread
-from pliant.algorithms.mapping.map_store import PointRows
+from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.parameters import (
     LocalisationParameters,
     MappingParameters,
@@ -230,7 +230,7 @@ def recover(
     motion: Motion,
     stamp_ns: int,
     rows: I32,
-    points: PointRows,
+    points: Landmarks,
     maxima: F32,
     grey: U8,
     camera: PinholeCamera,
@@ -268,7 +268,7 @@ def are_enough(points: int, parameters: MappingParameters) -> bool:
 def look_about(
     T_world_camera: F64,
     rows: I32,
-    points: PointRows,
+    points: Landmarks,
     grid: MaximaGrid,
     grey: U8,
     radius_px: float,
@@ -300,7 +300,7 @@ def look_about(
 def prove(
     T_world_camera: F64,
     rows: I32,
-    points: PointRows,
+    points: Landmarks,
     maxima: F32,
     grey: U8,
     camera: PinholeCamera,

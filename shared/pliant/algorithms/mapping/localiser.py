@@ -19,9 +19,10 @@ from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.frame import Frame, IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.frame_pose import localise, reacquire_points, to_global_shutter
 from pliant.algorithms.mapping.kept_map import known_camera, take_in
+from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.known_places import KnownPlaces
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.localisation import Motion
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.pose_quality import doubt, support_of
@@ -57,7 +58,7 @@ class Localiser:
         )
         self.whole_map = WholeMap()
         self._generator = np.random.default_rng(seed)
-        self._points = PointRows()
+        self._points = Landmarks()
         self._changes = MapChanges()
         self._places = KnownPlaces()
         self._segments = take_in(known, self._points, self.calibration)

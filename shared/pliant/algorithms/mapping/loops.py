@@ -15,7 +15,7 @@ from pliant.algorithms.bundle.pose_graph import Edges, optimise_pose_graph
 from pliant.algorithms.geometry import inverse, matrix_to_similarity
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.final_adjustment import ListedMap
-from pliant.algorithms.mapping.map_store import MAPPED, PointRows
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.compiler.kernel import kernel
 
 _COVISIBLE_SHARE = 0.3
@@ -48,7 +48,7 @@ class Loop(NamedTuple):
     rows: I32
     ids: I64
 
-    def living(self, points: PointRows) -> "Loop":
+    def living(self, points: Landmarks) -> "Loop":
         """With those of its points that still exist."""
         alive = points.ids[self.rows] == self.ids
         alive &= points.state[self.rows] == MAPPED

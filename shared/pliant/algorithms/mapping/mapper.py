@@ -29,9 +29,10 @@ from pliant.algorithms.mapping.frame_pose import (
     tracks_to_points,
 )
 from pliant.algorithms.mapping.kept_map import known_camera
-from pliant.algorithms.mapping.keyframes import keyframe_is_due
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.keyframe_rule import keyframe_is_due
+from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.localisation import Motion
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import (
     STANDING_ROOMS,

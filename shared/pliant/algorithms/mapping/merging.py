@@ -21,9 +21,10 @@ from pliant.algorithms.mapping.kept_map import (
     take_in,
     view_of,
 )
+from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.known_places import KnownPlaces, join
+from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.loops import Loop
-from pliant.algorithms.mapping.map_store import Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.segment import Segment, bend
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
@@ -76,7 +77,7 @@ class _Merging:
         self._spans = spans_of(both)
         self._places = KnownPlaces()
         self._places.know(both, calibration)
-        segments = take_in(both, PointRows(), calibration)
+        segments = take_in(both, Landmarks(), calibration)
         corrected = (n for n, each in enumerate(both) if each is not self._given[n])
         before = {both[n].segment: view_of(self._given[n]) for n in corrected}
         for each in segments:

@@ -17,7 +17,8 @@ from pliant.algorithms.bundle.subspace import refine_pose
 from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.mapping.changing_focal import RATE
-from pliant.algorithms.mapping.map_store import MAPPED, MAPPED_SHARE, Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import MAPPED, MAPPED_SHARE, Landmarks
 from pliant.algorithms.mapping.observation_table import weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import Path
@@ -147,7 +148,7 @@ class PassedFrames:
 
 def refined_poses(
     frames: Iterable[PassedFrame],
-    points: PointRows,
+    points: Landmarks,
     seen_by: SelfCalibration,
     parameters: MappingParameters,
 ) -> list[RefinedPose]:
@@ -191,7 +192,7 @@ def smoothed_poses(
     keyframes: list[Keyframe],
     path: Path,
     stamps_ns: dict[int, int],
-    points: PointRows,
+    points: Landmarks,
     seen_by: SelfCalibration,
     parameters: MappingParameters,
 ) -> list[EarlierPose]:

@@ -10,7 +10,8 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I32, U8, BoolArray
 from pliant.algorithms.geometry import inverse, transform_each
 from pliant.algorithms.image.patch_sums import PATCH_PIXELS, PATCH_SIZE
-from pliant.algorithms.mapping.map_store import PATCH_SIDE, Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import PATCH_SIDE, Landmarks
 from pliant.algorithms.mapping.reacquisition import FLAT
 from pliant.compiler.kernel import kernel
 
@@ -20,7 +21,7 @@ def look_alike(
     rows: I32,
     old: list[Keyframe],
     new: list[Keyframe],
-    points: PointRows,
+    points: Landmarks,
     min_zncc: float,
 ) -> BoolArray:
     """(n,) whether points look as others do.

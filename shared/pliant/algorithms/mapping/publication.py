@@ -9,7 +9,8 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, with_bits
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta, MapMoves
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.compiler.kernel import kernel
 
@@ -70,7 +71,7 @@ class MapChanges:
         segment: int,
         inliers: int,
         keyframes: list[Keyframe],
-        points: PointRows,
+        points: Landmarks,
         rows: I32,
         centre: F64,
         snapshot: bool,
@@ -183,7 +184,7 @@ def _differs(keyframe: Keyframe) -> bool:
 class KeyframeChanges:
     """Remembers what has been published, and makes each KeyframeDelta."""
 
-    def __init__(self, points: PointRows, after: int = -1) -> None:
+    def __init__(self, points: Landmarks, after: int = -1) -> None:
         """after: id of the last keyframe of earlier sessions, of which nothing is told."""
         self._points = points
         self._newest = after

@@ -24,7 +24,7 @@ from pliant.algorithms.image.patch_alignment import (
 )
 from pliant.algorithms.image.patch_sums import PATCH_PIXELS, PATCH_SIZE, TEMPLATE_FLOATS, UNIFORM
 from pliant.algorithms.image.pixels import Pixels, pixels_of
-from pliant.algorithms.mapping.map_store import PATCH_SIDE, PointRows
+from pliant.algorithms.mapping.landmarks import PATCH_SIDE, Landmarks
 from pliant.algorithms.mapping.parameters import ReacquisitionParameters
 from pliant.compiler.kernel import fast_kernel, kernel
 
@@ -142,7 +142,7 @@ class _Limits(NamedTuple):
 def reacquire(
     T_world_camera: F64,
     rows: I32,
-    points: PointRows,
+    points: Landmarks,
     maxima: F32,
     seen: F32,
     grey: U8 | None,
@@ -176,7 +176,7 @@ def reacquire(
 def match_widely(
     T_world_camera: F64,
     rows: I32,
-    points: PointRows,
+    points: Landmarks,
     grid: MaximaGrid,
     grey: U8,
     camera: PinholeCamera,
@@ -202,7 +202,7 @@ def match_widely(
 
 
 def _projected(
-    T_world_camera: F64, rows: I32, points: PointRows, camera: PinholeCamera
+    T_world_camera: F64, rows: I32, points: Landmarks, camera: PinholeCamera
 ) -> tuple[F32, BoolArray]:
     """Where a frame should show points, px (R, 2), and whether it does."""
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:3])

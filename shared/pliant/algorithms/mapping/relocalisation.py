@@ -19,8 +19,9 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.mapping.covisibility import most_shared, rows_of
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.localisation import NEAR, are_enough, look_about, prove, refine
-from pliant.algorithms.mapping.map_store import MAPPED, Keyframe, PointRows
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
 from pliant.algorithms.places import Features, match, repeated_share
@@ -91,7 +92,7 @@ def relocalise(
     seen: Features,
     places: Sequence[Place],
     elsewhere: Iterable[Place],
-    points: PointRows,
+    points: Landmarks,
     maxima: F32,
     grey: U8,
     camera: PinholeCamera,
@@ -153,7 +154,7 @@ def relocalise(
 def _looked_about(
     found: Recognised,
     place: Place,
-    points: PointRows,
+    points: Landmarks,
     maxima: F32,
     grey: U8,
     camera: PinholeCamera,
@@ -177,7 +178,7 @@ def _looked_about(
     return replace(found, T_world_camera=proved.T_world_camera, inliers=len(proved.rows))
 
 
-def _rows_near(keyframe: Keyframe, segment: list[Keyframe], points: PointRows) -> I32:
+def _rows_near(keyframe: Keyframe, segment: list[Keyframe], points: Landmarks) -> I32:
     """Rows of the points that may be seen from about a keyframe of a segment."""
     near = most_shared(segment, [keyframe], points)[:_NEAR_KEYFRAMES]
     rows = rows_of(near, np.zeros(0, np.int32), len(points.state))
@@ -188,7 +189,7 @@ def rest_is_elsewhere(
     T_world_camera: F64,
     keyframe: Keyframe,
     segment: list[Keyframe],
-    points: PointRows,
+    points: Landmarks,
     maxima: F32,
     grey: U8,
     camera: PinholeCamera,
@@ -233,7 +234,7 @@ def repeats(
 
 
 def corners_in_map(
-    keyframe: Keyframe, features: Features, points: PointRows, camera: PinholeCamera
+    keyframe: Keyframe, features: Features, points: Landmarks, camera: PinholeCamera
 ) -> tuple[F64, BoolArray]:
     """(n, 3) where in the world the corners of a keyframe are, and whether that is known: as deep
     as the point of the map beside them."""
@@ -256,7 +257,7 @@ def corners_in_map(
 def _propose(
     seen: Features,
     place: Place,
-    points: PointRows,
+    points: Landmarks,
     camera: PinholeCamera,
     parameters: MappingParameters,
     generator: np.random.Generator,
@@ -305,7 +306,7 @@ def _speaks_for_itself(
 
 
 def _is_as_good(
-    rival: Recognised, best: Recognised, points: PointRows, parameters: MappingParameters
+    rival: Recognised, best: Recognised, points: Landmarks, parameters: MappingParameters
 ) -> bool:
     """Whether as much speaks for another pose.
 
@@ -320,12 +321,12 @@ def _is_as_good(
     return elsewhere and rival.corners > _AS_GOOD * best.corners
 
 
-def _is_same(a: Recognised, b: Recognised, place: Place, points: PointRows) -> bool:
+def _is_same(a: Recognised, b: Recognised, place: Place, points: Landmarks) -> bool:
     same = a.keyframe.segment == b.keyframe.segment
     return same and is_same_pose(a.T_world_camera, b.T_world_camera, place.keyframe, points)
 
 
-def is_same_pose(a: F64, b: F64, keyframe: Keyframe, points: PointRows) -> bool:
+def is_same_pose(a: F64, b: F64, keyframe: Keyframe, points: Landmarks) -> bool:
     """Whether two poses of a frame are one, before what a keyframe sees."""
     between = inverse(a) @ b
     rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]

@@ -27,7 +27,7 @@ from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import inverse, so3_log
 from pliant.algorithms.image.moved_image import Move, moved_image
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.map_store import Keyframe
+from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.compiler.kernel import fast_kernel, kernel
 
 _SPAN = 1

@@ -11,7 +11,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.mapping.map_store import MAPPED, PointRows
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.point_patches import look_alike
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
@@ -42,7 +42,7 @@ step aside."""
 def same_place(
     old: Place,
     new: Place,
-    points: PointRows,
+    points: Landmarks,
     camera: PinholeCamera,
     parameters: MappingParameters,
     generator: np.random.Generator,
@@ -99,7 +99,7 @@ def _guided(
     S_a_b: F64,
     old: Place,
     new: Place,
-    points: PointRows,
+    points: Landmarks,
     camera: PinholeCamera,
     gate_px: float,
     min_zncc: float,

@@ -35,11 +35,13 @@ from pliant.algorithms.geometry import (
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.covisibility import focus_of
 from pliant.algorithms.mapping.final_adjustment import adjust_keyframes
-from pliant.algorithms.mapping.map_store import FREE, MAPPED, UNLINKED, Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import FREE, MAPPED, Landmarks
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import PassedFrames
 from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.mapping.track_links import UNLINKED
 from pliant.compiler.kernel import kernel
 
 _MIN_DEPTH = 1e-6
@@ -147,7 +149,7 @@ class Segment:
     """
 
     id: int
-    points: PointRows
+    points: Landmarks
     keyframes: list[Keyframe] = field(default_factory=list[Keyframe])
     path: Path = field(default_factory=Path)
     passed: PassedFrames = field(default_factory=PassedFrames)

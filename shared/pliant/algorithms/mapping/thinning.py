@@ -20,7 +20,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import I32, I64, BoolArray
 from pliant.algorithms.mapping.final_adjustment import MOST_SEEN
-from pliant.algorithms.mapping.map_store import MAPPED
+from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.parameters import WindowParameters
 from pliant.algorithms.mapping.segment import GivenUp, Segment
 from pliant.compiler.kernel import kernel

@@ -16,8 +16,8 @@ from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.epipolar import rotation_between
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame, keep_waiting
 from pliant.algorithms.mapping.frame import Frame, IdealFrame
+from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.localisation import refine
-from pliant.algorithms.mapping.map_store import Keyframe
 from pliant.algorithms.mapping.parameters import LocalisationParameters, MappingParameters
 from pliant.algorithms.mapping.passing import EarlierPose
 

@@ -9,7 +9,8 @@ from pliant.algorithms.bundle.subspace import solve_subspace
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, move_by_similarity
 from pliant.algorithms.mapping.directions import at_infinity, place
-from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED, Keyframe, PointRows
+from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED, Landmarks
 from pliant.algorithms.mapping.observation_table import (
     columns_in_state,
     count_cameras,
@@ -50,7 +51,7 @@ class Window:
         *,
         fixed: int,
         outside: int,
-        points: PointRows,
+        points: Landmarks,
         camera: PinholeCamera,
         k_sigmas: tuple[float, float],
     ) -> None:

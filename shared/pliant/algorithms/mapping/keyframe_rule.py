@@ -18,7 +18,7 @@ from typing import NamedTuple
 from pliant.algorithms.camera import size_unit
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.frame_pose import directions_of
-from pliant.algorithms.mapping.map_store import CANDIDATE, MAPPED
+from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED
 from pliant.algorithms.mapping.parameters import KeyframeParameters
 
 
