@@ -107,6 +107,13 @@ def test_algorithms_are_pure() -> None:
     assert not breaches
 
 
+def test_landmarks_alone_write_their_positions() -> None:
+    writes = re.compile(r"points\.(xyz|spread|published_xyz|published_sigmas)\[[^\n]*\] = ")
+    mapping = LIBRARY / "algorithms" / "mapping"
+    texts = {path.name: path.read_text(encoding="utf-8") for path in python_files(mapping)}
+    assert [name for name, text in texts.items() if writes.search(text)] == []
+
+
 def test_open3d_is_loaded_by_one_module() -> None:
     """Which says what to install where a library of the system is missing."""
     loaded_by = [

@@ -95,12 +95,9 @@ class ActiveMap:
     def begin(self, start: Start, waiting: list[WaitingFrame], latest: IdealFrame) -> None:
         """Take over a start.   latest: the newest of the waiting frames, with its image."""
         newest = waiting[-1]
-        rows = self.points.allocate(len(start.ids))
-        self.points.segment[rows] = self.segment.id
-        self.points.first_keyframe[rows] = self.next_keyframe_id
-        self.points.xyz[rows] = start.points_world
+        rows = self._allocate(len(start.ids))
         self.points.kappas[rows] = start.kappas
-        self.points.promote(rows)
+        self.points.place(rows, start.points_world)
         self.links.ids, self.links.rows = start.ids, rows
         self.links.follow(newest.ids, self.points)
         self._link_new_tracks(newest.points_px)
@@ -271,11 +268,12 @@ class ActiveMap:
     def _link_new_tracks(self, points_px: F32) -> I64:
         """Give candidate rows to tracks that have none.  Returns the indices of those tracks."""
         new = np.flatnonzero(self.links.rows == UNLINKED)
-        rows = self.points.allocate(len(new))
-        self.links.rows[new] = rows
-        self.points.segment[rows] = self.segment.id
-        self.points.first_keyframe[rows] = self.next_keyframe_id
+        self.links.rows[new] = self._allocate(len(new))
         return new
+
+    def _allocate(self, count: int) -> I32:
+        keyframe = self.next_keyframe_id
+        return self.points.allocate(count, segment=self.segment.id, keyframe=keyframe)
 
     def _paint(self, rows: I32, points_px: F32, frame: IdealFrame) -> None:
         image = frame.colours

@@ -366,12 +366,8 @@ class Atlas:
         elif self.active is not None:
             window = self.active.window
             keyframes = window.keyframes
-            rows = window.rows if everything else self._unpublished(window.current_rows())
+            rows = window.rows if everything else self.points.unpublished(window.current_rows())
         for earlier in self._earlier.adjusted:
             keyframes = [*keyframes, *earlier.keyframes]
             rows = np.concatenate([rows, earlier.mapped_rows()])
         return keyframes, rows
-
-    def _unpublished(self, rows: I32) -> I32:
-        """Those of which nothing has been published."""
-        return rows[np.isnan(self.points.published_sigmas[rows])]

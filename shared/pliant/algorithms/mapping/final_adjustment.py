@@ -202,7 +202,7 @@ def adjust_keyframes(
     if seen.flow is not None:
         seen.px = seen.px - (found.correction[3] * seen.flow).astype(np.float32)
     seen.px = view.pixels(view.magnified(seen.px, -seen.log_focal[seen.camera]))
-    points.xyz[seen.rows] = seen.xyz
+    points.move_to(seen.rows, seen.xyz)
     for slot, keyframe in enumerate(keyframes):
         keyframe.T_world_camera = seen.T_world_camera[slot]
     good = _forget_outliers(seen, keyframes, points, view.camera, parameters.window.outlier_px)

@@ -131,7 +131,8 @@ def take_in(
     for each in kept:
         mine = rows[first : first + len(each.point_ids)]
         first += len(mine)
-        _put(points, mine, each, calibration)
+        zoom = calibration.view.camera.fx / view_of(each).camera.fx
+        points.restore(mine, each, _zoomed(each.point_patches, zoom))
     order = np.argsort(points.ids[rows], kind="stable").astype(np.int32)
     ids, rows = points.ids[rows][order], rows[order]
     if (np.diff(ids) == 0).any():
@@ -226,23 +227,6 @@ def _inverse_distance(keyframes: list[Keyframe]) -> float:
             distance = np.linalg.norm(keyframe.focus - keyframe.T_world_camera[:3, 3])
             return 1.0 / max(float(distance), 1e-9)
     return 1.0
-
-
-def _put(points: Landmarks, rows: I32, kept: KeptKeyframe, calibration: SelfCalibration) -> None:
-    points.state[rows] = MAPPED
-    points.ids[rows] = kept.point_ids
-    points.segment[rows] = kept.segment
-    points.first_keyframe[rows] = kept.id
-    points.xyz[rows] = points.published_xyz[rows] = kept.points_world
-    points.spread[rows] = 0.0
-    points.published_sigmas[rows] = np.nan  # told again where this session sees them
-    points.colours[rows] = kept.point_colours
-    points.keyframes[rows] = points.base_keyframes[rows] = kept.point_keyframes
-    points.parallax_rad[rows] = points.base_parallax_rad[rows] = kept.point_parallax_rad
-    points.sigmas[rows] = kept.point_sigmas
-    points.kappas[rows] = kept.point_kappas
-    zoom = calibration.view.camera.fx / view_of(kept).camera.fx
-    points.patches[rows] = _zoomed(kept.point_patches, zoom)
 
 
 def _keyframe(kept: KeptKeyframe, ids: I64, rows: I32, calibration: SelfCalibration) -> Keyframe:

@@ -3,8 +3,11 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8
+from pliant.algorithms.geometry import transform_each
 from pliant.algorithms.image.patch_alignment import TEMPLATE_MARGIN
 from pliant.algorithms.image.patch_sums import PATCH_SIZE
+from pliant.algorithms.kept_keyframe import KeptKeyframe
+from pliant.algorithms.map_delta import MapMoves
 
 PATCH_SIDE = PATCH_SIZE + 2 * TEMPLATE_MARGIN
 """Of the grey levels kept around a point, whose samples lie at -4.5, ..., 4.5 px from it."""
@@ -19,6 +22,8 @@ another row until the keyframes have been published."""
 
 class Landmarks:
     """Points and candidates, one row each; arrays grow by doubling, rows of candidates are reused.
+
+    Positions are written by its methods alone.
 
     state: FREE, CANDIDATE, MAPPED or MERGED.    ids: of mapped points, never reused; else -1.
     alias: the row that a MERGED one stands for; itself otherwise.
@@ -62,8 +67,8 @@ class Landmarks:
         self._next_id = 0
         self._removed: list[I64] = []
 
-    def allocate(self, count: int) -> I32:
-        """Rows of ``count`` new candidates, cleared."""
+    def allocate(self, count: int, *, segment: int = 0, keyframe: int = 0) -> I32:
+        """Rows of ``count`` new candidates, cleared.   keyframe: id of the first that sees them."""
         reused = self._free[:count]
         self._free = self._free[count:]
         fresh = count - len(reused)
@@ -83,6 +88,8 @@ class Landmarks:
         self.spread[rows] = np.nan
         self.published_xyz[rows] = np.nan
         self.published_sigmas[rows] = np.nan
+        self.segment[rows] = segment
+        self.first_keyframe[rows] = keyframe
         return rows
 
     def free(self, rows: I32) -> None:
@@ -94,6 +101,55 @@ class Landmarks:
         """Give back the rows of points that stay as they were last published."""
         self.culled += len(rows)
         self.free(rows)
+
+    def place_candidates(self, rows: I32, xyz: F64, spread: F64) -> None:
+        """Give candidates provisional places (n, 3), with how uncertain these are (n, 3)."""
+        self.xyz[rows], self.spread[rows] = xyz, spread
+
+    def place(
+        self, rows: I32, xyz: F64, parallax_rad: F32 | float = 0.0, sigmas: F32 | float = 0.0
+    ) -> None:
+        """Candidates have been triangulated at (n, 3), and become points of the map."""
+        self.xyz[rows] = xyz
+        self.parallax_rad[rows], self.sigmas[rows] = parallax_rad, sigmas
+        self.promote(rows)
+
+    def restore(self, rows: I32, kept: KeptKeyframe, patches: U8) -> None:
+        """Points of an earlier session that hang on a keyframe, with their patches."""
+        self.state[rows] = MAPPED
+        self.ids[rows] = kept.point_ids
+        self.segment[rows] = kept.segment
+        self.first_keyframe[rows] = kept.id
+        self.xyz[rows] = self.published_xyz[rows] = kept.points_world
+        self.spread[rows] = 0.0
+        self.published_sigmas[rows] = np.nan  # told again where this session sees them
+        self.colours[rows] = kept.point_colours
+        self.keyframes[rows] = self.base_keyframes[rows] = kept.point_keyframes
+        self.parallax_rad[rows] = self.base_parallax_rad[rows] = kept.point_parallax_rad
+        self.sigmas[rows] = kept.point_sigmas
+        self.kappas[rows] = kept.point_kappas
+        self.patches[rows] = patches
+
+    def move_to(self, rows: I32 | I64, xyz: F64) -> None:
+        """An adjustment has found points, or candidates their places, at (n, 3)."""
+        self.xyz[rows] = xyz
+
+    def move(self, segment: int, moves: MapMoves) -> None:
+        """A segment has moved, and with it what has been published of it."""
+        rows = self.used(segment)
+        S = moves.matrices(self.first_keyframe[rows].astype(np.int64))
+        self.xyz[rows] = transform_each(S, self.xyz[rows])
+        self.published_xyz[rows] = transform_each(S, self.published_xyz[rows])
+        self.spread[rows] = (S[:, :3, :3] @ self.spread[rows][:, :, None])[:, :, 0]
+
+    def move_published(self, rows: I32, moves: MapMoves) -> None:
+        """Readers have been told how points move that have been adjusted."""
+        hosts = self.first_keyframe[rows].astype(np.int64)
+        self.published_xyz[rows] = moves.points(self.published_xyz[rows], hosts)
+
+    def unpublished(self, rows: I32) -> I32:
+        """Those of the rows of which nothing has been published."""
+        return rows[np.isnan(self.published_sigmas[rows])]
 
     def promote(self, rows: I32) -> None:
         """Make candidates points of the map: they get their ids, in the order given."""
@@ -131,6 +187,11 @@ class Landmarks:
     def go_on_after(self, last_id: int) -> None:
         """Points up to this id come from elsewhere."""
         self._next_id = max(self._next_id, last_id + 1)
+
+    def used(self, segment: int) -> I64:
+        """Rows of all points and candidates of a segment; the latter may have a place, too."""
+        used = slice(0, self.count)
+        return np.flatnonzero((self.state[used] != FREE) & (self.segment[used] == segment))
 
     def mapped(self, segment: int) -> I32:
         """Rows of all points of a segment."""

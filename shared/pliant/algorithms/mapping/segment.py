@@ -36,7 +36,7 @@ from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.covisibility import focus_of
 from pliant.algorithms.mapping.final_adjustment import adjust_keyframes
 from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.landmarks import FREE, MAPPED, Landmarks
+from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.passing import PassedFrames
 from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
@@ -221,7 +221,7 @@ class Segment:
     def move(self, moves: MapMoves) -> F64:
         """Move keyframes, points and frames.  Returns the similarity (4, 4) of the newest
         keyframe."""
-        keyframes, points = self.keyframes, self.points
+        keyframes = self.keyframes
         S = moves.matrices(np.array([keyframe.id for keyframe in keyframes], np.int64))
         poses = move_by_similarity(S, np.array([keyframe.T_world_camera for keyframe in keyframes]))
         for keyframe, move, T_world_camera in zip(keyframes, S, poses, strict=True):
@@ -233,14 +233,7 @@ class Segment:
                 keyframe.published_pose = T_world_camera.copy()
             if keyframe.focus is not None:
                 keyframe.focus = move[:3, :3] @ keyframe.focus + move[:3, 3]
-        used = slice(0, points.count)  # candidates have a provisional place, too
-        here = (points.state[used] != FREE) & (points.segment[used] == self.id)
-        rows = np.flatnonzero(here)
-        hosts = points.first_keyframe[rows].astype(np.int64)
-        S_hosts = moves.matrices(hosts)
-        points.xyz[rows] = transform_each(S_hosts, points.xyz[rows])
-        points.published_xyz[rows] = transform_each(S_hosts, points.published_xyz[rows])
-        points.spread[rows] = (S_hosts[:, :3, :3] @ points.spread[rows][:, :, None])[:, :, 0]
+        self.points.move(self.id, moves)
         self.path.scale(moves)
         self.given_up.move(moves)
         self.strayed = S[0] @ self.strayed
@@ -298,9 +291,7 @@ class Segment:
             return found, None
         moves = self.given_up.together_with(moves)
         self.given_up.move(moves)
-        rows = self.mapped_rows()
-        hosts = self.points.first_keyframe[rows].astype(np.int64)
-        self.points.published_xyz[rows] = moves.points(self.points.published_xyz[rows], hosts)
+        self.points.move_published(self.mapped_rows(), moves)
         return found, moves
 
 
@@ -345,9 +336,7 @@ def bend(
     """Move the points to where another camera would have mapped what it sees at the same places of
     the image, candidates with their provisional places among them.   refocus: as of ``see_by``."""
     points, keyframes = segment.points, segment.keyframes
-    used = slice(0, points.count)
-    here = (points.state[used] != FREE) & (points.segment[used] == segment.id)
-    rows = np.flatnonzero(here)
+    rows = points.used(segment.id)
     ids = np.array([keyframe.id for keyframe in keyframes], np.int64)
     # What hung on a keyframe that the map has forgotten hangs on the one before it.
     slots = np.maximum(np.searchsorted(ids, points.first_keyframe[rows], side="right") - 1, 0)
@@ -359,7 +348,7 @@ def bend(
     px = before.camera.project(in_host).astype(np.float32)
     px = moved_px(px, before, after, None if refocus is None else refocus[slots[ahead]])
     in_host[:, :2] = after.camera.normalise(px) * in_host[:, 2:]
-    points.xyz[rows] = _each(T_world_host[ahead], in_host)
+    points.move_to(rows, _each(T_world_host[ahead], in_host))
 
 
 def _each(T: F64, points: F64) -> F64:

@@ -149,9 +149,10 @@ class Window:
             inverse_distance = float(np.median(1.0 / distance))
         columns = columns_in_state(self.rows, self.points.state, CANDIDATE)
         rows = self.rows[columns]
-        self.points.xyz[rows], self.points.spread[rows] = place(
+        xyz, spread = place(
             self.T_world_camera, self.u, self.v, self.seen, columns, self._camera, inverse_distance
         )
+        self.points.place_candidates(rows, xyz, spread)
         return inverse_distance
 
     def flow_since_keyframe(self, least: int) -> tuple[int, int, float]:
@@ -198,11 +199,7 @@ class Window:
             self.T_world_camera, self.u, self.v, self.seen, columns, self._camera
         )
         good = (parallax >= np.radians(limits.min_parallax_deg)) & (errors < limits.max_error_px)
-        rows = self.rows[columns[good]]
-        points.xyz[rows] = xyz[good]
-        points.parallax_rad[rows] = parallax[good]
-        points.sigmas[rows] = sigmas[good]
-        points.promote(rows)
+        points.place(self.rows[columns[good]], xyz[good], parallax[good], sigmas[good])
 
     def current_rows(self) -> I32:
         """Rows that the current frame sees."""
@@ -229,7 +226,7 @@ class Window:
         )
 
     def _take(self, columns: I32, result: BundleResult) -> None:
-        self.points.xyz[self.rows[columns]] = result.points_world
+        self.points.move_to(self.rows[columns], result.points_world)
         self.T_world_camera = result.T_world_camera
         for slot, keyframe in enumerate(self.keyframes):
             keyframe.T_world_camera = self.T_world_camera[slot]
