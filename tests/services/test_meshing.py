@@ -26,6 +26,7 @@ from pliant.algorithms.meshing.mesh_blocks import BlockMesh
 from pliant.algorithms.meshing.rendering import DrawnTriangles
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import load_config
+from pliant.fusion import voxel_file
 from pliant.fusion.keyframe_spool import KeyframeSpool
 from pliant.messages import codec, topics
 from pliant.messages.mesh_pieces import joined, split
@@ -250,7 +251,11 @@ def test_no_keyframes_no_mesh() -> None:
     assert run(empty) == {}
 
 
-def test_a_volume_too_small_is_said_with_what_all_keyframes_need() -> None:
+def test_a_volume_too_small_is_said_with_what_all_keyframes_need(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(voxel_file, "_SHARE_OF_FREE", 0.0)
+
     def made(fine_voxel: float, limit_mb: int) -> tuple[set[str], list[str]]:
         monitor, bus = Notes(), ReplayBus(inputs())
         sets = (f"fine_voxel={fine_voxel}", "coarse_voxel=0.1", f"max_memory_mb={limit_mb}")
@@ -263,11 +268,13 @@ def test_a_volume_too_small_is_said_with_what_all_keyframes_need() -> None:
     levels, notes = made(0.006, limit)
     assert levels == {"coarse"}
     (told,) = [note for note in notes if "no fine mesh" in note]
-    assert "meshing.tsdf.fine_voxel=0.006 needs 13 MB for segment 0, the limit is 12 MB" in told
+    assert "meshing.tsdf.fine_voxel=0.006 needs 13 MB for segment 0, " in told
+    assert "half of the free disk have room for 12 MB" in told
     assert made(0.006, 14)[0] == {"coarse", "fine"}
     # It is what all keyframes need, however few of them there was room for.
     (worse,) = [note for note in made(0.006, 3)[1] if "no fine mesh" in note]
-    assert "needs 13 MB for segment 0, the limit is 3 MB" in worse
+    assert "needs 13 MB for segment 0, " in worse
+    assert "have room for 3 MB" in worse
     for note, size in ((told, limit), (worse, 3)):
         fitting = float(note.split("about ")[1].split()[0])
         assert fitting > 0.006

@@ -9,7 +9,7 @@ from fusion_scene import BALL, CAMERA, RADIUS, edge_uses, make_view, surface_err
 
 from pliant.algorithms.meshing.mesh_blocks import BlockMesh, TriangleMesh
 from pliant.algorithms.meshing.parameters import TsdfParameters
-from pliant.algorithms.meshing.tsdf_blocks import BlockPool, find_rows
+from pliant.algorithms.meshing.tsdf_blocks import BlockPool, InMemory, find_rows
 from pliant.algorithms.meshing.tsdf_integrate import blocks_in_band, pixel_planes
 from pliant.algorithms.meshing.tsdf_volume import TsdfVolume, VolumeFullError
 from pliant.fusion.memory import (
@@ -41,7 +41,7 @@ def assert_same(first: Any, second: Any) -> None:
 
 def test_a_pool_keeps_what_is_in_its_blocks_as_others_come_and_go() -> None:
     generator = np.random.default_rng(0)
-    pool = BlockPool(most=2000)
+    pool = BlockPool(InMemory(most=2000))
     held: dict[tuple[int, ...], int] = {}
 
     def check() -> None:
@@ -57,7 +57,7 @@ def test_a_pool_keeps_what_is_in_its_blocks_as_others_come_and_go() -> None:
     for step in range(1, 15):
         keys = np.array([(step, k, 0) for k in range(180)], np.int32)
         used = len(held)
-        if used + len(keys) > pool.most:
+        if used + len(keys) > pool.where.most:
             with pytest.raises(ValueError, match="there is room for 2000"):
                 pool.add(keys, step)
             check()
@@ -74,7 +74,7 @@ def test_a_pool_keeps_what_is_in_its_blocks_as_others_come_and_go() -> None:
         pool.remove(gone)
         check()
         assert np.array_equal(pool.births, pool.keys[:, 0])
-    assert pool.room <= pool.most
+    assert pool.room <= pool.where.most
     pool.remove(np.arange(len(pool.keys), dtype=np.int32))
     assert len(pool.keys) == 0
 

@@ -4,22 +4,56 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing.mesh_blocks import BLOCK_BYTES, sorted_keys
+from pliant.algorithms.meshing.mesh_blocks import BLOCK_BYTES, TriangleMesh, sorted_keys
 from pliant.algorithms.meshing.parameters import TsdfParameters
 from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.meshing.tsdf_integrate import blocks_in_band, pixel_planes
 from pliant.algorithms.meshing.tsdf_volume import TsdfVolume, VolumeFullError
+from pliant.fusion.voxel_file import VoxelFile
 
 
 class FinalVolume:
-    """Once it is full it is empty, and counts what it would take."""
+    """In memory up to its limit, then on disk.  Once that is full it is empty, and counts what it
+    would take.  A context manager."""
 
     def __init__(self, voxel_size: float, camera: PinholeCamera, tsdf: TsdfParameters) -> None:
-        self.volume = TsdfVolume(voxel_size, tsdf)
+        self._file = VoxelFile(tsdf.max_memory_mb * 10**6)
+        self.volume = TsdfVolume(voxel_size, tsdf, self._file)
         self.is_full = False
         self._camera = camera
         self._tsdf = tsdf
         self._needed = np.zeros((0, 3), np.int32)
+
+    def __enter__(self) -> "FinalVolume":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._empty()
+
+    def mesh(self) -> TriangleMesh:
+        """The whole surface; the volume is empty then."""
+        mesh = self.volume.extract_all()
+        self._empty()
+        return mesh
+
+    def _empty(self) -> None:
+        self.volume = TsdfVolume(self.volume.scale.voxel, self._tsdf)
+        self._file.__exit__()
+
+    @property
+    def memory_bytes(self) -> int:
+        """Of the voxels, but for what is on disk."""
+        return self.volume.memory_bytes if self.file_bytes == 0 else 0
+
+    @property
+    def file_bytes(self) -> int:
+        """Of the voxels on disk."""
+        return self._file.size_bytes
+
+    @property
+    def most_bytes(self) -> int:
+        """What there is room for."""
+        return self._file.most * BLOCK_BYTES
 
     @property
     def needed_bytes(self) -> int:
@@ -33,9 +67,9 @@ class FinalVolume:
             try:
                 self.volume.integrate(depths, weights, colour, self._camera, T_world_camera)
                 return
-            except VolumeFullError:
+            except (VolumeFullError, OSError):  # meanwhile others may have filled the disk
                 self.is_full, self._needed = True, self.volume.keys
-                self.volume = TsdfVolume(self.volume.scale.voxel, self._tsdf)
+                self._empty()
         pixels = pixel_planes(depths, weights, self._camera)
         band = blocks_in_band(pixels, T_world_camera, self.volume.scale)
         self._needed = sorted_keys(np.concatenate([self._needed, band]))

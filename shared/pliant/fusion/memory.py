@@ -55,15 +55,23 @@ def check_voxel_sizes(camera: PinholeCamera, parameters: TsdfParameters) -> None
             )
 
 
-def too_fine(level: str, parameters: TsdfParameters, needed_bytes: int, what: str) -> str:
-    """One line: voxels of that level, "fine" or "coarse", need more than the limit for ``what``."""
+def too_fine(
+    level: str, parameters: TsdfParameters, needed_bytes: int, what: str,
+    room_bytes: int | None = None,
+) -> str:  # fmt: skip
+    """One line: voxels of that level, "fine" or "coarse", need more for ``what`` than there is.
+
+    room_bytes: in memory and on disk; None: the limit of memory.
+    """
     voxel: float = getattr(parameters, f"{level}_voxel")
-    excess = needed_bytes / (parameters.max_memory_mb * 1e6)
-    fitting = _rounded_up(_MARGIN * voxel * excess**_GROWTH)
+    most = parameters.max_memory_mb * 1e6 if room_bytes is None else room_bytes
+    limit = f"the limit is {parameters.max_memory_mb} MB (meshing.tsdf.max_memory_mb)"
+    if room_bytes is not None:
+        limit = f"memory and half of the free disk have room for {most / 1e6:.0f} MB"
+    fitting = _rounded_up(_MARGIN * voxel * (needed_bytes / most) ** _GROWTH)
     return (
-        f"meshing.tsdf.{level}_voxel={voxel:.4g} needs {needed_bytes / 1e6:.0f} MB for {what}, the "
-        f"limit is {parameters.max_memory_mb} MB (meshing.tsdf.max_memory_mb): "
-        f"about {fitting:g} would fit"
+        f"meshing.tsdf.{level}_voxel={voxel:.4g} needs {needed_bytes / 1e6:.0f} MB for {what}, "
+        f"{limit}: about {fitting:g} would fit"
     )
 
 

@@ -8,6 +8,7 @@ observations and surfaces of all keyframes wait on disk.
 """
 
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -216,7 +217,8 @@ class Mesher:
         for keyframe in self._spool.keyframes():
             by_segment.setdefault(self._map.keyframes[keyframe].segment, []).append(keyframe)
         for segment, keyframes in sorted(by_segment.items()):
-            yield from self._finish_segment(segment, keyframes, timer)
+            with ExitStack() as held:
+                yield from self._finish_segment(segment, keyframes, timer, held)
 
     def _fuse_one(self, keyframe: int, count: str, timer: StageTimer) -> None:
         """Put a keyframe into the live mesh as the map has it now, in place of what is in there."""
@@ -264,14 +266,14 @@ class Mesher:
         live.take_out(keyframe, self._within(keyframe, depth_map, old.correction), colour)
 
     def _finish_segment(
-        self, segment: int, keyframes: list[int], timer: StageTimer
+        self, segment: int, keyframes: list[int], timer: StageTimer, held: ExitStack
     ) -> Iterator[FinalMesh]:
         unit = self._median_depth(keyframes)
         tsdf = self._parameters.tsdf
         if self._parameters.depth == "dense":
             tsdf = tsdf.model_copy(update={"min_weight": tsdf.dense_min_weight})
         volumes = {
-            level: FinalVolume(share * unit, self._camera, tsdf)
+            level: held.enter_context(FinalVolume(share * unit, self._camera, tsdf))
             for level, share in (("fine", tsdf.fine_voxel), ("coarse", tsdf.coarse_voxel))
         }
         dense = self._dense(keyframes, timer)
@@ -296,12 +298,13 @@ class Mesher:
             return
         for level, volume in volumes.items():
             if volume.is_full:
-                what = f"segment {segment}"
-                self._tell(f"no {level} mesh: {too_fine(level, tsdf, volume.needed_bytes, what)}")
+                needed, room, what = volume.needed_bytes, volume.most_bytes, f"segment {segment}"
+                self._tell(f"no {level} mesh: {too_fine(level, tsdf, needed, what, room)}")
                 continue
-            self.counts[f"final_{level}_mib"] = volume.volume.memory_bytes / 2**20
+            self.counts[f"final_{level}_mib"] = volume.memory_bytes / 2**20
+            self.counts[f"final_{level}_file_mib"] = volume.file_bytes / 2**20
             with timer(f"final {level} meshing"):
-                mesh = volume.volume.extract_all()
+                mesh = volume.mesh()
             yield FinalMesh(segment, level, volume.volume.scale.voxel, fused, mesh)
 
     def _dense(self, keyframes: list[int], timer: StageTimer) -> DenseDepths:

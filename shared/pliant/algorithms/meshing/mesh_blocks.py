@@ -157,7 +157,7 @@ class BlockMesh:
 
     def blocks(self, packed_keys: list[int]) -> MeshBlocks:
         """The held ones of some blocks, which are given in ascending order."""
-        return _joined([self._blocks[key] for key in packed_keys if key in self._blocks])
+        return joined_blocks([self._blocks[key] for key in packed_keys if key in self._blocks])
 
     def snapshot(self) -> MeshBlocks:
         """Everything held, for a viewer that joins late."""
@@ -240,7 +240,8 @@ def _same(held: MeshBlocks, blocks: MeshBlocks, at: slice, face: slice) -> bool:
     )
 
 
-def _joined(parts: list[MeshBlocks]) -> MeshBlocks:
+def joined_blocks(parts: list[MeshBlocks]) -> MeshBlocks:
+    """Those of the first part, then those of the next ones; keys must ascend throughout."""
     if not parts:
         return no_blocks()
     return MeshBlocks(

@@ -130,7 +130,10 @@ class TsdfParameters(Parameters):
         default=True, description="What a keyframe sees through counts against surface there."
     )
     max_memory_mb: int = Field(
-        default=2000, ge=1, description="Memory of one volume, MB: a finer voxel is refused."
+        default=1000,
+        ge=1,
+        description="Memory of one volume, MB.  What the final mesh needs beyond it is on disk, in "
+        "TMPDIR or /var/tmp.  A voxel with which a single keyframe needs more is refused.",
     )
 
 

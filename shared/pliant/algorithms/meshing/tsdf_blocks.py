@@ -49,6 +49,24 @@ class Scale(NamedTuple):
     truncation: float
 
 
+class InMemory:
+    """Room for the sums of blocks.   most: blocks that there is ever room for."""
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+
+    def grow(self, sums: list[I32], used: int, least: int) -> None:
+        """Put into the list arrays of ``least`` rows or more, with the first ``used`` as before."""
+        room = min(2 * least, self.most)
+        for k, old in enumerate(sums):
+            # One after the other, so that at no time all are there twice.
+            sums[k] = np.empty((room, *old.shape[1:]), np.int32)
+            sums[k][:used] = old[:used]
+
+    def let_go(self) -> None:
+        """Told when none of the blocks will be needed soon."""
+
+
 class BlockPool:
     """The blocks of a volume and room for more.
 
@@ -58,13 +76,13 @@ class BlockPool:
     elsewhere in memory after each ``add``.
     """
 
-    def __init__(self, most: int) -> None:
-        """most: blocks that there is ever room for."""
-        self.most = most
+    def __init__(self, where: InMemory) -> None:
+        """where: what gives room for more."""
+        self.where = where
         self.keys = np.zeros((0, 3), np.int32)
         self.births = np.zeros(0, np.int64)
         self.table = make_table(self.keys)
-        lattice = (min(_FIRST_BLOCKS, most), SIDE, SIDE, SIDE)
+        lattice = (min(_FIRST_BLOCKS, where.most), SIDE, SIDE, SIDE)
         self._sums = [np.empty((*lattice, *last), np.int32) for last in ((), (), (4,))]
 
     @property
@@ -83,14 +101,10 @@ class BlockPool:
         Raises ValueError where they are more than there is ever room for; nothing has changed then.
         """
         used, total = len(self.keys), len(self.keys) + len(keys)
-        if total > self.most:
-            raise ValueError(f"{total} blocks, there is room for {self.most}")
+        if total > self.where.most:
+            raise ValueError(f"{total} blocks, there is room for {self.where.most}")
         if total > self.room:
-            room = min(2 * total, self.most)
-            for k, old in enumerate(self._sums):
-                # One after the other, so that at no time all are there twice.
-                self._sums[k] = np.empty((room, *old.shape[1:]), np.int32)
-                self._sums[k][:used] = old[:used]
+            self.where.grow(self._sums, used, total)
         for sums in self._sums:
             sums[used:total] = 0
         self.keys = np.concatenate([self.keys, keys])

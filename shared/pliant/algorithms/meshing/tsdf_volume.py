@@ -13,12 +13,14 @@ from pliant.algorithms.meshing.mesh_blocks import (
     BLOCK_BYTES,
     MeshBlocks,
     TriangleMesh,
+    joined_blocks,
     sorted_keys,
     weld,
 )
 from pliant.algorithms.meshing.parameters import TsdfParameters
 from pliant.algorithms.meshing.tsdf_blocks import (
     BlockPool,
+    InMemory,
     Scale,
     find_rows,
     with_neighbours,
@@ -31,6 +33,9 @@ from pliant.algorithms.meshing.tsdf_integrate import (
     blocks_in_view,
     pixel_planes,
 )
+
+_AT_ONCE = 4096
+"""Blocks that are meshed while they and their neighbours, some 100 MB, are in memory."""
 
 
 class VolumeFullError(Exception):
@@ -52,13 +57,16 @@ class Integration:
 class TsdfVolume:
     """Depth maps in, blocks of mesh out."""
 
-    def __init__(self, voxel_size: float, parameters: TsdfParameters) -> None:
-        """voxel_size: in scene units."""
+    def __init__(
+        self, voxel_size: float, parameters: TsdfParameters, where: InMemory | None = None
+    ) -> None:
+        """voxel_size: in scene units.    where: the voxels are; None: in memory up to its limit."""
         if not (math.isfinite(voxel_size) and voxel_size > 0.0):
             raise ValueError(f"voxel_size: expected a positive size, got {voxel_size}")
         self.scale = Scale(voxel_size, parameters.truncation_voxels * voxel_size)
         self._parameters = parameters
-        self._blocks = BlockPool(max(1, parameters.max_memory_mb * 10**6 // BLOCK_BYTES))
+        most = max(1, parameters.max_memory_mb * 10**6 // BLOCK_BYTES)
+        self._blocks = BlockPool(InMemory(most) if where is None else where)
         self._serial = 0
 
     @property
@@ -85,13 +93,14 @@ class TsdfVolume:
         band = blocks_in_band(pixels, T_world_camera, self.scale)
         new = band[find_rows(self._blocks.table, band) < 0]
         total = len(self.keys) + len(new)
-        if total > self._blocks.most:
+        if total > self._blocks.where.most:
             raise VolumeFullError(total * BLOCK_BYTES)
         self._serial += 1
         if len(new):
             self._blocks.add(new, self._serial)
         changed = self._add(1, self._serial, pixels, colour, T_world_camera)
         self._release(new)
+        self._blocks.where.let_go()
         return Integration(self._serial, changed)
 
     def remove(
@@ -121,7 +130,11 @@ class TsdfVolume:
 
     def extract_all(self) -> TriangleMesh:
         """The whole surface, welded across blocks."""
-        return weld(self.extract(self.keys))
+        keys, parts = sorted_keys(self.keys), list[MeshBlocks]()
+        for first in range(0, len(keys), _AT_ONCE):
+            parts.append(self.extract(keys[first : first + _AT_ONCE]))
+            self._blocks.where.let_go()
+        return weld(joined_blocks(parts))
 
     def _add(
         self, sign: int, serial: int, pixels: PixelPlanes, colour: U8, T_world_camera: F64
