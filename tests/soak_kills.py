@@ -157,7 +157,7 @@ def mesher_killed(
     ((frame, later),) = moments
     output = folder / "run"
     with running(*kind.arguments, *SETTINGS, "--output", output) as run:
-        run.wait_for("meshing what was recorded")
+        run.wait_for("meshing the recording")
         threading.Event().wait(frame / kind.frames * 2.0 + later)
         meshers = children(run.process.pid, "mesh.afterwards")
         killed = _kill(dict(zip((victim,), meshers, strict=False)), (victim,))

@@ -107,7 +107,7 @@ def test_dropped_and_broken_images_are_told_apart(tmp_path: Path) -> None:
     assert told in lines
     assert "1 image dropped to keep up (live mode)" in record(tmp_path, ["", "dropped"])
     lines = record(tmp_path, ["", "dropped", MASKED, MASKED])
-    assert "2 images passed over: masked as a whole" in lines
+    assert "2 images skipped: fully masked" in lines
     assert not any("broken" in line for line in lines)
 
 
@@ -129,14 +129,14 @@ def test_what_a_map_cannot_tell_is_left_out_and_what_it_gave_up_is_told() -> Non
         "median_tracks_per_frame": 900.0,
         "median_inliers_per_frame": 0.0,
     }
-    waited = "median per frame: 900 tracks, every frame waited for the map to begin"
+    waited = "median per frame: 900 tracks, every frame waited for the map to start"
     assert waited in summary(report)
     report["median_inliers_per_frame"] = 700.0
     assert "median per frame: 900 tracks, 700 mapped inliers" in summary(report)
     assert not any("kept_observations" in line for line in summary(report))
     counted = {"given_up_keyframes": 1.0, "given_up_points": 5200.0}
     report["counters"] = {"bundle_adjustment": counted}
-    told = "kept_observations: 1 keyframe and 5200 points move with what is kept"
+    told = "kept_observations: 1 keyframe and 5200 points dropped, but kept in the results"
     assert any(line.endswith(told) for line in summary(report))
 
 
@@ -148,7 +148,7 @@ def test_one_is_not_many(tmp_path: Path) -> None:
 def test_a_recorder_that_was_killed_did_not_cut_the_source_off(tmp_path: Path) -> None:
     """The topic of the camera is closed before the first frame; those of the frames are open."""
     lines = record(tmp_path, [""] * 4, announced=10, ended=[topics.STREAM])
-    told = "4 of 10 frames came: the run was stopped or cut off"
+    told = "4 of 10 frames arrived: the run was stopped or interrupted"
     assert [line for line in lines if "ended early" in line] == [f"ended early: {told}"]
     assert told in (tmp_path / "report.html").read_text()
     assert json.loads((tmp_path / "report.json").read_text())["complete"] is False
@@ -185,7 +185,7 @@ def test_the_end_of_a_run_says_what_to_look_at_and_how_large_it_is(
     pipeline._finish(tmp_path, interrupted=False, failure=None)
     first, second, *_ = capsys.readouterr().out.splitlines()
     assert re.search(r"\(\d[\d.]* [KM]iB, of which the recording \d[\d.]* KiB\): traj", first)
-    assert second == f"to look at: {tmp_path / 'report.html'}, in a browser"
+    assert second == f"open in a browser: {tmp_path / 'report.html'}"
 
 
 def test_a_source_that_failed_says_why(tmp_path: Path) -> None:
@@ -201,7 +201,9 @@ def test_a_video_that_is_cut_off_is_noticed(
     tmp_path: Path, announced: int, complete: bool, said: bool
 ) -> None:
     lines = record(tmp_path, [""] * 4, announced=announced, complete=complete)
-    assert ("ended early: 4 of 10 frames came: the file is cut off or damaged" in lines) is said
+    assert (
+        "ended early: 4 of 10 frames arrived: the file is truncated or damaged" in lines
+    ) is said
 
 
 def test_a_run_that_was_interrupted_before_it_recorded_has_nothing_to_mesh(
@@ -260,7 +262,7 @@ def in_segment(delta: MapDelta, frame: int, segment: int) -> MapDelta:
         (
             [1, 1],
             -1,
-            "{} was recognised in none of 2 frames: the run went on in 1 segment of its own",
+            "{} was recognised in none of 2 frames: the run made 1 segment of its own",
         ),
         ([-1, -1], -1, "{} was recognised in none of 2 frames"),
     ],
@@ -282,6 +284,6 @@ def test_it_is_said_how_long_a_known_map_was_looked_for(
         if not final:
             run.inliers[frame], run.tracks[frame] = delta.inliers, 900
     lines = summary(rigid_report(run, run.history.final()))
-    assert [line for line in lines if "known map" in line] == [
-        told.format("the known map of 1 keyframe")
+    assert [line for line in lines if "loaded map" in line] == [
+        told.format("the loaded map of 1 keyframe")
     ]

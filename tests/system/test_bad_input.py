@@ -105,7 +105,7 @@ MISTAKES: list[tuple[Sequence[str], int, Sequence[str]]] = [
     (["run", TINY, "--config", "nowhere.yaml"], 1, ["nowhere.yaml", "No such file"]),
     (["run", TINY, "--config", "empty"], 1, ["empty", "directory"]),
     (["run", TINY, "--start", "99"], 1, ["built-in:tiny: is 1.30 s long", "--start 99 s"]),
-    (["run", TINY, "--resume", "--poses"], 2, ["--poses needs a run from its beginning"]),
+    (["run", TINY, "--resume", "--poses"], 2, ["--poses needs a run from its start"]),
     (["run", TINY, "--mode", "nonsense"], 2, ["--mode", "lossless", "live", "--help"]),
     (["run", TINY, "--port", "99999"], 2, ["--port", "65535"]),
     (["run", TINY, "--no-such-option"], 2, ["--no-such-option", "run --help"]),

@@ -34,7 +34,7 @@ def test_an_upright_clip_is_mapped_and_its_recording_replays_to_the_same_bytes(
     done = pliant("run", clip, *given, *NO_MESH, "--output", folder)
     assert done.returncode == 0, done.stderr
     # Where nothing draws nobody is told to look on (and in test_mesh.py, without Rerun).
-    assert (f"; look on: pliant view {folder}" in done.stderr) == bool(find_spec("rerun"))
+    assert (f"; watch live: pliant view {folder}" in done.stderr) == bool(find_spec("rerun"))
     result = pliant_api.open(folder)
     assert result.image(20).shape[:2] == (height, width)
     assert len(result.trajectory) == len(upright)

@@ -31,7 +31,7 @@ def test_a_run_goes_on_in_a_map_and_replays(office: Path, tmp_path: Path) -> Non
     assert report["known_map"]["frames_in_it"] == report["frames_with_pose"] == report["frames"]
     assert report["known_map"]["looked"] == 0
     assert [segment["id"] for segment in report["segments"]] == [0]
-    assert "in the known map" in done.stdout
+    assert "in the loaded map" in done.stdout
     first = read_tum(office / "trajectory.txt").positions
     second = read_tum(tmp_path / "today" / "trajectory.txt").positions
     assert np.linalg.norm(first - second, axis=1).max() < 0.01  # one world, at one scale

@@ -313,7 +313,7 @@ def test_of_a_good_run_there_is_nothing_to_say() -> None:
 
 def test_what_the_verdict_says_of_the_lens_is_not_said_again() -> None:
     """And the frame in a hundred that is doubtful is not what makes the run so."""
-    open_lens = "the focal length stays unknown"
+    open_lens = "unknown focal length"
     doubtful = {"verdict": "doubtful", "verdict_reason": open_lens, "doubtful_frames": [7]}
     assert advice(report(calibration_verdict=open_lens, **doubtful), STAMPS) == []
 
@@ -333,11 +333,11 @@ def test_what_the_verdict_says_of_the_lens_is_not_said_again() -> None:
         ),
         ({"frames_with_pose": 80}, "No pose for 20 frames"),
         ({"median_tracks_per_frame": 100.0}, "100 tracks"),
-        ({"median_inliers_per_frame": 100.0}, "turned more than it moved"),
-        ({"doubtful_frames": [*range(30)], "verdict": "doubtful"}, "30 poses rest on"),
+        ({"median_inliers_per_frame": 100.0}, "rotated more than it moved"),
+        ({"doubtful_frames": [*range(30)], "verdict": "doubtful"}, "30 poses rely on"),
         ({"calibration_verdict": "the focal length is wrong"}, "The focal length is wrong."),
-        ({"frames_passed_over": [5]}, "did not keep up"),
-        ({"frames_without_pixels": {"5": "dropped"}}, "did not keep up"),
+        ({"frames_passed_over": [5]}, "was too slow"),
+        ({"frames_without_pixels": {"5": "dropped"}}, "was too slow"),
         (
             {"frames_without_pixels": {str(n): "broken: cut off" for n in range(9)}},
             "9 broken images",

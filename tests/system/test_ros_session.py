@@ -146,8 +146,8 @@ def publish_all(driver: Driver, frames: list[Any], camera: Any, images: "queue.Q
 
 def test_wrong_requests_are_one_line(tmp_path: Path) -> None:
     for arguments, says in (
-        ((), "which session"),
-        ((tmp_path,), "no run goes on there"),
+        ((), "no session given"),
+        ((tmp_path,), "no active run in this folder"),
         (("--connect", "tcp/127.0.0.1:9"), "--session"),
         (("--connect", "tcp/127.0.0.1:9", "--session", "a", "--name", "my robot"), "not a name"),
         (("--connect", "tcp/127.0.0.1:9", "--session", "a", "--router", "x"), "not an endpoint"),

@@ -98,13 +98,13 @@ def test_the_first_result_stays_whatever_ends_the_second_pass(
     monkeypatch.setattr(module, place, ends)
     assert second_pass(output, request, 0) == (130 if isinstance(error, KeyboardInterrupt) else 0)
     assert contents(output) == before
-    assert "the result of the first pass stays" in capsys.readouterr().err
+    assert "the result of the first pass is kept" in capsys.readouterr().err
 
 
 def test_where_nothing_is_lost_the_first_result_is_the_best(tiny_run: Path, tmp_path: Path) -> None:
     done = pliant("run", TINY, "--quality", "high", "--output", tmp_path / "tiny")
     assert done.returncode == 0, done.stderr
-    assert "second pass: no frame was lost that shows something" in done.stderr
+    assert "second pass: no frame with image content was lost" in done.stderr
     assert digests(tmp_path / "tiny") == digests(tiny_run)
 
 

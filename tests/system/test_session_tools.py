@@ -104,7 +104,7 @@ def test_a_run_is_found_by_its_result_folder(tmp_path: Path) -> None:
     (idle := tmp_path / "idle").mkdir()
     for name in ("status", "stop"):
         refused = in_this_process(name, str(idle))
-        assert (refused.returncode, "no run goes on there" in refused.stderr) == (1, True)
+        assert (refused.returncode, "no active run in this folder" in refused.stderr) == (1, True)
     result = tmp_path / "long"
     with start("run", long_source(tmp_path), *NO_MESH, "--output", str(result)) as run:
         rows: set[str] = set()

@@ -60,7 +60,7 @@ def test_the_page_shows_the_surface(result: Path) -> None:
     assert layers["mesh"]["count"] >= 2 * layers["points"]["count"]  # from both sides
     assert layers["mesh"]["triangles"] > layers["points"]["count"]
     assert layers["path"]["count"] == FRAMES
-    assert f"{FRAMES}, {FRAMES} followed" in page
+    assert f"{FRAMES}, {FRAMES} tracked" in page
     assert '<span class="verdict good">good</span>' in page
     assert "surfels.npz" in page
     assert "://" not in page

@@ -51,7 +51,7 @@ def test_results_are_made_of_what_was_recorded(tiny_run: Path, tmp_path: Path) -
     assert (folder / "mesh.ply").read_bytes() == (tiny_run / "mesh.ply").read_bytes()
     assert {p.name for p in folder.iterdir()} == {p.name for p in tiny_run.iterdir()}
     over = in_this_process("run", TINY, "--resume", "--output", folder)
-    assert_one_line(over, "nothing is left to resume")
+    assert_one_line(over, "there is nothing to resume")
 
 
 def test_what_was_cut_off_cannot_be_resumed(tiny_run: Path, tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ def test_what_was_cut_off_cannot_be_resumed(tiny_run: Path, tmp_path: Path) -> N
     recover(folder / "cut.mcap", folder / "recording.mcap")
     (folder / "cut.mcap").unlink()
     done = in_this_process("run", TINY, "--resume", "--output", folder)
-    assert_one_line(done, "begun without --on-crash restart, and cannot go on")
+    assert_one_line(done, "started without --on-crash restart, and cannot resume")
 
 
 def test_a_service_that_is_killed_while_it_starts_is_started_again(

@@ -60,7 +60,7 @@ def test_a_run_is_taken_up_with_the_options_that_it_was_begun_with(tmp_path: Pat
     same = RunRequest(source="a.mp4", overrides=settings, seed=3)
     assert resumed_config(tmp_path, same) == resumed_config(tmp_path, RunRequest(source="a.mp4"))
     for other in (RunRequest(source="a.mp4", overrides=settings), RunRequest(source="a", seed=4)):
-        with pytest.raises(ResultError, match="and this is another one"):
+        with pytest.raises(ResultError, match="and this one differs"):
             resumed_config(tmp_path, other)
 
 

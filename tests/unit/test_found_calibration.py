@@ -90,18 +90,18 @@ def test_one_line_says_what_was_found_or_what_leaves_it_open():
     guess = calibration_from_fov(640, 480, 60.0)
     ahead, round_about = path(0.1, (0.0, 0.0, 1.0)), path(1.0, (1.0, 0.0, 0.0))
     found = calibration_verdict(run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.004,) * 4), round_about)
-    assert "was found" in found
+    assert found.startswith("estimated focal length")
     assert "+-0.8 %" in found
     unknown = calibration_verdict(run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.09,) * 4), ahead)
-    assert "stays unknown" in unknown
-    assert "moves straight ahead and it turns by 6 degrees only" in unknown
+    assert "unknown focal length" in unknown
+    assert "moves straight ahead and it rotates by only 6 degrees" in unknown
 
 
 def test_a_calibration_that_the_images_contradict_is_told_and_by_how_much():
     correction = (math.log(1.2), 0.0, 0.0, 0.0)
     told = calibration_verdict(run_with(PINHOLE, correction, (0.003,) * 4), {})
     assert "contradict" in told
-    assert "1.200 times what was given (+-0.8 %)" in told
+    assert "1.200 times the given one (+-0.8 %)" in told
     assert not calibration_verdict(run_with(PINHOLE, (0.008, 0.004, 0.0, 0.0), (1e-3,) * 4), {})
     assert not calibration_verdict(run_with(PINHOLE, correction, (0.2,) * 4), {})
 
@@ -109,10 +109,10 @@ def test_a_calibration_that_the_images_contradict_is_told_and_by_how_much():
 def test_what_bends_the_map_is_a_doubt_and_what_was_corrected_is_none():
     guess = calibration_from_fov(640, 480, 60.0)
     open_still = run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.09,) * 4)
-    assert calibration_doubt(open_still, {}).startswith("the focal length stays unknown")
+    assert calibration_doubt(open_still, {}).startswith("unknown focal length")
     assert not calibration_doubt(run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.004,) * 4), {})
     far = run_with(PINHOLE, (math.log(0.89), 0.12, 0.0, 0.0), (0.003,) * 4)
-    assert "focal length 0.890 times what was given" in calibration_doubt(far, {})
+    assert "focal length 0.890 times the given one" in calibration_doubt(far, {})
     assert not calibration_doubt(run_with(PINHOLE, (0.05, 0.0, 0.0, 0.0), (0.003,) * 4), {})
     assert not calibration_doubt(run_with(PINHOLE, (0.0, 0.0, 0.0, 0.0), (0.003,) * 4), {})
     assert not calibration_doubt(Run(), {})

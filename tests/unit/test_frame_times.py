@@ -197,7 +197,7 @@ def test_a_list_with_many_wrong_times_is_refused(tmp_path: Path) -> None:
 
 def test_a_verdict_speaks_of_all_frames_of_the_source() -> None:
     half = judge(frames=60, in_segments=[60], doubtful=0, absent=60)
-    assert half == (DOUBTFUL, "only 50% of the frames of the source came")
+    assert half == (DOUBTFUL, "only 50% of the source's frames arrived")
     assert judge(frames=50, in_segments=[50], doubtful=0, absent=70)[0] == BAD
     few = judge(frames=115, in_segments=[115], doubtful=0, absent=5)
     assert few == (GOOD, "96% of the frames of the source have a pose in the largest segment")

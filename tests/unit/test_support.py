@@ -139,7 +139,7 @@ def test_a_frame_that_was_passed_over_and_placed_later_is_not_doubtful() -> None
 
 
 def test_a_run_whose_calibration_bends_the_map_is_doubtful() -> None:
-    known = "the focal length stays unknown"
+    known = "unknown focal length"
     judged = judge(frames=100, in_segments=[100], doubtful=0, calibration=known)
     assert judged == (DOUBTFUL, known)
     assert judge(frames=100, in_segments=[20], doubtful=0, calibration=known)[0] == BAD
@@ -165,7 +165,7 @@ def test_a_run_that_did_not_keep_up_is_doubtful() -> None:
     lost = judge(frames=100, in_segments=[29], doubtful=0, behind=20)
     assert (few[0], most[0], lost[0]) == (GOOD, DOUBTFUL, BAD)
     assert "29% of the frames have a pose" in most[1]
-    assert "the computer did not keep up with 71%" in most[1]
+    assert "the computer was too slow for 71%" in most[1]
 
 
 @pytest.mark.parametrize(
@@ -175,12 +175,12 @@ def test_a_run_that_did_not_keep_up_is_doubtful() -> None:
         ({"slipping": 20}, GOOD, "all frames"),
         ({"slipping": 61}, DOUBTFUL, "in 61% of the frames less than 75% of the surfels in view"),
         ({"together": 20}, GOOD, "all frames"),
-        ({"together": 61}, DOUBTFUL, "if it is the camera that moves, --camera moving"),
+        ({"together": 61}, DOUBTFUL, "if the camera moves, use --camera moving"),
         ({"in_segments": [60, 40]}, DOUBTFUL, "60% of the frames"),
         ({"in_segments": [30, 20, 10]}, BAD, "30% of the frames"),
-        ({"in_segments": []}, BAD, "no surfels were followed"),
-        ({"in_segments": [0]}, BAD, "no surfels were followed"),
-        ({"frames": 0, "in_segments": []}, BAD, "no surfels were followed"),
+        ({"in_segments": []}, BAD, "no surfels were tracked"),
+        ({"in_segments": [0]}, BAD, "no surfels were tracked"),
+        ({"frames": 0, "in_segments": []}, BAD, "no surfels were tracked"),
         ({"unusable": 50}, DOUBTFUL, "50% of the depth maps could not be used"),
         ({"depth_from": "flat"}, DOUBTFUL, "started on a plane"),
         ({"depth_from": "map"}, GOOD, "all frames"),

@@ -56,9 +56,9 @@ def session_at(
 
     if result is None:
         if not connect:
-            raise ResultError("which session? Give the result folder of a run, or --connect")
+            raise ResultError("no session given: pass the result folder of a run, or --connect")
         return connect, session
     endpoints, name = running_session(result)
     if not endpoints:
-        raise ResultError(f"{result}: no run goes on there")
+        raise ResultError(f"{result}: no active run in this folder")
     return endpoints, name

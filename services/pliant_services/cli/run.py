@@ -194,9 +194,9 @@ def run(
     if profile == "rigid" and (camera or depth_frames or depth):
         raise typer.BadParameter("--camera, --depth and --depth-frames need --profile deformable")
     if light and profile != "rigid":
-        raise typer.BadParameter("--light needs --profile rigid: surfels cost most of the other")
+        raise typer.BadParameter("--light needs --profile rigid: it reduces tracks, not surfels")
     if sharpest and not every:
-        raise typer.BadParameter("--sharpest needs --every: of how many frames?")
+        raise typer.BadParameter("--sharpest needs --every N: the number of frames to choose from")
     part = {"start_s": start, "end_s": end, "every": every, "longest_side_px": max_size}
     sets += [f"ingest.{name}={value}" for name, value in part.items() if value is not None]
     sets += [] if auto_mask else ["ingest.mask_static=false"]
@@ -205,13 +205,13 @@ def run(
     sets += [f"surfels.depth_from={depth}"] if depth else []
     sets += [f"ingest.depth={depth_frames}"] if depth_frames else []
     if resume and poses:
-        raise typer.BadParameter("--poses needs a run from its beginning, and --resume goes on")
+        raise typer.BadParameter("--poses needs a run from its start: leave out --resume")
     if localise and known is None:
         raise typer.BadParameter("--localise needs --map: a result folder or its map.pliant")
     if quality == "high" and (localise or profile != "rigid"):
-        raise typer.BadParameter("--quality high needs a map that grows, of --profile rigid")
+        raise typer.BadParameter("--quality high needs --profile rigid, without --localise")
     if known is not None and profile != "rigid":
-        raise typer.BadParameter("--map needs --profile rigid: surfels keep no map")
+        raise typer.BadParameter("--map needs --profile rigid: a deformable run has no map")
     # A map that does not grow has no new surface.
     localising = ["bundle_adjustment.only_localise=true", "meshing.enabled=false"]
     sets += localising if localise else []
@@ -238,7 +238,7 @@ def run(
         quality=quality,
     )
     if quiet and (poses or view):
-        raise typer.BadParameter("--quiet prints nothing: leave it, or --poses and --view")
+        raise typer.BadParameter("--quiet prints nothing: leave out --quiet, or --poses and --view")
     with silence() if quiet else nullcontext():
         code = run_pipeline(request)
     raise typer.Exit(code)

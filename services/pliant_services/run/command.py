@@ -58,7 +58,7 @@ from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 from pliant_services.runtime.limits import check_limits
 
 _DEFORMABLE = "deformable"
-_WRITTEN_AGAIN = "the run had come to its end already: its results are written again"
+_WRITTEN_AGAIN = "the run was already complete: its results are written again"
 
 
 def run_pipeline(request: RunRequest) -> int:
@@ -129,8 +129,8 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
     check_start(dataset)
     if request.quality == "high" and plays_live(dataset, config):
         raise DatasetError(
-            f"{request.source}: --quality high reads a source twice, and what comes live comes "
-            "once: leave it, and run it on the recording"
+            f"{request.source}: --quality high reads a source twice, which a live source does not "
+            "allow: leave it out, and use it on the recording"
         )
     if request.force and not dataset.is_live:
         next(iter(dataset), None)  # what has no first frame costs no earlier result
@@ -153,8 +153,8 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
     else:
         if request.resume and plays_live(dataset, config):
             raise ResultError(
-                f"{output} was recorded live, and what was passed over then would be others now: "
-                f"`pliant run {output / RECORDING_NAME} --output ...` works on what was recorded"
+                f"{output} was recorded live, and a resumed run would skip other frames: `pliant "
+                f"run {output / RECORDING_NAME} --output ...` uses the recorded frames"
             )
         fleet = Fleet(
             services,
@@ -166,7 +166,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
         interrupted, failure = _go_through(request, config, output, fleet, progress, viewer)
         output = _where_now(output, held, failure, progress)
     if failure is None and mesh_afterwards and parts.exists(output / RECORDING_NAME):
-        progress.say("meshing what was recorded ...")
+        progress.say("meshing the recording ...")
         from pliant_services.mesh.afterwards import add_mesh  # it loads what else replays
 
         try:
@@ -186,7 +186,7 @@ def _where_now(output: Path, held: Held, failure: PliantError | None, progress: 
     run failed, where it was deleted."""
     now = held.path
     if now is None:
-        raise failure or ResultError(f"{output} was deleted during the run: nothing of it is left")
+        raise failure or ResultError(f"{output} was deleted during the run: the results are lost")
     if now != output:
         progress.say(f"{output} was renamed during the run: the results go to {now}")
     return now
@@ -238,7 +238,7 @@ def _go_through(
                     viewer.start(fleet)
                 with _told_poses(request, fleet):
                     fleet.start(lambda name: service_arguments(name, request, output))
-                    look_on = f"; look on: pliant view {output}" if has_viewer() else ""
+                    look_on = f"; watch live: pliant view {output}" if has_viewer() else ""
                     interrupted = _wait(fleet, progress, f"services are up{look_on}")
                 if viewer is not None:
                     viewer.see_the_end(fleet)
@@ -267,7 +267,7 @@ def _wait(fleet: Fleet, progress: Progress, up: str) -> bool:
         progress.say(up)
         fleet.wait(progress.on_rest)
     except KeyboardInterrupt:
-        progress.say("stopping after the frame at hand (Ctrl-C again to kill)")
+        progress.say("stopping after the current frame (Ctrl-C again to kill)")
         fleet.end_source()
         fleet.wait(progress.on_rest)
         return True
@@ -305,17 +305,21 @@ def _finish(
         crashed = isinstance(failure, ServiceDiedError) and failure.crashed
         if not (crashed or resumed):
             discard(output, [f"{name}.log" for name in BY_NAME])
-        silent = KeyboardInterrupt() if interrupted else ResultError(f"{output}: no frame came")
+        silent = (
+            KeyboardInterrupt()
+            if interrupted
+            else ResultError(f"{output}: the source delivered no frame")
+        )
         raise failure or silent
     # They load what a launcher that waits has no use for.
     from pliant.results.verdict import grade
     from pliant.results.write import write_results
 
-    again = f"pliant run ... --output {output} --resume writes them"
+    again = f"use pliant run ... --output {output} --resume"
     try:
         report = write_results(output)
     except KeyboardInterrupt:
-        print(f"the results are not written: {again}", file=sys.stderr, flush=True)
+        print(f"the results are not written; {again} to write them", file=sys.stderr, flush=True)
         raise
     except PliantError as error:
         if failure is not None:  # it came first, and says why this one followed
@@ -335,13 +339,13 @@ def _say_guess(calibration: Calibration, profile: str, progress: Progress) -> No
         return
     if profile == _DEFORMABLE:
         raise CalibrationError(
-            "no calibration comes with the source, and --profile deformable finds none: "
-            f"give --calibration FILE ({UNDERSTOOD}), or --fov DEGREES"
+            "no calibration: --profile deformable needs one: pass --calibration FILE "
+            f"({UNDERSTOOD}), or --fov DEGREES"
         )
     fov = math.degrees(2.0 * math.atan(0.5 * calibration.width / calibration.fx))
     progress.say(
-        f"no calibration: the camera is taken to see {fov:.0f} degrees across, and its focal "
-        "length is found from the images (--calibration FILE, or --fov DEGREES, says it)"
+        f"no calibration: assuming a {fov:.0f} degree horizontal field of view; the "
+        "focal length will be estimated (or pass --calibration FILE, --fov DEGREES)"
     )
 
 

@@ -57,7 +57,7 @@ class Progress:
             static = static_line(self._counters)
             if static != self._static:
                 self._static = static
-                self.say(static or "what never changed has changed: nothing is masked any more")
+                self.say(static or "the static area has changed: nothing is masked any more")
             if status.service == "surfels":
                 self._show_surfels(status)
             if status.service != "bundle_adjustment":

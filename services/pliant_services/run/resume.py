@@ -16,11 +16,11 @@ from pliant_services.run.request import RunRequest
 
 KNOWN_MAP = "known_map"
 """In the folder of checkpoints: where the map is in which a run goes on."""
-_NONE = "there is no run to resume: leave --resume"
-_OVER = "its run came to its end, and nothing is left to resume: --force begins anew"
+_NONE = "there is no run to resume: leave out --resume"
+_OVER = "its run is complete, and there is nothing to resume: use --force to start again"
 _CUT_OFF = (
-    "its run was begun without --on-crash restart, and cannot go on: `pliant recover` keeps what "
-    "was recorded, --force begins anew"
+    "its run was started without --on-crash restart, and cannot resume: `pliant recover` keeps "
+    "the recording, --force starts again"
 )
 
 
@@ -33,8 +33,8 @@ def resumed_config(output: Path, request: RunRequest) -> Config:
     said = request.overrides or request.config_file or request.seed is not None
     if said and kept != load_config(request.config_file, request.overrides, seed=request.seed):
         raise ResultError(
-            "--resume takes the configuration of its run, and this is another one: leave --config, "
-            "--set, --seed and what else changes it"
+            "--resume uses the configuration of its run, and this one differs: leave out "
+            "--config, --set, --seed and other options that change it"
         )
     return kept
 
@@ -47,8 +47,8 @@ def resumed_map(output: Path, request: RunRequest) -> Path | None:
     begun_in = Path(note.read_text("utf-8", "surrogateescape")) if note.is_file() else None
     if request.known is not None and MapFile(request.known).path.resolve() != begun_in:
         raise ResultError(
-            f"--resume goes on in the map of its run, {begun_in or 'which has none'}, and "
-            f"{request.known} is another one: leave --map"
+            f"--resume uses the map of its run, {begun_in or 'which has none'}, and "
+            f"{request.known} is another one: leave out --map"
         )
     return begun_in
 

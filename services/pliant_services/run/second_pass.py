@@ -81,16 +81,18 @@ def second_pass(output: Path, request: RunRequest, code: int) -> int:
             )
             second, first = write_rigid_results(made), _report(output)
             if not is_better(second, first):
-                _say(f"it has {_posed(second)}, the first {_posed(first)}: the first stays")
+                _say(
+                    f"it has {_posed(second)}, the first {_posed(first)}: the first result is kept"
+                )
                 return code
             replace_by(output, made)
-        _say(f"{_posed(second)}, in the first {_posed(first)}")
+        _say(f"{_posed(second)}, in the first pass {_posed(first)}")
         tell(output, second)
     except KeyboardInterrupt:
-        _say("stopped: the result of the first pass stays")
+        _say("stopped: the result of the first pass is kept")
         return INTERRUPTED
     except (PliantError, OSError, MemoryError) as error:
-        _say(f"{error}: the result of the first pass stays")
+        _say(f"{error}: the result of the first pass is kept")
     return code
 
 
@@ -99,16 +101,16 @@ def what_is_lost(run: Run) -> tuple[list[Stretch], str]:
     history = run.history
     segments = {frame: segment for frame, (segment, _) in history.final().items()}
     if not segments:
-        return [], "there is no map to begin with"
+        return [], "the first pass has no map"
     lost = [
         frame
         for frame, (_, reason) in history.states.items()
         if frame not in segments and frame not in run.missing and reason not in FLAWS
     ]
     if not lost and len(set(segments.values())) == 1:
-        return [], "no frame was lost that shows something: the first result is the best"
+        return [], "no frame with image content was lost: nothing to improve"
     stretches = lost_stretches(segments, history.stamps_ns)
-    return stretches, "" if stretches else "nothing comes after the frames that were lost"
+    return stretches, "" if stretches else "no tracked frame follows the lost ones"
 
 
 def is_better(second: dict[str, Any], first: dict[str, Any]) -> bool:

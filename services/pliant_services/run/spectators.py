@@ -29,7 +29,7 @@ def check_viewer(output: Path, *, web: bool, save: Path | None, force: bool) -> 
     place(web=web, save=save, force=force)
     folder = save.resolve().parent if save is not None else output.resolve()
     if not folder.is_dir() and folder != output.resolve():
-        raise ResultError(f"{save}: there is no such folder: choose another --save")
+        raise ResultError(f"{save}: no such folder: choose another --save")
     if not has_viewer():
         raise ResultError("Rerun is not installed: pip install 'pliant[view]'")
 
@@ -62,7 +62,7 @@ class Viewer:
         while not fleet.wait_for_viewer(0.2):
             waited += 0.2
             if self._process.poll() is not None or waited > _WAIT_S:
-                raise ResultError("the viewer did not start; what it said stands above")
+                raise ResultError("the viewer did not start; its messages are above")
 
     def see_the_end(self, fleet: Fleet) -> None:
         """Wait until it has drawn what the services said last, and has written its file."""
@@ -76,7 +76,7 @@ class Viewer:
         """Leave what a browser shows where it is until Ctrl-C; a window stays by itself."""
         if self._web and self._process is not None and self._process.poll() is None:
             with suppress(KeyboardInterrupt):
-                print("the browser's view stays until Ctrl-C", file=sys.stderr, flush=True)
+                print("the browser view stays open until Ctrl-C", file=sys.stderr, flush=True)
                 self._process.wait()
 
     def __exit__(self, *_: object) -> None:

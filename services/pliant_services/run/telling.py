@@ -17,10 +17,10 @@ def tell(output: Path, report: dict[str, Any]) -> None:
     with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
         files = ", ".join(files_of(output, report))
         print(f"results in {output}/ ({_sizes(output)}): {files}, {_recording_in(output)}")
-        print(f"to look at: {output / PAGE_NAME}, in a browser")
+        print(f"open in a browser: {output / PAGE_NAME}")
         exports = ", ".join(exports_in(output))
         if exports:
-            print(f"of the result before: {exports}: export again with --force")
+            print(f"exports of the previous result: {exports}; export again with --force")
         for line in summary(report):
             print(line)
 

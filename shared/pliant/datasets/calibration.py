@@ -131,8 +131,8 @@ def calibration_from_fov(
     fov_deg = fov_deg if said else UNSAID_FOV_DEG
     if not 1.0 <= fov_deg <= 170.0:  # also refuses NaN
         raise CalibrationError(
-            f"--fov {fov_deg:g}: the horizontal field of view must be 1 to 170 degrees; a wider "
-            "lens needs a calibration file"
+            f"--fov {fov_deg:g}: the horizontal field of view must be 1 to 170 degrees; "
+            "a wider lens needs a calibration file"
         )
     focal = 0.5 * side / math.tan(math.radians(0.5 * fov_deg))
     return Calibration(

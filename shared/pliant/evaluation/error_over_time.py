@@ -30,6 +30,7 @@ def error_over_time(evaluation: Evaluation) -> str:
         says=("error over time", metres(largest), f"{last:.1f} s"),
     )
     return (
-        f"<h2>Against the truth</h2><figure>{drawn}<figcaption>Distance to the true position, "
-        f"after the alignment of the whole trajectory (Sim(3)): {told}.</figcaption></figure>"
+        f"<h2>Comparison with ground truth</h2><figure>{drawn}<figcaption>Distance to the "
+        "ground-truth position, after Sim(3) alignment of the whole trajectory: "
+        f"{told}.</figcaption></figure>"
     )

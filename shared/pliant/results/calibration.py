@@ -16,7 +16,7 @@ from pliant.datasets.working_size import at_size
 from pliant.errors import CalibrationError
 from pliant.results.run import Run
 
-FOUND = "the focal length was found"
+FOUND = "estimated focal length"
 """What a verdict begins with that asks nothing of the user."""
 
 _GRID = 24
@@ -149,14 +149,14 @@ def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
     known = f"{fov:.1f} degrees across, {sure}"
     if run.stream.focal_sigma > 0.0:
         if sigmas[0] > _KNOWN:
-            return f"the focal length stays unknown ({known}){_why(final)}: give --calibration"
-        return f"{FOUND} ({known}): calibration.yaml is for the next run"
+            return f"unknown focal length ({known}){_why(final)}: pass --calibration"
+        return f"{FOUND} ({known}): pass calibration.yaml to the next run"
     if not _is_contradicted(run):
         return ""
     return (
         f"the images contradict the calibration: focal length {math.exp(correction[0]):.3f} times "
-        f"what was given ({sure}), k1 {correction[1]:+.3f}, "
-        f"{_corner_px(camera, correction):.0f} px at the corner; run again with calibration.yaml"
+        f"the given one ({sure}), k1 {correction[1]:+.3f}, {_corner_px(camera, correction):.0f} "
+        "px at the corner; run again with --calibration calibration.yaml"
     )
 
 
@@ -168,7 +168,8 @@ def focal_changes(run: Run) -> str:
     low, high = (focal * each for each in run.focal_range)
     return (
         f"the focal length changes during the clip ({low:.0f} to {high:.0f} px): zoom, focus "
-        "breathing or stabilisation; film with zoom, focus and stabilisation locked"
+        "breathing or stabilisation; lock zoom and focus, switch stabilisation off, and film "
+        "again"
     )
 
 
@@ -223,5 +224,5 @@ def _why(final: dict[int, Any]) -> str:
     if lengths.sum() > 0.0 and along.sum() > _FORWARD * lengths.sum():
         reasons.append("the camera moves straight ahead")
     if turns.max() < _TURN_DEG:
-        reasons.append(f"it turns by {turns.max():.0f} degrees only")
+        reasons.append(f"it rotates by only {turns.max():.0f} degrees")
     return ", as " + " and ".join(reasons) if reasons else ""

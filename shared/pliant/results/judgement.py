@@ -55,19 +55,19 @@ def judge(
         return BAD, told
     if share < _WHOLE and 2 * behind > of_source - longest:
         return DOUBTFUL, (
-            f"{told}: the computer did not keep up with {behind / of_source:.0%}, take smaller "
-            "images (--max-size) or fewer tracks (--light)"
+            f"{told}: the computer was too slow for {behind / of_source:.0%}; use smaller images "
+            "(--max-size) or fewer tracks (--light)"
         )
     if focal:
         return DOUBTFUL, focal
     if doubtful > DOUBTS * posed:
         return DOUBTFUL, (
             f"{doubtful / posed:.0%} of the poses are doubtful: something large moves, or the "
-            "scene deforms (--profile deformable)?"
+            "scene deforms (then use --profile deformable)"
         )
     if absent > (1.0 - _WHOLE) * of_source:
         came = 1.0 - absent / of_source
-        return DOUBTFUL, f"only {came:.0%} of the frames of the source came"
+        return DOUBTFUL, f"only {came:.0%} of the source's frames arrived"
     if broken > (1.0 - _WHOLE) * frames:
         return DOUBTFUL, f"{broken / frames:.0%} of the images are broken"
     if share < _WHOLE:
@@ -102,23 +102,26 @@ def judge_surfels(
     )  # fmt: skip
     posed = sum(in_segments)
     if not posed:
-        return BAD, "no surfels were followed"
+        return BAD, "no surfels were tracked"
     if word == BAD:
         return word, why
     if slipping > DOUBTS * posed:
         return DOUBTFUL, (
             f"in {slipping / posed:.0%} of the frames less than {_FOLLOWED:.0%} of the surfels in "
-            "view are followed: something covers them, or moves too fast?"
+            "view are tracked: something covers them, or moves too fast"
         )
     if word != GOOD:
         return word, why
     if together > DOUBTS * posed:
         return DOUBTFUL, (
-            f"in {together / posed:.0%} of the frames all surfels have moved like one rigid thing: "
-            "if it is the camera that moves, --camera moving"
+            f"in {together / posed:.0%} of the frames all surfels move like one rigid body: if "
+            "the camera moves, use --camera moving"
         )
     if unusable > (1.0 - _WHOLE) * frames:
         return DOUBTFUL, f"{unusable / frames:.0%} of the depth maps could not be used"
     if depth_from == "flat":
-        return DOUBTFUL, f"{why}, but started on a plane: their motion is right in the image alone"
+        return (
+            DOUBTFUL,
+            f"{why}, but surfels started on a plane: their motion is valid only in the image",
+        )
     return GOOD, why

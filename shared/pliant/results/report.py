@@ -143,12 +143,14 @@ def source_failed(run: Run) -> bool:
 def ended_early(run: Run, came: int) -> str:
     """Why fewer frames came than the source had announced; "" if they did not."""
     absent = absent_frames(run, came)
-    counted = f"{came} of {came + absent} frames came: " if absent else ""
+    counted = f"{came} of {came + absent} frames arrived: " if absent else ""
     if run.source_failure:
         return counted + run.source_failure
     if not absent:
         return ""
-    why = "the file is cut off or damaged" if run.complete else "the run was stopped or cut off"
+    why = (
+        "the file is truncated or damaged" if run.complete else "the run was stopped or interrupted"
+    )
     return counted + why
 
 

@@ -136,9 +136,11 @@ def surfel_summary(report: dict[str, Any]) -> list[str]:
     """The report in a few lines."""
     alive, frames = report["alive_per_frame"], report["frames"]
     lines = [
-        f"{counted(frames, 'frame')} at {report['frames_per_second']:.1f} frames/s, "
-        f"{report['frames_with_pose']} followed ({100.0 * report['success_rate']:.1f} %), "
-        f"{counted(report['births'], 'surfel')} born",
+        (
+            f"{counted(frames, 'frame')} at {report['frames_per_second']:.1f} frames/s, "
+            f"{report['frames_with_pose']} tracked ({100.0 * report['success_rate']:.1f} %), "
+            f"{counted(report['births'], 'surfel')} created"
+        ),
         f"alive: {report['median_alive']:.0f} in the median frame, "
         f"{alive[-1] if alive else 0} in the last one "
         f"({', '.join(f'{n} {state}' for state, n in report['last_states'].items()) or 'none'})",
@@ -150,8 +152,8 @@ def surfel_summary(report: dict[str, Any]) -> list[str]:
         lines.append(f"no surfels could start: {report['last_reason']}")
     elif report["frames_lost"]:
         lines.append(
-            f"tracking was lost in {counted(len(report['frames_lost']), 'frame')}, "
-            f"first {report['frames_lost'][0]}; it starts again where there is depth"
+            f"tracking was lost in {counted(len(report['frames_lost']), 'frame')}, first "
+            f"{report['frames_lost'][0]}; it restarts where there is depth"
         )
     return lines
 

@@ -50,7 +50,9 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
     if not report["segments"]:
         lines.append(f"no map could start: {report['last_reason'] or 'no frames'}")
     elif len(report["segments"]) > 1:
-        lines.append(f"the map was lost and restarted: {len(report['segments'])} segments")
+        lines.append(
+            f"the camera was lost and a new segment started: {len(report['segments'])} segments"
+        )
     return [*lines, _judged(report)]
 
 
@@ -61,7 +63,7 @@ def _judged(report: dict[str, Any]) -> str:
 def _mapped(report: dict[str, Any]) -> str:
     """How many tracks were mapped in the median of the frames that had a pose as they came."""
     if report["segments"] and not report["median_inliers_per_frame"]:
-        return "every frame waited for the map to begin"
+        return "every frame waited for the map to start"
     return f"{report['median_inliers_per_frame']:.0f} mapped inliers"
 
 
@@ -70,10 +72,10 @@ def _told_of_map(report: dict[str, Any]) -> list[str]:
     known = report.get("known_map")
     if known is None:
         return []
-    there = f"the known map of {counted(known['keyframes'], 'keyframe')}"
+    there = f"the loaded map of {counted(known['keyframes'], 'keyframe')}"
     if known["frames_in_it"] == 0:
         own = len(report["segments"])
-        instead = f": the run went on in {counted(own, 'segment')} of its own" if own else ""
+        instead = f": the run made {counted(own, 'segment')} of its own" if own else ""
         return [f"{there} was recognised in none of {counted(report['frames'], 'frame')}{instead}"]
     share = known["frames_in_it"] / max(report["frames"], 1)
     return [
@@ -88,8 +90,11 @@ def _given_up(counters: Mapping[str, float]) -> list[str]:
         return []
     keyframes, points = (int(counters[f"given_up_{name}"]) for name in ("keyframes", "points"))
     return [
-        "the map is larger than bundle_adjustment.window.kept_observations: "
-        f"{counted(keyframes, 'keyframe')} and {counted(points, 'point')} move with what is kept"
+        (
+            "the map is larger than bundle_adjustment.window.kept_observations: "
+            f"{counted(keyframes, 'keyframe')} and {counted(points, 'point')} dropped, but kept "
+            "in the results"
+        )
     ]
 
 
@@ -102,7 +107,7 @@ def _faults(report: dict[str, Any]) -> list[str]:
     static = static_line(report.get("counters", {}).get("ingest", {}))
     lines += [static] if static else []
     if masked:
-        lines.append(f"{counted(masked, 'image')} passed over: masked as a whole")
+        lines.append(f"{counted(masked, 'image')} skipped: fully masked")
     if dropped:
         why = _why_dropped(report.get("counters", {}).get("ingest", {}))
         lines.append(

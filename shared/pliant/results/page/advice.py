@@ -24,53 +24,54 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
     why = report["last_reason"] or "no frames"
     if not segments and any(flaw.split()[-1] == why.split()[-1] for flaw in FLAWS):
         told.append(
-            f"No map could start: {why}. Play the video: if it looks right there, convert it once."
+            f"No map could start: {why}. Play the video. If it looks right there, convert it "
+            "and run the copy."
         )
     elif not segments:
         told.append(
-            "No map could start. Move the camera sideways by a tenth of the distance to the scene "
-            "or more, not only turn it, with things at several distances in view, not one wall or "
-            f"table alone. It said: {why}."
+            "No map could start. Move the camera sideways by at least a tenth of the distance to "
+            "the scene; do not only rotate it. Keep objects at several distances in view, not "
+            f"one wall or table alone. The reason was: {why}."
         )
     first_ns = min(stamps_ns.values(), default=0)
     for before, after in itertools.pairwise(segments):
         when_s = 1e-9 * (stamps_ns.get(after["first_frame"], first_ns) - first_ns)
         told.append(
-            f"Before {when_s:.1f} s the camera was lost for good, and another map began "
-            f"({before['frames']} and {counted(after['frames'], 'frame')}): move more slowly "
-            "there, and let half of what is in view stay in view; or come back to what was "
-            "seen before."
+            f"Before {when_s:.1f} s the camera was lost, and a new map started "
+            f"({before['frames']} and {counted(after['frames'], 'frame')}). Move more slowly "
+            "there, with at least 50 % overlap between views a second apart, or return to a "
+            "mapped place."
         )
     frames, posed = report["frames"], report["frames_with_pose"]
     missing = frames - posed - len(report["frames_without_pixels"])
     if segments and missing > _LONG * frames:
         told.append(
             f"No pose for {counted(missing, 'frame')}: dark, blurred or covered images, or a "
-            "camera that was carried off. More light makes exposures shorter and images sharper."
+            "sudden jump of the camera. More light makes exposures shorter and images sharper."
         )
     broken = len(broken_images(report["frames_without_pixels"]))
     if broken > _LONG * frames:
         told.append(
-            f"{counted(broken, 'broken image')}: copy the video again from where it was taken, or "
-            "convert it once."
+            f"{counted(broken, 'broken image')}: copy the video again from the camera, or convert "
+            "it and run the copy."
         )
     # None were mapped as they came where every frame waited for the map: that says nothing.
     tracks, mapped = report["median_tracks_per_frame"], report["median_inliers_per_frame"]
     if segments and tracks < _FEW_TRACKS:
         told.append(
-            f"Only {tracks:.0f} tracks a frame: blank walls, little light or defocus. Keep "
-            "something with detail in view, and the focus fixed."
+            f"Only {tracks:.0f} tracks per frame: blank walls, little light or defocus. Keep "
+            "textured objects in view, and the focus fixed."
         )
     elif segments and 0 < mapped < _FEW_MAPPED * tracks:
         told.append(
-            "Few of the tracks became points of the map: the camera turned more than it moved, or "
-            "much of what it sees moves by itself. Walk round things instead of turning to them."
+            "Few of the tracks became map points: the camera rotated more than it moved, or much "
+            "of the scene moves. Walk around objects instead of turning towards them."
         )
     if len(report["doubtful_frames"]) > DOUBTS * posed:
         told.append(
-            f"{len(report['doubtful_frames'])} poses rest on a small part of the image: something "
-            "large moves in front of the camera, or most of what it sees is blank. If the scene "
-            "deforms, use --profile deformable."
+            f"{len(report['doubtful_frames'])} poses rely on a small part of the image: something "
+            "large moves in front of the camera, or most of the view has no texture. If the "
+            "scene deforms, use --profile deformable."
         )
     calibration = report["calibration_verdict"]
     said = calibration == report["verdict_reason"] or calibration.startswith(FOUND)
@@ -80,7 +81,7 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
         why == DROPPED for why in report["frames_without_pixels"].values()
     ):
         told.append(
-            "The machine did not keep up with the camera: record first and run the recording, or "
-            "use smaller images (--max-size) or fewer tracks (--light)."
+            "The computer was too slow for the camera. Film first and run the video, or use "
+            "smaller images (--max-size) or fewer tracks (--light)."
         )
     return told

@@ -40,16 +40,16 @@ def put_truth_in(path: Path, section: str) -> None:
 
 _FILES = {
     "trajectory.txt": "camera poses after all corrections (TUM)",
-    "trajectory_causal.txt": "each pose as it was known at once",
+    "trajectory_causal.txt": "online poses, as estimated at frame time",
     "keyframes.txt": "poses of the keyframes",
-    "points.ply": "the cloud of points",
+    "points.ply": "the point cloud",
     "mesh.ply": "the surface, fine",
     "mesh_coarse.ply": "the surface, coarse",
     "calibration.yaml": "the camera, for --calibration of the next run",
     "surfels.npz": "every surfel of every frame",
     "report.json": "all figures",
-    "map.pliant": "the map, for another day: pliant run SOURCE --map",
-    "scale.yaml": "how long a unit of the recording is",
+    "map.pliant": "the map for later runs: pliant run SOURCE --map",
+    "scale.yaml": "metres per unit of the recording",
     "recording.mcap": "every message",
 }
 
@@ -71,12 +71,11 @@ def table_rows(told: Iterable[tuple[str, str]]) -> str:
 def canvas(scene: Scene) -> str:
     """What can be turned."""
     return (
-        '<canvas id="view"></canvas><p class="soft"><span id="layers"></span> drag to turn, '
-        "shift-drag to move, wheel or pinch to come closer, double-click two points to measure</p>"
-        '<p id="picked"></p>'
-        f'<script type="application/json" id="scene">{scene.header}</script>'
-        f'<script type="text/plain" id="bytes">{scene.bytes}</script>'
-        f"<script>{_part('viewer.js')}</script>"
+        '<canvas id="view"></canvas><p class="soft"><span id="layers"></span> drag to '
+        "rotate, shift-drag to move, wheel or pinch to zoom, double-click two points to "
+        'measure</p><p id="picked"></p><script type="application/json" '
+        f'id="scene">{scene.header}</script><script type="text/plain" '
+        f'id="bytes">{scene.bytes}</script><script>{_part("viewer.js")}</script>'
     )
 
 
@@ -91,5 +90,5 @@ def bullets(heading: str, told: list[str]) -> str:
 def _times(report: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [("together", f"{report['frames_per_second']:.1f} frames/s")]
     for service, spent in report["cpu_milliseconds_per_frame"].items():
-        rows.append((service, f"{spent:.1f} ms of CPU a frame"))
+        rows.append((service, f"{spent:.1f} ms of CPU per frame"))
     return rows

@@ -53,7 +53,7 @@ def write_page(
         clip=clip,
         figures=table_rows(_figures(run, report)),
         chart=_chart(run, report, final),
-        advice=bullets("What to do better next time", advice(report, run.history.stamps_ns)),
+        advice=bullets("Advice for the next run", advice(report, run.history.stamps_ns)),
     )  # fmt: skip
 
 
@@ -94,11 +94,11 @@ def clip_of_keyframes(run: Run, recording: Recording) -> str:
     except ResultError:  # an OpenCV without animations
         _, encoded = cv2.imencode(".jpg", pictures[len(pictures) // 2][..., ::-1])
         kind, data = "jpeg", encoded.tobytes()
-    told = "Keyframes with the points of the map that they see: near ones red, far ones blue."
+    told = "Keyframes with their map points: near ones red, far ones blue."
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
     return (
-        '<section><h2>What it saw</h2><figure><img alt="Keyframes with the points of the map" '
-        f'src="{source}"><figcaption>{told}</figcaption></figure></section>'
+        '<section><h2>Camera images</h2><figure><img alt="Keyframes with the points of the '
+        f'map" src="{source}"><figcaption>{told}</figcaption></figure></section>'
     )
 
 
@@ -132,7 +132,7 @@ def _picture(run: Run, number: int, seen: SeenKeyframe) -> U8:
 def _figures(run: Run, report: dict[str, Any]) -> list[tuple[str, str]]:
     camera = run.stream.camera if run.stream else None
     mapped = report["median_inliers_per_frame"]
-    waited = "every frame waited for the map to begin"
+    waited = "every frame waited for the map to start"
     rows = [
         ("frames", f"{report['frames']}, {report['frames_with_pose']} with a pose"),
         *ended(report),
@@ -150,14 +150,19 @@ def _figures(run: Run, report: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     if camera is not None:
         rows.append(("images", f"{camera.width}x{camera.height}"))
-        rows.append(("field of view", f"{_fov_deg(camera.width, camera.fx):.1f} degrees across"))
+        rows.append(
+            (
+                "field of view",
+                f"{_fov_deg(camera.width, camera.fx):.1f} degrees horizontal",
+            )
+        )
     correction = report["calibration_correction"]
     if correction is not None and camera is not None:
         found = _fov_deg(camera.width, camera.fx * correction["focal_factor"])
-        rows.append(("as the images have it", f"{found:.1f} degrees"))
+        rows.append(("estimated field of view", f"{found:.1f} degrees"))
         if abs(correction["readout"]) > _SOME_READOUT:
             rows.append(("rolling shutter", f"{correction['readout']:.0%} of the frame interval"))
-    rows.append(("scale", "metres" if report["scale_is_metric"] else "arbitrary: of one camera"))
+    rows.append(("scale", "metres" if report["scale_is_metric"] else "unknown (monocular)"))
     return rows
 
 
@@ -182,6 +187,6 @@ def _chart(run: Run, report: dict[str, Any], final: dict[int, tuple[int, F64]]) 
         shaded=[frame for frame in frames if frame not in final],
     )
     return (
-        f"<figure>{drawn}<figcaption>Tracks (blue), and those of them that the map explains "
+        f"<figure>{drawn}<figcaption>Tracks (blue), and those with a consistent map point "
         "(orange). Shaded: frames without a pose.</figcaption></figure>"
     )

@@ -11,8 +11,8 @@ from pliant.results.page.page import bullets, canvas, ended, fill_page, table_ro
 from pliant.wording import counted
 
 _TINTS = (
-    '<p class="soft">The surface as it was in the last frame that was followed. Colours: how far '
-    "each place has moved since it was first seen, from blue (hardly) to red (as far as any).</p>"
+    '<p class="soft">The surface in the last tracked frame. Colours show the motion of each '
+    "part since its first frame, from blue (least) to red (most).</p>"
 )
 
 
@@ -33,19 +33,19 @@ def write_surfel_page(
         clip="",
         figures=table_rows(_surfel_figures(report)),
         chart=_surfel_chart(report),
-        advice=bullets("What else it said", lines),
+        advice=bullets("Further messages", lines),
     )  # fmt: skip
 
 
 def _surfel_figures(report: dict[str, Any]) -> list[tuple[str, str]]:
     alive = report["alive_per_frame"] or [0]
     return [
-        ("frames", f"{report['frames']}, {report['frames_with_pose']} followed"),
+        ("frames", f"{report['frames']}, {report['frames_with_pose']} tracked"),
         *ended(report),
         ("surfels", f"{report['median_alive']:.0f} in the median frame, {alive[-1]} in the last"),
         ("born", f"{report['births']:,}"),
         ("started", counted(len(report["segments"]), "time")),
-        ("scale", "metres" if report["scale_is_metric"] else "arbitrary: of one camera"),
+        ("scale", "metres" if report["scale_is_metric"] else "unknown (monocular)"),
     ]
 
 
@@ -64,6 +64,6 @@ def _surfel_chart(report: dict[str, Any]) -> str:
         shaded=report["frames_lost"],
     )
     return (
-        f"<figure>{drawn}<figcaption>Surfels (blue), and those of them that are followed (orange). "
-        "Shaded: frames in which all were lost.</figcaption></figure>"
+        f"<figure>{drawn}<figcaption>Surfels (blue), and the tracked ones (orange). Shaded: "
+        "frames in which all were lost.</figcaption></figure>"
     )
