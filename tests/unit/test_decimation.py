@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F32, F64, I32
-from pliant.algorithms.meshing.decimation import decimated
+from pliant.algorithms.meshing import decimation
+from pliant.algorithms.meshing.decimation import clustered, decimated
 
 
 def grid(side: int) -> tuple[F32, I32]:
@@ -122,3 +123,39 @@ def test_the_same_mesh_gives_the_same_bytes() -> None:
     second = decimated(positions, grey(positions), triangles, 500)
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def waves(side: int) -> tuple[F32, I32]:
+    positions, triangles = grid(side)
+    positions[:, 2] = height(positions)
+    return positions, triangles
+
+
+def height(positions: F32) -> F32:
+    return np.float32(0.05) * np.sin(12.0 * positions[:, 0]) * np.cos(9.0 * positions[:, 1])
+
+
+def test_a_very_large_mesh_is_clustered_first_and_ends_as_near(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    positions, triangles = waves(200)
+    found: list[float] = []
+    for workable in (10**6, 10**4):
+        monkeypatch.setattr(decimation, "_WORKABLE", workable)
+        kept, _, fewer = decimated(positions, grey(positions), triangles, 600)
+        assert 500 < len(fewer) <= 600
+        assert (turned(kept, fewer)[:, 2] > 0.0).all()
+        assert turned(kept, fewer)[:, 2].sum() == pytest.approx(1.0, abs=0.05)
+        found.append(float(np.sqrt(np.mean((kept[:, 2] - height(kept)) ** 2))))
+    assert found[1] < 1.5 * found[0]
+
+
+def test_clusters_are_at_most_so_many_and_cover_the_same() -> None:
+    positions, triangles = waves(200)
+    tints = np.stack([255.0 * positions[:, 0]] * 3, axis=1).astype(np.uint8)
+    kept, colours, fewer = clustered(positions, tints, triangles, 9000)
+    assert 2000 < len(fewer) <= 9000
+    assert len(np.unique(np.sort(fewer, axis=1), axis=0)) == len(fewer)
+    assert np.abs(kept[:, 2] - height(kept)).max() < 0.005
+    assert turned(kept, fewer)[:, 2].sum() == pytest.approx(1.0, abs=0.05)
+    assert np.abs(colours[:, 0] - 255.0 * kept[:, 0]).max() < 2.0

@@ -11,12 +11,21 @@ thresholds, not by cost: of a flat square it loses 6 % at 40 triangles, and it s
 what is flat as on what is bent (tests/unit/test_decimation.py fails with it).
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 
 _AT_ONCE = 0.2
 """Share of the edges, the cheapest ones, that may collapse in a pass."""
+_WORKABLE = 1_000_000
+"""Triangles whose edges are looked at one by one, which takes some 300 MB.  Of more, vertices are
+clustered first: where _MANY times fewer are wanted that no longer shows."""
+_MANY = 8
+_COARSER = 1.5
+_ROWS = 1 << 16
+"""Worked on together, so that what is needed between steps stays small."""
 _EVEN = 1e-4
 """How much an edge's squared length counts beside squared distances from planes: where all is flat
 the shortest collapse, and triangles stay even.  More of it costs shape, less makes splinters."""
@@ -30,6 +39,9 @@ def decimated(positions: F32, colours: U8, triangles: I32, most: int) -> tuple[F
     positions, colours: (V, 3).    triangles: (T, 3).  Which way they turn stays.  It has more
     where the edges that are left folded when they were tried.
     """
+    workable = max(_WORKABLE, _MANY * most)
+    if len(triangles) > workable:
+        positions, colours, triangles = clustered(positions, colours, triangles, workable)
     places = positions.astype(np.float64)
     tints = np.column_stack([colours, np.ones(len(colours))]).astype(np.float64)
     faces = _proper(triangles.astype(np.int64))
@@ -57,6 +69,40 @@ def decimated(positions: F32, colours: U8, triangles: I32, most: int) -> tuple[F
     return places[used].astype(np.float32), means, corners.reshape(-1, 3).astype(np.int32)
 
 
+def clustered(positions: F32, colours: U8, triangles: I32, most: int) -> tuple[F32, U8, I32]:
+    """A mesh of at most so many triangles: the vertices in each cell of a grid become their mean.
+
+    Rossignac and Borrel 1993: coarse, and in memory that is a few times the mesh's own.
+    """
+    low = positions.min(axis=0)
+    some = positions[triangles[:: max(1, len(triangles) // 4096)]].astype(np.float64)
+    side = float(np.median(np.linalg.norm(some[:, 1] - some[:, 0], axis=1))) or 1e-30
+    while True:
+        side *= _COARSER
+        cells = np.floor((positions - low) / np.float32(side)).astype(np.int64)
+        _, cluster = np.unique(_numbered(cells), return_inverse=True)
+        faces = _proper(cluster[triangles])
+        # Of triangles that fall onto each other one stays.
+        _, first = np.unique(_numbered(np.sort(faces, axis=1)), return_index=True)
+        if len(first) <= most:
+            break
+    faces = faces[np.sort(first)]
+    counts = np.bincount(cluster)
+    means = [np.bincount(cluster, column) / counts for column in (*positions.T, *colours.T)]
+    return (
+        np.stack(means[:3], axis=1).astype(np.float32),
+        np.rint(np.stack(means[3:], axis=1)).astype(np.uint8),
+        faces.astype(np.int32),
+    )
+
+
+def _numbered(rows: I64) -> I64:
+    """(N,) the same number for rows (N, 3) that are the same."""
+    first, second, third = rows.T
+    _, pair = np.unique(first * (int(second.max(initial=0)) + 1) + second, return_inverse=True)
+    return pair * (int(third.max(initial=0)) + 1) + third
+
+
 def _proper(triangles: I64) -> I64:
     """Those of three different vertices."""
     a, b, c = triangles.T
@@ -76,8 +122,11 @@ def _sides(triangles: I64, vertices: int) -> list[I64]:
 
 def _turned(places: F64, triangles: I64) -> F64:
     """(T, 3) normals, as long as twice the area."""
-    a, b, c = places[triangles].transpose(1, 0, 2)
-    return np.cross(b - a, c - a)
+    turned = np.empty((len(triangles), 3))
+    for rows in _parts(len(triangles)):
+        a, b, c = places[triangles[rows]].transpose(1, 0, 2)
+        turned[rows] = np.cross(b - a, c - a)
+    return turned
 
 
 def _quadrics(places: F64, triangles: I64) -> F64:
@@ -101,23 +150,23 @@ def _quadrics(places: F64, triangles: I64) -> F64:
 def _add(quadrics: F64, corners: I64, normals: F64, on: F64, weights: F64) -> None:
     """Add planes, by their unit normals and a point of each, to the vertices at their corners."""
     planes = np.column_stack([normals, -(normals * on).sum(axis=1)])
-    each = (weights[:, None, None] * planes[:, :, None] * planes[:, None, :]).reshape(-1, 16)
     for column in corners.T:
-        np.add.at(quadrics, column, each)
+        for rows in _parts(len(planes)):
+            n = planes[rows]
+            each = weights[rows, None, None] * n[:, :, None] * n[:, None, :]
+            np.add.at(quadrics, column[rows], each.reshape(-1, 16))
+
+
+def _parts(count: int) -> Iterator[slice]:
+    return (slice(first, first + _ROWS) for first in range(0, count, _ROWS))
 
 
 def _cheapest(edges: I64, places: F64, quadrics: F64, most: int) -> tuple[I64, F64]:
     """(C,) edges that collapse together, at most so many, and (C, 3) what they become."""
     u, v = np.divmod(edges, len(places))
-    both = quadrics[u] + quadrics[v]
-    middle, apart = 0.5 * (places[u] + places[v]), places[u] - places[v]
-    # By the middle, where little is to be said: along a plane.
-    A = both[:, :3, :3]
-    stiff = _EVEN * np.trace(A, axis1=1, axis2=2) + 1e-300
-    shift = -(both[:, :3, 3] + np.einsum("nij,nj->ni", A, middle))
-    onto = middle + np.linalg.solve(A + stiff[:, None, None] * np.eye(3), shift[..., None])[..., 0]
-    at = np.column_stack([onto, np.ones(len(onto))])
-    costs = np.einsum("ni,nij,nj->n", at, both, at) + stiff * (apart**2).sum(axis=1)
+    onto, costs = np.empty((len(edges), 3)), np.empty(len(edges))
+    for rows in _parts(len(edges)):
+        onto[rows], costs[rows] = _collapses(u[rows], v[rows], places, quadrics)
     order = np.argsort(costs, kind="stable")
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
@@ -127,6 +176,20 @@ def _cheapest(edges: I64, places: F64, quadrics: F64, most: int) -> tuple[I64, F
     order = order[: int(np.ceil(_AT_ONCE * len(order)))]
     chosen = order[(best[u] == rank)[order] & (best[v] == rank)[order]][:most]
     return edges[chosen], onto[chosen]
+
+
+def _collapses(u: I64, v: I64, places: F64, quadrics: F64) -> tuple[F64, F64]:
+    """(E, 3) what edges from u to v become, and (E,) what that costs."""
+    both = quadrics[u] + quadrics[v]
+    middle, apart = 0.5 * (places[u] + places[v]), places[u] - places[v]
+    # By the middle, where little is to be said: along a plane.
+    A = both[:, :3, :3]
+    stiff = _EVEN * np.trace(A, axis1=1, axis2=2) + 1e-300
+    shift = -(both[:, :3, 3] + np.einsum("nij,nj->ni", A, middle))
+    onto = middle + np.linalg.solve(A + stiff[:, None, None] * np.eye(3), shift[..., None])[..., 0]
+    at = np.column_stack([onto, np.ones(len(onto))])
+    costs = np.einsum("ni,nij,nj->n", at, both, at) + stiff * (apart**2).sum(axis=1)
+    return onto, costs
 
 
 def _unfolded(edges: I64, onto: F64, places: F64, triangles: I64) -> BoolArray:
