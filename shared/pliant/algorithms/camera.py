@@ -28,6 +28,11 @@ class PinholeCamera:
         """(3, 3) intrinsic matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    @property
+    def pinhole(self) -> F64:
+        """(4,) fx, fy, cx, cy: what kernels take."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
+
     def project(self, points_camera: F32 | F64) -> F64:
         """Project (N, 3) camera-frame points to (N, 2) pixels.  Points behind give nonsense."""
         points = np.asarray(points_camera, np.float64)

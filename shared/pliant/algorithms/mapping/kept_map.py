@@ -97,7 +97,7 @@ def keep(
             session=origin.session,
             source_frame=origin.frame,
             turned=keyframe.turned,
-            given=np.array([*size, given.fx, given.fy, given.cx, given.cy], np.float64),
+            given=np.array([*size, *given.pinhole]),
             correction=calibration.correction.copy(),
             sigmas=calibration.sigmas,
             T_world_camera=keyframe.T_world_camera.copy(),
