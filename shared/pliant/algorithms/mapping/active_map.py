@@ -5,7 +5,7 @@ import bisect
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
-from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.camera import PinholeCamera, size_unit
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.covisibility import (
     MAX_MISSES,
@@ -15,9 +15,11 @@ from pliant.algorithms.mapping.covisibility import (
     near_keyframes,
     rows_of,
 )
+from pliant.algorithms.mapping.directions import helping_candidates
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.frame import IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.keyframe import Keyframe, Observations
+from pliant.algorithms.mapping.keyframe_rule import Overlap
 from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -186,6 +188,23 @@ class ActiveMap:
         distance_a = np.linalg.norm(self.points.xyz[a] - centre, axis=1)
         distance_b = np.linalg.norm(self.points.xyz[b] - centre, axis=1)
         return np.abs(distance_a - distance_b) < _SAME_DEPTH_SHARE * distance_b
+
+    def helping_candidates(self) -> I64:
+        """Indices of the tracks of candidates that help to place the current frame."""
+        directions = helping_candidates(self.points, self.links.rows)
+        return directions if self.candidates_agree else directions[:0]
+
+    def overlap(self, age_s: float, interval_s: float) -> Overlap:
+        """Of the frame in the window with the last keyframe.  age_s, interval_s: as of it."""
+        shared, before, flow_px = self.window.flow_since_keyframe(MAPPED)
+        if shared < self.parameters.start.min_points and len(self.helping_candidates()):
+            shared, before, flow_px = self.window.flow_since_keyframe(CANDIDATE)
+            in_view = shared  # the others have no place to look for them
+        else:
+            in_view = max(shared, self.window.in_view_since_keyframe())
+        unit = size_unit(self.camera.width, self.camera.height)
+        before = max(before, 1)
+        return Overlap(shared / before, in_view / before, flow_px / unit, age_s, interval_s)
 
     def observed(self, placed: PlacedFrame, directions: I64) -> tuple[I32, F32]:
         """Rows and pixels of the points that place the current frame."""

@@ -13,7 +13,6 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.directions import (
     Spread,
-    helping_candidates,
     off_epipolar_line,
     placed_candidates,
     spread_of,
@@ -65,12 +64,6 @@ class Located(NamedTuple):
     is_firm: bool
 
 
-def directions_of(active: ActiveMap) -> I64:
-    """Indices of the tracks of candidates that help to place the frame."""
-    directions = helping_candidates(active.points, active.links.rows)
-    return directions if active.candidates_agree else directions[:0]
-
-
 def localise(
     active: ActiveMap, motion: Motion, frame: IdealFrame, generator: np.random.Generator
 ) -> Located | None:
@@ -83,7 +76,7 @@ def localise(
     points, parameters, tracks = active.points, active.parameters, frame.tracks
     predictions = motion.predictions(frame.stamp_ns)
     active.candidates_agree = True
-    directions = directions_of(active)
+    directions = active.helping_candidates()
     linked = np.concatenate([active.linked(MAPPED), directions])
     limits = parameters.localisation
     if len(linked) >= limits.min_inliers:
@@ -179,7 +172,7 @@ def reacquire_points(active: ActiveMap, frame: IdealFrame, T_world_camera: F64) 
 
 def refine_by_all(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     """The pose by its tracks and the points found without one, from close by."""
-    directions = directions_of(active)
+    directions = active.helping_candidates()
     rows, points_px = active.observed(placed, directions)
     located = refine(
         placed.T_world_camera, active.points.xyz[rows], points_px, active.camera,
@@ -192,7 +185,7 @@ def adjust(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFram
     """Eq. 6 over the window and this frame.  motion: before it."""
     judge_tracks(active, placed)
     active.see(placed)
-    if active.parameters.window.sweeps > 0 and not len(directions_of(active)):
+    if active.parameters.window.sweeps > 0 and not len(active.helping_candidates()):
         placed = replace(placed, T_world_camera=active.window.sweep_current(active.parameters))
     return supported(active, motion, placed)
 
@@ -214,7 +207,7 @@ def _track_errors(active: ActiveMap, placed: PlacedFrame) -> tuple[I64, F32]:
 def supported(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFrame:
     """With what there is for its pose.  motion: before it."""
     T_world_camera, tracks = placed.T_world_camera, placed.frame.tracks
-    rows, points_px = active.observed(placed, directions_of(active))
+    rows, points_px = active.observed(placed, active.helping_candidates())
     errors = reprojection_errors(T_world_camera, active.points.xyz[rows], points_px, active.camera)
     inliers = errors < active.parameters.localisation.inlier_px
     telling = _settled(active, motion, tracks)

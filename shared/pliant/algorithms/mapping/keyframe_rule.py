@@ -15,10 +15,6 @@ fewer points with the last keyframe than a map starts with.
 
 from typing import NamedTuple
 
-from pliant.algorithms.camera import size_unit
-from pliant.algorithms.mapping.active_map import ActiveMap
-from pliant.algorithms.mapping.frame_pose import directions_of
-from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED
 from pliant.algorithms.mapping.parameters import KeyframeParameters
 
 
@@ -27,14 +23,15 @@ class Overlap(NamedTuple):
 
     share: of the points of the keyframe that are seen.   in_view: that are in the image.
     flow: how far the median point has moved beside the turn of the camera, px at 640x480.
-    age_s: since the keyframe.   interval_s: since the last frame.
+    age_s: since the keyframe.   interval_s: since the last frame, so that the next one may be
+    expected as long after this one.
     """
 
     share: float
     in_view: float
     flow: float
     age_s: float
-    interval_s: float
+    interval_s: float = 0.0
 
 
 def is_due(overlap: Overlap, limits: KeyframeParameters) -> bool:
@@ -50,23 +47,3 @@ def is_due(overlap: Overlap, limits: KeyframeParameters) -> bool:
         overlap.in_view**until_next < limits.min_shared_share
         or overlap.share**until_next < limits.min_tracked_share
     )
-
-
-def keyframe_is_due(active: ActiveMap, age_s: float, interval_s: float) -> bool:
-    """Whether the frame in the window is to become a keyframe.
-
-    age_s: since the last keyframe.   interval_s: since the last frame, so that the next one may be
-    expected as long after this one.
-    """
-    if active.segment.resumes:
-        return True  # the camera has been recognised
-    shared, before, flow_px = active.window.flow_since_keyframe(MAPPED)
-    if shared < active.parameters.start.min_points and len(directions_of(active)):
-        shared, before, flow_px = active.window.flow_since_keyframe(CANDIDATE)
-        in_view = shared  # the others have no place to look for them
-    else:
-        in_view = max(shared, active.window.in_view_since_keyframe())
-    unit = size_unit(active.camera.width, active.camera.height)
-    before = max(before, 1)
-    overlap = Overlap(shared / before, in_view / before, flow_px / unit, age_s, interval_s)
-    return is_due(overlap, active.parameters.keyframe)

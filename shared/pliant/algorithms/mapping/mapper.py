@@ -30,7 +30,7 @@ from pliant.algorithms.mapping.frame_pose import (
 )
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.keyframe_rule import keyframe_is_due
+from pliant.algorithms.mapping.keyframe_rule import is_due
 from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -170,9 +170,11 @@ class Mapper:
             return IdealFrame.of(frame, self.calibration)
 
     def _keyframe_is_due(self, active: ActiveMap, stamp_ns: int) -> bool:
+        if active.segment.resumes:
+            return True  # the camera has been recognised
         age_s = 1e-9 * (stamp_ns - self._keyframe_ns)
         interval_s = self._motion.unmapped_s + self._motion.lost_s(stamp_ns)
-        return keyframe_is_due(active, age_s, interval_s)
+        return is_due(active.overlap(age_s, interval_s), self._parameters.keyframe)
 
     def _insert_keyframe(
         self, active: ActiveMap, placed: PlacedFrame, timer: StageTimer

@@ -11,6 +11,7 @@ from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame, adjusted_start, table_of
+from pliant.algorithms.mapping.keyframe_rule import Overlap, is_due
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.parameters import MappingParameters, PointParameters
 from pliant.algorithms.triangulation import triangulate
@@ -31,6 +32,7 @@ def reach_back(
 ) -> Start:
     """The start with what can be placed of the frames that waited longer than it takes."""
     limits = parameters.localisation
+    rule = parameters.keyframe.model_copy(update={"min_shared_share": _OVERLAP})
     frames = {each.frame: each for each in waiting}
     poses = zip(start.frames.tolist(), start.T_world_camera, strict=True)
     keyframes = [(frames[frame], T) for frame, T in poses][::-1]
@@ -50,7 +52,8 @@ def reach_back(
             break
         placed.append((frame, located.T_world_camera))
         last = keyframes[-1][0]
-        if np.isin(last.ids, frame.ids, assume_unique=True).mean() < _OVERLAP:
+        share = float(np.isin(last.ids, frame.ids, assume_unique=True).mean())
+        if is_due(Overlap(share, share, 0.0, 1e-9 * (last.stamp_ns - frame.stamp_ns)), rule):
             keyframes.append(placed[-1])
     if len(known[0]) == len(start.ids):
         return start

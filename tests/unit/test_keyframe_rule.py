@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 
-from pliant.algorithms.mapping import keyframe_rule
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.keyframe_rule import Overlap, is_due
 from pliant.algorithms.mapping.landmarks import MAPPED
@@ -79,5 +78,13 @@ def test_tracks_of_noise_make_no_keyframes(monkeypatch, mapped, due):
 
     monkeypatch.setattr(active.window, "flow_since_keyframe", shared)
     monkeypatch.setattr(active.window, "in_view_since_keyframe", lambda: mapped)
-    monkeypatch.setattr(keyframe_rule, "directions_of", lambda active: np.arange(4000))
-    assert keyframe_rule.keyframe_is_due(active, 0.1, 0.01) == due
+    monkeypatch.setattr(active, "helping_candidates", lambda: np.arange(4000))
+    assert is_due(active.overlap(0.1, 0.01), LIMITS) == due
+
+
+@pytest.mark.parametrize("age_s", [0.01, 10.0])
+def test_without_a_next_frame_the_share_decides_however_old_the_keyframe_is(age_s):
+    """As where a start reaches back, of which no flow is known."""
+    least = LIMITS.min_shared_share
+    assert not is_due(Overlap(least, least, 0.0, age_s), LIMITS)
+    assert is_due(Overlap(least - 1e-6, least - 1e-6, 0.0, age_s), LIMITS)
