@@ -21,6 +21,8 @@ _CELL_DEPTH = 0.03
 _SUPERSAMPLE = 2
 _BAND = 32
 """Rows that are drawn at a time: what is in between stays small, and in the processor's cache."""
+_ROWS = 1 << 16
+"""Triangles that are worked on at a time."""
 _CLAY = 235.0
 # A lamp above the left shoulder shows form, one at the eye leaves nothing black.
 _LAMP = np.array([-0.43, -0.72, -0.55])
@@ -59,7 +61,7 @@ def mesh_view(mesh: TriangleMesh, T_world_camera: F64) -> MapView:
 
 def _samples(mesh: TriangleMesh) -> tuple[F64, F64]:
     """(N, 3) places spread over the surface by area, and its normals there, of any length."""
-    normals = _outwards(mesh, mesh.positions[mesh.triangles].astype(np.float64))
+    normals = np.concatenate([_outwards(mesh, rows) for rows in _parts(mesh)])
     ends = np.cumsum(np.linalg.norm(normals, axis=1))
     at = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * ends[-1]
     rows = np.minimum(np.searchsorted(ends, at), len(ends) - 1)
@@ -124,17 +126,27 @@ def _lit(normals: F32, colours: F32, edges: F32) -> tuple[F32, F32, F32]:
 
 
 def _towards(mesh: TriangleMesh, view: MapView) -> BoolArray:
-    corners = mesh.positions[mesh.triangles].astype(np.float64)
-    rays = corners[:, 0] - view.T_world_view[:3, 3]
-    return (_outwards(mesh, corners) * rays).sum(axis=1) < 0.0
+    eye = view.T_world_view[:3, 3]
+    parts = [
+        (_outwards(mesh, rows) * (mesh.positions[mesh.triangles[rows, 0]] - eye)).sum(axis=1) < 0.0
+        for rows in _parts(mesh)
+    ]
+    return np.concatenate(parts) if parts else np.zeros(0, np.bool_)
 
 
-def _outwards(mesh: TriangleMesh, corners: F64) -> F64:
-    """(F, 3) normals of the triangles, as long as twice their area.  corners: (F, 3, 3)."""
+def _parts(mesh: TriangleMesh) -> list[slice]:
+    """Of its triangles: in memory there are millions of them, but few of what is in between."""
+    return [slice(first, first + _ROWS) for first in range(0, len(mesh.triangles), _ROWS)]
+
+
+def _outwards(mesh: TriangleMesh, rows: slice) -> F64:
+    """(F, 3) normals of some triangles, as long as twice their area."""
+    faces = mesh.triangles[rows]
+    corners = mesh.positions[faces].astype(np.float64)
     edges = corners[:, 1:] - corners[:, :1]
     away = np.cross(edges[:, 0], edges[:, 1])
     # Which side is out is said by the normals, whatever the order of the corners.
-    return away * np.sign((away * mesh.normals[mesh.triangles[:, 0]]).sum(axis=1))[:, None]
+    return away * np.sign((away * mesh.normals[faces[:, 0]]).sum(axis=1))[:, None]
 
 
 def _finish(planes: F32, covered: BoolArray) -> U8:
