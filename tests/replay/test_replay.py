@@ -142,7 +142,7 @@ def test_what_cannot_be_replayed_is_one_line(result: Path, tmp_path: Path) -> No
     assert_one_line(in_this_process("replay", tmp_path / "none.mcap"), "no such recording")
     assert_one_line(in_this_process("replay", result, "--output", result), "is read from there")
     assert_one_line(
-        in_this_process("replay", result, "--check", "--loop"), "--loop is for playing", 2
+        in_this_process("replay", result, "--check", "--loop"), "--loop applies to playing", 2
     )
 
 

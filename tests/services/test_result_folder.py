@@ -151,11 +151,11 @@ def test_an_evaluation_against_the_truth_of_another_recording(truth: Path) -> No
 @pytest.mark.parametrize(
     ("output", "says"),
     [
-        ("cal/000005.yaml", "lies in"),
-        ("cal/calib.yaml", "lies in"),
+        ("cal/000005.yaml", "is in the source folder"),
+        ("cal/calib.yaml", "is in the source folder"),
         ("clip.yaml", READ),  # its picture would be what is filmed
         ("mask.yaml", READ),
-        ("found.png", "is no picture"),
+        ("found.png", "a calibration needs a .yaml file"),
     ],
 )
 def test_a_calibration_and_its_picture_replace_nothing(

@@ -69,7 +69,7 @@ def test_only_a_folder_that_nobody_mounts_has_the_key_that_signs(folder: Path) -
     assert not (folder / "ca.key").exists()
     key = folder.with_name(f"{folder.name}-authority") / "ca.key"
     assert key.stat().st_mode & 0o077 == key.parent.stat().st_mode & 0o077 == 0
-    with pytest.raises(ResultError, match="keep the authority elsewhere"):
+    with pytest.raises(ResultError, match="choose an --authority outside of it"):
         make_certificates(folder, NAMES, [], authority=folder / "authority")
 
 

@@ -323,5 +323,5 @@ def test_tracks_tell_where_surfels_went(
 
 @pytest.mark.parametrize("setting", ["surfels.depth_from=map", "surfels.prediction=tracks"])
 def test_what_nobody_publishes_is_said_at_once(everything: Messages, setting: str) -> None:
-    with pytest.raises(ConfigError, match=f"{setting}: nobody here publishes"):
+    with pytest.raises(ConfigError, match=f"{setting}: no service of this session publishes"):
         follow(load_config(None, [setting]), everything)

@@ -127,7 +127,7 @@ def test_an_interrupted_batch_goes_on_and_a_broken_clip_stops_nobody(
     assert at_last.stderr == ""  # nothing was left to do
     assert "1 of 1 done" in at_last.stdout
     assert_one_line(
-        in_this_process("batch", clips, "--output", output), "begun with other options of run"
+        in_this_process("batch", clips, "--output", output), "started with other options of run"
     )
 
 
@@ -162,9 +162,10 @@ def test_no_scheduler_no_dask_and_workers_without_the_clips_are_one_line(
     (tmp_path / "none" / "distributed" / "__init__.py").write_text("raise ImportError('none')")
     batch = ("batch", "clips", "--dask")
     done = in_this_process(*batch, "tcp://127.0.0.1:1", cwd=tmp_path)
-    assert_one_line(done, "--dask tcp://127.0.0.1:1: no scheduler answers")
+    assert_one_line(done, "--dask tcp://127.0.0.1:1: no answer from a scheduler")
     for address in ("nonsense://rack:8786", "tcp://", "rack", ""):
-        assert_one_line(in_this_process(*batch, address, cwd=tmp_path), "no scheduler answers")
+        done = in_this_process(*batch, address, cwd=tmp_path)
+        assert_one_line(done, "no answer from a scheduler")
     without = {"PYTHONPATH": str(tmp_path / "none")}
     done = pliant(*batch, "tcp://127.0.0.1:1", cwd=tmp_path, env=without)
     assert_one_line(done, "needs Dask: pip install 'pliant[dask]'")
@@ -177,7 +178,7 @@ def test_what_run_would_not_take_is_refused_before_anything_is_begun(tmp_path: P
     (tmp_path / "a.mp4").touch()
     for options, says, code in (
         (["--nonsense"], "No such option: --nonsense", 2),
-        (["--force"], "--force is for one run", 1),
+        (["--force"], "--force applies to a single run", 1),
         (["--profile", "elastic"], "elastic", 2),
         (["elsewhere"], "unexpected extra argument", 2),
     ):

@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.system]
 def test_a_camera_is_found_without_a_board(tmp_path: Path) -> None:
     file = tmp_path / "found.yaml"
     given = in_this_process("calibrate", TINY, "--output", file)
-    assert_one_line(given, "has a calibration, which `pliant run` takes: --fov DEGREES")
+    assert_one_line(given, "has a calibration, which `pliant run` uses: pass --fov DEGREES")
     done = pliant("calibrate", TINY, "--fov", "50", "--output", file)
     assert done.returncode == 0, done.stderr
     assert "estimated focal length" in done.stdout

@@ -21,7 +21,7 @@ def test_a_host_that_is_cut_off_is_named_and_nothing_is_lost(
         three.cut("edge")
         session.wait_for_complaint("bundle_adjustment", LONG.format("tracks/extrema from tracking"))
         rows = {line.split()[1]: line for line in session.status().splitlines()[1:]}
-        assert "told nothing" in rows["tracking"]
+        assert "silent" in rows["tracking"]
         assert rows["ingest"].split()[2] == "camera"
         assert " to take camera/image, for " in rows["ingest"]
         three.join("edge")

@@ -59,9 +59,9 @@ def test_what_cannot_be_shown_is_one_line(
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert_one_line(in_this_process("view", tiny_run, "--open3d"), "there is no display here")
-    assert_one_line(in_this_process("view", tiny_run, "--open3d", "--web"), "without --web")
+    assert_one_line(in_this_process("view", tiny_run, "--open3d", "--web"), "leave out --web")
     save = ("--save", tmp_path / "x.rrd")
-    assert_one_line(in_this_process("view", tiny_run, "--open3d", *save), "without --web, --save")
+    assert_one_line(in_this_process("view", tiny_run, "--open3d", *save), "leave out --web, --save")
     assert_one_line(in_this_process("view", "--open3d"), "nothing to view")
 
 
@@ -71,4 +71,4 @@ def test_a_display_that_does_not_answer_is_one_line(
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":98765")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert_one_line(in_this_process("view", tiny_run, "--open3d"), "cannot open a window here")
+    assert_one_line(in_this_process("view", tiny_run, "--open3d"), "cannot open a window")

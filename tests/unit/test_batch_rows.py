@@ -42,10 +42,10 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
     output = tmp_path / "mine"
     output.mkdir()
     (output / "thesis.txt").touch()
-    with pytest.raises(ResultError, match="exists, and holds no batch"):
+    with pytest.raises(ResultError, match="exists and is no batch folder"):
         run_batch(tmp_path / "clips", output, jobs=1, options=[])
     (output / "batch.json").write_text("{}")
-    with pytest.raises(ResultError, match="is no summary of a batch"):
+    with pytest.raises(ResultError, match="not a batch summary"):
         run_batch(tmp_path / "clips", output, jobs=1, options=[])
     (output / "batch.json").write_text(json.dumps({"options": ["--fov", "70"], "clips": []}))
     with pytest.raises(ResultError, match=r"other options of run \(--fov 70\)"):

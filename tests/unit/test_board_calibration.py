@@ -142,13 +142,13 @@ def test_what_a_mask_covers_is_no_board(tmp_path: Path) -> None:
 
 
 REFUSED = [
-    ("chessboard", "chessboard:8x5", "a chessboard of 9x6 squares in them: is that the --board?"),
-    ("chessboard", "charuco:7x10", "there is a chessboard of 9x6 squares"),
-    ("charuco", "chessboard:10x7", "markers of 4x4 in them"),
-    ("charuco", "charuco:7x10:25:18:5x5_100", "there is 35 markers of 4x4 in them"),
-    ("blank", "charuco:7x10", "is in none of 16 frames: show all of it, sharp and evenly lit"),
-    ("few", "charuco:7x10", "of which 4 differ, and 6 are needed"),
-    ("straight", "charuco:7x10", "the focal length stays open"),
+    ("chessboard", "chessboard:8x5", "they show a chessboard of 9x6 squares: check --board"),
+    ("chessboard", "charuco:7x10", "they show a chessboard of 9x6 squares"),
+    ("charuco", "chessboard:10x7", "markers of 4x4: check"),
+    ("charuco", "charuco:7x10:25:18:5x5_100", "they show 35 markers of 4x4"),
+    ("blank", "charuco:7x10", "is in none of 16 frames: show the whole board"),
+    ("few", "charuco:7x10", "with 4 different views; 6 are needed"),
+    ("straight", "charuco:7x10", "the focal length is uncertain"),
 ]
 
 
@@ -175,11 +175,11 @@ def test_what_is_no_calibration_is_one_line(
     [
         ("7x10", "expected KIND:COLUMNSxROWS"),
         ("charuco:2x9", "too few squares"),
-        ("chessboard:3x9", "at least 4 each way"),
-        ("charuco:7x10:25:30", "a marker is smaller than its square"),
-        ("charuco:7x10:2.5.1", "numbers of mm"),
+        ("chessboard:3x9", "use at least 4 per side"),
+        ("charuco:7x10:25:30", "a marker must be smaller than its square"),
+        ("charuco:7x10:2.5.1", "must be numbers, in mm"),
         ("charuco:7x10:25:18:9x9_50", "no dictionary 9x9_50: use "),
-        ("charuco:12x12", "4x4_50 has 50 markers, and it needs 72"),
+        ("charuco:12x12", "4x4_50 has 50 markers, but the board needs 72"),
     ],
 )
 def test_boards_that_cannot_be_are_refused(spelled: str, says: str) -> None:
@@ -220,9 +220,9 @@ def test_the_printed_board_is_the_one_that_is_looked_for(tmp_path: Path, spelled
 
 def test_wrong_use(tmp_path: Path) -> None:
     for arguments, says in (
-        ([], "give a source, or --print-board FILE"),
-        (["clip.mp4", "--board", "charuco:7x10", "--fov", "60"], "--fov is for a source without"),
-        (["--print-board", str(tmp_path / "board.svg")], "is printed as a .pdf"),
+        ([], "no source given: pass one, or --print-board FILE"),
+        (["clip.mp4", "--board", "charuco:7x10", "--fov", "60"], "--fov is only for a source"),
+        (["--print-board", str(tmp_path / "board.svg")], "is written as PDF"),
         (["clip.mp4", "--output", str(tmp_path)], "is a folder: name a file"),
     ):
         done = CliRunner().invoke(app, ["calibrate", *arguments])

@@ -147,7 +147,7 @@ def test_one_line_says_that_kernels_can_be_kept_nowhere(tmp_path: Path) -> None:
     )
     for nowhere in ({"PLIANT_CACHE_DIR": "/dev/null/here"}, {"HOME": "/dev/null"}):
         line = _call(tmp_path, code, nowhere)
-        assert "set PLIANT_CACHE_DIR to a folder that can be written" in line
+        assert "set PLIANT_CACHE_DIR to a writable folder" in line
         assert "\n" not in line
 
 

@@ -77,7 +77,7 @@ class _Batch:
             again = " again" if clip.state != "waiting" else ""
             clip.state, clip.exit_code = "begun", None
             self.save()
-            _say(f"{name}: begun{again}{where and f' on {where}'}")
+            _say(f"{name}: started{again}{where and f' on {where}'}")
 
     def end(self, name: str, outcome: Outcome) -> None:
         """What came of it."""
@@ -114,7 +114,9 @@ def run_batch(
     """
     refused = [each for each in options if each.partition("=")[0] in _OWN]
     if refused:
-        raise ResultError(f"{refused[0]} is for one run: leave it, each clip has its own folder")
+        raise ResultError(
+            f"{refused[0]} applies to a single run: leave it out; each clip has its own folder"
+        )
     sources = sources_in(folder, but=output)
     keep_apart(output, [folder])
     begun = _read(output, list(options))
@@ -160,19 +162,19 @@ def _read(output: Path, options: list[str]) -> list[Clip] | None:
     path = output / SUMMARY_NAME
     if not path.exists():
         if output.exists() and (not output.is_dir() or any(output.iterdir())):
-            raise ResultError(f"{output} exists, and holds no batch: choose another --output")
+            raise ResultError(f"{output} exists and is no batch folder: choose another --output")
         return None
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         clips = [Clip(**row) for row in content["clips"]]
         before: list[str] = content["options"]
     except (OSError, ValueError, KeyError, TypeError):
-        raise ResultError(f"{path}: is no summary of a batch: choose another --output") from None
+        raise ResultError(f"{path}: not a batch summary: choose another --output") from None
     if before != options:
         said = " ".join(before) or "none"
         raise ResultError(
-            f"{output}: was begun with other options of run ({said}): give those, or another "
-            "--output"
+            f"{output}: the batch was started with other options of run ({said}): pass those, or "
+            "choose another --output"
         )
     return clips
 
@@ -224,7 +226,7 @@ def _tell(batch: _Batch) -> None:
             "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
         )
     done = sum(clip.state == "done" for clip in clips)
-    print(f"{done} of {len(clips)} done; all of this is in {output / SUMMARY_NAME}")
+    print(f"{done} of {len(clips)} done; summary: {output / SUMMARY_NAME}")
 
 
 def _say(line: str) -> None:
@@ -242,4 +244,4 @@ def check_options(command: Any, options: Sequence[str]) -> None:
 def check_folder(folder: Path) -> None:
     """Raises DatasetError."""
     if not folder.is_dir():
-        raise DatasetError(f"{folder}: no such folder; name it before the options of run")
+        raise DatasetError(f"{folder}: no such folder; put the folder before the options of run")

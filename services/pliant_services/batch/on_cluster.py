@@ -42,14 +42,14 @@ class Cluster:
             parts = urlsplit(address if "://" in address else f"tcp://{address}")
             self._distributed.comm.registry.get_backend(parts.scheme)
             if not (parts.hostname and parts.port):
-                raise ValueError("it is no tcp://HOST:PORT")
+                raise ValueError("expected tcp://HOST:PORT")
             self._client = self._distributed.Client(
                 address, timeout=_ANSWERS_S, set_as_default=False, name="pliant-batch"
             )
         except (OSError, ValueError, TypeError) as error:
             what = str(error).partition("\n")[0][:200]
             raise BusError(
-                f"--dask {address}: no scheduler answers ({what}): start one with `dask "
+                f"--dask {address}: no answer from a scheduler ({what}): start one with `dask "
                 "scheduler`, and workers with `dask worker ADDRESS`"
             ) from None
 
@@ -101,14 +101,15 @@ class Cluster:
             return future.result()
         if future.status in ("cancelled", "lost"):
             raise BusError(
-                f"--dask {self._address}: the scheduler went away; the same command goes on"
+                f"--dask {self._address}: the connection to the scheduler was lost; repeat "
+                "the command to resume"
             )
         error = future.exception()
         why = str(error).partition("\n")[0]
         if isinstance(error, ModuleNotFoundError) or "pliant" in why:
-            why = "a worker has no Pliant: install the same release there"
+            why = "Pliant is not installed on a worker: install the same release there"
         elif isinstance(error, self._distributed.scheduler.KilledWorker):
-            why = "several workers died of it, one after the other"
+            why = "several workers died while processing it"
         return Outcome(exit_code=1, told={"verdict": "failed", "reason": why})
 
 

@@ -60,8 +60,8 @@ def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
         return _failed(f"{platform.node()} has pliant {__version__}, the batch {errand.version}")
     if not log.parent.is_dir():
         return _failed(
-            f"{platform.node()} has no folder {log.parent}: clips and results have to lie where "
-            "all machines see them, under the same names"
+            f"{platform.node()} has no folder {log.parent}: put clips and results in a folder "
+            "with the same name on all machines"
         )
     # One that was to be begun, and has a log, was begun by somebody who could not say it any more.
     begun = errand.state == "begun" or (errand.state == "waiting" and log.exists())

@@ -51,14 +51,14 @@ def parse_board(spelled: str) -> PrintedBoard:
         square = float(match["square"] or 25.0)
         marker = float(match["marker"] or 0.75 * square)
     except ValueError:
-        raise refused("squares and markers are numbers of mm") from None
+        raise refused("sizes of squares and markers must be numbers, in mm") from None
     least = 4 if match["kind"] == "chessboard" else 3
     if min(columns, rows) < least or (columns - 1) * (rows - 1) < _LEAST_CORNERS:
         raise refused(
-            f"too few squares: at least {least} each way, and {_LEAST_CORNERS} inner corners"
+            f"too few squares: use at least {least} per side, and {_LEAST_CORNERS} inner corners"
         )
     if not 0.0 < marker < square <= 1000.0:
-        raise refused("a marker is smaller than its square, and a square at most 1000 mm")
+        raise refused("a marker must be smaller than its square, and a square at most 1000 mm")
     dictionary = (match["dictionary"] or "4x4_50").lower()
     if match["kind"] == "chessboard":
         return PrintedBoard(Board(kind="chessboard", columns=columns, rows=rows), square, spelled)
@@ -66,7 +66,10 @@ def parse_board(spelled: str) -> PrintedBoard:
         raise refused(f"no dictionary {dictionary}: use {', '.join(sorted(DICTIONARIES))}")
     has = len(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]).bytesList)
     if columns * rows // 2 > has:
-        raise refused(f"{dictionary} has {has} markers, and it needs {columns * rows // 2}")
+        raise refused(
+            f"{dictionary} has {has} markers, but the board needs {columns * rows // 2}: use "
+            "another dictionary"
+        )
     board = Board(
         kind="charuco",
         columns=columns,

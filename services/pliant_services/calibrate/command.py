@@ -84,7 +84,9 @@ def check_file(output: Path, *, source: str, mask: Path | None, force: bool) -> 
         raise ResultError(f"{output} is a folder: name a file, such as {output / 'calib.yaml'}")
     picture = picture_of(output)
     if picture == output:
-        raise ResultError(f"{output}: a calibration is no picture: name it {output.stem}.yaml")
+        raise ResultError(
+            f"{output}: a calibration needs a .yaml file: use --output {output.stem}.yaml"
+        )
     read = [Path(source), *parts_of(Path(source))] if os.path.exists(source) else []
     read += [] if mask is None else [mask]
     for path in (output, picture):
@@ -92,7 +94,7 @@ def check_file(output: Path, *, source: str, mask: Path | None, force: bool) -> 
         for folder in (each.resolve() for each in read if each.is_dir()):
             if folder in path.resolve().parents:
                 raise ResultError(
-                    f"{path} lies in {folder}, which is read: choose another --output"
+                    f"{path} is in the source folder {folder}: choose another --output"
                 )
         if path.exists() and not force:
             raise ResultError(f"{path} exists: choose another --output, or --force to replace it")
@@ -131,9 +133,9 @@ def calibrate_with_board(
     chosen = choose_views(views, [each.sharpness for each in found], printed.board, width)
     if len(chosen) < MIN_VIEWS:
         raise CalibrationError(
-            f"{source}: {printed.spelled} is in {len(found)} of {counted(looked, 'frame')}, "
-            f"of which {len(chosen)} differ, and {MIN_VIEWS} are needed: move it through the whole "
-            f"image and tilt it; of the other frames: {_hint(others, printed)}"
+            f"{source}: {printed.spelled} is in {len(found)} of {counted(looked, 'frame')}, with "
+            f"{len(chosen)} different views; {MIN_VIEWS} are needed: move it through the whole "
+            f"image and tilt it. The other frames: {_hint(others, printed)}"
         )
     chosen_views = [views[i] for i in chosen]
     result = calibrate(chosen_views, width, height, lens)
@@ -160,7 +162,7 @@ def _look_for(
 ) -> tuple[list[_Found], list[U8], int]:
     """What the frames show of the board, a few that do not, and how many were looked at."""
     if dataset.is_live:
-        raise DatasetError(f"{source}: is live: film the board, and give the video")
+        raise DatasetError(f"{source}: is live: film the board, and pass the video")
     count = dataset.frame_count or sum(1 for _ in dataset)
     every = max(1, math.ceil(count / _LOOKED_AT))
     frames = Excerpt(dataset, _Part(every=every, sharpest=every > 1))
@@ -193,8 +195,8 @@ def _hint(others: list[U8], printed: PrintedBoard) -> str:
     """What to do where frames do not show the board: it may be another one that they show."""
     for seen in boards_seen(others):
         if seen != f"a chessboard of {printed.board.columns}x{printed.board.rows} squares":
-            return f"there is {seen} in them: is that the --board?"
-    return "show all of it, sharp and evenly lit"
+            return f"they show {seen}: check --board"
+    return "show the whole board, sharp and evenly lit"
 
 
 def _checked(
@@ -204,19 +206,19 @@ def _checked(
     if result is None:
         raise CalibrationError(
             f"{source}: no {lens} lens fits the views of {printed.spelled}: keep the board flat "
-            "and still, fill the image with it"
+            "and still, and fill the image with it"
             + ("" if lens == "fisheye" else "; a very wide lens needs --lens fisheye")
         )
     if result.rms_px > _WORST * width:
         raise CalibrationError(
-            f"{source}: the corners of {printed.spelled} are {result.rms_px:.1f} px off: is it "
-            "this board, flat, and held still?"
+            f"{source}: the corners of {printed.spelled} are {result.rms_px:.1f} px off: check "
+            "--board, and keep the board flat and still"
             + ("" if lens == "fisheye" else " A very wide lens needs --lens fisheye")
         )
     if result.focal_sigma > _KNOWN:
         raise CalibrationError(
-            f"{source}: the focal length stays open (+-{100.0 * result.focal_sigma:.0f} %): tilt "
-            f"{printed.spelled} by 30 degrees and more, both ways"
+            f"{source}: the focal length is uncertain (+-{100.0 * result.focal_sigma:.0f} %): "
+            f"tilt {printed.spelled} by 30 degrees and more, both ways"
         )
     found = result.lens
     return Calibration(  # whose checks it passes: the lens could be rectified
@@ -237,9 +239,11 @@ def _checked(
 def _advice(covered: float, focal_sigma: float) -> list[str]:
     lines: list[str] = []
     if covered < 0.7:
-        lines.append("where no view was, the distortion is a guess: bring the board to the corners")
+        lines.append(
+            "the distortion is uncertain in areas without views: move the board to the corners"
+        )
     if focal_sigma > 0.5 * CalibrationUncertainty().focal:
-        lines.append("the focal length would be surer with more and steeper tilts of the board")
+        lines.append("more and steeper tilts of the board would give a more accurate focal length")
     return lines
 
 
@@ -252,11 +256,11 @@ def calibrate_without_board(
     """
     dataset = open_source(source, fov_deg=fov_deg, topic=topic, mask=mask)
     if dataset.is_live:
-        raise DatasetError(f"{source}: is live: film, and give the video")
+        raise DatasetError(f"{source}: is live: film, and pass the video")
     if dataset.calibration.focal_sigma == 0.0:
         raise CalibrationError(
-            f"{source}: has a calibration, which `pliant run` takes: --fov DEGREES, a first guess, "
-            "finds one anew"
+            f"{source}: has a calibration, which `pliant run` uses: pass --fov DEGREES to "
+            "estimate a new one"
         )
     with tempfile.TemporaryDirectory(prefix="pliant-calibrate-") as folder:
         request = RunRequest(
@@ -278,7 +282,7 @@ def calibrate_without_board(
         verdict = str(report["calibration_verdict"]).partition(":")[0]
         if calibration.focal_sigma > _KNOWN:
             raise CalibrationError(
-                f"{source}: {verdict}: film sideways and with turns, or film a board "
+                f"{source}: {verdict}: film with sideways motion and rotations, or film a board "
                 "(pliant calibrate --print-board board.pdf)"
             )
         recording = Recording(Path(folder) / "run" / RECORDING_NAME)
@@ -291,7 +295,7 @@ def calibrate_without_board(
     if not len(left.points_px):  # no part of the image has enough of them
         picture.unlink(missing_ok=True)  # that of another calibration
         return [*lines, f"written: {output}"]
-    of = f"medians of what is left over of {count:,} sights of points, over the image"
+    of = f"median residuals of {count:,} observations of points, over the image"
     words = [f"{source}: {lines[0]}", verdict, of]
     assert run.stream is not None
     # What was seen are pixels of the size that the run was worked on at.

@@ -58,9 +58,9 @@ def options(
 
 _INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LACKING = {
-    errno.EMFILE: "too many open files for this shell's limit: ulimit -n 1024",
+    errno.EMFILE: "too many open files for this shell's limit: run ulimit -n 1024",
     errno.ENFILE: "too many open files on this machine: close other programs",
-    errno.ENOMEM: "the memory does not suffice: close other programs, or lift ulimit -v",
+    errno.ENOMEM: "not enough memory: close other programs, or raise ulimit -v",
 }
 """What the system refuses, by its error, and what to do."""
 # Typer carries its own copy of click, or uses click itself, depending on its version.
@@ -124,7 +124,7 @@ def _run(application: typer.Typer) -> int:
     try:
         os.getcwd()
     except OSError as error:
-        return _say(f"this shell's folder cannot be entered any more ({error.strerror}): cd to one")
+        return _say(f"the current folder is not accessible ({error.strerror}): cd to another one")
     try:
         importlib.import_module("pliant_services.cli.commands")  # registers them
         code = application(standalone_mode=False)
@@ -147,7 +147,7 @@ def _run(application: typer.Typer) -> int:
     except RuntimeError as error:
         if str(error) != "can't start new thread":
             raise
-        return _say(f"{error}: close other programs, or lift ulimit -u and ulimit -v")
+        return _say(f"{error}: close other programs, or raise ulimit -u and ulimit -v")
     except OSError as error:
         if error.errno in _LACKING:
             return _say(_LACKING[error.errno])

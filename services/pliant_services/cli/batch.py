@@ -41,7 +41,9 @@ def batch(
     from pliant_services.cli import app
 
     if dask is not None and jobs is not None:
-        raise typer.BadParameter("--jobs is for one machine: with --dask its workers' threads tell")
+        raise typer.BadParameter(
+            "--jobs is for one machine: with --dask, set the threads of the workers"
+        )
     command.check_folder(folder)
     runs = typer.main.get_command(app).commands["run"]  # type: ignore[attr-defined]
     command.check_options(runs, context.args)

@@ -70,12 +70,14 @@ def calibrate(
     from pliant_services.calibrate import board as boards
 
     if (source == "") == (print_board is None):
-        raise typer.BadParameter("give a source, or --print-board FILE")
+        raise typer.BadParameter("no source given: pass one, or --print-board FILE")
     if board is not None and fov is not None:
-        raise typer.BadParameter("--fov is for a source without a --board")
+        raise typer.BadParameter("--fov is only for a source without --board")
     if print_board is not None:
         if print_board.suffix.lower() != ".pdf":
-            raise ResultError(f"{print_board}: a board is printed as a .pdf")
+            raise ResultError(
+                f"{print_board}: a board is written as PDF: use a name that ends in .pdf"
+            )
         if print_board.exists() and not force:
             raise ResultError(f"{print_board} exists: choose another name, or --force")
         typer.echo(

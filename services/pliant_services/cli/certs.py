@@ -36,4 +36,6 @@ def certs(
     names = ["localhost", "127.0.0.1", *(hosts or [])]
     only = session_name(session) if session else ANY_SESSION
     made = make_certificates(folder, NAMES, names, authority=authority, session=only)
-    typer.echo(f"{folder}: made {', '.join(made)}" if made else f"{folder}: everything is there")
+    typer.echo(
+        f"{folder}: made {', '.join(made)}" if made else f"{folder}: complete, nothing to do"
+    )

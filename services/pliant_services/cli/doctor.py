@@ -100,7 +100,9 @@ def _arithmetic() -> Finding:
         remedy = "pip install --force-reinstall pliant"
         return Finding("error", "arithmetic", f"{_line(error)}; {remedy}")
     if strays:
-        remedy = "other bytes than elsewhere; pip install --upgrade numpy opencv-python-headless"
+        remedy = (
+            "results differ from other machines; pip install --upgrade numpy opencv-python-headless"
+        )
         return Finding("warning", "arithmetic", f"{', '.join(strays)}: {remedy}")
     return Finding("ok", "arithmetic", arithmetic.target())
 
@@ -113,7 +115,7 @@ def _scratch() -> Finding:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        remedy = "set PLIANT_CACHE_DIR to a folder that can be written"
+        remedy = "set PLIANT_CACHE_DIR to a writable folder"
         return Finding("error", "cache folder", f"{folder}: {error.strerror}; {remedy}")
     free = shutil.disk_usage(folder).free
     grade: Literal["ok", "warning"] = "ok" if free > _FREE_BYTES else "warning"

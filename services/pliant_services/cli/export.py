@@ -90,5 +90,5 @@ def _box(text: str) -> "Box":
             f"--crop {shown(text)}: expected XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX"
         ) from None
     if not (x < x_end and y < y_end and z < z_end):
-        raise typer.BadParameter(f"--crop {shown(text)}: the second corner exceeds the first one")
+        raise typer.BadParameter(f"--crop {shown(text)}: each maximum must exceed its minimum")
     return Box(low=(x, y, z), high=(x_end, y_end, z_end))

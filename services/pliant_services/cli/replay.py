@@ -79,7 +79,9 @@ def replay(
             "--readers": readers, "--loop": loop, "--connect": connect, "--port": port,
         }  # fmt: skip
         for option in [name for name, given in playing.items() if given]:
-            raise typer.BadParameter(f"{option} is for playing, not for running services again")
+            raise typer.BadParameter(
+                f"{option} applies to playing, not to running services again (--services, --check)"
+            )
         if tolerance and not check:
             raise typer.BadParameter("--tolerance needs --check")
         from pliant_services.replay.command import ReplayRequest, run_replay
@@ -119,7 +121,7 @@ def _rate(text: str) -> float:
     except ValueError:
         rate = -1.0
     if not (text == "max" or 1e-3 <= rate <= 1e3):
-        raise PliantError(f"--rate {text}: give a factor such as 0.5, or max")
+        raise PliantError(f"--rate {text}: expected a factor such as 0.5, or max")
     return rate
 
 

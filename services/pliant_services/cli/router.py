@@ -53,14 +53,16 @@ def router(
     endpoints = listen or ["tcp/127.0.0.1:7447"]
     secure = tls is not None
     if sessions and not secure:
-        raise PliantError("--session needs --tls: without certificates all reach all sessions")
+        raise PliantError(
+            "--session needs --tls: without certificates every client can access all sessions"
+        )
     served = [session_name(each) for each in sessions or ()]
     open_to_all = [] if secure else [each for each in endpoints if is_beyond_loopback(each)]
     if open_to_all:
         typer.echo(
-            f"WARNING: {', '.join(open_to_all)} is not on this machine alone, and asks for no "
-            "certificate: whoever reaches it sees every image, and may send what they like. "
-            "See `pliant certs`.",
+            f"WARNING: {', '.join(open_to_all)} is reachable from other machines and requires no "
+            "certificate: anyone who reaches it can see all images and send any message. See "
+            "`pliant certs`.",
             err=True,
         )
     session = open_router(

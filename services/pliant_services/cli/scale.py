@@ -12,7 +12,7 @@ def _point(text: str) -> tuple[float, ...]:
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:
-        raise typer.BadParameter(f"{shown(text)} is no point: expected X,Y,Z") from None
+        raise typer.BadParameter(f"{shown(text)} is not a point: expected X,Y,Z") from None
     return x, y, z
 
 

@@ -96,7 +96,9 @@ def service(
         from pliant.recording.map_file import MapFile
 
         if not source:
-            raise PliantError("ingest needs --source: a folder, a video, camera:0 or built-in:room")
+            raise PliantError(
+                "ingest needs --source, such as a folder, a video, camera:0 or built-in:room"
+            )
         arguments["dataset"] = open_source(
             source,
             calibration=calibration,

@@ -27,4 +27,4 @@ def stop(
     endpoints, session = session_at(result, connect, session)
     left = stop_session(endpoints, session, wait, identity_in(tls, OPERATOR))
     if left:
-        raise BusError(f"{', '.join(left)} still there after {wait:.0f} s")
+        raise BusError(f"{', '.join(left)} still active after {wait:.0f} s")

@@ -65,7 +65,7 @@ def mesh_recording(recording: Path, config: Config) -> Meshing:
     known = summarise(recording).topics
     missing = [topic.key for topic in inputs if topic.key not in known]
     if missing:
-        raise RecordingError(f"{recording}: without {missing[0]}: `pliant replay` makes it")
+        raise RecordingError(f"{recording}: has no {missing[0]}: `pliant replay` makes it")
     for stream in reader.decoded(topics.STREAM):
         assert isinstance(stream, CameraStream)
         check_voxel_sizes(stream.camera, config.meshing.tsdf)

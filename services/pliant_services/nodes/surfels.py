@@ -135,7 +135,9 @@ def _check(bus: Bus, config: Config) -> None:
     }
     for setting, (wanted, topic) in needs.items():
         if wanted and not bus.reads(topic):
-            raise ConfigError(f"{setting}: nobody here publishes {topic.key}, which it needs")
+            raise ConfigError(
+                f"{setting}: no service of this session publishes {topic.key}, which it needs"
+            )
 
 
 def _hear(bus: Bus) -> Iterator[_Heard]:
@@ -199,7 +201,7 @@ def _add(
     if not frame.lost:
         found = agree(view.depth, frame, config.surfels.patch_px)
         if found.depth is None:
-            return frame, f"no surfels are born on the map: {found.problem}"
+            return frame, f"no surfels are created on the map: {found.problem}"
         state.ratio, state.segment = found.ratio, view.segment
         return state.tracker.add(image, found.depth), ""
     # Nobody is left to compare with.  For the same map the last ratio holds, another starts anew.

@@ -75,9 +75,7 @@ def _replay_into(output: Path, request: ReplayRequest) -> int:
     recorded = summarise(request.recording)
     services = replayable(request.services or recorded_services(recorded))
     if not recorded.has_index:
-        raise RecordingError(
-            f"{request.recording}: not closed: `pliant recover` makes a recording that replays"
-        )
+        raise RecordingError(f"{request.recording}: not closed: use `pliant recover` to repair it")
     config = recorded_config(recorded.metadata, request.overrides)
     require_inputs(recorded, services)
     replay = Replay(request.recording, recorded, services, config)
@@ -91,7 +89,7 @@ def _replay_into(output: Path, request: ReplayRequest) -> int:
     for line in gaps(recorded, services):
         print(line, file=sys.stderr)
     if SECOND_PASS in recorded.metadata and topics.MAP_FINAL in replay.made:
-        print(f"{request.recording} is of two passes: a replay makes the first", file=sys.stderr)
+        print(f"{request.recording} has two passes: the replay makes the first", file=sys.stderr)
     replay.run(output / RECORDING_NAME, metadata)
     report = write_results(output)
     if earlier.is_aside(output):
@@ -125,5 +123,5 @@ def _replay_into(output: Path, request: ReplayRequest) -> int:
     )
     for name in sorted(before.keys() & now.keys()):
         if before[name] != now[name]:
-            print(f"recorded with {name} {before[name]}, here is {now[name]}")
+            print(f"recorded with {name} {before[name]}, this is {now[name]}")
     return DIFFERENT

@@ -51,7 +51,7 @@ def run_play(request: PlayRequest) -> int:
     if request.end_s is not None and request.end_s <= request.start_s:
         raise RecordingError(f"--end {request.end_s:g} is not after --start {request.start_s:g}")
     if request.loop and request.readers:
-        raise RecordingError("--loop is for viewers: what --readers read ends with the recording")
+        raise RecordingError("--loop is for viewers: leave it out, or --readers")
     what = Played(
         start_s=request.start_s,
         end_s=request.end_s,

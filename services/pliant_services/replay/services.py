@@ -63,8 +63,8 @@ def require_inputs(summary: Summary, services: Sequence[Process]) -> None:
         needing = _lacking(summary, services, topic)
         if needing:
             raise RecordingError(
-                f"{' and '.join(needing)} cannot be replayed: the recording is without {topic.key} "
-                "(cut off early, or one part of several? their folder replays as a whole)"
+                f"{' and '.join(needing)} cannot be replayed: the recording is without "
+                f"{topic.key} (truncated, or one part of several? pass the folder of all parts)"
             )
 
 
@@ -89,7 +89,7 @@ def gaps(summary: Summary, services: Sequence[Process]) -> list[str]:
     read = {t for p in services for t in (*p.inputs, *p.optional)}.difference(_made_by(services))
     missing = {(key := _recorded_as(t).key): summary.missing_of(key) for t in read}
     return [
-        f"{key} lacks {count} of its messages: what is made of the others is not what the run made"
+        f"{key} lacks {count} of its messages: the outputs will differ from those of the run"
         for key, count in sorted(missing.items())
         if count
     ]

@@ -34,9 +34,9 @@ class RosRequest:
 def run_ros(request: RosRequest) -> None:
     """Publish until the session ends.  Raises PliantError."""
     if not _NAME.fullmatch(request.name):
-        raise ResultError(f"--name {request.name}: not a name of ROS, such as /pliant")
+        raise ResultError(f"--name {request.name}: not a name that ROS accepts, such as /pliant")
     if not request.session:
-        raise ResultError("--connect needs --session: `pliant status` lists what runs there")
+        raise ResultError("--connect needs --session: `pliant status` lists the sessions")
     with open_session([request.router]) as ros:
         canvas = RosCanvas(Node(ros, request.name), request.name)
         follow(request.endpoints, request.session, canvas, request.patience_s, request.identity)

@@ -82,7 +82,7 @@ class Child:
             how = f"was killed by {known.get(-code, f'signal {-code}')}"
             how += " (is the memory full?)" if -code == signal.SIGKILL else ""
         text = "\n".join(words)
-        return f"{self.name} {how}; its log is {self.log}" + (f":\n{text}" if text else "")
+        return f"{self.name} {how}; log: {self.log}" + (f":\n{text}" if text else "")
 
 
 def first_to_fail(children: Sequence[Child]) -> Child | None:

@@ -115,8 +115,8 @@ class Fleet:
             if time.monotonic() > deadline:
                 missing = sorted(set(self._services) - self._ready)
                 raise BusError(
-                    f"{', '.join(missing)} did not come up in {READY_TIMEOUT_S:.0f} s: they may "
-                    f"still compile kernels (then run again); their logs: {self._log_folder}"
+                    f"{', '.join(missing)} did not start within {READY_TIMEOUT_S:.0f} s: they may "
+                    f"still compile kernels (then run again); logs: {self._log_folder}"
                 )
             time.sleep(_POLL_S)
 

@@ -19,10 +19,10 @@ def check_limits() -> None:
         soft = _WANTED_FILES if hard == unlimited else min(hard, _WANTED_FILES)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     if soft != unlimited and soft < _FILES:
-        raise PliantError(f"only {soft} open files are allowed: ulimit -n {_WANTED_FILES}")
+        raise PliantError(f"only {soft} open files are allowed: run ulimit -n {_WANTED_FILES}")
     addresses, _ = resource.getrlimit(resource.RLIMIT_AS)
     if addresses != unlimited and addresses < _ADDRESSES:
         raise PliantError(
-            f"only {addresses >> 20} MiB of address space are allowed, and a service needs "
-            f"{_ADDRESSES >> 20}: ulimit -v unlimited"
+            f"only {addresses >> 20} MiB of address space are allowed, but a service needs "
+            f"{_ADDRESSES >> 20}: run ulimit -v unlimited"
         )

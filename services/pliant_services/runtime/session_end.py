@@ -58,7 +58,7 @@ def run_alone(name: str, config: Config, options: ServiceOptions, *, results: bo
                 _join_parts(recorded)
         _leave(options.state, name)
     else:
-        print(f"{name}: its part of the session is done", file=sys.stderr)
+        print(f"{name}: already finished in this session", file=sys.stderr)
     if recorded is not None:
         _say_over(options)
     return code
@@ -121,10 +121,10 @@ def _leave(state: Path | None, name: str) -> None:
 def _check_recording(output: Path, state: Path | None) -> None:
     """Raise ResultError where the results cannot go there, or another session's are there."""
     if output.name != RECORDING_NAME:
-        raise ResultError(f"{output}: with --results the recording is named {RECORDING_NAME}")
+        raise ResultError(f"{output}: --results needs a recording named {RECORDING_NAME}")
     own = state / "recorder" if state is not None else None
     if parts.exists(output) and not (own is not None and own.is_dir()):
-        raise ResultError(f"{output.parent} holds a recording already: choose another folder")
+        raise ResultError(f"{output.parent} already contains a recording: choose another folder")
     try:
         make_folder(output.parent)
         if own is not None:

@@ -19,7 +19,7 @@ _HEADINGS = (
 
 
 _SAY_AGAIN_S = 0.5
-_SILENT = "told nothing: stopped, or its host cut off"
+_SILENT = "silent: stopped, or its host is disconnected"
 _READER = "this command"
 
 

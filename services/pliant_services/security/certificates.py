@@ -71,7 +71,7 @@ def make_certificates(
         where = error.filename or folder
         raise ResultError(f"{where}: cannot be written: {error.strerror}") from None
     except ValueError as error:
-        raise ResultError(f"{authority}: a broken authority there: {error}") from None
+        raise ResultError(f"{authority}: damaged signing key or certificate: {error}") from None
     return made
 
 
@@ -82,16 +82,18 @@ def authority_of(folder: Path) -> Path:
 
 def _check(folder: Path, authority: Path) -> None:
     if authority.resolve().is_relative_to(folder.resolve()):
-        raise ResultError(f"{authority}: services look into {folder}: keep the authority elsewhere")
+        raise ResultError(
+            f"{authority}: services read {folder}: choose an --authority outside of it"
+        )
     if (folder / "ca.key").exists():
         raise ResultError(
-            f"{folder}: made by an earlier release, where each certificate could pass for the "
-            "router's: make all of them again, in another folder"
+            f"{folder}: made by an earlier release, in which every certificate could imitate the "
+            "router: make new ones in another folder"
         )
     if (folder / "ca.pem").exists() and not (authority / "ca.key").exists():
         raise ResultError(
-            f"{authority / 'ca.key'}: not there, and {folder} has certificates of it: say with "
-            "--authority where it is"
+            f"{authority / 'ca.key'}: missing, but {folder} has certificates signed by it: pass "
+            "its folder with --authority"
         )
 
 
@@ -101,8 +103,8 @@ def _check_holder(path: Path, holder: str) -> None:
     names = [each.value for each in subject.get_attributes_for_oid(x509.oid.NameOID.COMMON_NAME)]
     if names != [holder]:
         raise ResultError(
-            f"{path}: of {', '.join(names)}, not of {holder}: keep those of another session in "
-            "another folder"
+            f"{path}: certificate of {', '.join(names)}, not of {holder}: use a separate folder "
+            "for each session"
         )
 
 

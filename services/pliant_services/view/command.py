@@ -92,12 +92,14 @@ def _show_in_open3d(request: ViewRequest) -> None:
     """A result that is over.  Raises PliantError."""
     if request.web or request.save is not None or request.endpoints:
         raise ResultError(
-            "--open3d opens a window of a result: without --web, --save and --connect"
+            "--open3d shows a result in a window: leave out --web, --save and --connect"
         )
     if request.source is None:
-        raise ResultError("nothing to view: give a result or a recording")
+        raise ResultError("nothing to view: pass a result or a recording")
     if request.source.is_dir() and running_session(request.source)[0]:
-        raise ResultError(f"{request.source}: the run goes on; --open3d shows results only")
+        raise ResultError(
+            f"{request.source}: the run is still active; --open3d shows only finished results"
+        )
     check_display("--web or --save FILE.rrd of Rerun")
     from pliant.api.result import Result
     from pliant_services.view.open3d_window import show
@@ -111,9 +113,9 @@ def _show(request: ViewRequest, where: Where) -> None:
     if not endpoints and request.source is not None and request.source.is_dir():
         endpoints, session = running_session(request.source)
     if not endpoints and request.source is None:
-        raise ResultError("nothing to view: give a result, a recording, or --connect and --session")
+        raise ResultError("nothing to view: pass a result, a recording, or --connect and --session")
     if endpoints and not session:
-        raise ResultError("--connect needs --session: `pliant status` lists what runs there")
+        raise ResultError("--connect needs --session: `pliant status` lists the sessions")
     recording = None if endpoints else _recording(request.source)
     name = session or (request.source.stem if request.source else "pliant")
     canvas = RerunCanvas(where, name=name, web_port=request.web_port)
@@ -129,7 +131,7 @@ def _show(request: ViewRequest, where: Where) -> None:
             _stay()
     finally:
         if not canvas.is_watched:
-            print("the window of Rerun is closed, or could not open", file=sys.stderr)
+            print("the Rerun window was closed, or could not open", file=sys.stderr)
         canvas.close()
 
 
@@ -165,7 +167,7 @@ def follow(
         while not _runs(connection, session):
             if time.monotonic() > deadline:
                 check_versions(_tokens(connection, session))
-                raise ResultError("no such session runs there: `pliant status` lists what does")
+                raise ResultError("no such session: `pliant status` lists the sessions")
             time.sleep(0.1)
         _draw_while(canvas, waiting, lambda: canvas.is_watched and _runs(connection, session))
         held.clear()
@@ -259,7 +261,7 @@ def _runs(connection: zenoh.Session, session: str) -> bool:
 def check_versions(tokens: Iterable[str]) -> None:
     """Raise BusError where a service is of another version: its messages would not be read."""
     for words in filter(None, (misfit(token, "this viewer") for token in tokens)):
-        raise BusError(f"{words}: look on with the release that runs there")
+        raise BusError(f"{words}: use the same release for the viewer")
 
 
 def _recording(source: Path | None) -> Recording | None:
@@ -275,7 +277,7 @@ def _recording(source: Path | None) -> Recording | None:
 def place(*, web: bool, save: Path | None, force: bool) -> Where:
     """Where a view goes.  Raises ResultError where it cannot."""
     if web and save is not None:
-        raise ResultError("--web and --save contradict each other: give one")
+        raise ResultError("--web and --save exclude each other: pass only one")
     if save is not None:
         if save.exists() and not force:
             raise ResultError(f"{save} exists: choose another --save, or --force")

@@ -13,7 +13,7 @@ from pliant.errors import ResultError
 from pliant.open3d_library import load_open3d
 from pliant.pictures.map import BACKGROUND, FOCAL, PATH_COLOUR, PLACES_COLOUR, choose_view
 
-_NO_WINDOW = "Open3D cannot open a window here: is the display of $DISPLAY there?"
+_NO_WINDOW = "Open3D cannot open a window: check $DISPLAY"
 _SIZE = (1280, 960)
 _POINT_SIZE_PX = 2.0
 
@@ -34,7 +34,7 @@ def opened(result: Result) -> Any:
     window can be opened.
     """
     if result.is_deformable or not len(result.trajectory):
-        raise ResultError(f"{result.path}: has no map: `pliant view` without --open3d shows it")
+        raise ResultError(f"{result.path}: has no map: use `pliant view` without --open3d")
     open3d = load_open3d()
     if not _display_answers():
         raise ResultError(_NO_WINDOW)

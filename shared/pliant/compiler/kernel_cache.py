@@ -63,7 +63,7 @@ class SourcesCache(FunctionCache):
         except RuntimeError:  # of Numba, where no place will do
             raise PliantError(
                 f"compiled kernels can be kept neither beside {function.__code__.co_filename} nor "
-                f"in {cache_folder()}: set PLIANT_CACHE_DIR to a folder that can be written"
+                f"in {cache_folder()}: set PLIANT_CACHE_DIR to a writable folder"
             ) from None
         stamp = hashlib.sha256()
         for path in sources(Path(function.__code__.co_filename)):
