@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from test_decimation import grey, waves
+from test_decimation import grey, grid, waves
 
 from pliant.algorithms.meshing.decimation import clustered, decimated
-from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.algorithms.meshing.mesh_blocks import LATTICE, SIDE, MeshBlocks, TriangleMesh, weld
 from pliant.pictures.mesh import draw_mesh, mesh_view
 
 
@@ -45,3 +45,40 @@ def test_bytes_for_each_triangle_are_few(work: Callable[[TriangleMesh], None], m
     finally:
         tracemalloc.stop()
     assert peak / len(mesh.triangles) < most
+
+
+def many_blocks(side: int = 40) -> MeshBlocks:
+    """Of a plane: each block has 81 vertices, those on its rim as its neighbours have them."""
+    count, n = side * side, LATTICE
+    keys = np.stack(np.meshgrid(np.arange(side), np.arange(side), [0], indexing="ij"), axis=-1)
+    x, y = np.divmod(np.arange(n * n, dtype=np.int32), n)
+    plane, triangles = grid(n)
+    local = (plane[:, :2] * SIDE)[None] + keys.reshape(-1, 1, 3)[..., :2] * SIDE
+    positions = np.concatenate([local, np.zeros((*local.shape[:2], 1))], axis=2)
+    positions = positions.reshape(-1, 3).astype(np.float32)
+    return MeshBlocks(
+        keys=keys.reshape(-1, 3).astype(np.int32),
+        vertex_counts=np.full(count, n * n, np.int32),
+        triangle_counts=np.full(count, len(triangles), np.int32),
+        edges=np.tile((y * n + x) * 3 + 2, count),
+        positions=positions,
+        normals=np.zeros_like(positions),
+        colours=np.zeros(positions.shape, np.uint8),
+        triangles=np.tile(triangles, (count, 1)),
+    )
+
+
+def test_blocks_are_welded_with_few_bytes_for_each_triangle() -> None:
+    side = 40
+    blocks = many_blocks(side)
+    tracemalloc.start()
+    try:
+        mesh = weld(blocks)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(mesh.positions) == (side * SIDE + 1) ** 2
+    assert len(mesh.triangles) == 2 * (side * SIDE) ** 2
+    corners = mesh.positions[mesh.triangles]
+    assert np.ptp(corners, axis=1).max() <= 1.0 + 1e-5  # each is where it was
+    assert peak / len(mesh.triangles) < 70

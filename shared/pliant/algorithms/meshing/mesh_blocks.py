@@ -3,7 +3,8 @@
 No kernels: whoever reads messages loads this.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from typing import Annotated
 
 import numpy as np
@@ -20,6 +21,7 @@ KEY_BITS = 21
 _KEY_MASK = (1 << KEY_BITS) - 1
 LATTICE = SIDE + 1
 """Lattice points along the side of a block's cubes."""
+_ROWS = 1 << 16
 LAST_KEY = (1 << 63) - 1
 """No packed key lies behind this one; none lies before 0."""
 
@@ -173,30 +175,40 @@ def weld(blocks: MeshBlocks) -> TriangleMesh:
 
     Blocks must be of one time: what they share on their faces must be the same in both.
     """
-    block = np.repeat(np.arange(len(blocks.keys)), blocks.vertex_counts)
-    at, axis = blocks.edges // 3, blocks.edges % 3
-    local = np.stack([at % LATTICE, at // LATTICE % LATTICE, at // LATTICE**2], axis=1)
-    lattice = blocks.keys[block].astype(np.int64) * SIDE + local
-    # 20 bits a coordinate and two for the axis.
-    shifted = lattice + (1 << 19)
-    ids = (((shifted[:, 0] << 20 | shifted[:, 1]) << 20 | shifted[:, 2]) << 2) | axis
+    block = np.repeat(np.arange(len(blocks.keys), dtype=np.int32), blocks.vertex_counts)
+    ids = np.empty(len(block), np.int64)
+    for rows in _parts(len(block)):
+        ids[rows] = _edge_ids(blocks.keys[block[rows]], blocks.edges[rows])
     _, first, where = np.unique(ids, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order), dtype=np.int32)
-    rows = first[order]
-    starts = np.concatenate([[0], np.cumsum(blocks.vertex_counts)[:-1]]).astype(np.int64)
-    corners = (
-        blocks.triangles + np.repeat(starts, blocks.triangle_counts)[:, None]
-        if len(blocks.triangles)
-        else blocks.triangles.astype(np.int64)
-    )
+    place, kept = rank[where.ravel()], first[order]
+    del block, ids, first, where, order, rank
+    of_triangle = np.repeat(np.cumsum(blocks.vertex_counts, dtype=np.int64) - blocks.vertex_counts,
+                            blocks.triangle_counts)  # fmt: skip
+    triangles = np.empty((len(of_triangle), 3), np.int32)
+    for rows in _parts(len(triangles)):
+        triangles[rows] = place[blocks.triangles[rows] + of_triangle[rows, None]]
     return TriangleMesh(
-        positions=blocks.positions[rows],
-        normals=blocks.normals[rows],
-        colours=blocks.colours[rows],
-        triangles=rank[where[corners]].astype(np.int32).reshape(-1, 3),
+        positions=blocks.positions[kept],
+        normals=blocks.normals[kept],
+        colours=blocks.colours[kept],
+        triangles=triangles,
     )
+
+
+def _edge_ids(keys: I32, edges: I32) -> I64:
+    """(N,) numbers of lattice edges: 20 bits a coordinate and two for the axis."""
+    at, axis = edges // 3, edges % 3
+    local = np.stack([at % LATTICE, at // LATTICE % LATTICE, at // LATTICE**2], axis=1)
+    shifted = keys.astype(np.int64) * SIDE + local + (1 << 19)
+    return (((shifted[:, 0] << 20 | shifted[:, 1]) << 20 | shifted[:, 2]) << 2) | axis
+
+
+def _parts(count: int) -> Iterator[slice]:
+    """Of many rows, so that what is in between stays small."""
+    return (slice(first, first + _ROWS) for first in range(0, count, _ROWS))
 
 
 def unwelded(blocks: MeshBlocks) -> TriangleMesh:
@@ -241,16 +253,12 @@ def _same(held: MeshBlocks, blocks: MeshBlocks, at: slice, face: slice) -> bool:
 
 
 def joined_blocks(parts: list[MeshBlocks]) -> MeshBlocks:
-    """Those of the first part, then those of the next ones; keys must ascend throughout."""
+    """Those of the first part, then those of the next ones; keys must ascend throughout.
+
+    The list is empty then.
+    """
     if not parts:
         return no_blocks()
-    return MeshBlocks(
-        keys=np.concatenate([p.keys for p in parts]),
-        vertex_counts=np.concatenate([p.vertex_counts for p in parts]),
-        triangle_counts=np.concatenate([p.triangle_counts for p in parts]),
-        edges=np.concatenate([p.edges for p in parts]),
-        positions=np.concatenate([p.positions for p in parts]),
-        normals=np.concatenate([p.normals for p in parts]),
-        colours=np.concatenate([p.colours for p in parts]),
-        triangles=np.concatenate([p.triangles for p in parts]),
-    )
+    columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(MeshBlocks)}
+    parts.clear()  # a column at a time, so that not all is there twice
+    return MeshBlocks(**{name: np.concatenate(columns.pop(name)) for name in list(columns)})
