@@ -92,14 +92,20 @@ def run(
 
 
 def measure(
-    sources: Sequence[str], overrides: Sequence[str], seeds: Sequence[int], focal: float
+    sources: Sequence[str],
+    overrides: Sequence[str],
+    seeds: Sequence[int],
+    focal: float,
+    off_centre: float = 0.0,
 ) -> Iterator[str]:
-    """A row for each source and seed.   focal: the given focal length is taken times this."""
+    """A row for each source and seed.   focal: the given focal length is multiplied by this.
+    off_centre: added to the principal point, across, as a share of the focal length."""
     yield markdown_header(_HEADER)
     for source in sources:
         dataset = open_source(source, part=load_config(None, overrides).ingest)
         given = dataset.calibration
-        lens = replace(given, fx=focal * given.fx, fy=focal * given.fy)
+        cx = given.cx + off_centre * given.fx
+        lens = replace(given, fx=focal * given.fx, fy=focal * given.fy, cx=cx)
         for seed in seeds:
             found = run(dataset, [*overrides, f"seed={seed}"], calibration=lens)
             ates = shown_ate(found.final), shown_ate(found.causal)

@@ -10,7 +10,11 @@ from pliant.algorithms.bundle.calibration import SharedCalibration, ideal_pixels
 from pliant.algorithms.bundle.normal_equations import SHARED
 from pliant.algorithms.bundle.packed_layout import build_packed_layout
 from pliant.algorithms.bundle.problem import BundleParameters, CalibrationUncertainty
-from pliant.algorithms.bundle.schur import SchurSystem, solve_schur
+from pliant.algorithms.bundle.schur import (
+    SchurSystem,
+    gain_of_principal_point,
+    solve_schur,
+)
 from pliant.algorithms.camera import PinholeCamera
 
 EXACT = BundleParameters(kernel_sigma_px=0.0, max_iterations=60, min_relative_decrease=1e-10)
@@ -230,3 +234,13 @@ def test_an_ideal_pixel_is_the_same_alone_and_among_many(lens):
     correction = np.array([0.01, *lens, 0.0, 0.01, -0.02])
     alone = [ideal_pixels(each, camera, correction) for each in px[:, None]]
     np.testing.assert_array_equal(ideal_pixels(px, camera, correction), np.concatenate(alone))
+
+
+def test_the_gain_of_a_principal_point_is_what_the_cost_falls_by_with_it():
+    held = FREE.model_copy(update={"principal_point": 0.0})
+    believed = with_lens(make_scene(cameras=6, points=150, noise_px=0.3).problem, a=0.01, b=-0.005)
+    found = solve_schur(believed, EXACT, uncertainty=held)
+    free = solve_schur(believed, EXACT, uncertainty=FREE, start=found.correction)
+    gain = gain_of_principal_point(believed, found, EXACT, FREE)
+    assert gain == pytest.approx(2.0 * (found.final_cost - free.final_cost), rel=0.1)
+    assert gain_of_principal_point(believed, free, EXACT, FREE) < 1e-3 * gain

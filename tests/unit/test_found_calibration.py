@@ -106,6 +106,17 @@ def test_a_calibration_that_the_images_contradict_is_told_and_by_how_much():
     assert not calibration_verdict(run_with(PINHOLE, correction, (0.2,) * 4), {})
 
 
+def test_a_principal_point_that_the_images_contradict_is_told_and_far_off_is_a_doubt():
+    near, off, far = ((0.0, 0.0, 0.0, 0.0, a, -0.01) for a in (0.02, 0.04, 0.06))
+    assert not calibration_verdict(run_with(PINHOLE, near, (1e-3,) * 6), {})
+    run = run_with(PINHOLE, off, (1e-3,) * 6)
+    assert "principal point +21, -5 px" in calibration_verdict(run, {})
+    assert not calibration_doubt(run, {})
+    doubt = calibration_doubt(run_with(PINHOLE, far, (1e-3,) * 6), {})
+    assert "principal point +31, -5 px" in doubt
+    assert found_calibration(run).cx == pytest.approx(310.0 + 0.04 * 520.0)
+
+
 def test_what_bends_the_map_is_a_doubt_and_what_was_corrected_is_none():
     guess = calibration_from_fov(640, 480, 60.0)
     open_still = run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.09,) * 4)

@@ -42,6 +42,13 @@ began with the wrong one (two standard deviations of what draws adjustments that
 _SURE = 3.0
 """Standard deviations of what was found that must lie between the two as well."""
 
+_OFF_CENTRE = 0.03
+"""Error of the principal point, as a share of the focal length, from which on the images contradict
+the calibration."""
+
+_FAR_OFF_CENTRE = 0.05
+"""As ``_BENDS`` of the principal point: online poses are wrong until it is found."""
+
 _FORWARD = math.cos(math.radians(15.0))
 _TURN_DEG = 20.0
 """Motion that leaves the focal length open: along the axis, or turning by less than this."""
@@ -153,10 +160,13 @@ def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
         return f"{FOUND} ({known}): pass calibration.yaml to the next run"
     if not _is_contradicted(run):
         return ""
+    _, _, _, a, b = parts_of(correction)
+    point = f"principal point {focal * a:+.0f}, {focal * b:+.0f} px, " if a or b else ""
     return (
         f"the images contradict the calibration: focal length {math.exp(correction[0]):.3f} times "
-        f"the given one ({sure}), k1 {correction[1]:+.3f}, {_corner_px(camera, correction):.0f} "
-        "px at the corner; run again with --calibration calibration.yaml"
+        f"the given one ({sure}), k1 {correction[1]:+.3f}, {point}"
+        f"{_corner_px(camera, correction):.0f} px at the corner; "
+        "run again with --calibration calibration.yaml"
     )
 
 
@@ -180,7 +190,8 @@ def calibration_doubt(run: Run, final: dict[int, Any]) -> str:
     if run.stream is None or len(correction) < 3 or len(sigmas) < 3:
         return ""
     guessed = run.stream.focal_sigma > 0.0
-    bent = sigmas[0] > _KNOWN if guessed else abs(correction[0]) > _BENDS and _is_contradicted(run)
+    far = abs(correction[0]) > _BENDS or _off_centre(correction) > _FAR_OFF_CENTRE
+    bent = sigmas[0] > _KNOWN if guessed else far and _is_contradicted(run)
     return calibration_verdict(run, final) if bent else ""
 
 
@@ -190,10 +201,16 @@ def _is_contradicted(run: Run) -> bool:
     if run.stream is None or run.stream.focal_sigma > 0.0 or len(sigmas) < 2:
         return False
     priors = CalibrationUncertainty().sigmas[:2].tolist()
-    return any(
+    return _off_centre(correction) > _OFF_CENTRE or any(
         abs(q) > max(_CONTRADICTED * prior, _SURE * sigma)
         for q, prior, sigma in zip(correction[:2], priors, sigmas[:2], strict=True)
     )
+
+
+def _off_centre(correction: tuple[float, ...]) -> float:
+    """How far the principal point is from the given one, as a share of the focal length."""
+    _, _, _, a, b = parts_of(correction)
+    return math.hypot(a, b)
 
 
 def _corner_px(camera: PinholeCamera, correction: tuple[float, ...]) -> float:

@@ -33,6 +33,10 @@ def in_process(
         int, typer.Option(min=1, help="Runs of each source, with seeds after it.")
     ] = 1,
     focal: Annotated[float, typer.Option(help="Times the given focal length: a wrong one.")] = 1.0,
+    off_centre: Annotated[
+        float,
+        typer.Option(help="Error of the given principal point, as a share of the focal length."),
+    ] = 0.0,
 ) -> None:
     """The rigid pipeline in one process, without services: final and causal ATE.
 
@@ -40,7 +44,7 @@ def in_process(
     """
     from benchmarks.in_process import measure
 
-    show(measure(sources, overrides or [], range(seed, seed + seeds), focal))
+    show(measure(sources, overrides or [], range(seed, seed + seeds), focal, off_centre))
 
 
 @app.command("map-starts")

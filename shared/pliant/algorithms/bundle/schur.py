@@ -129,14 +129,38 @@ def gain_of_focal(
     With b the right side of Eq. 9 and S its matrix that is ``b^T S^-1 b`` with them, less the same
     without them.
     """
+    system = _at_result(problem, found, parameters, uncertainty, walk)
+    return system.gain_of_focal(system.start())
+
+
+def gain_of_principal_point(
+    problem: BundleProblem,
+    found: BundleResult,
+    parameters: BundleParameters,
+    uncertainty: CalibrationUncertainty,
+) -> float:
+    """As ``gain_of_focal``, px^2, for the principal point of all cameras.
+
+    uncertainty: with a principal point that is unknown.
+    """
+    system = _at_result(problem, found, parameters, uncertainty, None)
+    return system.gain_of_principal_point(system.start())
+
+
+def _at_result(
+    problem: BundleProblem,
+    found: BundleResult,
+    parameters: BundleParameters,
+    uncertainty: CalibrationUncertainty,
+    walk: FocalWalk | None,
+) -> "SchurSystem":
     moved = replace(problem, T_world_camera=found.T_world_camera, points_world=found.points_world)
     layout = build_packed_layout(moved)
     calibration = SharedCalibration(
         layout, problem.intrinsics[:, 4:], uncertainty, found.correction
     )
-    focal = VaryingFocal(layout, walk, uncertainty.prior_px)
-    system = SchurSystem(layout, parameters, calibration, focal)
-    return system.gain_of_focal(system.start())
+    focal = None if walk is None else VaryingFocal(layout, walk, uncertainty.prior_px)
+    return SchurSystem(layout, parameters, calibration, focal)
 
 
 @dataclass(frozen=True)
@@ -320,15 +344,29 @@ class SchurSystem:
     def gain_of_focal(self, state: State) -> tuple[float, F64]:
         """As of the function."""
         assert self.focal is not None
+        rows = np.zeros((len(self.pattern.start) - 1, 6), np.bool_)
+        rows[self.focal.position] = True
+        gain, solution = self._gain_of(rows, state)
+        return gain, self.focal.steps(solution)
+
+    def gain_of_principal_point(self, state: State) -> float:
+        """As of the function."""
+        rows = np.zeros((len(self.pattern.start) - 1, 6), np.bool_)
+        rows[-1, 4:SHARED] = True
+        return self._gain_of(rows, state)[0]
+
+    def _gain_of(self, unknowns: BoolArray, state: State) -> tuple[float, F64]:
+        """``b^T S^-1 b`` less the same with some unknowns (N, 6) held, px^2, and ``S^-1 b``; zeros
+        where there is no solution."""
         self.linearise(state)
         S, b, diagonal = self._reduced_system(state, _GAUGE_DAMPING)
-        small, held = _GAUGE_DAMPING * diagonal, _GAUGE_DAMPING * diagonal
-        held[self.focal.position] *= _HELD / _GAUGE_DAMPING
+        small = _GAUGE_DAMPING * diagonal
+        held = np.where(unknowns, _HELD * diagonal, small)
         free = solve_reduced(self.pattern, S.copy(), b, small)
         alone = solve_reduced(self.pattern, S, b, held)
         if free is None or alone is None:
-            return 0.0, np.zeros_like(state.focal)
-        return float((b * (free - alone)).sum()), self.focal.steps(free)
+            return 0.0, np.zeros_like(b)
+        return float((b * (free - alone)).sum()), free
 
     def _reduced_system(self, state: State, damping: float) -> tuple[F64, F64, F64]:
         """Of Eq. 9, at a linearised state: S without damping, the right side (N, 6) and diag(H)

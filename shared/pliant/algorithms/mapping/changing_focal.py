@@ -24,6 +24,7 @@ from pliant.algorithms.bundle.problem import (
 from pliant.algorithms.bundle.schur import gain_of_focal
 from pliant.algorithms.bundle.varying_focal import FocalWalk
 from pliant.algorithms.mapping.keyframe import Keyframe
+from pliant.algorithms.mapping.principal_point import with_principal_point
 
 RATE = 0.05
 """Standard deviation of the log focal length a second later: weak beside what keyframes tell."""
@@ -45,10 +46,6 @@ other kinds gain more than 10 they range over up to 0.9 % in real clips."""
 _ONE_STEP = 0.35
 """Share of the range that one step of the robust adjustment shows at least."""
 
-_PRINCIPAL_POINT = 0.01
-"""Standard deviation of the principal point of a lens that changes, as a share of the focal
-length."""
-
 _AVERAGED_S = 0.5
 _PERCENTILES = (5.0, 95.0)
 
@@ -63,12 +60,6 @@ def gaps_s(keyframes: list[Keyframe]) -> F64:
 def walk_from(start: F64, gaps: F64) -> FocalWalk:
     """The prior of the focal lengths of keyframes, and where they begin (M,)."""
     return FocalWalk(gaps_s=gaps, rate=RATE, spread=SPREAD, start=start)
-
-
-def with_principal_point(uncertainty: CalibrationUncertainty) -> CalibrationUncertainty:
-    """A lens that magnifies tells where its principal point is, and bends the map by it."""
-    width = max(uncertainty.principal_point, _PRINCIPAL_POINT)
-    return uncertainty.model_copy(update={"principal_point": width})
 
 
 def focal_range(log_focals: F64, gaps: F64) -> tuple[float, float]:

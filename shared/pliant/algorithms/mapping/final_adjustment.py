@@ -19,7 +19,6 @@ from pliant.algorithms.mapping.changing_focal import (
     evidence_of_change,
     gaps_s,
     walk_from,
-    with_principal_point,
 )
 from pliant.algorithms.mapping.directions import at_infinity
 from pliant.algorithms.mapping.focal_search import best_along_focal
@@ -27,6 +26,10 @@ from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.principal_point import (
+    contradicts_principal_point,
+    with_principal_point,
+)
 from pliant.algorithms.mapping.rolling_shutter import readout_flow
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.triangulation import spread_of_rays
@@ -249,6 +252,9 @@ def adjust_listed(
     )  # fmt: skip
     found = solve()
     if varying and uncertainty is not None:
+        if contradicts_principal_point(problem, found, bundle, uncertainty):
+            uncertainty = with_principal_point(uncertainty)
+            found = solve(uncertainty=uncertainty, start=found.correction)
         evidence = evidence_of_change(problem, found, bundle, uncertainty, seen.gaps_s)
         if known.changes or evidence.calls_for_more:
             wide = with_principal_point(uncertainty)

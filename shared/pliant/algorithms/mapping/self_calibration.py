@@ -23,6 +23,7 @@ from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.map_delta import MapDelta
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.principal_point import PRINCIPAL_POINT, with_principal_point
 from pliant.algorithms.mapping.reaching_back import reach_back
 from pliant.algorithms.mapping.start import find_start, waits_long, why_no_start
 from pliant.algorithms.tracks import FrameExtrema
@@ -32,9 +33,6 @@ _GUESS = 0.05
 
 _LENS = 0.1
 """Standard deviations of k1 and k2 of an unknown lens."""
-
-_PRINCIPAL_POINT = 0.03
-"""Standard deviation of an unknown principal point, as a share of the focal length."""
 
 _HYPOTHESES = np.linspace(-2.0, 2.0, 7)
 """Focal lengths that a start is tried under, in standard deviations of the prior."""
@@ -123,7 +121,8 @@ class SelfCalibration:
         """Whether a correction (6,) that was found with its covariance (6, 6) is certainly of
         another lens than that in use, and hardly one that is given with this uncertainty."""
         far = _is_far(correction - self.correction, covariance, _CERTAIN)
-        return far and _is_far(correction, np.diag(given.sigmas**2), _UNLIKELY)
+        believed = with_principal_point(given)
+        return far and _is_far(correction, np.diag(believed.sigmas**2), _UNLIKELY)
 
     def prior(self, given: CalibrationUncertainty, start: F64) -> CalibrationUncertainty:
         """What draws an adjustment that begins from a correction (6,) to the calibration as it was
@@ -131,13 +130,15 @@ class SelfCalibration:
         wider: dict[str, float] = {}
         if given.readout > 0.0 and start[3]:
             wider["readout"] = max(given.readout, _ROLLING)
+        if start[4:].any():
+            given = with_principal_point(given)
         nothing = dataclasses.replace(self, correction=np.zeros(6))
         if nothing.is_refuted(self.correction, self.covariance, given):
             widths = {
                 "focal": _GUESS,
                 "k1": _LENS,
                 "k2": _LENS,
-                "principal_point": _PRINCIPAL_POINT,
+                "principal_point": PRINCIPAL_POINT,
             }
             known = given.model_dump()
             wider |= {k: max(known[k], width) for k, width in widths.items() if known[k] > 0.0}
@@ -222,7 +223,7 @@ def widened(parameters: MappingParameters, focal_sigma: float) -> MappingParamet
     wider: dict[str, float] = {"focal": focal_sigma}
     if focal_sigma > _GUESS:
         wider |= {"k1": max(prior.k1, _LENS), "k2": max(prior.k2, _LENS)}
-        wider["principal_point"] = max(prior.principal_point, _PRINCIPAL_POINT)
+        wider["principal_point"] = max(prior.principal_point, PRINCIPAL_POINT)
     return parameters.model_copy(update={"calibration": prior.model_copy(update=wider)})
 
 
