@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_exp
-from pliant.algorithms.mapping.final_adjustment import ListedMap, adjust_listed
+from pliant.algorithms.mapping.final_adjustment import ObservationList, adjust_list
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 
@@ -45,8 +45,8 @@ def _row(keyframes: int, points: int, seen: int) -> tuple[str, ...]:
     known = SelfCalibration.of(_CAMERA, parameters.calibration)
     whole = _map(keyframes, points, seen)
 
-    def adjust(listed: ListedMap, iterations: int) -> int:
-        found = adjust_listed(listed, known, parameters, iterations=iterations, start=known.in_use)
+    def adjust(listed: ObservationList, iterations: int) -> int:
+        found = adjust_list(listed, known, parameters, iterations=iterations, start=known.in_use)
         return found.iterations
 
     adjust(_map(10, points, seen), 2)  # compiles
@@ -61,7 +61,7 @@ def _peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def _map(keyframes: int, points: int, seen: int) -> ListedMap:
+def _map(keyframes: int, points: int, seen: int) -> ObservationList:
     """A camera goes sideways past points 2 to 8 units away, with noise of half a pixel; its scale
     has drifted by 5 %, and poses are off by 2 mrad."""
     generator = np.random.default_rng(0)
@@ -87,7 +87,7 @@ def _map(keyframes: int, points: int, seen: int) -> ListedMap:
     start = T.copy()
     start[:, :3, 3] *= drift
     start[1:, :3, :3] @= so3_exp(generator.normal(0.0, 0.002, (keyframes - 1, 3)))
-    found = ListedMap(
+    found = ObservationList(
         rows=np.arange(count, dtype=np.int32),
         xyz=xyz * drift[first],
         T_world_camera=start,

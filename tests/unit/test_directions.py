@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
+from test_global_adjustment import similarity
 from test_mapper import Published, run, trajectory_error
-from test_whole_map import similarity
 
 from pliant.algorithms.bundle.projection import move_camera
 from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform

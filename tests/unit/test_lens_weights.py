@@ -6,7 +6,7 @@ import pytest
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.mapping.active_map import ActiveMap
-from pliant.algorithms.mapping.final_adjustment import list_map
+from pliant.algorithms.mapping.final_adjustment import list_observations
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.observation_table import weigh
@@ -57,7 +57,7 @@ def test_an_adjustment_of_k1_lets_more_of_the_image_count(uncertain, covariance,
     known = SelfCalibration.of(CAMERA, uncertain)
     if covariance is not None:
         known = known.corrected(np.zeros(6), covariance, 9)
-    seen = list_map([keyframe], points, known, MappingParameters(calibration=uncertain))
+    seen = list_observations([keyframe], points, known, MappingParameters(calibration=uncertain))
     expected = weigh(AXIS_HALF_BORDER, CAMERA, sigmas)
     np.testing.assert_array_equal(seen.weights[np.argsort(-seen.px[:, 0])], expected)
     assert (expected[-1] < 1.0) == any(sigmas)

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
+from test_global_adjustment import error_of, similarity
 from test_mapper import Published, trajectory_error
-from test_whole_map import error_of, similarity
 
 from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.map_delta import TRACKING, MapMoves
-from pliant.algorithms.mapping.final_adjustment import ListedMap
+from pliant.algorithms.mapping.final_adjustment import ObservationList
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.global_adjustment import GlobalAdjustment
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.loops import Loop, close_loops
 from pliant.algorithms.mapping.mapper import Mapper
@@ -22,7 +23,6 @@ from pliant.algorithms.mapping.parameters import (
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.state import load_state, save_state
 
 AWAY = 80
@@ -104,10 +104,10 @@ def close(mapper):
     """By the graph, and by the adjustment where that is asked for."""
     answers = []
     for _ in range(2):
-        mapper.atlas.ask(2 * AWAY)
-        if (answer := mapper.whole_map.settle()) is not None:
-            mapper.follow(mapper.atlas.take_over(answer))
-            answers.append(answer)
+        mapper.atlas.request(2 * AWAY)
+        if (result := mapper.global_adjustment.settle()) is not None:
+            mapper.follow(mapper.atlas.take_over(result))
+            answers.append(result)
     return answers[0]
 
 
@@ -129,10 +129,10 @@ def test_a_loop_takes_out_the_drift_and_joins_the_points(drifted):
     loop, active = recognised(scene, mapper), mapper.atlas.active
     assert len(loop.rows) > 100
     before, count = error(active), mapper.point_count
-    mapper.whole_map.loops.append(loop)
-    answer = close(mapper)
-    assert answer.loops == [loop]
-    assert len(answer.moves.keyframe_ids) == len(active.keyframes)
+    mapper.global_adjustment.loops.append(loop)
+    result = close(mapper)
+    assert result.loops == [loop]
+    assert len(result.moves.keyframe_ids) == len(active.keyframes)
     assert error(active) < 0.05 * before
     assert mapper.point_count == count - len(loop.rows)
     active.collect_garbage()
@@ -143,8 +143,8 @@ def test_a_loop_takes_out_the_drift_and_joins_the_points(drifted):
 def test_the_map_goes_on_and_readers_have_it(drifted):
     scene, frames, mapper, published = drifted
     loop, told = recognised(scene, mapper), []
-    mapper.whole_map.loops.append(loop)
-    mapper.atlas.ask(2 * AWAY - 1)
+    mapper.global_adjustment.loops.append(loop)
+    mapper.atlas.request(2 * AWAY - 1)
     for k in range(2 * AWAY, 2 * AWAY + 10):
         mapper = load_state(save_state(mapper))
         delta = mapper.process(Frame(k, k * INTERVAL_NS, frames[k]))
@@ -165,11 +165,11 @@ def test_the_map_goes_on_and_readers_have_it(drifted):
 
 def test_a_loop_is_closed_sooner_than_the_map_is_adjusted(drifted):
     _, _, mapper, _ = drifted
-    mapper.whole_map.loops.append(recognised(*drifted[::2]))
-    mapper.atlas.ask(0)
+    mapper.global_adjustment.loops.append(recognised(*drifted[::2]))
+    mapper.atlas.request(0)
     limits = WholeMapParameters(distance_frames=30, observations_per_frame=500)
     parameters = PARAMETERS.model_copy(update={"whole_map": limits})
-    closing = replace(mapper.whole_map.question, parameters=parameters)
+    closing = replace(mapper.global_adjustment.job, parameters=parameters)
     adjusting = replace(closing, loops=[])
     assert adjusting.distance_frames > 40
     assert closing.distance_frames == pytest.approx(0.1 * adjusting.distance_frames, abs=0.5)
@@ -177,7 +177,7 @@ def test_a_loop_is_closed_sooner_than_the_map_is_adjusted(drifted):
 
 def test_a_loop_of_the_last_frames_is_closed_at_the_end(drifted):
     scene, _, mapper, published = drifted
-    mapper.whole_map.loops.append(recognised(scene, mapper))
+    mapper.global_adjustment.loops.append(recognised(scene, mapper))
     published.apply(mapper.finish())
     share, _ = trajectory_error(published, there_and_back())
     assert share < 1e-3
@@ -186,11 +186,11 @@ def test_a_loop_of_the_last_frames_is_closed_at_the_end(drifted):
 def test_a_loop_that_waits_moves_with_the_map(drifted):
     scene, _, mapper, _ = drifted
     loop = recognised(scene, mapper)
-    mapper.whole_map.loops.append(loop)
-    mapper.atlas.ask(0)
-    mapper.whole_map.loops.append(loop)
-    mapper.atlas.take_over(mapper.whole_map.settle())
-    (waiting,) = mapper.whole_map.loops
+    mapper.global_adjustment.loops.append(loop)
+    mapper.atlas.request(0)
+    mapper.global_adjustment.loops.append(loop)
+    mapper.atlas.take_over(mapper.global_adjustment.settle())
+    (waiting,) = mapper.global_adjustment.loops
     before, after = (np.linalg.norm(each.S_old_new - np.eye(4)) for each in (loop, waiting))
     assert after < 0.1 * before
 
@@ -200,9 +200,9 @@ def test_a_loop_that_others_contradict_is_left_out(drifted):
     good, bad = recognised(scene, mapper), recognised(scene, mapper, wrong=True)
     ids = [keyframe.id for keyframe in mapper.atlas.active.keyframes]
     others = [good._replace(old=ids[0], new=ids[-1]) for _ in range(2)]
-    mapper.whole_map.loops += [bad, *others]
-    answer = close(mapper)
-    assert answer.loops == others
+    mapper.global_adjustment.loops += [bad, *others]
+    result = close(mapper)
+    assert result.loops == others
     assert error(mapper.atlas.active) < 0.03
 
 
@@ -242,10 +242,10 @@ def test_a_place_that_looks_alike_is_too_far_for_drift(world):
         Loop(old=first.id, new=k.id, S_old_new=S, rows=rows, ids=points.ids[rows])
         for k in active.keyframes[-2:]
     ]
-    mapper.whole_map.loops += loops
-    answer = close(mapper)
-    assert answer.loops == []
-    assert mapper.whole_map == WholeMap()  # and nothing has been asked for
+    mapper.global_adjustment.loops += loops
+    result = close(mapper)
+    assert result.loops == []
+    assert mapper.global_adjustment == GlobalAdjustment()  # and nothing has been asked for
     assert error_of(active, there_and_back()) == before
 
 
@@ -263,7 +263,7 @@ def test_a_camera_that_was_recognised_stands_where_it_was_whatever_looks_alike()
             point += [len(xyz)] * len(group)
             xyz.append(generator.uniform((middle - 1, -1, 3), (middle + 1, 1, 5)))
     order = np.argsort(camera, kind="stable")
-    listed = ListedMap(
+    listed = ObservationList(
         rows=np.arange(len(xyz), dtype=np.int32), xyz=np.array(xyz),
         T_world_camera=np.array(cameras), camera=np.array(camera, np.int32)[order],
         point=np.array(point, np.int32)[order], px=np.zeros((len(order), 2), np.float32),

@@ -13,13 +13,13 @@ from test_recovery import dark, picture, textures
 from pliant.algorithms.geometry import align_umeyama, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.global_adjustment import held
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
     MappingParameters,
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.whole_map import held
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.map_history import MapHistory
 from pliant.messages import topics

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pliant.algorithms.mapping.final_adjustment import ListedMap
+from pliant.algorithms.mapping.final_adjustment import ObservationList
 
 KEYFRAMES, POINTS = 12, 3000
 
@@ -17,7 +17,7 @@ def listed():
     table = np.arange(KEYFRAMES)[:, None] - first
     camera, point = np.nonzero((table >= 0) & (table < length))
     count = len(point)
-    return ListedMap(
+    return ObservationList(
         rows=np.arange(POINTS, dtype=np.int32) + 5,
         xyz=generator.normal(size=(POINTS, 3)),
         T_world_camera=np.tile(np.eye(4), (KEYFRAMES, 1, 1)),

@@ -11,11 +11,11 @@ from test_recovery import dark, picture, textures
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.map_delta import LOST, TRACKING, MapMoves
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.global_adjustment import held
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, WholeMapParameters
 from pliant.algorithms.mapping.relocalisation import Place
 from pliant.algorithms.mapping.same_place import SamePlace, same_place
-from pliant.algorithms.mapping.whole_map import held
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.state import load_state, save_state
 

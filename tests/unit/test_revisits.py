@@ -171,7 +171,7 @@ def test_the_mapper_closes_a_loop_that_it_sees(killed):
     )
     mapper, published, moved = Mapper(CAMERA, parameters, 0), Published(), []
     for k, tracks in enumerate(scene.frames(poses)):
-        if killed and mapper.whole_map.closing:
+        if killed and mapper.global_adjustment.closing:
             mapper = load_state(save_state(mapper))
         grey = picture(scene, squares, poses[k])
         delta = mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey))

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
+from test_global_adjustment import similarity
 from test_loops import drifted, drifted_once, recognised, there_and_back, world
 from test_mapper import Published, trajectory_error
-from test_whole_map import similarity
 
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.mapping import thinning
@@ -306,7 +306,7 @@ def test_a_loop_is_closed_in_a_map_that_has_given_up_some(drifted):
     thin(active.segment, before // 2, limits(1000, 200), active.links.rows, whole=6)
     assert len(active.segment.given_up) > 10
     loop = recognised(scene, mapper)
-    mapper.whole_map.loops.append(loop)
+    mapper.global_adjustment.loops.append(loop)
     last = mapper.finish()
     assert last.same_places.tolist() == [[loop.old, loop.new]]
     assert np.isin(active.segment.given_up.ids, last.moved_keyframes).all()
@@ -318,9 +318,9 @@ def test_a_loop_to_what_was_given_up_is_one_to_its_host(drifted):
     active, loop = mapper.atlas.active, recognised(scene, mapper)
     thin(active.segment, 12_000, limits(1000, 200), active.links.rows, whole=6)
     gone = active.segment.given_up
-    mapper.whole_map.loops += [loop._replace(old=int(k)) for k in gone.ids[:2]]
-    mapper.atlas.ask(0)
+    mapper.global_adjustment.loops += [loop._replace(old=int(k)) for k in gone.ids[:2]]
+    mapper.atlas.request(0)
     kept = np.array([keyframe.id for keyframe in active.keyframes])
-    asked = [each.old for each in mapper.whole_map.question.loops]
+    asked = [each.old for each in mapper.global_adjustment.job.loops]
     assert asked == [gone.host_of(int(k), kept) for k in gone.ids[:2]]
     assert np.isin(asked, kept).all()

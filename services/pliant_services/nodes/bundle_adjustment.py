@@ -13,7 +13,7 @@ out  map/update       one per frame: pose, points, keyframes, corrections of ear
      map/kept         after that: each keyframe of the map with all that was known, for sessions to
                       come
 
-The whole map is adjusted in a thread beside the frames, see ``whole_map.py``.
+Global bundle adjustment runs in a thread, in parallel with tracking, see ``global_adjustment.py``.
 """
 
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -28,6 +28,12 @@ from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.image.masks import filled
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.global_adjustment import (
+    AdjustmentJob,
+    AdjustmentResult,
+    GlobalAdjustment,
+    find_moves,
+)
 from pliant.algorithms.mapping.keyframe import Keyframe as KeyframeOfMap
 from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.localiser import Localiser
@@ -37,7 +43,6 @@ from pliant.algorithms.mapping.parameters import MappingParameters, WindowParame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.thinning import thin
 from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
-from pliant.algorithms.mapping.whole_map import Answer, Question, WholeMap, find_moves
 from pliant.algorithms.places import PlaceIndex, describe, match
 from pliant.algorithms.tracking.maxima import maxima_of
 from pliant.algorithms.tracking.parameters import TrackingParameters
@@ -80,7 +85,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     # waiting: images and masks of the frames from which a map may yet start, by frame number.
     last, mapper, waiting = resume(bus, start)
     extrema = receive(bus, topics.EXTREMA, Extrema)
-    beside = Beside()
+    worker = AdjustmentWorker()
     for image, tracks in join(receive_images(bus, mapped_only=True), extrema):
         if tracks.missing:
             delta = mapper.skip(tracks.frame)
@@ -91,7 +96,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
                 frame = Frame.of_tracks(tracks.frame, tracks.stamp_ns, tracks)
                 delta = mapper.only_localise(frame, PASSED_OVER)
         else:
-            beside.answer(mapper.whole_map, tracks.frame)
+            worker.hand_over(mapper.global_adjustment, tracks.frame)
             colour = image.colour if image.colour.size else None
             covered = clearance(image)
             grey = filled(image.grey, covered)
@@ -116,7 +121,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
             points=mapper.point_count,
         )
         last = Header(frame=tracks.frame, stamp_ns=tracks.stamp_ns, frame_id=tracks.frame_id)
-        beside.ask(mapper.whole_map)
+        worker.start(mapper.global_adjustment)
         bus.checkpoint(tracks.frame, (last, mapper, waiting))
     with monitor.stage("finish"):
         final = mapper.finish()
@@ -129,30 +134,31 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     monitor.report(last, note="", points=mapper.point_count, **mapper.counters)
 
 
-class Beside:
-    """Adjusts the whole map in a thread beside the frames; kernels run outside Python's lock.
+class AdjustmentWorker:
+    """Runs global bundle adjustment in a thread, in parallel with tracking; kernels run outside
+    Python's lock.
 
-    It is no state: after a restart the mapper's question is asked again.
+    It is no state: after a restart it starts the mapper's job again.
     """
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, "whole map")
-        self._asked: Question | None = None
-        self._found: Future[Answer] | None = None
+        self._job: AdjustmentJob | None = None
+        self._result: Future[AdjustmentResult] | None = None
 
-    def ask(self, whole_map: WholeMap) -> None:
-        """Begin with what the mapper has asked."""
-        question = whole_map.question
-        if question is not None and question is not self._asked:
-            self._found = self._thread.submit(find_moves, question)
-        self._asked = question
+    def start(self, adjustment: GlobalAdjustment) -> None:
+        """Start the job that the mapper has requested."""
+        job = adjustment.job
+        if job is not None and job is not self._job:
+            self._result = self._thread.submit(find_moves, job)
+        self._job = job
 
-    def answer(self, whole_map: WholeMap, frame: int) -> None:
-        """Hand over what was found, where the mapper needs it now."""
-        if self._found is None or whole_map.question is not self._asked:
+    def hand_over(self, adjustment: GlobalAdjustment, frame: int) -> None:
+        """Give the mapper the result of its job, where it needs that now."""
+        if self._result is None or adjustment.job is not self._job:
             return
-        if whole_map.is_due(frame):
-            whole_map.answer, self._found = self._found.result(), None
+        if adjustment.is_due(frame):
+            adjustment.result, self._result = self._result.result(), None
 
 
 def _keyframe(
@@ -217,7 +223,7 @@ def warm_up() -> None:
         mapper.process(Frame(frame, 33_333_333 * frame, tracks, grey, colour))
     none = np.zeros((0, 2), np.int64)
     loop = Loop(old=0, new=5, S_old_new=np.eye(4), rows=none.astype(np.int32), ids=none)
-    mapper.whole_map.loops.append(loop)
+    mapper.global_adjustment.loops.append(loop)
     mapper.finish()
     # What few frames need: a pose that no prediction led to, points that have merged.
     px = camera.project(points).astype(np.float32)

@@ -21,6 +21,7 @@ from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.first_map import Start, WaitingFrame
 from pliant.algorithms.mapping.frame import IdealFrame
 from pliant.algorithms.mapping.frame_focal import refocused
+from pliant.algorithms.mapping.global_adjustment import AdjustmentResult, GlobalAdjustment, held
 from pliant.algorithms.mapping.kept_map import Origin, keep, spans_of, take_in
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.known_places import KnownPlaces, Meetings, join
@@ -30,7 +31,6 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.relocalisation import Recognised
 from pliant.algorithms.mapping.segment import Moved, Segment, see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, is_guess
-from pliant.algorithms.mapping.whole_map import Answer, WholeMap, held
 from pliant.algorithms.places import describe
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracks import FrameTracks
@@ -39,7 +39,7 @@ from pliant.algorithms.tracks import FrameTracks
 class Atlas:
     """points: of all segments.   calibration: of the camera.   active: the segment that it is in;
     None: in none.   segment: number of that, or of the last one; -1 before the first.
-    whole_map: the adjustment beside the frames.   places: where the camera may be recognised.
+    global_adjustment: of the active segment.   places: where the camera may be recognised.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Atlas:
         self.calibration = calibration
         self.active: ActiveMap | None = None
         self.segment = -1
-        self.whole_map = WholeMap()
+        self.global_adjustment = GlobalAdjustment()
         self.places = KnownPlaces()
         self._parameters = parameters
         self._earlier = EarlierSegments()
@@ -109,7 +109,7 @@ class Atlas:
         self.calibration = calibration
         active = self._enter(Segment(id=self._next_segment, points=self.points))
         self._next_segment += 1
-        self._forget_questions()
+        self._forget_jobs()
         active.begin(start, waiting, latest)
         self._adjusted = True  # not all of its keyframes are in the window
         self.calibrate()
@@ -124,9 +124,9 @@ class Atlas:
         self._spans.append((self._next_keyframe, segment.id))
         return self.active
 
-    def _forget_questions(self) -> None:
-        """They were asked of the segment that the camera was in before."""
-        self.whole_map = WholeMap()
+    def _forget_jobs(self) -> None:
+        """They are of the segment that the camera was in before."""
+        self.global_adjustment = GlobalAdjustment()
         self.places.enter()
 
     def recognise(self, grey: U8, maxima: F32, generator: np.random.Generator) -> Recognised | None:
@@ -149,9 +149,9 @@ class Atlas:
         self.leave()
         active = self._enter(self._earlier.take(seen.segment))
         if stays:
-            self.whole_map.withdraw()  # nobody knows how what is new would move
+            self.global_adjustment.withdraw()  # nobody knows how what is new would move
         else:
-            self._forget_questions()
+            self._forget_jobs()
         active.look_with(seen)
         active.links.follow(ids, self.points)
 
@@ -179,27 +179,27 @@ class Atlas:
             return
         segment, view = self.active.segment, self.calibration.view
         seen, earlier = describe(frame.image), self._earlier.like(self.calibration)
-        self.whole_map.loops += self.places.compare(
+        self.global_adjustment.loops += self.places.compare(
             keyframe, seen, segment,
             earlier if self._adjusts else [], view, self._parameters,
-            loops=self._adjusts and not self.whole_map.closing,
+            loops=self._adjusts and not self.global_adjustment.closing,
             image=(frame.tracks.maxima, frame.image) if is_confirmed else None,
         )  # fmt: skip
         self.places.remember(keyframe, seen, [segment, *earlier], view)
 
-    def ask(self, frame: int) -> None:
+    def request(self, frame: int) -> None:
         """Ask for the adjustment of the map as it is after a frame, where that is due."""
         if self.active is not None and self._adjusts:
-            self._ask(frame, self.active)
+            self._request(frame, self.active)
 
-    def _ask(self, frame: int, active: ActiveMap) -> None:
-        self.whole_map.ask(frame, active.segment, self.calibration, self._parameters)
+    def _request(self, frame: int, active: ActiveMap) -> None:
+        self.global_adjustment.request(frame, active.segment, self.calibration, self._parameters)
 
     def catch_up(self, frame: int) -> list[Moved]:
         """Take over, before a frame, what the keyframes and the adjustment have found."""
         moved = self._join_met(frame)
-        answer = self.whole_map.take(frame)
-        return moved if answer is None else [*moved, *self.take_over(answer)]
+        result = self.global_adjustment.take(frame)
+        return moved if result is None else [*moved, *self.take_over(result)]
 
     def _join_met(self, frame: int) -> list[Moved]:
         """Become one with an earlier segment that has been met."""
@@ -209,8 +209,8 @@ class Atlas:
         segments = [self._earlier.segment_of(loop.old) for loop in proved]
         met = [loop for loop, of in zip(proved, segments, strict=True) if of == segments[0]]
         earlier = self._earlier.take(segments[0])
-        self.whole_map.withdraw()
-        self.whole_map.loops += met
+        self.global_adjustment.withdraw()
+        self.global_adjustment.loops += met
         moved = join(self.active, earlier, met, self._spans, self.calibration)
         self.segment = self.active.segment.id
         spans = [(k, self.segment if of == moved.gone else of) for k, of in self._spans]
@@ -218,28 +218,28 @@ class Atlas:
         self.places.enter()
         self.active.room = self._earlier.share_room(self.points, self._parameters.window)
         assert moved.moves is not None
-        self.whole_map.move(moved.moves)
-        self._ask(frame, self.active)
+        self.global_adjustment.move(moved.moves)
+        self._request(frame, self.active)
         return [moved]
 
-    def take_over(self, answer: Answer) -> list[Moved]:
+    def take_over(self, result: AdjustmentResult) -> list[Moved]:
         """Go on with what the adjustment of the whole map has found."""
         assert self.active is not None
-        self.places.comparisons.refused += answer.refused
-        self.places.comparisons.closed += len(answer.loops)
+        self.places.comparisons.refused += result.refused
+        self.places.comparisons.closed += len(result.loops)
         moved: list[Moved] = []
-        if answer.moves is not None:
-            same_places = tuple((loop.old, loop.new) for loop in answer.loops)
-            moves = self.active.segment.given_up.together_with(answer.moves)
+        if result.moves is not None:
+            same_places = tuple((loop.old, loop.new) for loop in result.loops)
+            moves = self.active.segment.given_up.together_with(result.moves)
             at_end = self.move(held(moves, self._spans, self.segment))
-            self.active.segment.adjusted = int(answer.moves.keyframe_ids[-1])
+            self.active.segment.adjusted = int(result.moves.keyframe_ids[-1])
             moved = [at_end._replace(same_places=same_places)]
-            for loop in answer.loops:
+            for loop in result.loops:
                 self.active.join(loop)
-        before, self.calibration = self.calibration, answer.calibration
-        if len(answer.refocus):
-            refocus = self._refocus(answer)
-            log_focal = before.log_focal + float(refocus[-1]) if answer.calibration.changes else 0.0
+        before, self.calibration = self.calibration, result.calibration
+        if len(result.refocus):
+            refocus = self._refocus(result)
+            log_focal = before.log_focal + float(refocus[-1]) if result.calibration.changes else 0.0
             self.calibration = replace(self.calibration, log_focal=log_focal)
             return [*moved, self._change_lens(self.active, before, refocus)]
         if not self.calibration.sees_like(before):
@@ -249,15 +249,15 @@ class Atlas:
         self.active.segment.unroll(self.active.keyframes, self.calibration)
         return moved
 
-    def _refocus(self, answer: Answer) -> F64:
+    def _refocus(self, result: AdjustmentResult) -> F64:
         """(K,) by how much the log focal length of each keyframe changes: newer ones follow the
-        last that was asked for, and all lose theirs where it turns out to be the same for all."""
+        last of the job, and all lose theirs where it turns out to be the same for all."""
         assert self.active is not None
-        assert answer.moves is not None
-        if not answer.calibration.changes:
+        assert result.moves is not None
+        if not result.calibration.changes:
             return -np.array([keyframe.log_focal for keyframe in self.active.keyframes])
         ids = [keyframe.id for keyframe in self.active.keyframes]
-        return np.interp(ids, answer.moves.keyframe_ids, answer.refocus)
+        return np.interp(ids, result.moves.keyframe_ids, result.refocus)
 
     def _change_lens(
         self, active: ActiveMap, before: SelfCalibration, refocus: F64 | None = None
@@ -292,7 +292,7 @@ class Atlas:
         before = self.calibration
         self.calibration = refocused(self.active, before, motion, stamp_ns, tracks)
         if self.calibration.changes and not before.changes:
-            self.whole_map.due = 0.0  # how the map is bent is to be found at once
+            self.global_adjustment.due = 0.0  # how the map is bent is to be found at once
 
     def calibrate(self) -> list[Moved]:
         """Adjust the whole segment with its calibration where that is a guess, and due."""
@@ -302,7 +302,7 @@ class Atlas:
         due = len(active.keyframes) >= self.calibration.next_keyframes
         if not (due and self._adjusts):
             return []
-        self.whole_map = WholeMap()  # what was asked is of another map
+        self.global_adjustment = GlobalAdjustment()  # the job is of another map
         return [self._adjust(active)]
 
     def _adjust(self, active: ActiveMap) -> Moved:
@@ -315,7 +315,7 @@ class Atlas:
 
     def stay(self) -> None:
         """Forget what is about to move the map: nobody has it yet."""
-        self.whole_map, self.places.meetings = WholeMap(), Meetings()
+        self.global_adjustment, self.places.meetings = GlobalAdjustment(), Meetings()
 
     def finish(self, timer: StageTimer = no_stages) -> list[Moved]:
         """What is still to be corrected at the end of the stream."""
@@ -335,12 +335,12 @@ class Atlas:
 
     def _close_at_last(self, active: ActiveMap) -> list[Moved]:
         """Close the loops that are still open."""
-        self.whole_map.withdraw()  # the final adjustment does what was asked for
-        if not self.whole_map.loops:
+        self.global_adjustment.withdraw()  # the final adjustment does its work
+        if not self.global_adjustment.loops:
             return []
-        self._ask(0, active)
-        answer = self.whole_map.settle()
-        return [] if answer is None else self.take_over(answer)
+        self._request(0, active)
+        result = self.global_adjustment.settle()
+        return [] if result is None else self.take_over(result)
 
     def _adjust_at_last(self, active: ActiveMap) -> list[Moved]:
         """Adjust the segment that the camera was in last, in the frame of its beginning."""

@@ -46,7 +46,7 @@ _MIN_DEPTH = 1e-6
 
 
 @dataclass(kw_only=True)
-class ListedMap:
+class ObservationList:
     """What the keyframes see of the map, keyframe by keyframe, and the state of both.
 
     rows: (N,) of the points.     xyz: (N, 3).     T_world_camera: (M, 4, 4).
@@ -75,7 +75,7 @@ class ListedMap:
         """The pixels, which are those of the ideal camera of a view, become those of the image."""
         self.px = view.magnified(view.seen(self.px), self.log_focal[self.camera])
 
-    def most_seen(self, per_keyframe: int) -> "ListedMap":
+    def most_seen(self, per_keyframe: int) -> "ObservationList":
         """With the fewest points, those that most keyframes see first, that leave every keyframe
         so many of its own, or all that another one sees, too."""
         counts = np.bincount(self.point, minlength=len(self.rows))
@@ -186,7 +186,7 @@ def adjust_keyframes(
     are at infinity, and how what hangs on each keyframe moves.
     """
     given, before = known, known.view
-    seen = list_map(keyframes, points, known, parameters)
+    seen = list_observations(keyframes, points, known, parameters)
     seen.see_by(before)
     if parameters.calibration.sigmas.any():
         seen.flow = readout_flow(
@@ -194,7 +194,7 @@ def adjust_keyframes(
         )
     iterations = parameters.window.final_iterations
     poses, depths = seen.T_world_camera.copy(), seen.depths()
-    found = adjust_listed(
+    found = adjust_list(
         seen, known, parameters, iterations=iterations, start=known.correction, varying=True
     )
     known = known.corrected(found.correction, found.covariance, len(keyframes))
@@ -222,8 +222,8 @@ def adjust_keyframes(
     return known, seen.rows[(count < 2) | far], moves
 
 
-def adjust_listed(
-    seen: ListedMap,
+def adjust_list(
+    seen: ObservationList,
     known: SelfCalibration,
     parameters: MappingParameters,
     *,
@@ -268,12 +268,12 @@ def adjust_listed(
     return found
 
 
-def list_map(
+def list_observations(
     keyframes: list[Keyframe],
     points: Landmarks,
     known: SelfCalibration,
     parameters: MappingParameters,
-) -> ListedMap:
+) -> ObservationList:
     """px: as the rolling shutter saw them.   known: of the camera, whose pixels the keyframes have.
     parameters: of the adjustment that follows.
     """
@@ -290,7 +290,7 @@ def list_map(
     order = np.argsort(points.first_keyframe[rows], kind="stable")
     rows = rows[order]
     number[rows] = np.arange(len(rows), dtype=np.int32)
-    return ListedMap(
+    return ObservationList(
         rows=rows,
         xyz=points.xyz[rows],
         T_world_camera=np.array([keyframe.T_world_camera for keyframe in keyframes]),
@@ -328,7 +328,7 @@ def _spread_out(point: I32, counts: I64, most: int) -> BoolArray:
 
 
 def _problem(
-    seen: ListedMap, chosen: BoolArray, kept: BoolArray, camera: PinholeCamera
+    seen: ObservationList, chosen: BoolArray, kept: BoolArray, camera: PinholeCamera
 ) -> BundleProblem:
     """Of the chosen points and kept observations; the first keyframe does not move."""
     number = np.cumsum(chosen, dtype=np.int32) - 1
@@ -347,7 +347,7 @@ def _problem(
 
 
 def _forget_outliers(
-    seen: ListedMap,
+    seen: ObservationList,
     keyframes: list[Keyframe],
     points: Landmarks,
     camera: PinholeCamera,
@@ -366,7 +366,7 @@ def _forget_outliers(
 
 
 def _update_statistics(
-    seen: ListedMap, good: BoolArray, count: I64, points: Landmarks, camera: PinholeCamera
+    seen: ObservationList, good: BoolArray, count: I64, points: Landmarks, camera: PinholeCamera
 ) -> None:
     """Keyframes, parallax and uncertainty of the points, as ``MapDelta`` defines them."""
     rows, N = seen.rows, len(seen.rows)

@@ -25,6 +25,7 @@ from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.covisibility import marks_fewer
+from pliant.algorithms.mapping.global_adjustment import held
 from pliant.algorithms.mapping.kept_map import features_for
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
@@ -39,7 +40,6 @@ from pliant.algorithms.mapping.relocalisation import (
 from pliant.algorithms.mapping.same_place import Refusal, same_place
 from pliant.algorithms.mapping.segment import Moved, Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.whole_map import held
 from pliant.algorithms.places import Features, PlaceIndex, describe
 
 _WITHIN = 3

@@ -18,6 +18,7 @@ from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, 
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.frame import Frame, IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.frame_pose import localise, reacquire_points, to_global_shutter
+from pliant.algorithms.mapping.global_adjustment import GlobalAdjustment
 from pliant.algorithms.mapping.kept_map import known_camera, take_in
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.known_places import KnownPlaces
@@ -30,7 +31,6 @@ from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import Recognised, is_same_pose
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
-from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
 
 _LOOK_TURN_RAD = np.radians(5.0)
@@ -56,7 +56,7 @@ class Localiser:
         self.calibration = known_camera(known, camera) or SelfCalibration.of(
             camera, parameters.calibration
         )
-        self.whole_map = WholeMap()
+        self.global_adjustment = GlobalAdjustment()
         self._generator = np.random.default_rng(seed)
         self._points = Landmarks()
         self._changes = MapChanges()

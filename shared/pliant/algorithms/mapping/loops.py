@@ -14,7 +14,7 @@ from pliant.algorithms.arrays import F64, I32, I64, BoolArray
 from pliant.algorithms.bundle.pose_graph import Edges, optimise_pose_graph
 from pliant.algorithms.geometry import inverse, matrix_to_similarity
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.final_adjustment import ListedMap
+from pliant.algorithms.mapping.final_adjustment import ObservationList
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.compiler.kernel import kernel
 
@@ -57,7 +57,7 @@ class Loop(NamedTuple):
 
 
 def close_loops(
-    seen: ListedMap, keyframe_ids: I64, sigmas: F64, loops: list[Loop], focal_px: float
+    seen: ObservationList, keyframe_ids: I64, sigmas: F64, loops: list[Loop], focal_px: float
 ) -> tuple[MapMoves, list[Loop]]:
     """How the map moves with its keyframes where loops are closed; the first one stays.
 
@@ -74,7 +74,9 @@ def close_loops(
     return MapMoves(keyframe_ids=keyframe_ids, moves=moves), accepted
 
 
-def _edges(seen: ListedMap, sigmas: F64, loops: list[Loop], ends: I32, focal_px: float) -> Edges:
+def _edges(
+    seen: ObservationList, sigmas: F64, loops: list[Loop], ends: I32, focal_px: float
+) -> Edges:
     """Between keyframes that follow each other or meet again, then the loops.
 
     Where the camera was lost between two that follow each other, where the second one lies is known

@@ -28,6 +28,7 @@ from pliant.algorithms.mapping.frame_pose import (
     to_global_shutter,
     tracks_to_points,
 )
+from pliant.algorithms.mapping.global_adjustment import GlobalAdjustment
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.keyframe_rule import is_due
@@ -48,7 +49,6 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_sta
 from pliant.algorithms.mapping.start import impatient
 from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
 from pliant.algorithms.mapping.waiting import Waiting, earlier_poses, returned_poses
-from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
 
 _LEAST_LOST = 3
@@ -103,9 +103,9 @@ class Mapper:
         return self.calibration.view.camera
 
     @property
-    def whole_map(self) -> WholeMap:
-        """The adjustment of the whole map beside the frames."""
-        return self.atlas.whole_map
+    def global_adjustment(self) -> GlobalAdjustment:
+        """Of the segment that the camera is in."""
+        return self.atlas.global_adjustment
 
     @property
     def point_count(self) -> int:
@@ -151,7 +151,7 @@ class Mapper:
         self._lost_frames = 0
         self._go_on_from(active, placed, self._motion.then)
         if self._keyframe_is_new:
-            self.atlas.ask(frame.number)
+            self.atlas.request(frame.number)
         return self._publish_placed(placed)
 
     def _catch_up(self, frame: Frame, timer: StageTimer) -> IdealFrame:

@@ -3,7 +3,7 @@
 The second one is taken as a session whose segments all lie before us: its keyframes are compared
 with the places of the first map as those of a new segment are (``known_places``), what is proved
 moves it into the world of the first one, and what is left between the two its loops take out, with
-the adjustment of the whole map (``loops``, ``whole_map``).
+the adjustment of the whole map (``loops``, ``global_adjustment``).
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.mapping.active_map import ActiveMap
+from pliant.algorithms.mapping.global_adjustment import GlobalAdjustment, held
 from pliant.algorithms.mapping.kept_map import (
     Origin,
     corrected_as,
@@ -28,7 +29,6 @@ from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.segment import Segment, bend
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.whole_map import WholeMap, held
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +85,7 @@ class _Merging:
                 bend(each, before[each.id], calibration.view)
         self._worlds = [each for each in segments if each.id in numbers]
         self._rest = [each for each in segments if each.id not in numbers]
-        self._proved = WholeMap()
+        self._proved = GlobalAdjustment()
 
     def result(self) -> Merged | None:
         """What has become of both."""
@@ -159,12 +159,12 @@ class _Merging:
 
     def _close(self, segment: Segment, loops: list[Loop]) -> SelfCalibration:
         """Take out what is left between maps that were joined.  Returns what is known then."""
-        active, closing = self._active(segment), WholeMap(loops=loops)
-        closing.ask(0, segment, self._calibration, self._parameters)
-        answer = closing.settle()
-        if answer is not None and answer.moves is not None:
-            segment.move(held(answer.moves, self._spans, segment.id))
-            for loop in answer.loops:
+        active, closing = self._active(segment), GlobalAdjustment(loops=loops)
+        closing.request(0, segment, self._calibration, self._parameters)
+        result = closing.settle()
+        if result is not None and result.moves is not None:
+            segment.move(held(result.moves, self._spans, segment.id))
+            for loop in result.loops:
                 active.join(loop)
         active.collect_garbage()
         return segment.adjust(self._calibration, self._parameters)[0]

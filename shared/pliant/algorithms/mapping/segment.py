@@ -12,8 +12,8 @@ It goes on under another lens where the adjustment of the whole map has found th
 wrong.  Tracks come as pixels of the rectified image, and the mapper works on those of an ideal
 camera, see ``self_calibration``.  So what keyframes have seen is moved to where the new ideal
 camera sees it, and a point to where the keyframe on which it hangs sees it, as far away as it was:
-how distances change, the moves of ``whole_map`` say.  What is left, the adjustment of the window
-takes out.
+the moves of ``global_adjustment`` say how distances change.  The adjustment of the window takes out
+what is left.
 """
 
 from dataclasses import dataclass, field

@@ -17,12 +17,12 @@ from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.mapping.first_map import keep_waiting
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.global_adjustment import GlobalAdjustment
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import is_guess, widened
-from pliant.algorithms.mapping.whole_map import WholeMap
 from pliant.algorithms.stages import StageTimer, no_stages
 
 _KNOWN = 0.01
@@ -102,9 +102,9 @@ class TrialMapper:
         return self._mapper.waiting_frames
 
     @property
-    def whole_map(self) -> WholeMap:
-        """As ``Mapper.whole_map``."""
-        return self._mapper.whole_map
+    def global_adjustment(self) -> GlobalAdjustment:
+        """As ``Mapper.global_adjustment``."""
+        return self._mapper.global_adjustment
 
     @property
     def point_count(self) -> int:

@@ -1,22 +1,22 @@
-"""The whole map, adjusted beside the frames: when it is asked for, found, and taken over.
+"""Global bundle adjustment, in parallel with tracking: when it is requested, run, and applied.
 
-The window corrects what is new; what drifts beyond it only all keyframes together can tell.  Their
-adjustment takes longer than a frame, so it works on a copy of the map and its result is taken over
-a number of frames later that the size of the map decides.  How long it took decides nothing: who
-has not got it by then waits.
-Where the shutter may roll it begins with the first keyframes: they tell the readout.
+The window corrects what is new.  Drift beyond it takes all keyframes.  Their adjustment takes
+longer than a frame, so it works on a copy of the map.  Its result is applied a number of frames
+later that the size of the map decides, not the time that it took: whoever does not have it by then
+waits.  Where the shutter may roll the first adjustment comes with the first keyframes, for the
+readout.
 
 Meanwhile the map has grown and the window has moved.  So the result is not where the points are,
 but how the map around each keyframe moves: one similarity for each, as drift is small within what
-a keyframe sees.  The keyframes that were in the window do, too: in a map of a few dozen most of the
-drift is there.  What is newer moves rigidly with the last of them.  All of it moves as little as it
-can, so that poses from before and after fit together; at the end the beginning is back in its place
-(``Segment.strayed``).  Lens, focal length and readout are found anew each time, and used for what
-comes next once they are certainly other than those in use.
+a keyframe sees.  The keyframes that were in the window move, too: in a map of a few dozen most of
+the drift is there.  What is newer moves rigidly with the last of them.  All of it moves as little
+as it can, so that poses from before and after fit together; at the end the beginning is back in
+its place (``Segment.strayed``).  Lens, focal length and readout are estimated anew each time, and
+used for what comes next once they certainly differ from those in use.
 
-A place that is recognised asks at once, and is answered sooner: the graph of ``loops`` says how the
-map moves, and an adjustment, asked for at once, does the rest.  Where the graph refuses all loops
-nothing has been learnt, and nothing moves.
+A loop requests an adjustment at once, and gets its result sooner: the pose graph of ``loops`` says
+how the map moves, and an adjustment after it does the rest.  Where the graph refuses all loops
+nothing moves.
 """
 
 from dataclasses import dataclass, field, replace
@@ -29,9 +29,9 @@ from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.bundle.problem import BundleResult, CalibrationUncertainty
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.final_adjustment import (
-    ListedMap,
-    adjust_listed,
-    list_map,
+    ObservationList,
+    adjust_list,
+    list_observations,
     moves_between,
 )
 from pliant.algorithms.mapping.loops import Loop, close_loops
@@ -51,8 +51,8 @@ _NONE: F64 = np.zeros(0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Question:
-    """A copy of the map of a frame, to be adjusted.
+class AdjustmentJob:
+    """A copy of the map as it is after a frame, to be adjusted.
 
     keyframe_ids: (M,).   seen: what they see.   known: of the camera; ``seen`` has pixels of the
     rectified image.   loops: to be closed; where there are none all of it is adjusted.
@@ -61,7 +61,7 @@ class Question:
 
     frame: int
     keyframe_ids: I64
-    seen: ListedMap
+    seen: ObservationList
     known: SelfCalibration
     parameters: MappingParameters
     loops: list[Loop] = field(default_factory=list)
@@ -70,7 +70,7 @@ class Question:
 
     @property
     def distance_frames(self) -> int:
-        """Frames after which the answer is taken over: the time that it takes to find grows with
+        """Frames after which the result is taken over: the time that it takes to find grows with
         the observations."""
         limits = self.parameters.whole_map
         # Few keyframes take little time, and say what those that follow wait for.
@@ -79,7 +79,7 @@ class Question:
         return round(_GRAPH_SHARE * distance) if self.loops else distance
 
 
-class Answer(NamedTuple):
+class AdjustmentResult(NamedTuple):
     """How the map moves, None where it does not; the loops that were closed, whose points are to be
     joined; what is known of the camera by now; how many loops the others contradict; by how much
     the log focal length of each keyframe changes, (0,) where it is the same for all."""
@@ -92,34 +92,34 @@ class Answer(NamedTuple):
 
 
 @dataclass(kw_only=True)
-class WholeMap:
-    """Asks for an adjustment whenever the segment has grown by a share: all of them together cost
+class GlobalAdjustment:
+    """Requests an adjustment whenever the segment has grown by a share: all of them together cost
     a small multiple of the last.
 
-    due: keyframes made at which it asks again.    question: asked, and not yet taken over.
-    answer: of the question, where somebody has found it already.    loops: to be closed by the
-    next question, alone.    closed: whether some have been, and nothing was adjusted since.
+    due: keyframes made at which it requests the next.    job: requested, and not yet applied.
+    result: of the job, where a worker has finished it.    loops: to be closed by the next job,
+    alone.    closed: whether some have been, and nothing was adjusted since.
     """
 
     due: float = 0.0
-    question: Question | None = None
-    answer: Answer | None = None
+    job: AdjustmentJob | None = None
+    result: AdjustmentResult | None = None
     loops: list[Loop] = field(default_factory=list)
     closed: bool = False
 
     @property
     def closing(self) -> bool:
         """Whether loops are being closed."""
-        return self.question is not None and len(self.question.loops) > 0
+        return self.job is not None and len(self.job.loops) > 0
 
-    def ask(
+    def request(
         self,
         frame: int,
         segment: Segment,
         calibration: SelfCalibration,
         parameters: MappingParameters,
     ) -> None:
-        """Ask for the adjustment of the map as it is after a frame, where that is due."""
+        """Request the adjustment of the map as it is after a frame, where that is due."""
         camera = calibration.view.camera
         window, growth = parameters.window.keyframes, parameters.whole_map.growth
         count = len(segment.keyframes)
@@ -130,7 +130,7 @@ class WholeMap:
         # The window would move with what was there before the camera was recognised.
         early = early or (segment.since > 0 and count - segment.since <= window)
         early = early and not self.closed
-        if self.question is not None or (early and not self.loops):
+        if self.job is not None or (early and not self.loops):
             return
         points = segment.points
         keyframe_ids = np.array([keyframe.id for keyframe in segment.keyframes], np.int64)
@@ -143,7 +143,7 @@ class WholeMap:
             if early:
                 return
             self.due = (1.0 + growth) * count + (made - count)
-        seen = list_map(segment.keyframes, points, calibration, parameters)
+        seen = list_observations(segment.keyframes, points, calibration, parameters)
         if not loops:
             seen = seen.most_seen(parameters.whole_map.points_per_keyframe)
         seen.see_by(calibration.view)
@@ -152,7 +152,7 @@ class WholeMap:
                 seen.T_world_camera, segment.path.motions(segment.keyframes), seen.xyz, seen.camera,
                 seen.point, seen.px, camera,
             )  # fmt: skip
-        self.question = Question(
+        self.job = AdjustmentJob(
             frame=frame,
             keyframe_ids=keyframe_ids,
             seen=seen,
@@ -165,33 +165,33 @@ class WholeMap:
         self.closed = self.closed and len(loops) > 0
 
     def withdraw(self) -> None:
-        """What was asked is not taken over; its loops are asked for again."""
-        if self.question is not None:
-            self.loops = [*self.question.loops, *self.loops]
-            self.closed = self.closed or self.question.closed
-        self.question = self.answer = None
+        """Drop the job; the next one closes its loops."""
+        if self.job is not None:
+            self.loops = [*self.job.loops, *self.loops]
+            self.closed = self.closed or self.job.closed
+        self.job = self.result = None
 
     def is_due(self, frame: int) -> bool:
-        """Whether the answer is taken over before a frame is worked on."""
-        question = self.question
-        if question is None:
+        """Whether the result is applied before a frame is worked on."""
+        job = self.job
+        if job is None:
             return False
-        return frame >= question.frame + question.distance_frames
+        return frame >= job.frame + job.distance_frames
 
-    def take(self, frame: int) -> Answer | None:
-        """What was found, where it is taken over before a frame is worked on."""
+    def take(self, frame: int) -> AdjustmentResult | None:
+        """The result, where it is applied before a frame is worked on."""
         return self.settle() if self.is_due(frame) else None
 
-    def settle(self) -> Answer | None:
-        """As ``take``, no matter how long ago it was asked."""
-        if self.question is None:
+    def settle(self) -> AdjustmentResult | None:
+        """As ``take``, no matter how long ago it was requested."""
+        if self.job is None:
             return None
-        answer = find_moves(self.question) if self.answer is None else self.answer
-        self.question = self.answer = None
-        if answer.moves is not None:
-            self.move(answer.moves)
-        self.closed = self.closed or len(answer.loops) > 0
-        return answer
+        result = find_moves(self.job) if self.result is None else self.result
+        self.job = self.result = None
+        if result.moves is not None:
+            self.move(result.moves)
+        self.closed = self.closed or len(result.loops) > 0
+        return result
 
     def move(self, moves: MapMoves) -> None:
         """The worlds that loops tell of have moved."""
@@ -200,41 +200,43 @@ class WholeMap:
             self.loops[n] = loop._replace(S_old_new=old @ loop.S_old_new @ np.linalg.inv(new))
 
 
-def find_moves(question: Question) -> Answer:
+def find_moves(job: AdjustmentJob) -> AdjustmentResult:
     """How each keyframe moves with what hangs on it, and the readout."""
-    if question.loops:
-        return _close(question)
-    before, xyz = question.seen.T_world_camera, question.seen.xyz
-    depths = question.seen.depths()
-    seen = replace(question.seen, T_world_camera=before.copy(), xyz=xyz.copy())
-    known, parameters = question.known, question.parameters
-    found = adjust_listed(
+    if job.loops:
+        return _close(job)
+    before, xyz = job.seen.T_world_camera, job.seen.xyz
+    depths = job.seen.depths()
+    seen = replace(job.seen, T_world_camera=before.copy(), xyz=xyz.copy())
+    known, parameters = job.known, job.parameters
+    found = adjust_list(
         seen, known, parameters, iterations=parameters.whole_map.iterations, start=known.in_use,
         varying=True,
     )  # fmt: skip
     after = _learned(known, found, parameters.calibration)
     # A window that is half of the map does as well, unless it did not know the camera or the loops.
     bent = (known.readout == 0.0 and after.readout != 0.0) or not after.sees_like(known)
-    refocus = seen.log_focal - question.seen.log_focal
-    bent = bent or question.closed or after.changes or bool(refocus.any())
-    moving = bent or len(question.keyframe_ids) >= 2 * parameters.window.keyframes
-    nothing = Answer(None, [], known, 0)  # poses that are not finite would spread to the whole map
+    refocus = seen.log_focal - job.seen.log_focal
+    bent = bent or job.closed or after.changes or bool(refocus.any())
+    moving = bent or len(job.keyframe_ids) >= 2 * parameters.window.keyframes
+    nothing = AdjustmentResult(
+        None, [], known, 0
+    )  # poses that are not finite would spread to the whole map
     if not np.isfinite(seen.T_world_camera).all():
         return nothing
-    moves = _moves(question, seen, before, depths) if moving else None
+    moves = _moves(job, seen, before, depths) if moving else None
     if moves is not None and not np.isfinite(moves.moves).all():
         return nothing
-    return Answer(moves, [], after, 0, refocus if refocus.any() else _NONE)
+    return AdjustmentResult(moves, [], after, 0, refocus if refocus.any() else _NONE)
 
 
-def _close(question: Question) -> Answer:
+def _close(job: AdjustmentJob) -> AdjustmentResult:
     """What the graph makes of the loops; nothing where it refuses all of them."""
     moves, loops = close_loops(
-        question.seen, question.keyframe_ids, question.sigmas, question.loops,
-        question.known.view.camera.fx,
+        job.seen, job.keyframe_ids, job.sigmas, job.loops,
+        job.known.view.camera.fx,
     )  # fmt: skip
-    refused = len(question.loops) - len(loops)
-    return Answer(moves if loops else None, loops, question.known, refused)
+    refused = len(job.loops) - len(loops)
+    return AdjustmentResult(moves if loops else None, loops, job.known, refused)
 
 
 def _learned(
@@ -269,7 +271,7 @@ def _without_prior(
     return readout / share, float(sigma / np.sqrt(share))
 
 
-def _moves(question: Question, seen: ListedMap, before: F64, depths: F64) -> MapMoves:
+def _moves(job: AdjustmentJob, seen: ObservationList, before: F64, depths: F64) -> MapMoves:
     """How the map moves, which is as little as it can.
 
     Nothing holds its place, turn and scale.  Held by its beginning, which is known least, all that
@@ -290,7 +292,7 @@ def _moves(question: Question, seen: ListedMap, before: F64, depths: F64) -> Map
     s = both / ((new_from_mean**2).sum() + d**2 * (scales**2).sum())
     T[:, :3, :3] = R @ T[:, :3, :3]
     T[:, :3, 3] = c.mean(axis=0) + s * new_from_mean
-    return moves_between(question.keyframe_ids, before, T, s * scales)
+    return moves_between(job.keyframe_ids, before, T, s * scales)
 
 
 def held(moves: MapMoves, spans: list[tuple[int, int]], segment: int) -> MapMoves:

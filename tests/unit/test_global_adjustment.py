@@ -1,4 +1,4 @@
-"""Adjustments of the whole map beside the frames: asked, found, taken over, and folded."""
+"""Global bundle adjustment: requested, run in parallel, applied, and folded by readers."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -17,9 +17,10 @@ from pliant.algorithms.geometry import (
     transform,
 )
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping import whole_map
-from pliant.algorithms.mapping.final_adjustment import _spread_out, adjust_listed
+from pliant.algorithms.mapping import global_adjustment
+from pliant.algorithms.mapping.final_adjustment import _spread_out, adjust_list
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.global_adjustment import find_moves
 from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
@@ -28,11 +29,10 @@ from pliant.algorithms.mapping.parameters import (
     WindowParameters,
 )
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.whole_map import find_moves
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.map_history import MapHistory
 from pliant.state import load_state, save_state
-from pliant_services.nodes.bundle_adjustment import Beside
+from pliant_services.nodes.bundle_adjustment import AdjustmentWorker
 
 FRAMES = 150
 GROWING = MappingParameters(
@@ -53,23 +53,23 @@ def path(frames):
     return [looking((0.06 * k, 0.03 * np.sin(0.3 * k), 0.0)) for k in range(frames)]
 
 
-def fold(parameters, *, frames=FRAMES, camera=CAMERA, poses=None, beside=False, killed=False):
+def fold(parameters, *, frames=FRAMES, camera=CAMERA, poses=None, in_thread=False, killed=False):
     """The mapper, its deltas, and what a reader makes of them.
 
-    beside: the answer is found in a thread.   killed: the mapper is another one in every frame.
+    in_thread: the result is found in a thread.   killed: the mapper is another one in every frame.
     """
-    asking = Beside()
+    worker = AdjustmentWorker()
     mapper, history, deltas = Mapper(camera, parameters, 0), MapHistory(), []
     generator = np.random.default_rng(0)
     points = generator.uniform((-4.0, -3.0, 3.0), (14.0, 3.0, 9.0), (1500, 3))
     kappas = generator.uniform(5.0, 500.0, len(points)).astype(np.float32)
     tracks = Scene(points, kappas, death=0.02).frames(poses or path(frames))
     for frame, some in enumerate(tracks):
-        if killed and mapper.whole_map.question is not None:
+        if killed and mapper.global_adjustment.job is not None:
             mapper = load_state(save_state(mapper))
-        if beside:
-            asking.ask(mapper.whole_map)
-            asking.answer(mapper.whole_map, frame)
+        if in_thread:
+            worker.start(mapper.global_adjustment)
+            worker.hand_over(mapper.global_adjustment, frame)
         deltas.append(mapper.process(Frame(frame, frame * 33_000_000, some)))
         history.apply(deltas[-1], frame=frame, stamp_ns=frame)
     return mapper, deltas, history
@@ -131,8 +131,8 @@ def test_a_drifted_map_comes_back():
     drifted = error(active)
     assert drifted > 10.0 * usual
     parameters = GROWING.model_copy(update={"window": WindowParameters(keyframes=3)})
-    mapper.whole_map.ask(120, active.segment, mapper.calibration, parameters)
-    moves = find_moves(mapper.whole_map.question).moves
+    mapper.global_adjustment.request(120, active.segment, mapper.calibration, parameters)
+    moves = find_moves(mapper.global_adjustment.job).moves
     np.testing.assert_array_equal(moves.keyframe_ids, ids)  # those in the window, too
     active.move(moves)
     assert error(active) < 0.1 * drifted
@@ -141,17 +141,19 @@ def test_a_drifted_map_comes_back():
 def test_an_adjustment_that_comes_apart_moves_nothing(monkeypatch):
     mapper, _, _ = fold(AT_THE_END, frames=120)
     parameters = GROWING.model_copy(update={"window": WindowParameters(keyframes=3)})
-    mapper.whole_map.ask(120, mapper.atlas.active.segment, mapper.calibration, parameters)
+    mapper.global_adjustment.request(
+        120, mapper.atlas.active.segment, mapper.calibration, parameters
+    )
 
     def apart(seen, *arguments, **others):
-        found = adjust_listed(seen, *arguments, **others)
+        found = adjust_list(seen, *arguments, **others)
         seen.T_world_camera = np.full_like(seen.T_world_camera, np.nan)
         return found
 
-    monkeypatch.setattr(whole_map, "adjust_listed", apart)
-    answer = find_moves(mapper.whole_map.question)
-    assert answer.moves is None
-    assert answer.calibration is mapper.calibration
+    monkeypatch.setattr(global_adjustment, "adjust_list", apart)
+    result = find_moves(mapper.global_adjustment.job)
+    assert result.moves is None
+    assert result.calibration is mapper.calibration
 
 
 def test_a_map_moves_as_little_as_it_can():
@@ -162,13 +164,13 @@ def test_a_map_moves_as_little_as_it_can():
     drift = [similarity(1.004**k, (0, 0.002 * k, 0), (0, 0, 0.001 * k)) for k in range(len(ids))]
     active.move(MapMoves(keyframe_ids=ids, moves=np.array(drift)))
     parameters = GROWING.model_copy(update={"window": WindowParameters(keyframes=3)})
-    mapper.whole_map.ask(120, active.segment, mapper.calibration, parameters)
-    question = mapper.whole_map.question
-    moves = find_moves(question).moves
-    before, S = question.seen.T_world_camera, similarity_to_matrix(moves.moves)
+    mapper.global_adjustment.request(120, active.segment, mapper.calibration, parameters)
+    job = mapper.global_adjustment.job
+    moves = find_moves(job).moves
+    before, S = job.seen.T_world_camera, similarity_to_matrix(moves.moves)
     after, scales = move_by_similarity(S, before), moves.moves[:, 7]
     assert np.ptp(scales) > 0.01
-    depth = np.median(question.seen.depths())
+    depth = np.median(job.seen.depths())
     U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", before[:, :3, :3], after[:, :3, :3]))
     np.testing.assert_allclose(U @ Vt, np.eye(3), atol=1e-9)
 
@@ -226,9 +228,9 @@ def test_a_large_map_is_taken_over_later():
     """By what it has, not by how long it took; and no sooner where it is small."""
     mapper, _, _ = fold(AT_THE_END, frames=60)
     active = mapper.atlas.active
-    mapper.whole_map.ask(60, active.segment, mapper.calibration, GROWING)
-    question = mapper.whole_map.question
-    observations, keyframes = len(question.seen.px), len(question.keyframe_ids)
+    mapper.global_adjustment.request(60, active.segment, mapper.calibration, GROWING)
+    job = mapper.global_adjustment.job
+    observations, keyframes = len(job.seen.px), len(job.keyframe_ids)
     assert keyframes > 7
     for per_frame, distance in (
         (observations, 7),
@@ -237,9 +239,9 @@ def test_a_large_map_is_taken_over_later():
     ):
         limits = WholeMapParameters(distance_frames=7, observations_per_frame=per_frame)
         parameters = GROWING.model_copy(update={"whole_map": limits})
-        mapper.whole_map.question = replace(question, parameters=parameters)
-        assert not mapper.whole_map.is_due(60 + distance - 1)
-        assert mapper.whole_map.is_due(60 + distance)
+        mapper.global_adjustment.job = replace(job, parameters=parameters)
+        assert not mapper.global_adjustment.is_due(60 + distance - 1)
+        assert mapper.global_adjustment.is_due(60 + distance)
 
 
 def test_a_point_that_many_keyframes_see_is_told_of_by_some_of_all_of_the_time():
@@ -349,9 +351,9 @@ def test_readers_have_the_map_under_another_lens(mistaken):
     test_readers_have_the_map_that_the_mapper_has(mistaken)
 
 
-@pytest.mark.parametrize("how", ["beside", "killed"])
+@pytest.mark.parametrize("how", ["in_thread", "killed"])
 def test_where_the_answer_was_found_changes_nothing(mistaken, how):
-    """Of a question whose answer moves keyframes, and of one that finds a lens; large ones wait for
+    """Of a job whose result moves keyframes, and of one that finds a lens; large ones wait for
     longer than the others."""
     _, deltas, _ = mistaken
     assert sum(len(delta.moved_keyframes) > 0 for delta in deltas) > len(
