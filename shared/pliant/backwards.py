@@ -131,7 +131,7 @@ def reach_back(
     told = _Told(history, numbers, found)
     for number, source in enumerate(_backwards(dataset, numbers, room)):
         if source.stamp_ns != history.stamps_ns[source.index]:
-            raise DatasetError(f"{dataset.name}: has changed since it was read first")
+            raise DatasetError(f"{dataset.name}: has changed since the first pass")
         image = rectified(source, rectifier)
         if image.missing:
             told.take(mapper.skip(number))
@@ -267,7 +267,7 @@ def _backwards(dataset: Dataset, numbers: Sequence[int], room: int) -> Iterator[
             if source.index >= some[0]:
                 break
         if len(found) < len(some):
-            raise DatasetError(f"{dataset.name}: has fewer frames than when it was read first")
+            raise DatasetError(f"{dataset.name}: has fewer frames than in the first pass")
         yield from (found[number] for number in some)
 
 

@@ -65,11 +65,11 @@ def load_state(data: bytes) -> Any:
         release, schema, top, nodes = content
         if release != __version__:
             raise StateError(
-                f"a state of pliant {release}, this is {__version__}: go on with that release, or "
-                "start anew"
+                f"a state of pliant {release}, this is {__version__}: resume with that release, "
+                "or start again"
             )
         if schema != _schema(_find(*n[1:3]) for n in nodes if n[0] in ("object", "named", "model")):
-            raise StateError("a state whose records have other fields than here: start anew")
+            raise StateError("a state with other fields than in this release: start again")
         return _Reader(nodes).value(top)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ImportError) as error:
         raise StateError(f"a broken state: {error}") from None

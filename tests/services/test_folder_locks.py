@@ -38,7 +38,7 @@ def test_one_process_writes_a_result_folder_and_a_dead_one_holds_nobody_up(room:
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None
         holder.stdout.readline()
-        waits = f"is being written by process {holder.pid}: wait for its end$"
+        waits = f"is being written by process {holder.pid}: wait until it ends$"
         says = f"{waits[:-1]}, or choose another --output$"
         run = RunRequest(source="built-in:tiny", output=room, force=True)
         refused(lambda: run_pipeline(run), room, says)

@@ -86,12 +86,12 @@ def test_a_lock_that_is_a_link_empties_nothing(precious: Path, tmp_path: Path) -
     lock = folder / ".lock"
     for link in (os.symlink, os.link):
         link(precious, lock)
-        with pytest.raises(ResultError, match=r"\.lock is no lock of pliant: remove it$"):
+        with pytest.raises(ResultError, match=r"\.lock is not a lock of Pliant: remove it$"):
             write(folder)
         assert precious.read_text() == "precious"
         lock.unlink()
     os.mkfifo(lock)
-    with pytest.raises(ResultError, match="is no lock"):
+    with pytest.raises(ResultError, match="is not a lock"):
         write(folder)
 
 

@@ -111,7 +111,7 @@ def test_two_maps_become_one_in_which_images_are_found(office: Path, tmp_path: P
     assert pliant("run", TINY, "--start", "0.4", *NO_MESH, "--output", tuesday).returncode == 0
     done = pliant("map", "merge", office, tuesday, "--output", one)
     assert done.returncode == 0, done.stderr
-    assert "lies in segment 0 now" in done.stdout
+    assert "is now part of segment 0" in done.stdout
     told = pliant("map", "info", one).stdout
     assert "sessions: 2" in told
     assert "segment 0:" in told
@@ -136,7 +136,7 @@ def test_what_is_no_map_of_use_is_said_before_anything_is_touched(
 ) -> None:
     target = tmp_path / "there"
     for arguments, why in (
-        (("--map", tmp_path / "nowhere"), "no map there"),
+        (("--map", tmp_path / "nowhere"), "no map: pass"),
         (("--map", office / "recording.mcap"), "no map"),
         (("--map", office, "--output", office, "--force"), "is read from there"),
     ):

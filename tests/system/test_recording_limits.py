@@ -82,7 +82,7 @@ def test_a_full_disk_is_one_line_and_what_was_written_is_readable(tmp_path: Path
     )
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    assert "the disk is full; what was written stays readable" in done.stderr
+    assert "the disk is full; the recording so far stays readable" in done.stderr
     summary = summarise(tmp_path / "r")
     assert not summary.closed
     assert summary.topics[topics.EXTREMA.key].messages > 2

@@ -131,7 +131,7 @@ def test_exports_made_before_are_named(tiny_run: Path, tmp_path: Path) -> None:
     for name in ("nerfstudio", "images", "picture.png"):
         (folder / name).mkdir()
     _, told = scale_result(folder, Known(points=((-0.5, 0.0, 1.0), (0.5, 0.0, 1.0), 2.0)))
-    assert told.startswith("made before, in the old unit: trajectory_tum.txt, nerfstudio: ")
+    assert told.startswith("exports in the old unit: trajectory_tum.txt, nerfstudio: ")
     assert poses.read_bytes() == before
     assert export_result(folder, "tum", None, force=True).read_bytes() != before
 
@@ -144,7 +144,7 @@ def test_a_vertex_of_the_mesh_is_of_the_map_too(tiny_run: Path) -> None:
     some = mesh.positions[::20].tolist()
     vertex = max(some, key=lambda place: np.linalg.norm(points - place, axis=1).min())
     assert from_points(run, vertex, points[0], 1.0).metres_per_unit > 0.0
-    with pytest.raises(PliantError, match="nowhere in the map"):
+    with pytest.raises(PliantError, match="outside of the map"):
         from_points(replace(run, mesh=[]), vertex, points[0], 1.0)
 
 
@@ -183,11 +183,11 @@ def put_marker_into(sequence: Path, side_m: float) -> None:
         (Known(), "one of --points, --marker, --depth"),
         (Known(marker=0.1, depth=TINY), "one of --points, --marker, --depth"),
         (Known(marker=0.1), "keyframes see none"),
-        (Known(marker=-1.0), "no length"),
-        (Known(points=((1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 1.0)), "the two points are one"),
-        (Known(points=((1.0, 2.0, 3.0), (1.0, 2.0, 4.0), np.nan)), "no length"),
-        (Known(points=((-0.5, 0.0, 1.0), (900.0, 1.0, 1.0), 1.0)), "900,1,1 is nowhere in the map"),
-        (Known(points=((0.0, 0.0, -9.0), (0.5, 0.0, 1.0), 1.0)), "0,0,-9 is nowhere in the map"),
+        (Known(marker=-1.0), "expected a positive length"),
+        (Known(points=((1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 1.0)), "the two points are identical"),
+        (Known(points=((1.0, 2.0, 3.0), (1.0, 2.0, 4.0), np.nan)), "expected a positive length"),
+        (Known(points=((-0.5, 0.0, 1.0), (900.0, 1.0, 1.0), 1.0)), "900,1,1 is outside of the map"),
+        (Known(points=((0.0, 0.0, -9.0), (0.5, 0.0, 1.0), 1.0)), "0,0,-9 is outside of the map"),
         (Known(depth="nowhere"), "nowhere"),
     ],
 )
@@ -201,6 +201,6 @@ def test_what_tells_nothing_changes_nothing(tiny_run: Path, known: Known, says: 
 def test_a_scale_that_is_none_is_one_line(doubled: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(doubled, tmp_path / "tiny"))
     (folder / "scale.yaml").write_text("metres_per_unit: -1\nsigma: 0\nsource: nobody\n")
-    assert_one_line(in_this_process("export", folder, "--to", "tum"), "scale.yaml: no scale")
+    assert_one_line(in_this_process("export", folder, "--to", "tum"), "scale.yaml: no valid scale")
     told = in_this_process("scale", folder, "--points", "1,2", "1,2,4", 1)
     assert_one_line(told, "expected X,Y,Z", code=2)

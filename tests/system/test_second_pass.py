@@ -58,7 +58,7 @@ def test_what_was_lost_at_the_beginning_is_found(
     (output / "trajectory_segment_7.txt").write_text("of a segment that is one with another now")
     assert second_pass(output, request, 0) == 0
     said = capsys.readouterr()
-    assert "40 frames with a pose in 1 segment, in the first 25 frames" in said.err
+    assert "40 frames with a pose in 1 segment, in the first pass 25 frames" in said.err
     assert "all frames have a pose in one segment" in said.out
     report = json.loads((output / "report.json").read_text())
     assert report["frames_with_pose"] == report["frames"] == 40

@@ -275,7 +275,7 @@ def test_a_second_service_of_the_same_name_takes_over() -> None:
     peers.on_token(f"pliant/s/{token_key('tracking', 4)}", alive=True, now=0.0)
     peers.raise_if_refused()
     peers.on_token(f"pliant/s/{token_key('tracking', 6)}", alive=True, now=0.0)
-    with pytest.raises(BusError, match="took over"):
+    with pytest.raises(BusError, match="has replaced this one"):
         peers.raise_if_refused()
 
 

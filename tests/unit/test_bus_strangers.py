@@ -82,7 +82,7 @@ def test_what_is_no_message_is_counted_told_and_asked_for_again(endpoint: str) -
     assert result == [None]
     assert frames == list(range(3 * WINDOW))
     assert (box.refused, box.early) == (3, 1)
-    assert "tracking: messages passed over: camera/image" in said[0]
+    assert "tracking: ignored messages: camera/image" in said[0]
 
 
 def test_a_credit_of_nobody_is_refused(endpoint: str) -> None:

@@ -79,7 +79,7 @@ def test_kitti_round_trip(tmp_path: Path) -> None:
     assert np.allclose(again.T_world_camera, trajectory.T_world_camera, atol=1e-7)
     assert len(read_trajectory(poses)) == len(trajectory)
     times.unlink()
-    with pytest.raises(ResultError, match="carry no times"):
+    with pytest.raises(ResultError, match="have no times"):
         read_trajectory(poses)
 
 

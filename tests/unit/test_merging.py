@@ -219,9 +219,9 @@ def test_nothing_is_written_where_it_cannot_be(
         (first, second, first, True, "is read from there"),
         (first, second, there, False, "--force"),
         (first, second, tmp_path, True, "is read from there"),
-        (first, link, new, False, "the same map twice"),
+        (first, link, new, False, "is the same map as the first"),
         (first, damaged, new, False, "damaged"),
-        (first, tmp_path / "nowhere", new, False, "no map there"),
+        (first, tmp_path / "nowhere", new, False, "no map: pass"),
         (first, blind, new, False, "shows a place of"),
     ):
         with pytest.raises(PliantError) as refused:

@@ -46,12 +46,12 @@ def test_the_first_recorder_of_a_session_stays(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(zenoh_bus, "TOKEN_LEASE_S", 0.0)
     endpoint, said = free_endpoint(), list[str]()
     with closing(open_router(endpoint)), recorder(endpoint) as first:
-        with pytest.raises(BusError, match="session s has a recorder, which stays"):
+        with pytest.raises(BusError, match="session s already has a recorder: choose"):
             recorder(endpoint, said.append)
         with recorder(endpoint, said.append, session="other"):
             pass
         first._peers.raise_if_refused()
-    assert said == ["recorder: session s has a recorder: waiting until it is gone"]
+    assert said == ["recorder: session s already has a recorder: waiting until it ends"]
 
 
 def test_a_recorder_begins_once_the_one_that_died_is_gone() -> None:

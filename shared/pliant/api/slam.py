@@ -48,7 +48,7 @@ class Slam(Mapped):
         Raises ConfigError for a setting that there is not, CalibrationError.
         """
         if camera is not None and fov is not None:
-            raise CalibrationError("camera and fov contradict each other: give one of them")
+            raise CalibrationError("camera and fov exclude each other: pass only one")
         self._camera = None if camera is None else calibration_of(camera)
         self._fov = fov
         self._config = load_config(None, overrides_of(settings), seed=seed)
@@ -84,8 +84,8 @@ class Slam(Mapped):
         stamp_ns = round(1e9 * (number / _FPS if stamp is None else stamp))
         if stamp_ns <= last_ns:
             raise DatasetError(
-                f"image {number}: its time, {1e-9 * stamp_ns:.6f} s, is not after that of the one "
-                f"before, {1e-9 * last_ns:.6f} s"
+                f"image {number}: its time {1e-09 * stamp_ns:.6f} s is not after the previous "
+                f"time {1e-09 * last_ns:.6f} s"
             )
         source = source_frame(image, self._camera, number=number, stamp_ns=stamp_ns, mask=mask)
         if self._camera is None:
@@ -101,7 +101,9 @@ class Slam(Mapped):
 
     def _step(self, source: SourceFrame) -> "Tracked":
         if self._finished:
-            raise DatasetError("the map is finished, and takes no more images: begin another Slam")
+            raise DatasetError(
+                "the map is finished and accepts no more images: create another Slam"
+            )
         if self._pipeline is None:
             assert self._camera is not None
             self._pipeline = Pipeline(self._camera, self._config, self._history)

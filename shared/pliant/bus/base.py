@@ -169,7 +169,9 @@ def join(first: Iterator[_A], second: Iterator[_B]) -> Iterator[tuple[_A, _B]]:
         b = next(second, None)
         if b is None or a.frame != b.frame:
             met = "its end" if b is None else str(b.frame)
-            raise BusError(f"frames do not join: {a.frame} of one topic met {met} of the other")
+            raise BusError(
+                f"frame numbers do not match: {a.frame} of one topic, {met} of the other"
+            )
         yield a, b
     for b in second:
-        raise BusError(f"frames do not join: {b.frame} of one topic met the end of the other")
+        raise BusError(f"frame numbers do not match: {b.frame} of one topic, the end of the other")

@@ -52,7 +52,7 @@ class Checkpoints:
                 unfinished.unlink()
         except OSError as error:
             raise BusError(
-                f"{folder}: cannot make the folder of checkpoints: {error.strerror}{_owner(folder)}"
+                f"{folder}: cannot create the checkpoint folder: {error.strerror}{_owner(folder)}"
             ) from None
         self._places = {
             place.frame: place for place in (_read_place(p) for p in folder.glob("*.state"))
@@ -74,7 +74,7 @@ class Checkpoints:
         Raises BusError where the one before could not be written.
         """
         if self._failure is not None:
-            raise BusError(f"{self._folder}: checkpoints cannot be written: {self._failure}")
+            raise BusError(f"{self._folder}: cannot write checkpoints: {self._failure}")
         counts = [dict(place.inputs), dict(place.outputs)]
         header = [_VERSION, place.frame, *counts, list(place.ended)]
         parts = (msgpack.packb(header), state)
@@ -131,8 +131,8 @@ def _owner(folder: Path) -> str:
     if own in (0, uid):
         return ""
     return (
-        f" ({there} belongs to user {uid}, this is user {own}): PLIANT_USER={uid}:{gid} for "
-        "containers, else another --state"
+        f" ({there} belongs to user {uid}, this is user {own}): set PLIANT_USER={uid}:{gid} for "
+        "containers, otherwise choose another --state"
     )
 
 

@@ -23,7 +23,7 @@ class FaultLog:
         for key, box in outputs.items():
             (new_credits,) = self._new(f"credit of {key}", (box.refused,))
             parts += [f"credit of {key} {new_credits} refused"] if new_credits else []
-        return f"{self._service}: messages passed over: {', '.join(parts)}" if parts else ""
+        return f"{self._service}: ignored messages: {', '.join(parts)}" if parts else ""
 
     def _new(self, key: str, counts: tuple[int, ...]) -> tuple[int, ...]:
         before = self._told.get(key, (0,) * len(counts))

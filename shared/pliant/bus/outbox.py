@@ -195,7 +195,7 @@ class Outbox:
         if not self._kept or self._kept[0].sequence > sequence:
             oldest = self._kept[0].sequence if self._kept else self.sent
             raise BusError(
-                f"{self.topic}: a reader asks for message {sequence}, the oldest kept is {oldest}: "
-                "it restarted without its checkpoint"
+                f"{self.topic}: a reader requests message {sequence}, but the oldest kept is "
+                f"{oldest}: it restarted without its checkpoint"
             )
         return tuple(message for message in self._kept if message.sequence >= sequence)

@@ -90,7 +90,7 @@ class Peers:
         words = misfit(key, self.service)
         if words:
             if alive and name in self.needed and not self.here.get(name):
-                self.refusal = f"{words}: run one version everywhere"
+                self.refusal = f"{words}: install the same version everywhere"
             elif alive and len(self.strangers) < _MOST_STRANGERS:
                 self.strangers.setdefault(name, f"{words}: passed over")
             return ""
@@ -104,7 +104,7 @@ class Peers:
         self.met.setdefault(name, set()).add(int(number))
         self.gone_since.pop(name, None)
         if name == self.service and int(number) > self.incarnation and not self.stays:
-            self.refusal = f"another {name} took over in this session"
+            self.refusal = f"another {name} has replaced this one in the session"
         return name
 
     def is_known(self, name: str, incarnation: int) -> bool:

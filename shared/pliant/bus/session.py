@@ -30,7 +30,7 @@ _SOCKET = "unixsock-stream"
 _FOLDER, _BUS = "pliant-", "bus"
 _NO_SHARED_MEMORY = "shm segment"
 """What Zenoh says where /dev/shm is full, or missing."""
-_NO_SOCKET = "no Unix socket could be had: every user of this machine can reach the services"
+_NO_SOCKET = "no Unix socket available: every user of this machine can reach the services"
 _MAX_BYTES = max(topic.max_bytes for topic in TOPICS) + (1 << 20)
 """Whoever announces more than our largest topic takes is cut off, before memory is taken for it."""
 
@@ -70,7 +70,9 @@ class Identity:
         own = cls(folder / "ca.pem", folder / f"{name}.pem", folder / f"{name}.key")
         for path in (own.authority, own.certificate, own.key):
             if not path.is_file():
-                raise BusError(f"{path}: no such certificate; `pliant certs {folder}` makes them")
+                raise BusError(
+                    f"{path}: no such certificate: make one with `pliant certs {folder}`"
+                )
         return own
 
 

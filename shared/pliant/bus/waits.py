@@ -76,8 +76,8 @@ class Waits:
                 lost = self.peers.lost(readers, patience_s=patience_s, now=began)
                 if here and lost:
                     raise BusError(
-                        f"{lost[0]} went away with {output.box.on_the_way()} messages of "
-                        f"{output.topic.key} unread"
+                        f"{lost[0]} went away with {output.box.on_the_way()} unread messages of "
+                        f"{output.topic.key}"
                     )
                 whom = self.peers.absent(readers) or ", ".join(names)
                 self.now.begin(f"{whom} to take {output.topic.key}", began)

@@ -168,13 +168,11 @@ class ZenohBus:
         enough, said = time.monotonic() + TOKEN_LEASE_S, False
         while any(reply.ok is not None for reply in self._session.liveliness().get(tokens)):
             if not said:
-                say(f"{name}: session {session} has a {name}: waiting until it is gone")
+                say(f"{name}: session {session} already has a {name}: waiting until it ends")
                 said = True
             if time.monotonic() > enough or self._waits.interrupted():
                 self._session.close()  # type: ignore[no-untyped-call]
-                raise BusError(
-                    f"session {session} has a {name}, which stays: choose another --session"
-                )
+                raise BusError(f"session {session} already has a {name}: choose another --session")
             time.sleep(_LOOK_S)
 
     # -- sending -------------------------------------------------------------------------------

@@ -39,7 +39,8 @@ def read_trajectory(
         times = times if times is not None else path.with_name("times.txt")
         if not times.is_file():
             raise ResultError(
-                f"{path}: KITTI poses carry no times and {times} does not exist; name it as times"
+                f"{path}: KITTI poses have no times, and {times} does not exist: pass the "
+                "times file"
             )
         return read_kitti(path, read_kitti_times(times))
     return read_tum(path)

@@ -55,7 +55,7 @@ def draw_calibration(
             cv2.circle(image, _at(start), 2 << _SHIFT, _DOT, -1, 16, _SHIFT)
     right = _scatter(views, image.shape[0], longest)
     both = np.concatenate([image, np.full((image.shape[0], 4, 3), 120, np.uint8), right], axis=1)
-    lines = [*words, f"arrows: what is left over, {enlarged:.0f} times as long"]
+    lines = [*words, f"arrows: residuals, enlarged {enlarged:.0f} times"]
     return np.concatenate([both, _bar(lines, both.shape[1])])
 
 

@@ -106,8 +106,8 @@ class Index:
         for item in scan_chunk(chunk.file, chunk.offset, self._channels[chunk.file], size_limit):
             if isinstance(item, Damage):
                 raise RecordingError(
-                    f"{chunk.file}: damaged at byte {item.offset} ({item.what}): "
-                    "`pliant recover` keeps what is intact"
+                    f"{chunk.file}: damaged at byte {item.offset} ({item.what}): `pliant recover` "
+                    "keeps the intact part"
                 )
             if isinstance(item, StoredMessage) and item.log_time_ns >= from_ns:
                 check_version(item.channel, chunk.file)
@@ -124,7 +124,7 @@ class Index:
         summary = _summary(stream, size)
         if summary is None:
             raise RecordingError(
-                f"{file}: not closed, or its index is damaged: `pliant recover` makes it whole"
+                f"{file}: not closed, or its index is damaged: repair it with `pliant recover`"
             )
         channels = self._channels[file] = {}
         at = 0

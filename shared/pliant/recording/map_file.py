@@ -48,7 +48,7 @@ class MapFile:
         newer version."""
         self.path = path / MAP_NAME if path.is_dir() else path
         if not self.path.is_file():
-            raise MapError(f"{path}: no map there (a result folder, or its {MAP_NAME})")
+            raise MapError(f"{path}: no map: pass a result folder, or its {MAP_NAME}")
         try:
             self._recording = Recording(self.path)
             found = self._recording.metadata().get(_RECORD)

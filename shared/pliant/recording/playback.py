@@ -147,5 +147,7 @@ class Playback:
     def _first(self, chunk: IndexedChunk, topic: Topic | None = None) -> Recorded:
         found = next(self._index.messages([topic or self._clock], chunks=[chunk]), None)
         if found is None:
-            raise RecordingError(f"{self.path}: its index is wrong: `pliant recover` makes another")
+            raise RecordingError(
+                f"{self.path}: its index is wrong: repair it with `pliant recover`"
+            )
         return found

@@ -186,7 +186,7 @@ class _Walk:
                 start = min(at, following)
                 yield Damage(start, following - start, self._what(following))
                 at = following
-        yield Damage(self._size, 0, "the end is missing: the recording was cut off")
+        yield Damage(self._size, 0, "the end is missing: the recording is truncated")
 
     def _what(self, following: int) -> str:
         return "the end of the file" if following == self._size else "unreadable bytes"
@@ -283,7 +283,7 @@ class _Walk:
             yield Damage(chunk.at, chunk.end - chunk.at, "records in a chunk")
         elif not whole:
             start = chunk.at if chunk.compression else chunk.data + at
-            yield Damage(start, max(0, self._size - start), "the open chunk was cut off")
+            yield Damage(start, max(0, self._size - start), "the open chunk is truncated")
 
     def _message(
         self, records: Source, place: int, length: int, whole: bool

@@ -154,7 +154,7 @@ def describe(summary: Summary) -> Iterator[str]:
         yield f"command: {pliant.get('command', '?')}"
     if summary.clip:
         size = in_words(summary.topics[topics.CLIP.key].size)
-        yield f"images: frames of {summary.clip}, which is in it as it was ({size})"
+        yield f"images: frames of {summary.clip}, stored unchanged ({size})"
     packages = summary.metadata.get("packages", {})
     if packages:
         yield "packages: " + ", ".join(f"{name} {number}" for name, number in packages.items())
@@ -173,7 +173,7 @@ def state(summary: Summary) -> str:
         return "closed, nothing missing"
     words: list[str] = []
     if not summary.has_index:
-        words.append("not closed (pliant recover makes it whole again)")
+        words.append("not closed (repair it with `pliant recover`)")
     elif summary.open_topics:
         words.append(f"indexed, without the end of {counted(len(summary.open_topics), 'topic')}")
     else:
@@ -181,7 +181,7 @@ def state(summary: Summary) -> str:
         words.append("closed after an interruption" if interrupted else "closed")
     words.append(f"{counted(summary.missing, 'message')} missing" if summary.missing else "no gaps")
     if summary.repeated:
-        words.append(f"{counted(summary.repeated, 'message')} twice")
+        words.append(f"{counted(summary.repeated, 'message')} repeated")
     if summary.damage and summary.has_index:
         words.append("damaged")
     return ", ".join(words)

@@ -227,6 +227,6 @@ class RecordingWriter:
         self._broken = True
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             return RecordingError(
-                f"{self._path}: the disk is full; what was written stays readable"
+                f"{self._path}: the disk is full; the recording so far stays readable"
             )
         return RecordingError(f"{self._path}: cannot write the recording: {error.strerror}")

@@ -229,7 +229,7 @@ def check_output(output: Path, *, force: bool) -> None:
     if not parent.is_dir():
         raise ResultError(f"{output}: {parent} is a file: choose another --output")
     if not os.access(parent, os.W_OK | os.X_OK):
-        raise ResultError(f"{output}: {parent} cannot be written to: choose another --output")
+        raise ResultError(f"{output}: {parent} is not writable: choose another --output")
 
 
 def prepare(output: Path, config: str) -> None:
@@ -240,7 +240,10 @@ def prepare(output: Path, config: str) -> None:
     """
     folder = parts.folder_of_parts(output / RECORDING_NAME)
     if folder.is_symlink() and parts.parts_in(folder):
-        raise ResultError(f"{folder} is a link, and a recording is there: move it, or the link")
+        raise ResultError(
+            f"{folder} is a link to a folder with a recording: move the recording, or remove the "
+            "link"
+        )
     try:
         if (output / _LOGS).is_symlink():  # what it points to is not ours
             (output / _LOGS).unlink()

@@ -56,7 +56,7 @@ def read_scale(folder: Path) -> Scale | None:
     except (OSError, ValueError, KeyError, TypeError):
         found = None
     if found is None or not 0.0 < found.metres_per_unit < float("inf"):
-        raise ResultError(f"{path}: no scale: remove it, or measure again with `pliant scale`")
+        raise ResultError(f"{path}: no valid scale: remove the file, or run `pliant scale` again")
     return found
 
 

@@ -109,7 +109,7 @@ def holder_of(output: Path) -> str | None:
 def held(output: Path, holder: str, *, elsewhere: bool = True) -> ResultError:
     """The error of a folder that another process holds."""
     return ResultError(
-        f"{output} is being written by process {holder or '?'}: wait for its end"
+        f"{output} is being written by process {holder or '?'}: wait until it ends"
         + ", or choose another --output" * elsewhere
     )
 
@@ -119,7 +119,7 @@ def _opened(output: Path, folder: int) -> int:
 
     Raises ResultError, OSError.
     """
-    no_lock = ResultError(f"{output / LOCK_NAME} is no lock of pliant: remove it")
+    no_lock = ResultError(f"{output / LOCK_NAME} is not a lock of Pliant: remove it")
     try:
         lock = os.open(LOCK_NAME, _OPENED | os.O_CREAT, 0o644, dir_fd=folder)
     except OSError as error:

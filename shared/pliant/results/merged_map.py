@@ -27,7 +27,7 @@ def merge_maps(first: Path, second: Path, output: Path, *, force: bool) -> Itera
     if output.exists() and not force:
         raise MapError(f"{output} exists: choose another --output, or --force to replace it")
     if files[0].path.resolve() == files[1].path.resolve():
-        raise MapError(f"{second}: the same map twice")
+        raise MapError(f"{second}: is the same map as the first: pass two different maps")
     known, other = (list(file.keyframes()) for file in files)
     parameters = load_config().bundle_adjustment
     try:
@@ -37,7 +37,7 @@ def merge_maps(first: Path, second: Path, output: Path, *, force: bool) -> Itera
     if merged is None:
         raise MapError(
             f"{second}: none of its {counted(len(other), 'keyframe')} shows a place of {first}: "
-            "nothing is written; a run through both with --map joins them"
+            "nothing is written; film both places in one run with --map to merge them"
         )
     first_header = files[0].header
     header = MapHeader(
@@ -63,7 +63,7 @@ def _told(merged: Merged, second: Path, output: Path) -> Iterator[str]:
     points = sum(len(each.point_ids) for each in merged.keyframes)
     yield f"{output}: {counted(len(merged.keyframes), 'keyframe')}, {counted(points, 'point')}"
     for old, segment in merged.joined:
-        yield f"segment {old} of {second} lies in segment {segment} now"
+        yield f"segment {old} of {second} is now part of segment {segment}"
     for old, segment in merged.apart:
         yield f"segment {old} of {second} shows no place of the other map: it is segment {segment}"
     shows = "pair of keyframes shows" if merged.proofs == 1 else "pairs of keyframes show"

@@ -40,12 +40,14 @@ def scale_result(result: Path, known: Known) -> Iterator[str]:
     """
     given = [each for each in (known.points, known.marker, known.depth) if each is not None]
     if len(given) != 1:
-        raise ResultError("say what is known of the scene: one of --points, --marker, --depth")
+        raise ResultError("no known length given: pass one of --points, --marker, --depth")
     settle_killed(result)
     if not parts.exists(result / RECORDING_NAME):
-        raise ResultError(f"{result}: no result folder with a recording")
+        raise ResultError(f"{result}: not a result folder with a recording")
     if has_surfels(result / RECORDING_NAME):
-        raise ResultError(f"{result}: a scene that deforms: only results of rigid ones are scaled")
+        raise ResultError(
+            f"{result}: a deforming scene: only results of rigid scenes can be scaled"
+        )
     check_free(result, elsewhere=False)
     with written(result, force=True):
         recording = MetricRecording(result / RECORDING_NAME)
@@ -60,7 +62,7 @@ def scale_result(result: Path, known: Known) -> Iterator[str]:
     yield f"{unit} is {found.metres_per_unit:.4g} m ({found.source}{sure}): {result}/ is in metres"
     exports = exports_in(result, but=_WITHOUT_LENGTHS)
     if exports:
-        yield f"made before, in the old unit: {', '.join(exports)}: export again with --force"
+        yield f"exports in the old unit: {', '.join(exports)}: export again with --force"
 
 
 def _measure(recording: MetricRecording, run: Run, known: Known) -> Scale:

@@ -33,9 +33,9 @@ def from_points(run: Run, a: Sequence[float], b: Sequence[float], metres: float)
     """
     apart = float(np.linalg.norm(np.subtract(a, b)))
     if not 0.0 < apart < np.inf:
-        raise ResultError("--points: the two points are one: choose others")
+        raise ResultError("--points: the two points are identical: choose others")
     if not 0.0 < metres < np.inf:
-        raise ResultError(f"{metres:g} metres: no length")
+        raise ResultError(f"{metres:g} metres: expected a positive length")
     _check_mapped(run, a, b)
     told = f"two points {metres:g} m apart"
     return Scale(metres_per_unit=metres / apart, sigma=0.0, source=told)
@@ -55,7 +55,7 @@ def _check_mapped(run: Run, *places: Sequence[float]) -> None:
         if off > _FAR * spread:
             told = ",".join(f"{value:g}" for value in place)
             raise ResultError(
-                f"--points: {told} is nowhere in the map, whose nearest point is {off:.3g} away: "
+                f"--points: {told} is outside of the map, whose nearest point is {off:.3g} away: "
                 "pick both in report.html"
             )
 
@@ -94,7 +94,7 @@ def from_depth(recording: Recording, run: Run, source: str) -> Scale:
         if ratio is not None:
             ratios.append(ratio)
     if not ratios:
-        raise ResultError(f"{source}: no depth map shows what a keyframe of the run has mapped")
+        raise ResultError(f"{source}: no depth map covers the points of a keyframe")
     logs = np.log(ratios)
     middle = float(np.median(logs))
     sigma = _TO_SIGMA * float(np.median(np.abs(logs - middle)))

@@ -32,7 +32,7 @@ def from_marker(recording: Recording, run: Run, metres: float) -> Scale:
     square.  The scale is the median of what they tell.  Raises ResultError.
     """
     if not 0.0 < metres < np.inf:
-        raise ResultError(f"--marker {metres:g}: no length")
+        raise ResultError(f"--marker {metres:g}: expected a positive length")
     ideal = IdealCamera(run)
     told: list[tuple[float, float]] = []
     found = _markers(recording, ideal)
@@ -41,7 +41,7 @@ def from_marker(recording: Recording, run: Run, metres: float) -> Scale:
         if side is not None:
             told.append((metres / side[0], side[1]))
     if not told:
-        seen = f"{len(found)} in all, but none as a square by {_LEAST_VIEWS} keyframes"
+        seen = f"{len(found)} found, but none as a square in {_LEAST_VIEWS} keyframes"
         raise ResultError(
             f"{recording.path}: no marker: {seen if found else 'keyframes see none'} (ArUco, or "
             "AprilTag 36h11; film it from several sides)"
