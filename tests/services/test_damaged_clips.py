@@ -57,16 +57,18 @@ def test_what_decodes_to_other_pixels_is_refused_in_one_line(clip: Path, tmp_pat
     made = rewritten(path, tmp_path / "made.mcap", {topics.CLIP: pieces})
     stored = references(path)
     for number in (0, 20):
-        with pytest.raises(RecordingError, match=f"frame {number}: OpenCV .* makes other") as said:
+        with pytest.raises(
+            RecordingError, match=f"frame {number}: OpenCV .* decodes other"
+        ) as said:
             RecordedImages(Recording(made)).whole(stored[number])
         assert "with OpenCV 4.5" in str(said.value)
         assert "\n" not in str(said.value)
     without = rewritten(path, tmp_path / "without.mcap", {topics.CLIP: []})
-    with pytest.raises(RecordingError, match="the clip is not in it"):
+    with pytest.raises(RecordingError, match="the clip of its images is missing"):
         list(RecordedImages(Recording(without)))
     no_video = [replace(pieces[0], size=4, offset=0, data=b"none")]
     made = rewritten(path, tmp_path / "none.mcap", {topics.CLIP: no_video})
-    with pytest.raises(RecordingError, match="cannot read the clip in it"):
+    with pytest.raises(RecordingError, match="cannot read its clip"):
         list(RecordedImages(Recording(made)))
     beyond = [replace(pieces[0], offset=pieces[0].size)]
     made = rewritten(path, tmp_path / "beyond.mcap", {topics.CLIP: beyond})
@@ -134,5 +136,5 @@ def test_a_clip_that_finds_no_room_is_said(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(tempfile, "NamedTemporaryFile", full)
-    with pytest.raises(RecordingError, match="No space left on device; make room there"):
+    with pytest.raises(RecordingError, match="No space left on device; free some space there"):
         list(RecordedImages(Recording(path)))

@@ -194,7 +194,7 @@ def test_a_clip_that_is_written_to_during_the_run_costs_no_image_and_is_told(
     own.write_bytes(clip.read_bytes())
     path = tmp_path / "recording.mcap"
     bus = WritingBus(own, 9)
-    with pytest.raises(SourceLostError, match=r"own.mp4: was written to while it was read"):
+    with pytest.raises(SourceLostError, match=r"own.mp4: was modified during the run"):
         record(opened(own), path, bus=bus)
     published = published_on(bus)
     stored = references(path)

@@ -35,7 +35,7 @@ def test_a_camera_is_found_without_a_board(tmp_path: Path) -> None:
     assert (drawn == (40, 60, 190)).all(axis=2).sum() > 500  # arrows
     black = np.zeros((48, 64), np.uint8)
     cv2.imwrite(str(tmp_path / "black.png"), black)
-    for name, says in (("black.png", "is black all over"), ("none.png", "cannot be read")):
+    for name, says in (("black.png", "is completely black"), ("none.png", "cannot be read")):
         mask = tmp_path / name
         done = in_this_process(
             "calibrate", TINY, "--fov", "50", "--mask", mask, "--output", file, "--force"

@@ -97,7 +97,7 @@ def test_images_that_are_too_narrow_to_track_in_are_refused(
     size: tuple[int, int], tmp_path: Path
 ) -> None:
     source = write_sequence(tmp_path / "video", sliding(*size, 12))
-    with pytest.raises(DatasetError, match="too narrow to track in") as refused:
+    with pytest.raises(DatasetError, match="too narrow for tracking") as refused:
         open_source(str(source))
     assert len(str(refused.value).splitlines()) == 1
 

@@ -230,7 +230,7 @@ def test_nerfstudio_takes_what_it_gets(
 
 
 def test_a_mask_that_is_none_is_one_line(bonnet: Path, tmp_path: Path) -> None:
-    for mask, words in (("nothing.png", "cannot be read"), ("drive", "holds no images")):
+    for mask, words in (("nothing.png", "cannot be read"), ("drive", "contains no images")):
         done = in_this_process(
             "run", bonnet / "drive", "--mask", bonnet / mask, "--output", tmp_path / "result"
         )

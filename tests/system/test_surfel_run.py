@@ -148,4 +148,4 @@ def test_wrong_use_is_one_line(tmp_path: Path) -> None:
     images.mkdir()
     (images / "0.pgm").write_bytes(b"P5 64 48 255 " + bytes(64 * 48))
     done = in_this_process("run", images, "--fov", "60", "--profile", "deformable")
-    assert_one_line(done, "brings no depth along")
+    assert_one_line(done, "has no depth")

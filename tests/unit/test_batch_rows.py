@@ -30,9 +30,9 @@ def test_sources_of_a_folder(tmp_path: Path) -> None:
     results = folder_of_images(tmp_path / "results" / "old").parent
     found = sources_in(tmp_path, but=results)
     assert [path.name for path in found] == ["a.mov", "b.MP4", "drive.bag", "walk"]
-    with pytest.raises(DatasetError, match="is a sequence itself: `pliant run "):
+    with pytest.raises(DatasetError, match="is itself a sequence: use `pliant run "):
         sources_in(tmp_path / "walk", but=results)
-    with pytest.raises(DatasetError, match="holds none of the sources"):
+    with pytest.raises(DatasetError, match="contains no source"):
         sources_in(tmp_path / "empty", but=results)
 
 

@@ -30,7 +30,7 @@ def test_the_bits_that_are_used_become_eight_in_all_images_alike(
     source = open_source(str(tmp_path), fov_deg=60.0)
     for row, frame in enumerate(source):
         assert np.array_equal(decode(frame), grey(row, bits) >> (bits - 8))
-    assert f"images of 16 bits use {bits} of them: these are scaled to 8, in all images alike" in (
+    assert f"16-bit images use {bits} bits: these are scaled to 8 bits, in all images alike" in (
         notes_on(source)
     )
 

@@ -151,7 +151,7 @@ def test_impossible_options_get_one_clear_line(source: str, message: str, tmp_pa
 
 
 def test_an_existing_folder_is_not_overwritten(tmp_path: Path):
-    with pytest.raises(DatasetError, match="exists already"):
+    with pytest.raises(DatasetError, match="already exists"):
         render_sequence("tiny", tmp_path)
 
 

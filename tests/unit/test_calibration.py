@@ -219,7 +219,7 @@ def test_tum_cameras_are_usable(camera: str) -> None:
             "use pinhole, pinhole-radtan, pinhole-rational, fisheye",
         ),
         ({"model": "pinhole"}, "model pinhole has no k1, k2, p1, p2"),
-        ({"model": ["pinhole"]}, "is not understood"),
+        ({"model": ["pinhole"]}, "is not supported"),
         ({"k1": -300.0}, "distortion (-300, 0.01, 0.001, -0.001, 0): the distortion"),
     ],
 )
@@ -241,7 +241,7 @@ def test_missing_keys_are_named(tmp_path: Path, key: str) -> None:
         ("", "no keys and values"),
         ("just text", "no keys and values"),
         ("- 1\n- 2\n", "no keys and values"),
-        ("name: me\n", "holds no camera"),
+        ("name: me\n", "contains no camera"),
         ("!!python/object/apply:os.system ['true']", "not YAML"),
         (EUROC.replace("pinhole", "omni"), "camera_model 'omni'"),
         (EUROC.replace("radial-tangential", "fov"), "distortion_model 'fov'"),

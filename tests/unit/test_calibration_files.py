@@ -69,7 +69,7 @@ def test_opencv_as_xml(tmp_path: Path) -> None:
     [
         ("<?xml version='1.0'?><calibration><f>500</f></calibration>", "XML of another program"),
         ("<?xml version='1.0'?><opencv_storage><a>", "not XML"),
-        ("<?xml version='1.0'?><opencv_storage></opencv_storage>", "holds no camera"),
+        ("<?xml version='1.0'?><opencv_storage></opencv_storage>", "contains no camera"),
         (
             "<?xml version='1.0'?><!DOCTYPE x [<!ENTITY a 'aaaa'><!ENTITY b '&a;&a;'>]>"
             "<opencv_storage>&b;</opencv_storage>",
@@ -99,7 +99,9 @@ def test_colmap_binary(tmp_path: Path) -> None:
         assert (found.fx, found.fy, found.cx) == (500.0, 501.0, 320.0)
         assert found.distortion == (-0.2, 0.05, 1e-3, 2e-3, 0.0)
     file.write_bytes(cameras_bin(one, two))
-    assert "holds 2 cameras: say which took the images, as in --calibration FILE:7" in refused(file)
+    assert "has 2 cameras: select the camera of the images, as in --calibration FILE:7" in refused(
+        file
+    )
     assert read_calibration(Path(f"{file}:7"), SIZE).fx == 600.0
     assert "no camera 3" in refused(Path(f"{file}:3"))
     for data in (cameras_bin(one)[:-1], b"", cameras_bin((1, 99, 640, 480, [1.0])), b"x" * 1000):
@@ -125,7 +127,7 @@ def test_of_a_chain_the_user_topic_folder_or_size_tells_the_camera(tmp_path: Pat
     file = tmp_path / "camchain.yaml"
     file.write_text(CHAIN)
     asked = refused(file)
-    assert "holds 2 cameras (cam0, cam1): say which took the images" in asked
+    assert "has 2 cameras (cam0, cam1): select the camera of the images" in asked
     assert asked.endswith("--calibration FILE:cam1")
     assert read_calibration(Path(f"{file}:cam1"), SIZE).fx == 600.0
     assert read_calibration(Path(f"{file}:0"), SIZE).fx == 500.0

@@ -73,7 +73,7 @@ def test_a_source_without_depth_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no depth\.txt"):
         open_source(str(folder), depth="first")
     assert len(list(open_source(str(folder)))) == 4
-    with pytest.raises(DatasetError, match="brings no depth along: use"):
+    with pytest.raises(DatasetError, match="has no depth: use"):
         open_source(str(folder / "images"), fov_deg=60.0, depth="first")
     with pytest.raises(CalibrationError, match="depth_scale"):
         open_source(str(sequence(tmp_path / "t", [(0.0, 1000)], depth_scale=None)), depth="first")

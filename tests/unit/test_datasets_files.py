@@ -244,7 +244,7 @@ def test_the_users_calibration_wins(tmp_path: Path) -> None:
     other.write_text(yaml.safe_dump({**CALIBRATION, "fx": 70.0}))
     assert open_source(str(folder), calibration=other).calibration.fx == 70.0
     both = refused(folder, CalibrationError, calibration=other, fov_deg=60.0)
-    assert both == "--calibration and --fov contradict each other: give one"
+    assert both == "--calibration and --fov exclude each other: pass only one"
     assert str(other) in refused(
         folder, CalibrationError, calibration=other.with_name("none.yaml")
     ).replace("none.yaml", "other.yaml")
@@ -254,12 +254,12 @@ def test_nothing_there(tmp_path: Path) -> None:
     for source, says in ((tmp_path / "none", "no such file"), (tmp_path, "is an empty folder")):
         line = refused(source)
         assert says in line
-        assert line.endswith("`pliant run --help` and docs/sources.md say what is read")
+        assert line.endswith("see `pliant run --help` and docs/sources.md for supported sources")
         assert len(line) < len(str(source)) + 100
     (tmp_path / "readme.md").write_text("")
-    assert "holds none of the sources" in refused(tmp_path)
+    assert "contains no source" in refused(tmp_path)
     assert "is empty" in refused("")
-    assert "give its folder" in refused(listed_folder(tmp_path / "a") / "rgb.txt")
+    assert "pass its folder" in refused(listed_folder(tmp_path / "a") / "rgb.txt")
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def test_a_folder_has_them_by_the_names_of_images(tmp_path: Path) -> None:
     write(masks / "other.png", columns(9))
     assert told(source, masks) == [1, 2, WIDTH]
     said = notes_on(open_source(source, fov_deg=60.0, mask=masks))
-    assert said[-1:] == ["masked: 2 of 3 frames have a mask, the others are used as a whole"]
+    assert said[-1:] == ["masked: 2 of 3 frames have a mask, the others are used completely"]
 
 
 def test_a_folder_has_them_by_the_numbers_of_frames(tmp_path: Path) -> None:
@@ -142,12 +142,12 @@ def test_a_frame_without_a_mask_is_whole_whatever_came_before_it(tmp_path: Path)
     ("mask", "words"),
     [
         ("nowhere.png", "nowhere.png: cannot be read: No such file"),
-        ("text.png", "text.png: is no image that OpenCV can read"),
-        ("black.png", "black.png: is black all over"),
+        ("text.png", "text.png: OpenCV cannot read this image"),
+        ("black.png", "black.png: is completely black"),
         ("wide.png", "is 192x48 px, another aspect than the image's 64x48 px"),
-        ("empty", "empty: holds no images"),
-        ("others", "holds no mask of any frame: the first would be a.png, and is z.png"),
-        ("twice", "1.png and m1.png are of the same frame"),
+        ("empty", "empty: contains no images"),
+        ("others", "has no mask for any frame: the first should be a.png, but is z.png"),
+        ("twice", "1.png and m1.png are masks of the same frame"),
     ],
 )
 def test_what_is_no_mask_is_said_in_a_line(tmp_path: Path, mask: str, words: str) -> None:

@@ -213,7 +213,7 @@ def test_the_choice_of_a_topic(tmp_path: Path) -> None:
     other = open_source(str(tmp_path / "two"), topic="/other").calibration
     assert other.focal_sigma == UNSAID_SIGMA
     bags.write_ros2_bag(tmp_path / "none", ros, {"/chatter": [ros.text()]})
-    assert "no topic with images; it carries std_msgs/String" in refused(tmp_path / "none")
+    assert "no topic with images; its topics: std_msgs/String" in refused(tmp_path / "none")
     folder = tmp_path / "folder"
     folder.mkdir()
     cv2.imwrite(str(folder / "0.png"), bags.picture(0))
@@ -224,13 +224,13 @@ def test_what_cannot_be_understood_is_said(tmp_path: Path) -> None:
     ros = Ros(2)
     odd = ros.image(0, encoding="8UC2", pixels=bags.picture(0)[:, :, :2])
     bags.write_ros2_bag(tmp_path / "odd", ros, {"/image": [odd]})
-    assert "encoding '8UC2' are not understood" in refused(tmp_path / "odd", fov_deg=70.0)
+    assert "encoding '8UC2' are not supported" in refused(tmp_path / "odd", fov_deg=70.0)
     never = ros.camera_info(0)
     never.k[:] = 0.0
     never.p[:] = 0.0
     messages = {"/image": [ros.image(0)], "/camera_info": [never]}
     bags.write_ros2_bag(tmp_path / "never", ros, messages)
-    assert "the camera was not calibrated" in refused(tmp_path / "never")
+    assert "the camera is not calibrated" in refused(tmp_path / "never")
 
 
 @pytest.mark.parametrize("kind", FILES)
@@ -249,8 +249,8 @@ def test_a_file_that_is_cut_off_is_one_line(kind: str, tmp_path: Path) -> None:
         data = whole.read_bytes()
         cut.write_bytes(data[: len(data) // 2])
     text = refused(cut, fov_deg=70.0)
-    assert "cut off" in text
-    assert "mend it with" in text
+    assert "truncated" in text
+    assert "repair it with" in text
 
 
 def test_any_bytes_are_one_line(tmp_path: Path) -> None:
@@ -285,8 +285,8 @@ def test_of_colour_and_depth_the_colour_is_used_and_a_line_says_so(tmp_path: Pat
     source = open_source(str(tmp_path / "bag"), fov_deg=70.0)
     assert np.array_equal(decode(next(iter(source))), bags.picture(0))
     assert notes_on(source) == [
-        "/camera/color/image_raw is used, not /camera/color/image_raw/compressed, "
-        "/camera/depth/image_rect_raw (--topic chooses)"
+        "using /camera/color/image_raw, not /camera/color/image_raw/compressed, "
+        "/camera/depth/image_rect_raw (choose with --topic)"
     ]
     asked = open_source(str(tmp_path / "bag"), topic="/camera/color/image_raw", fov_deg=70.0)
     assert notes_on(asked) == []

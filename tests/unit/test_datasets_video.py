@@ -124,10 +124,10 @@ def test_files_that_are_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[st
     (tmp_path / "empty.mp4").touch()
     with pytest.raises(DatasetError, match=r"empty.mp4: is empty \(0 bytes\)"):
         open_source(str(tmp_path / "empty.mp4"), fov_deg=60.0)
-    with pytest.raises(DatasetError, match=r"holds some: .* `pliant batch"):
+    with pytest.raises(DatasetError, match=r"contains several: .* `pliant batch"):
         open_source(str(tmp_path))
     (tmp_path / "image.png").write_bytes(b"")
-    with pytest.raises(DatasetError, match="give its folder"):
+    with pytest.raises(DatasetError, match="pass its folder"):
         open_source(str(tmp_path / "image.png"), fov_deg=60.0)
     assert capfd.readouterr().err == ""  # one line is enough, and that is ours
 
@@ -248,7 +248,7 @@ def test_a_video_that_is_written_to_while_it_is_read_is_told_and_one_without_a_n
     frames = iter(open_source(str(file), fov_deg=60.0))
     next(frames)
     file.write_bytes(content[: len(content) // 2])
-    with pytest.raises(DatasetError, match=r"clip.avi: was written to while it was read"):
+    with pytest.raises(DatasetError, match=r"clip.avi: was modified during the run"):
         list(frames)
     file.write_bytes(content)
     frames = iter(open_source(str(file), fov_deg=60.0))
@@ -266,7 +266,7 @@ def test_a_video_that_is_written_to_while_a_part_of_it_is_read_is_told(tmp_path:
         next(frames)
         file.write_bytes(content)
         os.utime(file, (time, time))
-        with pytest.raises(DatasetError, match=r"clip.avi: was written to while it was read"):
+        with pytest.raises(DatasetError, match=r"clip.avi: was modified during the run"):
             list(frames)
 
 

@@ -208,7 +208,7 @@ def test_what_is_a_deforming_source() -> None:
         ("built-in:kinect-paper?tracks=/no/such.npz", "/no/such.npz: no such file"),
         ("built-in:kinect-paper?tracks={tmp}/text", "holds no array P_gt_mm"),
         ("built-in:kinect-paper?tracks={tmp}/flat.npz", "should be (frames, points, 3)"),
-        ("built-in:kinect-paper?tracks={tmp}/behind.npz", "not before the camera"),
+        ("built-in:kinect-paper?tracks={tmp}/behind.npz", "not in front of the camera"),
         ("built-in:sliding?amplitude=0.1", "unknown option 'amplitude'; valid options: frames"),
         ("built-in:breathing?amplitude=2", "amplitude=2"),
         ("built-in:breathing?frames=121", "has only 120 frames"),

@@ -79,7 +79,7 @@ def test_a_first_depth_map_is_that_of_the_first_frame_taken() -> None:
 
 
 def test_nothing_left_is_one_line() -> None:
-    with pytest.raises(DatasetError, match="--end 1: is not after --start 2"):
+    with pytest.raises(DatasetError, match="--end 1: must be after --start 2"):
         Excerpt(Frames(), IngestParameters(start_s=2.0, end_s=1.0))
     with pytest.raises(DatasetError, match=r"no frame lies between --start 1.01 s and --end 1.09"):
         list(Excerpt(Frames(), IngestParameters(start_s=1.01, end_s=1.09)))

@@ -51,7 +51,7 @@ def test_one_kind_is_used_and_a_line_says_which(
     found, said = names(tmp_path)
     assert found == [used.format(row) for row in range(COUNT)]
     assert len(said) == 1
-    assert "are used; passed over: 5 " in said[0]
+    assert "; skipping 5 " in said[0]
 
 
 def test_kinds_of_other_frames_stay_together(tmp_path: Path) -> None:
@@ -105,8 +105,8 @@ def test_files_of_other_formats_are_named(tmp_path: Path) -> None:
     found, said = names(tmp_path)
     assert len(found) == COUNT
     assert said == [
-        f"{tmp_path.name}: 3 files (.dng, .heic) passed over: not a format that is read; convert "
-        "them to JPEG or PNG"
+        f"{tmp_path.name}: 3 files (.dng, .heic) passed over: unsupported format; convert "
+        "to JPEG or PNG"
     ]
 
 
@@ -115,15 +115,13 @@ def test_a_folder_of_one_source_names_it(tmp_path: Path) -> None:
     (tmp_path / "zip" / "__MACOSX" / "seq_01").mkdir(parents=True)
     (tmp_path / "zip" / "__MACOSX" / "seq_01" / "._0.png").write_bytes(b"x")
     with pytest.raises(
-        DatasetError, match=r"is no source, but seq_01 in it is: `pliant run .*/seq_01`"
+        DatasetError, match=r"is not a source, but contains one: use `pliant run .*/seq_01`"
     ):
         open_source(str(tmp_path / "zip"))
     heic = tmp_path / "heic"
     heic.mkdir()
     (heic / "IMG_0001.HEIC").write_bytes(b"x")
-    with pytest.raises(
-        DatasetError, match=r"1 file \(\.heic\): not a format that is read; convert"
-    ):
+    with pytest.raises(DatasetError, match=r"1 file \(\.heic\): unsupported format; convert"):
         open_source(str(heic))
 
 
@@ -132,7 +130,7 @@ def test_pages_behind_the_first_are_named(tmp_path: Path) -> None:
         assert cv2.imwritemulti(str(tmp_path / f"{row}.tiff"), [GREY, GREY, GREY])
     found, said = names(tmp_path)
     assert len(found) == 2
-    assert said == ["0.tiff: has 3 pages or frames, of which the first is read: convert it"]
+    assert said == ["0.tiff: has 3 pages or frames, and only the first is read: convert it"]
 
 
 def test_images_that_a_list_leaves_out_are_named(tmp_path: Path) -> None:
@@ -140,7 +138,7 @@ def test_images_that_a_list_leaves_out_are_named(tmp_path: Path) -> None:
     lines = [f"{0.1 * row:.1f} rgb/{row}.png" for row in range(20)]
     (tmp_path / "rgb.txt").write_text("\n".join(lines))
     source = open_source(str(tmp_path), fov_deg=60.0)
-    assert notes_on(source) == ["rgb.txt: lists 20 images; 10 more in rgb/ are left out"]
+    assert notes_on(source) == ["rgb.txt: lists 20 images; 10 more in rgb/ are skipped"]
 
 
 def test_a_listed_file_that_is_missing_costs_itself(tmp_path: Path) -> None:
@@ -151,7 +149,7 @@ def test_a_listed_file_that_is_missing_costs_itself(tmp_path: Path) -> None:
     source = open_source(str(tmp_path), fov_deg=60.0)
     assert [frame.index for frame in source if not frame.data] == [7]
     assert notes_on(source) == [
-        "rgb.txt: 1 file of 20 (the first in line 8) missing: they count as broken"
+        "rgb.txt: 1 file of 20 (the first in line 8) are missing and count as broken"
     ]
     for row in range(3):
         (tmp_path / "rgb" / f"{row}.png").unlink()
@@ -183,5 +181,5 @@ def test_a_collection_is_no_sequence(other: str, tmp_path: Path) -> None:
     (tmp_path / "x.png").rename(tmp_path / other)
     found = [path.name for path in sources_in(tmp_path, but=tmp_path / "results")]
     assert found == sorted(["data", Path(other).parts[0]])
-    with pytest.raises(DatasetError, match="holds some: name one of them"):
+    with pytest.raises(DatasetError, match="contains several: pass one of them"):
         open_source(str(tmp_path))

@@ -136,7 +136,7 @@ def test_a_folder_whose_names_tell_no_times_says_what_is_assumed(tmp_path: Path)
     source = open_source(str(tmp_path / "a"), fov_deg=60.0)
     assert [f.name for f in source] == ["1.png", "2.png", "10.png"]
     (note,) = notes_on(source)
-    assert note.startswith("times: the file names tell none: 30 images/s are assumed")
+    assert note.startswith("times: none in the file names, assuming 30 images/s")
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def test_a_preview_before_the_film_is_passed_over(
     file = tmp_path / "two.mp4"
     file.write_bytes(with_track_before(film, preview, enabled=enabled))
     dataset = open_source(str(file), fov_deg=60.0)
-    assert notes_on(dataset) == ["2 video streams (160x120, 320x240): stream 2 is read"]
+    assert notes_on(dataset) == ["2 video streams (160x120, 320x240): reading stream 2"]
     assert (dataset.calibration.width, dataset.calibration.height) == (WIDTH, HEIGHT)
     assert_film(list(dataset), images)
 
@@ -105,7 +105,7 @@ def test_a_preview_in_matroska_is_passed_over(tmp_path: Path) -> None:
     file = tmp_path / "three.mkv"
     file.write_bytes(matroska(tracks))
     dataset = open_source(str(file), fov_deg=60.0)
-    note = "3 video streams (160x160, 320x320, 640x640): stream 2 is read"
+    note = "3 video streams (160x160, 320x320, 640x640): reading stream 2"
     assert notes_on(dataset) == [note]
     assert_film(list(dataset), moving(FRAMES, 320, 320))
 
@@ -248,7 +248,7 @@ def test_pixels_that_are_not_square(tmp_path: Path, film: bytes) -> None:
     file = tmp_path / "wide.mp4"
     file.write_bytes(with_aspect(film, 4, 3))
     dataset = open_source(str(file))
-    assert notes_on(dataset) == ["pixels are 1.33 times as wide as high"]
+    assert notes_on(dataset) == ["pixel aspect ratio 1.33"]
     assert dataset.calibration.fy == pytest.approx(dataset.calibration.fx * 4 / 3)
     file.write_bytes(with_aspect(film, 1, 2))  # it is higher than wide now
     tall = open_source(str(file)).calibration

@@ -292,7 +292,7 @@ def test_what_cannot_be_had_is_one_line(
     wrong = node.publisher(RosTopic.of("/wrong/image", "sensor_msgs/msg/Image"))
     wait_until_published(endpoint, "/wrong/image")
     monkeypatch.setattr("pliant.datasets.ros_camera._FIRST_S", 0.0)
-    with pytest.raises(DatasetError, match="no message came"):
+    with pytest.raises(DatasetError, match="no message arrived"):
         open_source(f"ros:{host}", topic="/wrong/image")
     stopping = threading.Event()
 

@@ -111,7 +111,7 @@ def _open_ros(source: str, options: SourceOptions) -> Dataset:
 def _open_video(source: str, options: SourceOptions) -> Dataset:
     path = Path(source)
     if path.suffix.lower() in (*SUFFIXES, ".txt", ".csv", ".yaml"):
-        raise DatasetError(f"{source}: a single file of this kind is no source; give its folder")
+        raise DatasetError(f"{source}: a single file of this kind is not a source; pass its folder")
     return VideoFile(path, options)
 
 
@@ -148,7 +148,7 @@ def formats() -> dict[str, SourceFormat]:
         except Exception as error:  # of foreign code
             said = shortened(f"{type(error).__name__}: {error}".split("\n")[0], 200)
             raise DatasetError(
-                f"the source format {point.name} ({point.value}) does not load: {said}; mend or "
+                f"the source format {point.name} ({point.value}) does not load: {said}; fix or "
                 "uninstall its package"
             ) from error
         if not isinstance(kind, SourceFormat):
@@ -196,10 +196,10 @@ def open_source(
         for kind in formats().values():
             if kind.recognises(source):
                 if topic and not kind.has_topics:
-                    raise DatasetError(f"{source}: has no topics to choose from: leave out --topic")
+                    raise DatasetError(f"{source}: has no topics: leave out --topic")
                 if depth != "none" and not kind.has_depth:
                     raise DatasetError(
-                        f"{source}: brings no depth along: use a folder with rgb.txt and depth.txt"
+                        f"{source}: has no depth: use a folder with rgb.txt and depth.txt"
                     )
                 opened = kind.open(source, options)
                 opened = opened if mask is None else Masked(opened, mask)
@@ -223,13 +223,16 @@ def _why_none(folder: Path) -> str:
     """Why a folder is no source, and what may be."""
     clips = [each for each in sorted(folder.iterdir()) if each.name[0] != "." and _is_clip(each)]
     if len(clips) == 1:
-        return f"is no source, but {clips[0].name} in it is: `pliant run {clips[0]}`"
+        return f"is not a source, but contains one: use `pliant run {clips[0]}`"
     if clips:
-        return f"is no source, but holds some: name one of them, or all by `pliant batch {folder}`"
+        return (
+            "is not a source, but contains several: pass one of them, or use `pliant batch "
+            f"{folder}` for all"
+        )
     foreign = foreign_files(folder)
     if foreign:
         return foreign[0].removeprefix(f"{folder.name}: ").replace(" passed over", "")
-    what = "holds none of the sources" if any(folder.iterdir()) else "is an empty folder"
+    what = "contains no source" if any(folder.iterdir()) else "is an empty folder"
     return f"{what}; {HELP}"
 
 
@@ -251,7 +254,7 @@ def check_start(dataset: Dataset) -> None:
         whole.check_start()
 
 
-HELP = "`pliant run --help` and docs/sources.md say what is read"
+HELP = "see `pliant run --help` and docs/sources.md for supported sources"
 """Where the sources are listed that are understood."""
 
 
@@ -261,7 +264,7 @@ def sources_in(folder: Path, *, but: Path) -> list[Path]:
     Raises DatasetError where there are none, or the folder is one itself.
     """
     if any(kind.recognises(str(folder)) for kind in formats().values()):
-        raise DatasetError(f"{folder}: is a sequence itself: `pliant run {folder}`")
+        raise DatasetError(f"{folder}: is itself a sequence: use `pliant run {folder}`")
     try:
         paths = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError as error:
@@ -269,7 +272,7 @@ def sources_in(folder: Path, *, but: Path) -> list[Path]:
     results = (but.resolve(), *but.resolve().parents)
     found = [path for path in paths if path.resolve() not in results and _is_clip(path)]
     if not found:
-        raise DatasetError(f"{folder}: holds none of the sources; {HELP}")
+        raise DatasetError(f"{folder}: contains no source; {HELP}")
     return found
 
 

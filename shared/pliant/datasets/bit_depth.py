@@ -56,7 +56,7 @@ def note_on(bits: int) -> list[str]:
     """What a user should know of it."""
     if bits >= _ALL:
         return []
-    return [f"images of 16 bits use {bits} of them: these are scaled to 8, in all images alike"]
+    return [f"16-bit images use {bits} bits: these are scaled to 8 bits, in all images alike"]
 
 
 def _may_be_deep(frame: SourceFrame) -> bool:

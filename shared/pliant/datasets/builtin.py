@@ -83,7 +83,7 @@ def parse_builtin(source: str) -> tuple[str, Options]:
             valid = ", ".join(kind.model_fields)
             raise DatasetError(f"{source}: unknown option {shown(key)}; valid options: {valid}")
         if not equals:
-            raise DatasetError(f"{source}: option {shown(key)} has no value; write {key}=VALUE")
+            raise DatasetError(f"{source}: option {shown(key)} has no value; use {key}=VALUE")
         given[key] = tuple(value.split(",")) if key == "distortion" else value
     try:
         options = kind.model_validate(given)
@@ -139,7 +139,7 @@ def render_sequence(
 ) -> Path:
     """Render a sequence into a new folder ``output``.  DatasetError if that exists already."""
     if output.exists():
-        raise DatasetError(f"{output}: exists already; name another folder or remove it first")
+        raise DatasetError(f"{output}: already exists; choose another folder, or remove it")
     _check_name(name)
     plan = _plan(name, options or parse_builtin(name)[1])
     try:

@@ -124,5 +124,5 @@ def _read_tracks(file: Path) -> F64:
     if tracks.ndim != 3 or tracks.shape[2] != 3 or min(tracks.shape[:2]) < 3:
         raise DatasetError(f"{file}: {_TRACKS_KEY} should be (frames, points, 3)")
     if not np.isfinite(tracks).all() or tracks[:, :, 2].min() <= 0.0:
-        raise DatasetError(f"{file}: {_TRACKS_KEY} has points that are not before the camera")
+        raise DatasetError(f"{file}: {_TRACKS_KEY} has points that are not in front of the camera")
     return tracks

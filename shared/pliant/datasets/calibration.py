@@ -256,7 +256,7 @@ def _model(content: dict[str, Any]) -> LensModel:
             return "pinhole-rational"
         return "pinhole-radtan" if distorted else "pinhole"
     if given not in _MODELS:
-        raise CalibrationError(f"model {shown(given)} is not understood: use {', '.join(_MODELS)}")
+        raise CalibrationError(f"model {shown(given)} is not supported: use {', '.join(_MODELS)}")
     model = cast(LensModel, given)
     unused = [k for k in distorted if k not in COEFFICIENTS[model]]
     if unused:

@@ -36,13 +36,13 @@ def colmap(text: str, wanted: Wanted) -> Keys:
     if wanted.camera:
         cameras = [tuple(row[1:]) for row in lines if row[0] == wanted.camera.removeprefix("cam")]
         if not cameras:
-            raise CalibrationError(f"no camera {wanted.camera}: see the first column")
+            raise CalibrationError(f"no camera {wanted.camera}: use a number of the first column")
     if wanted.image_size is not None and len(cameras) > 1:
         size = tuple(map(str, wanted.image_size))
         cameras = [row for row in cameras if row[1:3] == size] or cameras
     if len(cameras) > 1:
         raise CalibrationError(
-            f"holds {len(cameras)} cameras: say which took the images, as in --calibration "
+            f"has {len(cameras)} cameras: select the camera of the images, as in --calibration "
             f"FILE:{lines[-1][0]}"
         )
     name, width, height, *values = cameras[0]
@@ -88,15 +88,15 @@ def _of_all_frames(content: Keys) -> Keys:
         if isinstance(frame, dict)
     ]
     if any(camera != each[0] for camera in each):
-        raise CalibrationError("gives images cameras that differ: give the calibration of one")
+        raise CalibrationError("has different cameras for its images: pass the calibration of one")
     return each[0] if each else {}
 
 
 def _known_colmap(name: str) -> tuple[LensModel, str]:
     if name not in _COLMAP:
         raise CalibrationError(
-            f"camera model {name} is not understood: calibrate again with OPENCV "
-            "(a wide lens: with OPENCV_FISHEYE)"
+            f"camera model {name} is not supported: calibrate again with OPENCV (a wide lens: "
+            "with OPENCV_FISHEYE)"
         )
     return _COLMAP[name]
 

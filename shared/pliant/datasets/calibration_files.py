@@ -72,7 +72,7 @@ def check_size(calibration: Calibration, image_size: tuple[int, int] | None, whe
     if image_size is not None and image_size != size:
         raise CalibrationError(
             f"{where}: is for images of {size[0]}x{size[1]} px, but they have "
-            f"{image_size[0]}x{image_size[1]}; give the calibration of these images"
+            f"{image_size[0]}x{image_size[1]}; pass the calibration of these images"
         )
 
 
@@ -84,6 +84,8 @@ def _read(file: Path) -> str:
             f"{file}: no such calibration file; write one with {UNDERSTOOD}"
         ) from None
     except IsADirectoryError:
-        raise CalibrationError(f"{file}: a folder without a calibration file: name it") from None
+        raise CalibrationError(
+            f"{file}: a folder without a calibration file: pass the file"
+        ) from None
     except OSError as error:
         raise CalibrationError(f"{file}: cannot be read: {error.strerror}") from None

@@ -52,7 +52,7 @@ def flat_from_keys(content: Keys, wanted: Wanted) -> Keys:
     for kind in FORMATS:
         if not isinstance(kind.mark, re.Pattern) and any(key in content for key in kind.mark):
             return kind.flat(content, wanted)
-    raise CalibrationError(f"holds no camera; understood are {UNDERSTOOD}")
+    raise CalibrationError(f"contains no camera; supported are {UNDERSTOOD}")
 
 
 def _keys(text: str) -> Keys:
@@ -62,9 +62,9 @@ def _keys(text: str) -> Keys:
     try:
         content = _json(text) or load_yaml(text)
     except YamlError as error:
-        raise CalibrationError(f"not YAML ({error}); understood are {UNDERSTOOD}") from None
+        raise CalibrationError(f"not YAML ({error}); supported are {UNDERSTOOD}") from None
     if not isinstance(content, dict):
-        raise CalibrationError(f"no keys and values; understood are {UNDERSTOOD}")
+        raise CalibrationError(f"no keys and values; supported are {UNDERSTOOD}")
     return {str(key): value for key, value in cast(Keys, content).items()}
 
 
@@ -142,7 +142,7 @@ def _of_chain(cameras: Keys, wanted: Wanted) -> str:
         if len(chosen) == 1:
             return chosen[0]
     raise CalibrationError(
-        f"holds {len(names)} cameras ({', '.join(names)}): say which took the images, as in "
+        f"has {len(names)} cameras ({', '.join(names)}): select the camera of the images, as in "
         f"--calibration FILE:{names[-1]}"
     )
 
@@ -151,8 +151,8 @@ def _euroc(content: Keys, wanted: Wanted) -> Keys:
     camera = str(content.get("camera_model", "pinhole")).lower()
     if camera not in ("pinhole", "pinhole-radtan", "fisheye"):
         raise CalibrationError(
-            f"camera_model {shown(camera)} is not understood: calibrate again with pinhole "
-            "(a wide lens: with pinhole-equi)"
+            f"camera_model {shown(camera)} is not supported: calibrate again with pinhole (a wide "
+            "lens: with pinhole-equi)"
         )
     size = _numbers(content, "resolution", 2) if "resolution" in content else None
     return _lens(content, _numbers(content, "intrinsics", 4), size, _said_model(content))
@@ -186,7 +186,7 @@ def _lens(content: Keys, intrinsics: list[Any], size: list[Any] | None, said: st
     model, coefficients = _DISTORTION.get(said), _numbers(content, key, None)
     if model is None:
         raise CalibrationError(
-            f"distortion_model {shown(said)} is not understood: calibrate again with radtan or "
+            f"distortion_model {shown(said)} is not supported: calibrate again with radtan or "
             "equidistant"
         )
     names = COEFFICIENTS[model]
@@ -194,7 +194,7 @@ def _lens(content: Keys, intrinsics: list[Any], size: list[Any] | None, said: st
         coefficients = coefficients[:-1]  # more terms than the model has, if they are zero
     if len(coefficients) > len(names):
         raise CalibrationError(
-            f"{len(coefficients)} distortion coefficients, but {said} is understood with at most "
+            f"{len(coefficients)} distortion coefficients, but {said} is supported with at most "
             f"{len(names)} ({' '.join(names)}): calibrate again with those"
         )
     if model == "pinhole-rational":
@@ -249,7 +249,7 @@ def _orb_slam(content: Keys, wanted: Wanted) -> Keys:
     model = _ORB_SLAM.get(said.lower())
     if model is None:
         raise CalibrationError(
-            f"Camera.type {shown(said)} is not understood: calibrate again with PinHole or "
+            f"Camera.type {shown(said)} is not supported: calibrate again with PinHole or "
             "KannalaBrandt8"
         )
     camera = "Camera1" if "Camera1.fx" in content else "Camera"
@@ -278,7 +278,7 @@ def _kitti(text: str, wanted: Wanted) -> Keys:
     if len(row) != 12:
         raise CalibrationError(f"P{camera} has {len(row)} numbers: expected 12")
     if wanted.image_size is None:
-        raise CalibrationError("a KITTI calibration does not say how large the images are")
+        raise CalibrationError("a KITTI calibration has no image size")
     return {"model": "pinhole", "fx": row[0], "fy": row[5], "cx": row[2], "cy": row[6]}
 
 
@@ -313,7 +313,7 @@ FORMATS = (
     CalibrationFormat(
         "nerfstudio's transforms.json", ("fl_x", "camera_angle_x", "frames"), nerfstudio
     ),
-    CalibrationFormat("our own calib.yaml", ("fx", "fy", "cx", "cy"), _own),
+    CalibrationFormat("Pliant's calib.yaml", ("fx", "fy", "cx", "cy"), _own),
 )
 """Every kind of calibration file; the first that a file looks like reads it."""
 

@@ -95,7 +95,8 @@ class CameraDevice:
         if not capture.isOpened():
             capture.release()
             raise DatasetError(
-                f"{self.name}: no such camera, or another program uses it; the first is camera:0"
+                f"{self.name}: no such camera, or another program uses it; the first camera "
+                "is camera:0"
             )
         if self._size is not None:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._size[0])

@@ -57,15 +57,15 @@ def with_depth(
         _check_stereo(folder, calibration)
     elif not file.is_file():
         raise DatasetError(
-            f"{folder}: no {LIST_NAME}: surfels need a depth map to start from, listed there like "
-            f"the images in rgb.txt, or right images of a rectified pair in {stereo.LIST_NAME}; "
-            "without any, see --depth map and --depth flat"
+            f"{folder}: no {LIST_NAME}: surfels start from a depth map, listed there like the "
+            f"images in rgb.txt, or from right images of a rectified pair in {stereo.LIST_NAME}; "
+            "without either, use --depth map or --depth flat"
         )
     maps = [each for each in read_list(file, folder).images if not each.fault]
     _check_scale(folder, calibration)
     rows, of_maps = associate(_stamps(images), _stamps(maps), max_difference_ns=_MAX_DIFFERENCE_NS)
     if not len(rows):
-        raise DatasetError(f"{file}: no depth map is within 20 ms of an image; correct its times")
+        raise DatasetError(f"{file}: no depth map is within 20 ms of an image; correct the times")
     wanted = slice(1 if options.depth == "first" else None)
     pairs = zip(rows[wanted].tolist(), of_maps[wanted].tolist(), strict=True)
     found: dict[int, Path | StereoPair] = {row: maps[of_map].path for row, of_map in pairs}

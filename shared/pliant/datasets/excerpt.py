@@ -43,9 +43,7 @@ class Excerpt:
         Raises DatasetError where the end is not after the start.
         """
         if 0.0 < part.end_s <= part.start_s:
-            raise DatasetError(
-                f"--end {part.end_s:g}: is not after --start {part.start_s:g}: nothing is left"
-            )
+            raise DatasetError(f"--end {part.end_s:g}: must be after --start {part.start_s:g}")
         self.source = source
         self.part = part
         self._first_depth_only = first_depth_only

@@ -121,6 +121,8 @@ def _timed(paths: Sequence[Path], fps: float | None) -> tuple[list[ListedImage],
     if fps is not None or len(images) == 1:
         return images, []
     return images, [
-        f"times: the file names tell none: {DEFAULT_FPS:.0f} images/s are assumed (fps in "
-        f"{CALIBRATION_NAME} or times in {LIST_NAME} say better)"
+        (
+            f"times: none in the file names, assuming {DEFAULT_FPS:.0f} images/s (or set fps in "
+            f"{CALIBRATION_NAME}, or times in {LIST_NAME})"
+        )
     ]

@@ -81,7 +81,7 @@ def images_of_one_kind(folder: Path) -> tuple[list[Path], list[str]]:
     if left_out:
         told = ", ".join(f"{len(paths)} {shortened(kind)}" for kind, paths in left_out.items())
         used = ", ".join(shortened(kind) for kind in chosen)
-        notes.append(f"{folder.name}: the images {used} are used; passed over: {told}")
+        notes.append(f"{folder.name}: using the images {used}; skipping {told}")
     return [path for path in files if _kind(path) in chosen], notes
 
 
@@ -141,7 +141,7 @@ def _pages(files: Sequence[Path]) -> list[str]:
         count = 1
     if able is None or count <= 1:
         return []
-    return [f"{able.name}: has {count} pages or frames, of which the first is read: convert it"]
+    return [f"{able.name}: has {count} pages or frames, and only the first is read: convert it"]
 
 
 def foreign_files(folder: Path) -> list[str]:
@@ -155,6 +155,6 @@ def foreign_files(folder: Path) -> list[str]:
         return []
     count = sum(suffix in _FOREIGN for suffix in suffixes)
     return [
-        f"{folder.name}: {counted(count, 'file')} ({', '.join(found)}) passed over: not a format "
-        "that is read; convert them to JPEG or PNG"
+        f"{folder.name}: {counted(count, 'file')} ({', '.join(found)}) passed over: "
+        "unsupported format; convert to JPEG or PNG"
     ]

@@ -76,7 +76,8 @@ def read_list(file: Path, folder: Path, *, unit: str = "seconds") -> ImageList:
     if missing:
         of = f"{counted(len(missing), 'file')} of {len(rows)}"
         told.append(
-            f"{file.name}: {of} (the first in line {missing[0].line}) missing: they count as broken"
+            f"{file.name}: {of} (the first in line {missing[0].line}) are missing and count "
+            "as broken"
         )
     others = [row.other for row in rows if row.other is not None]
     return ImageList(
@@ -94,7 +95,7 @@ def _unlisted(file: Path, rows: "Sequence[_Row]") -> list[str]:
     if not left:
         return []
     names = ", ".join(sorted({f"{folder.name}/" for folder in folders})[:3])
-    return [f"{file.name}: lists {len(listed)} images; {left} more in {names} are left out"]
+    return [f"{file.name}: lists {len(listed)} images; {left} more in {names} are skipped"]
 
 
 def stamps_of(
@@ -142,7 +143,7 @@ def mended(
     first = next(row for row in range(len(stamps)) if found[row].fault)
     told = (
         f"{file.name}: the times of {counted(wrong, 'image')} do not increase (the first in line "
-        f"{lines[first]}): they count as broken"
+        f"{lines[first]}), and count as broken"
     )
     return found, [told]
 
@@ -151,7 +152,9 @@ def inside(folder: Path, name: str, where: str) -> Path:
     """The path of a listed file.  Raises DatasetError where it would leave the folder."""
     normal = os.path.normpath(name)
     if "\0" in name or os.path.isabs(name) or normal.split(os.sep)[0] == "..":
-        raise DatasetError(f"{where}: {shown(name)} is outside of {folder}; list files inside it")
+        raise DatasetError(
+            f"{where}: {shown(name)} is outside of {folder}; list only files inside it"
+        )
     return folder / normal
 
 
@@ -202,8 +205,8 @@ def _refuse(stamps_ns: Sequence[int], lines: Sequence[int], file: Path) -> None:
     what = "repeats" if stamps_ns[i] == stamps_ns[i - 1] else "runs backwards from"
     before, here = _seconds(stamps_ns[i - 1]), _seconds(stamps_ns[i])
     raise DatasetError(
-        f"{file}: line {lines[i]}: the time {here} s {what} that of line {lines[i - 1]} "
-        f"({before} s); sort the list, remove doubles"
+        f"{file}: line {lines[i]}: the time {here} s {what} that of line {lines[i - 1]} ({before} "
+        "s); sort the list and remove duplicates"
     )
 
 

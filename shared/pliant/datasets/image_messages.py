@@ -87,8 +87,8 @@ def _frame_of(kind: str, image: RecordedImage, index: int) -> SourceFrame:
     encoding = OTHER_NAMES.get(message.encoding, message.encoding)
     if encoding not in RAW_BYTES:
         raise BrokenFrame(
-            f"images with encoding {shown(message.encoding)} are not understood; convert them "
-            f"to one of {', '.join(RAW_BYTES)}"
+            f"images with encoding {shown(message.encoding)} are not supported; convert them to "
+            f"one of {', '.join(RAW_BYTES)}"
         )
     return SourceFrame(
         index=index,
@@ -128,7 +128,7 @@ def calibration(message: Any, *, rectified: bool) -> Calibration:
         content["distortion_coefficients"] = {"data": []}
         return calibration_from_camera_info(content)
     if len(K) != 9 or K[0] == 0.0:
-        raise CalibrationError("the camera was not calibrated (K is zero)")
+        raise CalibrationError("the camera is not calibrated (K is zero)")
     _check_region(message)
     content["camera_matrix"] = {"data": K}
     content["distortion_model"] = str(message.distortion_model)
@@ -143,7 +143,7 @@ def _check_region(message: Any) -> None:
     ) * int(message.height)
     if cropped or max(getattr(message, "binning_x", 0), getattr(message, "binning_y", 0)) > 1:
         raise CalibrationError(
-            "the images are binned or cropped, the calibration is for whole ones"
+            "the images are binned or cropped, but the calibration is for full images"
         )
 
 

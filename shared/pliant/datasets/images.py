@@ -38,7 +38,7 @@ class SourceOptions:
 
     def __post_init__(self) -> None:
         if self.calibration is not None and self.fov_deg is not None:
-            raise CalibrationError("--calibration and --fov contradict each other: give one")
+            raise CalibrationError("--calibration and --fov exclude each other: pass only one")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +143,7 @@ def image_size(images: Sequence[ListedImage]) -> tuple[int, int]:
         return most_frequent(sizes)
     tried = min(count, _TRIED_FOR_SIZE)
     which = "the only image does not" if tried == 1 else f"none of the first {tried} images does"
-    raise DatasetError(f"{images[0].path}: {which} decode; are these image files?")
+    raise DatasetError(f"{images[0].path}: {which} decode; check that these are image files")
 
 
 def _spread(count: int) -> list[int]:
@@ -172,7 +172,7 @@ def choose_calibration(
     if options.calibration is not None:
         return read_calibration(options.calibration, size, kitti_camera=kitti_camera, source=source)
     if isinstance(found, Calibration):
-        check_size(found, size, f"{where}: its known calibration")
+        check_size(found, size, f"{where}: its built-in calibration")
         return found
     if found is not None and found.is_file():
         return read_calibration(found, size, kitti_camera=kitti_camera, source=source)

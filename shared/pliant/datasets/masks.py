@@ -53,7 +53,7 @@ class Masked:
         else:
             used = self._fitting(path)
             if not used.any():
-                raise DatasetError(f"--mask {path}: is black all over, which leaves nothing to use")
+                raise DatasetError(f"--mask {path}: is completely black, and would mask everything")
             self._fixed = _kept(used)
             share = 100.0 * (1.0 - used.mean())
             self.note = f"masked: {share:.0f} % of each image are ignored ({path.name})"
@@ -79,18 +79,16 @@ class Masked:
         try:
             scaled(used, (self.calibration.width, self.calibration.height))
         except ValueError as error:
-            raise DatasetError(f"--mask {path}: is {error}: make it of one of them") from None
+            raise DatasetError(f"--mask {path}: is {error}: use one of these sizes") from None
         return used
 
     def _take_folder(self, folder: Path) -> str:
         """Find out whose the masks are, and say it."""
         if self.is_live:
-            raise DatasetError(
-                f"--mask {folder}: a camera has no frames to name yet: give an image"
-            )
+            raise DatasetError(f"--mask {folder}: a camera needs a single mask image, not a folder")
         files = image_files(folder)
         if not files:
-            raise DatasetError(f"--mask {folder}: holds no images: give a folder of PNG")
+            raise DatasetError(f"--mask {folder}: contains no images: pass a folder of PNG files")
         self._fitting(files[0])
         images = self.source.names if isinstance(self.source, ImageFiles) else []
         named = {file.stem: file for file in reversed(files)}
@@ -104,11 +102,11 @@ class Masked:
         if not found:
             wanted = f"{Path(images[0]).stem}.png" if images else "000000.png"
             raise DatasetError(
-                f"--mask {folder}: holds no mask of any frame: the first would be {wanted}, and is "
-                f"{files[0].name}"
+                f"--mask {folder}: has no mask for any frame: the first should be {wanted}, but "
+                f"is {files[0].name}"
             )
         of = "the" if self.frame_count is None else f"{self.frame_count}"
-        rest = "" if found == self.frame_count else ", the others are used as a whole"
+        rest = "" if found == self.frame_count else ", the others are used completely"
         return f"masked: {found} of {of} frames have a mask{rest}"
 
 
@@ -122,8 +120,8 @@ def _read(path: Path) -> BoolArray:
     pixels = decoded(data, flags)
     if pixels is None:
         raise DatasetError(
-            f"--mask {path}: is no image that OpenCV can read, or one of more than a gigapixel: "
-            "give a PNG of the images' size"
+            f"--mask {path}: OpenCV cannot read this image, or it exceeds a gigapixel: pass a PNG "
+            "of the images' size"
         )
     # What is compressed with losses has no exact black.
     least = 128 if encoding_of(data) in _LOSSY else 1
@@ -138,7 +136,9 @@ def _numbered(folder: Path, files: list[Path], frames: int | None) -> dict[int, 
         number = int(digits[-1]) if digits else -1
         if number in found:
             other = found[number].name
-            raise DatasetError(f"--mask {folder}: {other} and {file.name} are of the same frame")
+            raise DatasetError(
+                f"--mask {folder}: {other} and {file.name} are masks of the same frame: remove one"
+            )
         if digits:
             found[number] = file
     from_one = frames is not None and sorted(found) == list(range(1, frames + 1))

@@ -66,8 +66,8 @@ class _Mcap:
                 raise damaged(self.path, error, _HINT) from None
             if summary is None or (summary.chunk_indexes == [] and not summary.channels):
                 raise DatasetError(
-                    f"{self.path}: is cut off or was never closed: it has no index; mend it with "
-                    f"{_HINT}"
+                    f"{self.path}: is truncated or was never closed: it has no index; repair it "
+                    f"with {_HINT}"
                 )
             yield _OpenMcap(self.path, reader, summary)
 
@@ -114,8 +114,8 @@ def _decoder(path: Path, schema: Schema | None, encoding: str) -> _Decoder:
     if encoding == "json":
         return _from_json
     raise DatasetError(
-        f"{path}: {shortened(schema.name)} encoded as {shown(encoding)} is not understood: "
-        "only cdr, ros1, protobuf and json are"
+        f"{path}: {shortened(schema.name)} encoded as {shown(encoding)} is not supported: use "
+        "cdr, ros1, protobuf or json"
     )
 
 

@@ -135,12 +135,12 @@ def _choose(topics: list[MessageTopic], wanted: str, path: Path) -> MessageTopic
         )
     if not images:
         names = ", ".join(sorted({t.kind for t in topics})) or "nothing"
-        raise DatasetError(f"{path}: no topic with images; it carries {names[:300]}")
+        raise DatasetError(f"{path}: no topic with images; its topics: {names[:300]}")
     if not wanted and len(images) > 1:
         likely = _of_a_camera(images)
         if len(likely) == 1:
             return likely[0]
-        raise DatasetError(f"{path}: several topics with images, choose by --topic: {listed}")
+        raise DatasetError(f"{path}: several topics with images; choose one with --topic: {listed}")
     return named[0] if wanted else images[0]
 
 
@@ -160,7 +160,7 @@ def _other_topics(topics: list[MessageTopic], chosen: MessageTopic, wanted: str)
     if wanted or not others:
         return []
     named = shortened(", ".join(sorted(others)), 120)
-    return [f"{chosen.name} is used, not {named} (--topic chooses)"]
+    return [f"using {chosen.name}, not {named} (choose with --topic)"]
 
 
 def _with_images(listed: str) -> str:
@@ -192,7 +192,7 @@ def _calibration(opened: OpenMessages, images: MessageTopic, where: str) -> Cali
         return image_messages.calibration(message.message, rectified=rectified)
     except (CalibrationError, *image_messages.FOREIGN) as error:
         raise CalibrationError(
-            f"{where}: the calibration in {able[0].name}: {shortened(str(error), 200)}; give "
+            f"{where}: the calibration in {able[0].name}: {shortened(str(error), 200)}; pass "
             "--calibration FILE"
         ) from None
 
@@ -208,12 +208,12 @@ def recorded_image(time_ns: int, decode: Callable[[bytes], Any], data: bytes) ->
 
 def missing_library(path: Path, library: str) -> DatasetError:
     """What to say where an optional library is not there."""
-    return DatasetError(f"{path}: needs {library} to be read: pip install 'pliant[bags]'")
+    return DatasetError(f"{path}: reading this file needs {library}: pip install 'pliant[bags]'")
 
 
 def damaged(path: Path, error: BaseException, hint: str) -> DatasetError:
     """One line for whatever a library says of a broken file."""
     said: Any = " ".join(str(error).split())[:120]
     return DatasetError(
-        f"{path}: is cut off or damaged ({said or type(error).__name__}); mend it with {hint}"
+        f"{path}: is truncated or damaged ({said or type(error).__name__}); repair it with {hint}"
     )

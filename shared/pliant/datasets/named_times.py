@@ -105,7 +105,7 @@ def _seconds_and_rest(seconds: Sequence[str], rest: Sequence[str] | None) -> Nam
         for second, part in zip(seconds, rest, strict=True)
     ]
     unique = len(set(stamps)) == len(stamps)
-    return _in_order(stamps, "seconds and their fraction") if unique else None
+    return _in_order(stamps, "seconds and fraction") if unique else None
 
 
 def _dates(names: Sequence[str]) -> NamedTimes | None:

@@ -24,8 +24,8 @@ def keys_of_xml(text: str) -> dict[str, Any]:
         raise CalibrationError(f"not XML: {shortened(str(error))}") from None
     if root.tag != _ROOT:
         raise CalibrationError(
-            f"XML of another program (<{shortened(root.tag)}>): only OpenCV's is read; export the "
-            "calibration for OpenCV or COLMAP"
+            f"XML of another program (<{shortened(root.tag)}>): only OpenCV's is supported; "
+            "export the calibration for OpenCV or COLMAP"
         )
     return {element.tag: _value(element) for element in root}
 

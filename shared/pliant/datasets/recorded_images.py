@@ -69,7 +69,7 @@ class _RecordedClip:
         except OSError as error:
             raise RecordingError(
                 f"{self._path}: the clip in it cannot be unpacked to {tempfile.gettempdir()}: "
-                f"{error.strerror}; make room there, or set TMPDIR"
+                f"{error.strerror}; free some space there, or set TMPDIR"
             ) from None
         self._decoder = self._held.enter_context(ExitStack())
         self._begin()
@@ -85,9 +85,9 @@ class _RecordedClip:
         if found is None:
             version = self._made_with or "of its version"
             raise RecordingError(
-                f"{self._path}: frame {image.frame}: OpenCV {cv2.__version__} makes other pixels "
-                f"of the clip in it than the run had{self._missing}: read it where it was made, or "
-                f"with OpenCV {version}"
+                f"{self._path}: frame {image.frame}: OpenCV {cv2.__version__} decodes other "
+                f"pixels from its clip than the run{self._missing}: read it on the machine of the "
+                f"run, or with OpenCV {version}"
             )
         return found
 
@@ -132,7 +132,7 @@ class _RecordedClip:
             self._video = self._decoder.enter_context(opened(self._file))
         except DatasetError:
             raise RecordingError(
-                f"{self._path}: OpenCV {cv2.__version__} cannot read the clip in it{self._missing}"
+                f"{self._path}: OpenCV {cv2.__version__} cannot read its clip{self._missing}"
             ) from None
         self._next = 0
 
@@ -157,8 +157,8 @@ class _RecordedClip:
             there += file.write(piece.data)
         if file is None:
             raise RecordingError(
-                f"{self._path}: the clip is not in it that its images are made from (one part of "
-                "several? their folder has it)"
+                f"{self._path}: the clip of its images is missing (if this is one part of "
+                "several, pass the folder of all parts)"
             )
         file.flush()
         if there < size:

@@ -89,7 +89,8 @@ class _OpenGraph:
                 except queue.Empty:
                     if last_ns < 0 and time.monotonic() > deadline:
                         raise DatasetError(
-                            f"{self._path}: {topic.name}: no message came within {_FIRST_S:.0f} s"
+                            f"{self._path}: {topic.name}: no message arrived within "
+                            f"{_FIRST_S:.0f} s"
                         ) from None
                     if ros.name not in {there.name for there in self._node.published()}:
                         return

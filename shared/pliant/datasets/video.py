@@ -66,7 +66,7 @@ class VideoFile:
             pixel_aspect=float(aspect),
         )
         if aspect != 1 and self.calibration.focal_sigma > 0.0:
-            self.notes.append(f"pixels are {float(aspect):.3g} times as wide as high")
+            self.notes.append(f"pixel aspect ratio {float(aspect):.3g}")
 
     def reaches(self, time_s: float) -> bool:
         """Whether a frame is found there by seeking; where none is, only reading tells."""
@@ -97,7 +97,7 @@ class VideoFile:
         now = file_version(self.file)
         if now != self._version and now[:2] == self._version[:2]:
             raise DatasetError(
-                f"{self.file}: was written to while it was read, and its frames may be of two "
+                f"{self.file}: was modified during the run, and its frames may come from two "
                 "videos: run it again"
             )
 

@@ -217,6 +217,6 @@ def _why_not(file: Path) -> str:
     if file_version(file) and not file.stat().st_size:
         return "is empty (0 bytes): copy it again"
     return (
-        "not a video that OpenCV can read: without pictures, cut off before its end, or in a "
-        "format that it does not know (then convert it, e.g. to MP4)"
+        "not a video that OpenCV can read: without images, truncated, or in an unsupported "
+        "format (then convert it, e.g. to MP4)"
     )

@@ -102,7 +102,7 @@ def _note(streams: Sequence[VideoStream], chosen: VideoStream) -> str:
         f"{each.width}x{each.height}{' (picture)' if each.is_still else ''}" for each in streams
     )
     number = next(i for i, each in enumerate(streams, start=1) if each is chosen)
-    return f"{len(streams)} video streams ({listed}): stream {number} is read"
+    return f"{len(streams)} video streams ({listed}): reading stream {number}"
 
 
 def streams_of(file: Path) -> Container:

@@ -48,7 +48,7 @@ class SmallerImages:
         self.frame_count = source.frame_count
         self.ground_truth_path: Path | None = source.ground_truth_path
         to = f"{self.calibration.width}x{self.calibration.height}"
-        self.note = f"images of {whole.width}x{whole.height} px are worked on at {to} px"
+        self.note = f"images of {whole.width}x{whole.height} px are processed at {to} px"
 
     def __iter__(self) -> Iterator[SourceFrame]:
         for frame in self.source:
@@ -90,8 +90,9 @@ def at_working_size(source: Dataset, longest_side_px: int = 0) -> Dataset:
     shorter = min(width, height, round(min(width, height) * LONGEST_SIDE_PX / longer))
     if shorter < _LEAST_SHORTER_SIDE_PX:
         raise DatasetError(
-            f"{source.name}: images of {width}x{height} px are too narrow to track in: the shorter "
-            f"side needs {_LEAST_SHORTER_SIDE_PX} px where the longer one has {LONGEST_SIDE_PX}"
+            f"{source.name}: images of {width}x{height} px are too narrow for tracking: the "
+            f"shorter side needs {_LEAST_SHORTER_SIDE_PX} px where the longer one has "
+            f"{LONGEST_SIDE_PX}"
         )
     side = longest_side_px or _side_of(source, longer)
     return SmallerImages(source, side) if side < longer else source
