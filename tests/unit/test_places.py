@@ -55,6 +55,18 @@ def test_corners_are_found_again_where_the_camera_turned_and_came_nearer():
     assert len(match(a, describe(noise(2)))) < 10
 
 
+def test_a_large_image_has_its_corners_where_a_small_one_has_them_in_its_own_pixels():
+    small, times = noise(1, 480, 640), (2.5, 2.0)
+    large = cv2.resize(small, (1600, 960), interpolation=cv2.INTER_CUBIC)
+    a, b = describe(small), describe(large)
+    pairs = match(a, b)
+    expected = (a.points_px[pairs[:, 0]] + 0.5) * times - 0.5
+    errors = np.linalg.norm((expected - b.points_px[pairs[:, 1]]) / times, axis=1)
+    assert len(pairs) >= 100
+    assert np.median(errors) < 1.0
+    assert np.abs(np.median(expected - b.points_px[pairs[:, 1]], axis=0)).max() < 0.5
+
+
 def test_an_image_of_nothing_has_no_corners():
     features = describe(np.full((48, 64), 90, np.uint8))
     assert features.points_px.shape == (0, 2)

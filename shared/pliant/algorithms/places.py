@@ -36,6 +36,10 @@ from pliant.compiler.kernel import fast_kernel, kernel
 _FEATURES = 700
 """In an image.  With the index these are 45 kB."""
 
+_MOST_PIXELS = 640 * 480
+"""Of the image that corners are looked for in: larger ones are reduced to as many, which costs half
+as much and leaves as many corners as are wanted."""
+
 _SCALE_FACTOR = 1.2
 _LEVELS = 8
 """Of the pyramid: 3.6 times."""
@@ -81,28 +85,42 @@ class Features:
 
 def describe(grey: U8) -> Features:
     """Corners of an image (H, W), none where it shows nothing."""
+    small, scale = _reduced(grey)
     orb = cv2.ORB_create(  # pyright: ignore[reportAttributeAccessIssue]
         nfeatures=_FEATURES, scaleFactor=_SCALE_FACTOR, nlevels=_LEVELS,
         fastThreshold=_FAST_THRESHOLD,
     )  # fmt: skip
-    corners, descriptors = orb.detectAndCompute(grey, None)
+    corners, descriptors = orb.detectAndCompute(small, None)
     if descriptors is None:
         return Features(points_px=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), "u1"))
     # OpenCV scales pixels by their corner, we by their centre.
     places = [(*corner.pt, 0.5 * (_SCALE_FACTOR**corner.octave - 1.0)) for corner in corners]
     u, v, shift = np.array(places).T
-    points_px = np.column_stack([u + shift, v + shift]).astype(np.float32)
-    return Features(points_px=points_px, descriptors=descriptors)
+    points_px = np.column_stack([u + shift, v + shift])
+    if small is not grey:
+        points_px = (points_px + 0.5) / scale - 0.5
+    return Features(points_px=points_px.astype(np.float32), descriptors=descriptors)
+
+
+def _reduced(grey: U8) -> tuple[U8, F64]:
+    """The image at no more than so many pixels, and its (width, height) as shares of before."""
+    height, width = grey.shape
+    share = np.sqrt(_MOST_PIXELS / grey.size)
+    if share >= 1.0:
+        return grey, np.ones(2)
+    size = max(round(share * width), 1), max(round(share * height), 1)
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8), np.array(size) / (width, height)
 
 
 def match(a: Features, b: Features) -> I64:
     """(m, 2) corners of a and of b that are each other's best, clearly better than the next."""
     A, B = (np.ascontiguousarray(each.descriptors).view(np.uint64) for each in (a, b))
-    there, back = np.full(len(A), -1, np.int32), np.full(len(B), -1, np.int32)
+    there, back = np.full(len(A), -1, np.int64), np.full(len(B), -1, np.int64)
     _best(A, B, there, back)
     found = np.flatnonzero(there >= 0)
     found = found[back[there[found]] == found]
-    return np.column_stack([found, there[found]]).astype(np.int64)
+    return np.column_stack([found, there[found]])
 
 
 def look_alike(seen: Features, corners: I64) -> I64:
@@ -117,41 +135,66 @@ def look_alike(seen: Features, corners: I64) -> I64:
 def _alike(A: U64, B: U64, found: BoolArray) -> None:
     for i in range(A.shape[0]):
         for j in range(B.shape[0]):
-            distance = 0
+            bits = np.uint64(0)
             for k in range(_WORDS):
-                distance += _bits(A[i, k] ^ B[j, k])
-            found[i, j] = distance <= _MAX_BITS
+                bits += _bits_of_bytes(A[i, k] ^ B[j, k])
+            found[i, j] = _sum_of_bytes(bits) <= _MAX_BITS
 
 
 @fast_kernel
-def _bits(word: np.uint64) -> np.int64:
-    """How many bits are set."""
+def _bits_of_bytes(word: np.uint64) -> np.uint64:
+    """How many bits are set in each byte, in that byte."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     twos = np.uint64(0x3333333333333333)
     word = (word & twos) + ((word >> np.uint64(2)) & twos)
-    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+    return (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+
+
+@fast_kernel
+def _sum_of_bytes(word: np.uint64) -> np.int64:
+    """By shifts, not by a product, which has no SIMD code."""
+    pairs = np.uint64(0x00FF00FF00FF00FF)
+    word = (word & pairs) + ((word >> np.uint64(8)) & pairs)
+    word = word + (word >> np.uint64(16))
+    return np.int64((word + (word >> np.uint64(32))) & np.uint64(0xFFFF))
 
 
 @kernel
-def _best(A: U64, B: U64, there: I32, back: I32) -> None:
+def _best(A: U64, B: U64, there: I64, back: I64) -> None:
     """Index of the nearest of B to each of A, left where none is near or the next is as well; and
     of the nearest of A to each of B."""
-    closest = np.full(B.shape[0], 257, np.int64)
+    count = B.shape[0]
+    columns = np.ascontiguousarray(B.T)
+    b0, b1, b2, b3 = columns[0], columns[1], columns[2], columns[3]
+    distances = np.empty(count, np.int64)
+    closest = np.full(count, 257, np.int64)
     for i in range(A.shape[0]):
-        nearest, least, following = -1, 256, 256
-        for j in range(B.shape[0]):
-            distance = 0
-            for k in range(_WORDS):
-                distance += _bits(A[i, k] ^ B[j, k])
-            if distance < least:
-                nearest, least, following = j, distance, least
-            elif distance < following:
-                following = distance
-            if distance < closest[j]:
-                closest[j], back[j] = distance, i
-        if least <= _MAX_BITS and least <= _RATIO * following:
-            there[i] = nearest
+        a0, a1, a2, a3 = A[i, 0], A[i, 1], A[i, 2], A[i, 3]
+        least = np.int64(256)
+        for j in range(count):  # SIMD code, as the next loop
+            bits = _bits_of_bytes(a0 ^ b0[j]) + _bits_of_bytes(a1 ^ b1[j])
+            bits += _bits_of_bytes(a2 ^ b2[j]) + _bits_of_bytes(a3 ^ b3[j])
+            distance = _sum_of_bytes(bits)
+            distances[j] = distance
+            least = min(least, distance)
+        for j in range(count):
+            nearer = distances[j] < closest[j]
+            closest[j] = distances[j] if nearer else closest[j]
+            back[j] = i if nearer else back[j]
+        if least <= _MAX_BITS:
+            there[i] = _clearly_nearest(distances, least)
+
+
+@kernel
+def _clearly_nearest(distances: I64, least: np.int64) -> int:
+    """The first at the least distance; -1 where the next is about as near."""
+    nearest, following = -1, 256
+    for j in range(distances.size):
+        if nearest < 0 and distances[j] == least:
+            nearest = j
+        else:
+            following = min(following, distances[j])
+    return nearest if least <= _RATIO * following else -1
 
 
 def words_of(descriptors: U8) -> I32:

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from pliant.algorithms.arrays import F64, BoolArray
-from pliant.algorithms.geometry import so3_exp
 from pliant.compiler.kernel import kernel
 
 _ROUNDS = 10
 _MOST = 1.0
 """Turn and change of the log scale within one round."""
 
+_SETTLED = 1e-10
+_SMALL_RAD = 1e-6
 _MIN_DEPTH = 1e-6
 
 _FLAT = 1e-9
@@ -81,24 +82,60 @@ def refine_similarity(S_a_b: F64, pairs: Pairs, *, scale: float) -> F64:
 
     scale: of these, on the plane z = 1.
     """
+    found = S_a_b.copy()
+    _refine(found, pairs.xyz_a, pairs.xyz_b, pairs.seen_a, pairs.seen_b, scale)
+    return found
+
+
+@kernel
+def _refine(S: F64, xyz_a: F64, xyz_b: F64, seen_a: F64, seen_b: F64, scale: float) -> None:
+    """Overwrites S (4, 4)."""
+    residuals, J = np.empty((len(xyz_a), 5)), np.empty((len(xyz_a), 5, 7))
+    step, R = np.empty(7), np.empty((3, 3))
     for _ in range(_ROUNDS):
-        step = np.empty(7)
-        residuals, J = residuals_of(S_a_b, pairs)
-        _solve(*_normal_equations(residuals, J, scale, scale / _DEPTH_SIGMA), step)
-        if not np.abs(step[[0, 1, 2, 6]]).max() < _MOST:
+        _linearise(S, xyz_a, xyz_b, seen_a, seen_b, residuals, J)
+        H, g = _normal_equations(residuals, J, scale, scale / _DEPTH_SIGMA)
+        _solve(H, g, step)
+        largest = abs(step[6])
+        for k in range(3):
+            largest = max(largest, abs(step[k]))
+        if not largest < _MOST:
             break  # nothing holds it
-        S_a_b = moved(S_a_b, step)
-        if np.abs(step).max() < 1e-10:
+        _move(S, step, R)
+        if np.abs(step).max() < _SETTLED:
             break
-    return S_a_b
 
 
 def moved(S: F64, step: F64) -> F64:
     """S (4, 4) after a step (omega, tau, sigma): ``X -> e^sigma exp(omega) X + tau``."""
-    after = np.eye(4)
-    after[:3, :3] = np.exp(step[6]) * so3_exp(step[:3])
-    after[:3, 3] = step[3:6]
-    return after @ S
+    after = S.copy()
+    _move(after, step, np.empty((3, 3)))
+    return after
+
+
+@kernel
+def _move(S: F64, step: F64, R: F64) -> None:
+    """As ``moved``, in place.   R: (3, 3) is overwritten by ``e^sigma exp(omega)`` (Rodrigues)."""
+    x, y, z = step[0], step[1], step[2]
+    squared = x * x + y * y + z * z
+    angle = np.sqrt(squared)
+    a, b = 1.0 - squared / 6.0, 0.5 - squared / 24.0
+    if angle > _SMALL_RAD:
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared
+    scale = np.exp(step[6])
+    for r in range(3):
+        for c in range(3):
+            R[r, c] = b * step[r] * step[c]
+        R[r, r] += 1.0 - b * squared
+    R[0, 1], R[1, 0] = R[0, 1] - a * z, R[1, 0] + a * z
+    R[0, 2], R[2, 0] = R[0, 2] + a * y, R[2, 0] - a * y
+    R[1, 2], R[2, 1] = R[1, 2] - a * x, R[2, 1] + a * x
+    for c in range(4):
+        s0, s1, s2 = S[0, c], S[1, c], S[2, c]
+        for r in range(3):
+            S[r, c] = scale * (R[r, 0] * s0 + R[r, 1] * s1 + R[r, 2] * s2)
+    for r in range(3):
+        S[r, 3] += step[3 + r]
 
 
 def residuals_of(S_a_b: F64, pairs: Pairs) -> tuple[F64, F64]:
@@ -170,7 +207,8 @@ def _project_into(X: F64, dX: F64, seen: F64, error: F64, J: F64) -> None:
 
 @kernel
 def _normal_equations(residuals: F64, J: F64, scale: float, as_image: float) -> tuple[F64, F64]:
-    """(7, 7) and (7,) with Geman-McClure weights.   as_image: what distances count as."""
+    """(7, 7), its lower half, and (7,) with Geman-McClure weights.   as_image: what distances count
+    as."""
     H, g = np.zeros((7, 7)), np.zeros(7)
     for n in range(len(residuals)):
         r = residuals[n]
@@ -181,7 +219,7 @@ def _normal_equations(residuals: F64, J: F64, scale: float, as_image: float) -> 
             weight = times / (1.0 + squared / scale**2) ** 2
             for i in range(7):
                 g[i] += weight * J[n, k, i] * r[k]
-                for j in range(7):
+                for j in range(i + 1):
                     H[i, j] += weight * J[n, k, i] * J[n, k, j]
     return H, g
 
