@@ -1,5 +1,6 @@
 """Volumes of which only a part is in memory."""
 
+import mmap
 import resource
 from pathlib import Path
 
@@ -62,6 +63,25 @@ def test_what_is_in_the_file_need_not_be_in_memory() -> None:
         assert resident_bytes() - before < 0.2 * rows * BLOCK_BYTES
         for array in arrays:
             assert (array[5000:6000] == 5000).all()
+
+
+def test_what_was_in_memory_is_not_there_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    most = 0
+
+    class Watched(mmap.mmap):
+        def madvise(self, option: int, start: int = 0, length: int = 0) -> None:
+            nonlocal most
+            most = max(most, resident_bytes())
+            super().madvise(option, start, length or len(self))
+
+    monkeypatch.setattr(mmap, "mmap", Watched)
+    rows = 30000
+    arrays = [np.full((rows, 8, 8, 8, *last), 3, np.int32) for last in ((), (), (4,))]
+    before = resident_bytes()
+    with VoxelFile(1) as room:
+        room.grow(arrays, rows, rows + 1)
+        assert 0 < most - before < 0.25 * rows * BLOCK_BYTES
+        assert all((array[:rows:999] == 3).all() for array in arrays)
 
 
 def test_rows_stay_as_the_file_grows() -> None:

@@ -18,6 +18,8 @@ from pliant.algorithms.meshing.tsdf_blocks import InMemory
 
 _GROWTH = 1.25
 """Nothing is copied as a file grows, so it can stay near what is needed."""
+_COPIED = 4096
+"""Blocks at a time, when memory is full of them."""
 _SHARE_OF_FREE = 0.5
 """Of the disk, at the most: others need some, too."""
 
@@ -64,8 +66,10 @@ class VoxelFile(InMemory):
             self._maps[k] = mmap.mmap(file.fileno(), size)
             sums[k] = np.frombuffer(self._maps[k], np.int32).reshape(room, *old.shape[1:])
             if was_in_memory:
-                sums[k][:used] = old[:used]
-                self._maps[k].madvise(mmap.MADV_DONTNEED)
+                for first in range(0, used, _COPIED):
+                    rows = slice(first, min(first + _COPIED, used))
+                    sums[k][rows] = old[rows]
+                    self._maps[k].madvise(mmap.MADV_DONTNEED)
             self.size_bytes += size
 
     def let_go(self) -> None:
