@@ -22,7 +22,7 @@ from pliant.rendering.textures import make_texture
 CAMERA = CameraOptions(focal=320.0, fps=30.0)
 """90 degrees wide."""
 
-_BLOCK_M = (20.0, 15.0)
+BLOCK_M = (20.0, 15.0)
 """Half the extent of the block, along x and y."""
 _STREET_M, _PAVEMENT_M = 12.0, 2.0
 _LANE_M = 0.8
@@ -93,9 +93,9 @@ class _Row(NamedTuple):
         )  # fmt: skip
 
 
-def street_block() -> Scene:
+def street_block(block_m: tuple[float, float] = BLOCK_M) -> Scene:
     """The houses of the block and those across the street, with all that stands before them."""
-    x, y = _BLOCK_M
+    x, y = block_m
     wide, deep = x + _STREET_M, y + _STREET_M
     rng = np.random.default_rng(17)
     solids = [
@@ -180,9 +180,9 @@ def _car(row: _Row, at: float, rng: np.random.Generator) -> list[Solid]:
     ]
 
 
-def ride() -> SplinePath:
+def ride(block_m: tuple[float, float] = BLOCK_M) -> SplinePath:
     """Once around and on, slower about the corners."""
-    half = np.array(_BLOCK_M) + 0.5 * _STREET_M + _LANE_M
+    half = np.array(block_m) + 0.5 * _STREET_M + _LANE_M
     outline = _rounded(half, _CORNER_M)
     lengths = np.linalg.norm(np.diff(outline, axis=0), axis=1)
     marks = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -218,12 +218,15 @@ def _rounded(half: F64, radius: float) -> F64:
     return np.concatenate([*points, points[0]])
 
 
-def render(folder: Path, *, frames: int | None = None, camera: CameraOptions = CAMERA) -> None:
+def render(
+    folder: Path, *, frames: int | None = None, camera: CameraOptions = CAMERA,
+    block_m: tuple[float, float] = BLOCK_M,
+) -> None:  # fmt: skip
     """Make a folder with the ride: images, true poses and depths.   frames: the first of it only.
 
     Raises FileExistsError where it is there already.
     """
-    scene, path = street_block(), ride()
+    scene, path = street_block(block_m), ride(block_m)
     count = round(path.duration_s * camera.fps)
     stamps_ns = [round(1e9 * n / camera.fps) for n in range(min(count, frames or count))]
     geometry = SceneGeometry(scene)

@@ -27,6 +27,13 @@ def test_the_ride_comes_back_to_where_it_began():
     assert np.linalg.norm(T[0, :3, 3] - T[-1, :3, 3]) > 12.0
 
 
+def test_a_larger_block_has_a_longer_street():
+    path = ride((62.0, 53.0))
+    T = np.array([path.T_world_camera(t) for t in np.arange(0.0, path.duration_s, 0.1)])
+    assert 500.0 < path_length(T) < 530.0
+    assert len(street_block((62.0, 53.0)).solids) > 2.0 * len(street_block().solids)
+
+
 def test_nothing_is_ridden_into():
     positions = ridden()[:, :3, 3]
     for solid in street_block().solids[1:]:

@@ -192,6 +192,9 @@ def street_block(
     folder: Annotated[Path, typer.Argument(help="Folder to make.")],
     frames: Annotated[int | None, typer.Option(min=2, help="First frames only.")] = None,
     fps: Annotated[float, typer.Option(min=1.0, help="Frames a second.")] = 30.0,
+    block: Annotated[
+        tuple[float, float], typer.Option(help="Half the extent of the block, metres.")
+    ] = (20.0, 15.0),
 ) -> None:
     """Render a ride of 203 m about a block of houses, out of doors: 150 s of CPU.
 
@@ -199,7 +202,8 @@ def street_block(
     """
     from benchmarks.street_block import CAMERA, render
 
-    render(folder, frames=frames, camera=CAMERA.model_copy(update={"fps": fps}))
+    camera = CAMERA.model_copy(update={"fps": fps})
+    render(folder, frames=frames, camera=camera, block_m=block)
 
 
 @app.command()
