@@ -27,46 +27,48 @@ class IngestParameters(Parameters):
 
     mode: Literal["auto", "lossless", "live"] = Field(
         default="auto",
-        description="lossless: nobody drops a frame, the slowest reader sets the pace.  live: the "
-        "newest frame wins.  auto: live for a camera, lossless for everything else.",
+        description="lossless: no frame is dropped, the slowest reader sets the pace.  live: old "
+        "frames are dropped.  auto: live for a camera, lossless for other sources.",
     )
     depth: Literal["first", "all"] = Field(
         default="first",
-        description="Depth maps for surfels: the first one alone, or those of all frames, from "
-        "which new surfels are born, too.",
+        description="Depth maps for surfels: only the first, or those of all frames, which also "
+        "create new surfels.",
     )
     longest_side_px: int = Field(
         default=0,
         ge=0,
-        description="Images are worked on, and recorded, with no more pixels along their longer "
-        "side; 0: as many as their details need, at most 1280.",
+        description="Maximum pixels along the longer side of processed and recorded images; 0: "
+        "chosen by the level of detail, at most 1280.",
     )
     start_s: float = Field(
-        default=0.0, ge=0.0, description="Frames are taken from so many seconds after the first on."
+        default=0.0, ge=0.0, description="Start this many seconds after the first frame."
     )
     end_s: float = Field(
-        default=0.0, ge=0.0, description="And until so many seconds after it; 0: to the end."
+        default=0.0,
+        ge=0.0,
+        description="End this many seconds after the first frame; 0: at the end.",
     )
-    every: int = Field(default=1, ge=1, description="One of so many frames is taken.")
+    every: int = Field(default=1, ge=1, description="Process every Nth frame.")
     sharpest: bool = Field(
-        default=False, description="Of these, that with the finest details, not the first."
+        default=False, description="Choose the sharpest of each N frames, not the first."
     )
     mask_static: bool = Field(
         default=True,
-        description="Borders and overlays that never change while the scene moves are found in the "
-        "first seconds, and masked.  A given mask replaces them.",
+        description="Detect and mask borders and overlays that never change while the scene "
+        "moves.  A given mask replaces them.",
     )
     mapping_lag_s: float = Field(
         default=0.4,
         ge=0.0,
-        description="Live mode: a frame is mapped while those that wait for bundle adjustment came "
-        "less than this before it, or none of them is to be mapped; the others are only localised.",
+        description="Live mode: maximum backlog (s) of bundle adjustment before frames skip "
+        "mapping and are only localised.",
     )
     pose_lag_s: float = Field(
         default=2.0,
         ge=0.0,
-        description="Live mode: a frame that is not mapped is localised by its tracks while those "
-        "that wait for bundle adjustment came less than this before it; else it gets no pose.",
+        description="Live mode: maximum backlog (s) of bundle adjustment before unmapped frames "
+        "skip localisation too, and get no pose.",
     )
 
 
@@ -77,40 +79,43 @@ class BusParameters(Parameters):
         default=16,
         ge=1,
         le=4096,
-        description="Messages of one topic on the way to its slowest reader; bounds memory.",
+        description="Maximum messages of a topic on the way to its slowest reader; bounds memory.",
     )
     window_mib: int = Field(
         default=256,
         ge=1,
         le=65536,
-        description="And no more MiB than this; a larger message goes alone.",
+        description="Maximum MiB of one topic on the way; a larger message is sent alone.",
     )
     lag_messages: int = Field(
         default=128,
         ge=1,
         le=4096,
-        description="Messages of one topic on the way to bundle adjustment, with those that it "
-        "passes over in live mode; beyond, the others wait for it.",
+        description="Maximum messages of one topic on the way to bundle adjustment, including "
+        "those that it skips in live mode; beyond, other services wait.",
     )
     lag_mib: int = Field(
-        default=160, ge=1, le=65536, description="And no more MiB than this; bounds memory."
+        default=160, ge=1, le=65536, description="Maximum MiB of these messages; bounds memory."
     )
     patience_s: float = Field(
         default=60.0,
         ge=0.0,
-        description="How long a peer or the router may be away before a service gives up.",
+        description="Seconds without a peer or the router after which a service exits.",
     )
     checkpoint_frames: int = Field(
         default=60,
         ge=1,
-        description="Frames between two checkpoints of a service, where services are restarted.",
+        description="Frames between two checkpoints of a service, if services are restarted.",
     )
     link_images: Literal["raw", "lossless", "jpeg"] = Field(
         default="raw",
         description="How the ingest sends images.  raw: fastest on one machine.  lossless: half "
-        "the bytes, the same pixels.  jpeg: a fifth or less; what is recorded are these JPEGs.",
+        "the bytes, the same pixels.  jpeg: a fifth or less; these JPEGs are "
+        "recorded.",
     )
-    jpeg_quality: int = Field(default=90, ge=1, le=100, description="Of bus.link_images=jpeg.")
+    jpeg_quality: int = Field(
+        default=90, ge=1, le=100, description="JPEG quality for bus.link_images=jpeg."
+    )
 
 
 class RecorderParameters(Parameters):
@@ -120,44 +125,44 @@ class RecorderParameters(Parameters):
         default=1.0,
         gt=0.0,
         le=60.0,
-        description="At most this many seconds are lost in a power cut.",
+        description="Maximum seconds of data lost in a power cut.",
     )
     window_messages: int = Field(
         default=256,
         ge=2,
         le=65536,
-        description="Messages of one topic that are on the way to the disk.  Twice the rate of 60 "
-        "frames/s times the interval of a second, and as much again for a slow disk.",
+        description="Maximum messages of one topic on the way to the disk.  60 frames/s for the "
+        "interval of a second, as much again for a slow disk, and twice that.",
     )
     window_mib: int = Field(
         default=64,
         ge=1,
         le=65536,
-        description="MiB of one topic on the way to the disk.  60 images/s of 752x480 are 21 MiB "
-        "a second; half of the window is what starts writing early, the rest covers that.",
+        description="Maximum MiB of one topic on the way to the disk.  60 images/s of 752x480 "
+        "are 21 MiB per second; half of the window triggers an early write, the rest "
+        "covers it.",
     )
     images: bool = Field(
         default=True,
-        description="False: a small recording without camera/source, from the tracks on.",
+        description="False: a small recording without camera/source, starting with the tracks.",
     )
     clip: bool = Field(
         default=True,
-        description="A video is recorded as its file, and its frames as numbers in it with "
-        "checksums, where that is smaller.  False: raw frames, which any decoder leaves as they "
-        "are.",
+        description="Record the file of a video, and its frames as numbers and checksums, if "
+        "that is smaller.  False: raw frames, independent of a decoder.",
     )
     roll_mib: int = Field(
-        default=0, ge=0, description="Begin a new file beyond so many MiB; 0 for a single file."
+        default=0, ge=0, description="Start a new file beyond this many MiB; 0: a single file."
     )
     roll_s: float = Field(
-        default=0.0, ge=0.0, description="Begin a new file after so many seconds; 0 for never."
+        default=0.0, ge=0.0, description="Start a new file after this many seconds; 0: never."
     )
 
 
 class Config(Parameters):
     """Everything that a run can be told."""
 
-    seed: int = Field(default=0, ge=0, description="Seeds every random choice.")
+    seed: int = Field(default=0, ge=0, description="Seed of all random choices.")
     ingest: IngestParameters = IngestParameters()
     bus: BusParameters = BusParameters()
     tracking: TrackingParameters = TrackingParameters()

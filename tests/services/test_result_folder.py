@@ -141,8 +141,8 @@ def test_an_evaluation_against_the_truth_of_another_recording(truth: Path) -> No
     refused(evaluation(truth, json=truth / "figures.json"), truth, says)
     groundtruth.write_text("".join(poses.splitlines(keepends=True)[:3]))
     [said] = evaluation(truth)()
-    warning = f"warning: only 3 of 5 poses have a true pose: is {truth} of this recording?"
-    assert said.splitlines()[-1] == warning
+    warning = "warning: only 3 of 5 poses have a ground-truth pose: check that "
+    assert said.splitlines()[-1] == f"{warning}{truth} belongs to this recording"
     groundtruth.write_text(poses)
     [said] = evaluation(truth)()
     assert "warning" not in said

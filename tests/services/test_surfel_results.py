@@ -46,5 +46,5 @@ def test_depth_that_was_made_up_is_doubtful_and_not_in_metres(
     report = write_results(tmp_path)
     assert (report["verdict"], report["scale_is_metric"]) == (verdict, is_metric)
     for kind in OF_STILL_SCENES:
-        with pytest.raises(ResultError, match=f"^--to {kind} needs the map .* --to surface writes"):
+        with pytest.raises(ResultError, match=f"^--to {kind} needs the map .* use --to surface"):
             export_result(tmp_path, kind, None, force=False)

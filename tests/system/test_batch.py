@@ -113,7 +113,7 @@ def test_an_interrupted_batch_goes_on_and_a_broken_clip_stops_nobody(
 
     done = pliant(*again)
     assert done.returncode == 1, done.stderr  # of the broken one
-    assert "tiny_scene: begun again" in done.stderr
+    assert "tiny_scene: started again" in done.stderr
     assert "1 of 2 done" in done.stdout
     assert digests(output / "tiny_scene") == digests(tiny_run)
     broken, tiny = json.loads((output / "batch.json").read_text())["clips"]
@@ -147,7 +147,7 @@ def test_the_clip_of_a_worker_that_is_killed_goes_to_another_one(
     code, table, errors = disturbed(arguments, output / "logs" / "tiny_scene.log", kill_worker)
     assert code == 0, errors
     assert "Traceback" not in errors
-    assert "tiny_scene: begun again on" in errors
+    assert "tiny_scene: started again on" in errors
     assert "1 of 1 done" in table
     assert digests(output / "tiny_scene") == digests(tiny_run)
 

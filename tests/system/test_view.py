@@ -67,7 +67,7 @@ def test_wrong_requests_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyP
         ((tmp_path / "nothing", "--save", tmp_path / "x.rrd"), "no such recording"),
         (("--save", tmp_path / "x.rrd"), "nothing to view"),
         ((tmp_path, "--save", there), "--force"),
-        ((tmp_path, "--save", there, "--web"), "contradict"),
+        ((tmp_path, "--save", there, "--web"), "exclude each other"),
         ((tmp_path,), "there is no display"),
         (("--connect", "tcp/127.0.0.1:9", "--save", tmp_path / "x.rrd"), "--session"),
         (("--connect", "a", "--session", "b", "--save", tmp_path / "x.rrd"), "not an endpoint"),
@@ -112,7 +112,7 @@ def test_a_viewer_that_cannot_start_leaves_an_earlier_result(
 
 def test_a_taken_port_is_one_line() -> None:
     pytest.importorskip("rerun")
-    with socket.create_server(("0.0.0.0", 0)) as taken, pytest.raises(ResultError, match="taken"):
+    with socket.create_server(("0.0.0.0", 0)) as taken, pytest.raises(ResultError, match="in use"):
         RerunCanvas("web", name="taken", web_port=taken.getsockname()[1])
 
 

@@ -106,7 +106,7 @@ def test_what_cannot_be_compared_is_said(open3d: Any, tmp_path: Path) -> None:
     points, faces = relief(5)
     scan = tmp_path / "scan.ply"
     write_ply(scan, points)
-    with pytest.raises(ResultError, match="no place in the scan"):
+    with pytest.raises(ResultError, match="cannot be placed in the scan"):
         list(mesh_against_scan(tmp_path, scan, None, {}))
     with pytest.raises(ResultError, match=r"no mesh\.ply"):
         list(mesh_against_scan(tmp_path, scan, still, {}))

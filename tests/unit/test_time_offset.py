@@ -112,8 +112,8 @@ def test_eval_proposes_an_offset_and_takes_it(tmp_path: Path) -> None:
     plain = CliRunner().invoke(app, command)
     assert plain.exit_code == 0, plain.output
     (line,) = [each for each in plain.output.splitlines() if "fits far better" in each]
-    assert line.startswith("the truth fits far better 0.100 s (3.0 frames) later: ATE ")
-    assert line.endswith("if the clocks differ, --offset 0.100")
+    assert line.startswith("ground truth fits far better 0.100 s (3.0 frames) later: ATE ")
+    assert line.endswith("if the clocks differ, use --offset 0.100")
     for offset in ("0.100", "3f"):
         file = tmp_path / f"{offset}.json"
         taken = CliRunner().invoke(app, [*command, "--offset", offset, "--json", str(file)])
@@ -139,7 +139,7 @@ def test_where_no_time_is_in_both_the_error_says_which_offset_fits(tmp_path: Pat
     command = ["eval", str(tmp_path / "poses.txt"), "-g", str(tmp_path / "truth.txt")]
     done = CliRunner().invoke(app, command)
     assert isinstance(done.exception, ResultError)
-    assert "(both begin alike: --offset 1000000002.000)" in str(done.exception)
+    assert "(both start together: try --offset 1000000002.000)" in str(done.exception)
     taken = evaluate_result(
         tmp_path / "poses.txt", groundtruth=tmp_path / "truth.txt", offset="1000000002"
     )

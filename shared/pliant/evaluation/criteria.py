@@ -83,7 +83,7 @@ def align(estimate: F64, truth: F64) -> Similarity:
     scale, R, t = align_umeyama(positions, true_positions, with_scale=True)
     extent = float(np.linalg.norm(true_positions - true_positions.mean(axis=0), axis=1).max())
     if extent <= 1e-9 or scale <= 0.0:
-        raise ValueError("alignment needs a camera that moves: the true positions have no extent")
+        raise ValueError("alignment needs a moving camera: all ground-truth positions are equal")
     return Similarity(scale=scale, R=R, t=t)
 
 

@@ -53,7 +53,10 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
     _check_outputs(request)
     _check_scan(request)
     if request.offset and (request.surfels or request.tracks or request.points or request.mesh):
-        raise ResultError("--offset is for poses: leave it, or --tracks, --map, --mesh, --surfels")
+        raise ResultError(
+            "--offset applies only to poses: leave out --offset, or --tracks, --map, --mesh, "
+            "--surfels"
+        )
     if request.surfels:
         yield from _evaluate_surfels(request)
         return
@@ -114,8 +117,8 @@ def _evaluated(result: Path, truth: Path, request: EvaluationRequest) -> Evaluat
         by_s = 0.0 if better is None else evaluation.offset_s + better.seconds
         raise ResultError(
             f"{result}: no accuracy, {evaluation.final.reason} in {request.groundtruth}: "
-            "--groundtruth must be of this recording, its stamps by the same clock"
-            + (f" (both begin alike: --offset {by_s:.3f})" if better is not None else "")
+            "--groundtruth must belong to this recording, with the same clock"
+            + (f" (both start together: try --offset {by_s:.3f})" if better is not None else "")
         )
     return evaluation
 
@@ -124,9 +127,9 @@ def _proposal(evaluation: Evaluation, better: TimeOffset) -> str:
     """What a user may try where the times of poses and truth seem to differ."""
     where = "later" if better.seconds > 0.0 else "earlier"
     return (
-        f"the truth fits far better {abs(better.seconds):.3f} s ({abs(better.frames):.1f} frames) "
-        f"{where}: ATE {metres(better.rmse_m)} instead of {metres(better.before_m)}: if the clocks "
-        f"differ, --offset {evaluation.offset_s + better.seconds:.3f}"
+        f"ground truth fits far better {abs(better.seconds):.3f} s ({abs(better.frames):.1f} "
+        f"frames) {where}: ATE {metres(better.rmse_m)} instead of {metres(better.before_m)}: if "
+        f"the clocks differ, use --offset {evaluation.offset_s + better.seconds:.3f}"
     )
 
 
@@ -134,7 +137,7 @@ def _check_scan(request: EvaluationRequest) -> None:
     """Raise PliantError, before the work, where it cannot be used."""
     if request.scan is not None and (request.surfels or len(request.results) > 1):
         raise ResultError(
-            "--scan is for the mesh of one result: leave out the others, or --surfels"
+            "--scan needs the mesh of one result: leave out the other results, or --surfels"
         )
     if request.scan is not None:
         if not request.scan.is_file():
@@ -156,7 +159,7 @@ def _check_outputs(request: EvaluationRequest) -> None:
             continue
         keep_apart(path, read, option=option)
         if path.exists() and truth.is_dir() and truth.resolve() in path.resolve().parents:
-            raise ResultError(f"{path} is of what is read, {truth}: choose another {option}")
+            raise ResultError(f"{path} belongs to the input {truth}: choose another {option}")
         if path.is_file() and not request.force:
             raise ResultError(f"{path} exists: choose another {option}, or --force to replace it")
         read.append(path)
@@ -171,7 +174,7 @@ def _tell_pages(results: Sequence[Path], evaluations: Sequence[Evaluation]) -> I
             try:
                 put_truth_in(page, drawn)
             except OSError as error:
-                yield f"{page}: the error over time is not in it ({error.strerror})"
+                yield f"{page}: cannot add the error over time ({error.strerror})"
             else:
                 yield f"error over time: {page}"
 

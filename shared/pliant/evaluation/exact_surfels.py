@@ -341,7 +341,10 @@ def format_exact(surfels: ExactSurfels, *, moving_camera: bool) -> str:
     mean = surfels.summary()
     counts = ("mean 1-", f"{mean['alive_share']:.1%}", f"{mean['followed']:.0f}")
     lines.append((*counts, *_figures(mean, moving_camera)))
-    text = ["surfels against exact truth, untrimmed, no alignment; % of the depth", table(lines)]
+    text = [
+        "surfels compared with exact ground truth, untrimmed, no alignment; % of the depth",
+        table(lines),
+    ]
     text.append(
         f"whole run: RMSE {mean['whole']:.2%}, alive in the last frame {mean['alive_last']:.1%} "
         f"(of those in view {mean['followed_last']:.1%}), frames until loss "

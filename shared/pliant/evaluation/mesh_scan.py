@@ -56,7 +56,7 @@ def mesh_against_scan(
     """The fine mesh of a result folder.  Raises PliantError."""
     load_open3d()
     if alignment is None:
-        raise ResultError("without an aligned trajectory the mesh has no place in the scan")
+        raise ResultError("without an aligned trajectory the mesh cannot be placed in the scan")
     if not (result / "mesh.ply").is_file():
         raise ResultError(f"{result}: no mesh.ply: run with a mesh, or `pliant mesh {result}`")
     mesh, true = read_ply(result / "mesh.ply"), read_ply(scan)
@@ -67,7 +67,7 @@ def mesh_against_scan(
     diameter = float(np.linalg.norm(np.ptp(true.points.astype(np.float64), axis=0)))
     spacing = _SPACING * SURFACE_LIMIT * diameter
     if not spacing > 0.0:
-        raise ResultError(f"{scan}: all its points are one")
+        raise ResultError(f"{scan}: all points are equal")
     places = alignment.apply(mesh.points.astype(np.float64))
     samples = thin_out(sample_surface(places, mesh.faces, spacing), spacing)
     surface = true.points.astype(np.float64)
@@ -75,7 +75,7 @@ def mesh_against_scan(
         surface = sample_surface(surface, true.faces, spacing)
     found = compare_with_scan(samples, thin_out(surface, spacing), diameter)
     figures["scan"] = asdict(found)
-    yield f"mesh.ply against {scan}:"
+    yield f"mesh.ply compared with {scan}:"
     yield format_scan(found)
 
 
@@ -107,12 +107,11 @@ def format_scan(truth: ScanTruth) -> str:
     """Three lines, ready to print."""
     t = truth
     return (
-        f"registered by ICP: scale {t.scale:.4f}, turned by {t.turn_deg:.2f} deg, moved by "
-        f"{metres(t.shift_m)}; {100 * t.registered:.1f} % was within 1 % before\n"
-        f"distance: mesh to scan {metres(t.accuracy_m)}, scan to mesh {metres(t.completeness_m)}, "
-        f"chamfer {metres(t.chamfer_m)}\n"
-        f"within 1 % of the diameter ({t.diameter_m:.2f} m): F-score {t.f_score:.3f}, "
-        f"precision {t.precision:.3f}, recall {t.recall:.3f}"
+        f"registered by ICP: scale {t.scale:.4f}, rotated by {t.turn_deg:.2f} deg, moved by "
+        f"{metres(t.shift_m)}; {100 * t.registered:.1f} % was within 1 % before\ndistance: mesh "
+        f"to scan {metres(t.accuracy_m)}, scan to mesh {metres(t.completeness_m)}, chamfer "
+        f"{metres(t.chamfer_m)}\nwithin 1 % of the diameter ({t.diameter_m:.2f} m): F-score "
+        f"{t.f_score:.3f}, precision {t.precision:.3f}, recall {t.recall:.3f}"
     )
 
 

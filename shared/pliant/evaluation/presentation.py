@@ -13,7 +13,7 @@ from pliant.evaluation.criteria import ErrorStatistics, RelativeErrors
 from pliant.evaluation.run_evaluation import Evaluation, TrajectoryEvaluation
 from pliant.formats.text import write_bytes
 
-ALIGNMENT = "Sim(3) aligned (scale is not known to a single camera)"
+ALIGNMENT = "Sim(3) aligned (the scale of a single camera is unknown)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ def summarise(evaluations: Sequence[Evaluation], *, kind: str = "final") -> Summ
     for evaluation in evaluations:
         part = evaluation.final if kind == "final" else evaluation.causal
         if part is None:
-            raise ResultError(f"{evaluation.result}: has no causal trajectory")
+            raise ResultError(f"{evaluation.result}: has no online trajectory")
         parts.append(part)
 
     def over(value: Callable[[TrajectoryEvaluation], float | None]) -> MeanAndDeviation | None:
@@ -169,13 +169,13 @@ def format_evaluation(evaluation: Evaluation) -> str:
     final = evaluation.final
     if final.partly_compared:
         lines.append(
-            f"warning: only {final.matched} of {final.localised} poses have a true pose: "
-            f"is {evaluation.groundtruth} of this recording?"
+            f"warning: only {final.matched} of {final.localised} poses have a ground-truth pose: "
+            f"check that {evaluation.groundtruth} belongs to this recording"
         )
     if final.unlike and final.ate_m:
         lines.append(
-            f"warning: the error is as large as the motion, as true positions spread by "
-            f"{metres(final.spread_m)}: is {evaluation.groundtruth} of this recording?"
+            f"warning: the error is as large as the motion (spread {metres(final.spread_m)}): "
+            f"check that {evaluation.groundtruth} belongs to this recording"
         )
     return "\n".join(lines)
 

@@ -67,7 +67,7 @@ def _against_surfaces(result: Path, folder: Path, figures: dict[str, Any]) -> st
     for surfels in recorded_surfels(result / RECORDING_NAME):
         if surfels.frame >= len(truth):
             raise ResultError(
-                f"{result}: has more frames than {folder}: name the sequence that it was made of"
+                f"{result}: has more frames than {folder}: pass the sequence of this run"
             )
         if surfels.missing or (scale is None and not len(surfels.ids)):
             continue
@@ -92,4 +92,4 @@ def _against_surfaces(result: Path, folder: Path, figures: dict[str, Any]) -> st
 
 
 def _nothing(result: Path) -> str:
-    return f"{result}: has no surfels to judge; was it --profile deformable?"
+    return f"{result}: has no surfels: run it with --profile deformable"

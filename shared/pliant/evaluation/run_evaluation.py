@@ -192,7 +192,7 @@ def _no_alignment(why: str, part: Trajectory, matched: int, max_difference_ns: i
         return "no frame was localised"
     if matched < MIN_POSES:
         limit = max_difference_ns / 1e9
-        return f"only {matched} of {len(part)} poses have a true pose within {limit:g} s"
+        return f"only {matched} of {len(part)} poses have a ground-truth pose within {limit:g} s"
     return why
 
 
@@ -223,8 +223,8 @@ def _other_segments(trajectory: Trajectory, report: RunReport, path: Path) -> li
     counts = sorted(segment.frames for segment in report.segments or () if segment.frames)
     if report.segments is not None and len(trajectory) != (counts[-1] if counts else 0):
         raise ResultError(
-            f"{path}: holds {len(trajectory)} poses, but the longest segment of report.json "
-            f"holds {counts[-1] if counts else 0}; the two are not of one run"
+            f"{path}: holds {len(trajectory)} poses, but the longest segment of report.json holds "
+            f"{(counts[-1] if counts else 0)}: the two belong to different runs"
         )
     return counts[:-1]
 

@@ -32,7 +32,9 @@ class SurfaceTruth:
         """Raises DatasetError where the folder is not one of a deforming built-in sequence."""
         file = folder / SURFACES_NAME
         if not file.is_file():
-            raise DatasetError(f"{folder}: has no {SURFACES_NAME}: no deforming built-in sequence")
+            raise DatasetError(
+                f"{folder}: has no {SURFACES_NAME}: it is not a deforming built-in sequence"
+            )
         with np.load(file, allow_pickle=False) as content:
             self.names: list[str] = content["names"].tolist()
             self._vertices: list[F32] = [content[f"vertices_{k}"] for k in range(len(self.names))]

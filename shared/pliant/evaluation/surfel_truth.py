@@ -230,7 +230,7 @@ def format_surfels(rows: list[SurfelRow]) -> str:
     lengths = [f"{1e3 * mean[name]:.2f}" for name in figures]
     share = f"{mean['alive'] / max(1.0, mean['judged']):.1%}"
     lines.append(("mean 1-", share, f"{mean['compared']:.0f}", *lengths))  # type: ignore[arg-type]
-    return "surfels against true depth, mm, no alignment\n" + table(lines)
+    return "surfels compared with exact depth, mm, no alignment\n" + table(lines)
 
 
 def _median(values: F64) -> float:

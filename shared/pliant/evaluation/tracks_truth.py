@@ -209,6 +209,6 @@ def format_tracks(evaluation: TracksEvaluation) -> str:
             f"tracks of age >= {MATURE_AGE} in a frame, median: {evaluation.living_median:.0f}, "
             f"{100.0 * evaluation.mature_right:.2f} % of them within {LIMIT_PX:g} px",
             f"births: {evaluation.births} in {evaluation.frames} frames, of which {without} on a "
-            "depth jump or without surface have no truth",
+            "jump in depth or without surface have no ground truth",
         ]
     )

@@ -37,15 +37,17 @@ def true_frames(folder: Path) -> Truth:
             if line and not line.startswith("#")
         ]
     except (OSError, ValueError, KeyError, IndexError) as error:
-        raise ResultError(f"{folder}: no true depth: {error}") from None
+        raise ResultError(f"{folder}: no ground-truth depth: {error}") from None
     poses = read_tum(folder / "groundtruth.txt").T_world_camera
 
     def frame(number: int) -> tuple[F64, F64]:
         if number >= min(len(depths), len(poses)):
-            raise ResultError(f"{folder}: no frame {number}; is the result one of this sequence?")
+            raise ResultError(
+                f"{folder}: no frame {number}: check that the result belongs to this sequence"
+            )
         depth: Any = cv2.imread(str(depths[number]), cv2.IMREAD_UNCHANGED)
         if depth is None:
-            raise ResultError(f"{depths[number]}: cannot read the true depth")
+            raise ResultError(f"{depths[number]}: cannot read the ground-truth depth")
         known = np.where(np.isin(depth, invalid), 0, depth).astype(np.float64)
         return known * scale, poses[number]
 

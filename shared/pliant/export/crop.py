@@ -45,4 +45,4 @@ def _some(inside: BoolArray, what: str, positions: F32 | F64, box: Box) -> BoolA
         return inside
     ends = (positions.min(axis=0), positions.max(axis=0)) if len(positions) else ()
     extent = ",".join(f"{value:.3g}" for end in ends for value in end.tolist())
-    raise ResultError(f"--crop {box}: no {what} is inside; all lie within {extent or 'nothing'}")
+    raise ResultError(f"--crop {box}: no {what} is inside; the extent is {extent or 'nothing'}")

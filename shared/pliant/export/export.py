@@ -95,7 +95,7 @@ def export_result(
         if to not in OPTIONS[option]:
             *others, last = OPTIONS[option]
             has = f"{', '.join(others)} and {last}" if others else last
-            raise ResultError(f"--{option}: {to} has no such option, only {has}")
+            raise ResultError(f"--{option}: not available for {to}, only for {has}")
     if not result.exists():
         raise ResultError(f"{result}: no such result folder or recording")
     folder = result if result.is_dir() and not parts_in(result) else None
@@ -120,8 +120,8 @@ def export_result(
             except PliantError as error:
                 if to in OF_STILL_SCENES and has_surfels(recording.path):
                     raise ResultError(
-                        f"--to {to} needs the map or mesh of a rigid scene, and {result} deforms: "
-                        "--to surface writes its meshes"
+                        f"--to {to} needs the map or mesh of a rigid scene, but {result} is "
+                        "deforming: use --to surface for its meshes"
                     ) from None
                 error.args = (str(error).replace(f"{made}", f"{path}"),)
                 raise
@@ -144,7 +144,7 @@ def _check_ending(path: Path, to: str, name: str) -> None:
     """
     given, own = path.suffix.lower(), Path(name).suffix
     if to in _NAMED and given != own:
-        raise ResultError(f"{path}: --to {to} writes a file of the ending {own}: name it so")
+        raise ResultError(f"{path}: --to {to} writes a {own} file: use this ending")
     files = {Path(each).suffix for each, _ in EXPORTS.values()} | {".obj", ".zip"}
     if not own and given and given in files:
         raise ResultError(f"{path}: --to {to} writes a folder: leave out the ending {given}")

@@ -163,7 +163,7 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ResultError(f"{folder}: cannot be made ({error.strerror})") from None
+        raise ResultError(f"{folder}: cannot be created ({error.strerror})") from None
 
 
 def write_png(path: Path, pixels: U8 | U16) -> None:

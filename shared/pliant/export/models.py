@@ -87,7 +87,7 @@ def solid(recording: Recording, path: Path, folder: Path | None, crop: Box | Non
     run = read_run(recording.path)
     mesh = mesh_of(run.mesh, run.history.longest_segment())
     if mesh is None or not len(mesh.triangles):
-        raise ResultError(f"{recording.path}: there is no mesh in it: run its source again")
+        raise ResultError(f"{recording.path}: has no mesh: run its source again")
     write_mesh(path, watertight(cropped_mesh(mesh, crop)))
 
 

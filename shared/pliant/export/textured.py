@@ -51,7 +51,7 @@ def textured_mesh(
     pieces = [p for p in recording.decoded(topics.MESH_FINAL) if isinstance(p, MeshPiece)]
     fine = mesh_of(pieces, segment)
     if run.stream is None or fine is None or not len(fine.triangles):
-        raise ResultError(f"{recording.path}: there is no mesh in it: run its source again")
+        raise ResultError(f"{recording.path}: has no mesh: run its source again")
     fine = cropped_mesh(fine, crop)
     fine = cleaned(fine) if clean else fine
     return textured(fine, recording, run, run.stream, segment, triangles=triangles, texels=_TEXELS)

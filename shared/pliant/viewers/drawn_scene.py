@@ -217,8 +217,8 @@ class Scene:
             self._canvas.note(
                 at,
                 f"the viewer {what}: {missed} updates of the map are missing before frame "
-                f"{at.frame}; points are shown once they are told again, at the latest with the "
-                "next snapshot of the window",
+                f"{at.frame}; points appear when they are sent again, at the latest with the next "
+                "snapshot of the window",
             )
 
     def _take_places(self, at: Moment, update: MapUpdate, *, final: bool) -> None:

@@ -286,7 +286,7 @@ class RerunCanvas:
                     rrb.Spatial2DView(origin=_IMAGE, name="Image", contents="$origin/**"),
                     rrb.TimeSeriesView(
                         origin="curves/milliseconds",
-                        name="Milliseconds a frame",
+                        name="Milliseconds per frame",
                         plot_legend=rrb.PlotLegend(corner="LeftTop"),
                     ),
                     rrb.Horizontal(

@@ -100,7 +100,7 @@ class RerunPage:
             self._server = ThreadingHTTPServer((LOOPBACK, port), Handler)
         except OSError:
             raise ResultError(
-                f"port {port} is taken here: another viewer may be open; choose another --web-port"
+                f"port {port} is in use, perhaps by another viewer: choose another --web-port"
             ) from None
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 

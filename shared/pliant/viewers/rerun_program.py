@@ -29,7 +29,7 @@ class RerunProgram:
         for port in ports:
             if listens(port):
                 raise ResultError(
-                    f"port {port} is taken here: another viewer may be open; close it, or choose "
+                    f"port {port} is in use, perhaps by another viewer: close it, or choose "
                     "another --web-port"
                 )
         self.ports = ports
@@ -52,8 +52,8 @@ class RerunProgram:
         while not all(listens(port) for port in ports):
             if self._process.poll() is not None or time.monotonic() > deadline:
                 raise ResultError(
-                    "Rerun does not come up: `python -m rerun` says why; --save FILE.rrd needs "
-                    "no viewer"
+                    "Rerun does not start: `python -m rerun` shows why; --save FILE.rrd needs no "
+                    "viewer"
                 )
             time.sleep(_LOOK_S)
 
