@@ -17,7 +17,6 @@ LATER = {
     "CHANGELOG.md",
     "experiments.md",
     "meshing.md",
-    "places.md",
     "results.md",
     "surfels.md",
 }
