@@ -18,7 +18,6 @@ LATER = {
     "experiments.md",
     "meshing.md",
     "results.md",
-    "surfels.md",
 }
 PAGES = [
     page
