@@ -21,7 +21,7 @@ LATER = {
 }
 PAGES = [
     page
-    for page in sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+    for page in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
     if page.name not in LATER
 ]
 LONGEST_LINE = 150  # characters, outside of tables and code

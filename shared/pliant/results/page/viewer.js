@@ -101,7 +101,7 @@ function begin() {
     const text = picked.map((each) => each.map((value) => value.toPrecision(5)).join(","));
     const apart = picked.length === 2 ? Math.hypot(...sum([1, picked[0]], [-1, picked[1]])).toPrecision(4) : "";
     document.getElementById("picked").textContent = apart
-      ? `${apart} apart; in metres by: pliant scale RESULT --points ${text.join(" ")} METRES` : `${text}, double-click another point`;
+      ? `${apart} apart; for metres run: pliant scale RESULT --points ${text.join(" ")} METRES` : `${text}, double-click another point`;
     gl.bindVertexArray(marks.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, marks.buffer);
     const shares = picked.flatMap((each) => each.map((value, k) => (value - header.low[k]) / header.size[k]));
@@ -205,4 +205,4 @@ function begin() {
 }
 
 if (gl) begin();
-else document.getElementById("layers").textContent = "This browser shows no 3D (WebGL 2 is off): open points.ply or mesh.ply.";
+else document.getElementById("layers").textContent = "No 3D view: this browser has no WebGL 2: open points.ply or mesh.ply.";
