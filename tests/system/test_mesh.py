@@ -50,6 +50,11 @@ def test_the_mesh_against_the_truth(result: Path, tmp_path: Path) -> None:
     assert found["within"] > 0.9
     assert found["covered"] > 0.5
     assert found["normal_deg"] < 8.0
+    surface = json.loads(figures.read_text())["surface"]
+    assert surface.keys() == {"trajectory", "icp", "icp_scale", "floor"}
+    assert surface["floor"]["chamfer_m"] < surface["trajectory"]["chamfer_m"]
+    assert "+ ICP, scale" in done.stdout
+    assert (folder / "mesh_error.png").stat().st_size > 1000
 
 
 def test_a_mesher_that_is_killed_fuses_again_and_the_mesh_is_that_of_an_ordinary_run(

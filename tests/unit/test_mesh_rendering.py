@@ -1,6 +1,7 @@
 """What a camera sees of a mesh, against planes known exactly; surfaces within a distance."""
 
 import numpy as np
+import pytest
 
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
@@ -100,3 +101,24 @@ def test_no_mesh_covers_nothing() -> None:
     found = evaluate(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)).result()
     assert found.covered == found.f_score == 0.0
     assert np.isnan(found.median_error)
+
+
+def test_a_wall_aside_is_told_by_its_columns_and_its_vertices() -> None:
+    """ICP moves it back; true depth at our own poses has no error where those are true."""
+    points, faces = wall(3.1)
+    measured = evaluate(points, faces)
+    columns = measured.columns()
+    assert columns["trajectory"].completion_m == pytest.approx(0.1, rel=0.02)
+    assert columns["icp"].completion_m < 0.02
+    assert columns["floor"].chamfer_m == 0.0
+    distances, diameter = measured.distances(0.05)
+    assert diameter == pytest.approx(np.hypot(79 / 70.0 * 3.0, 59 / 75.0 * 3.0), rel=1e-6)
+    near = (np.abs(points[:, 0]) < 1.0) & (np.abs(points[:, 1]) < 0.7)
+    np.testing.assert_allclose(distances[near], 0.1, atol=0.01)
+    assert np.isinf(distances[np.abs(points[:, 0]) > 3.0]).all()
+
+
+def test_no_mesh_has_no_columns() -> None:
+    nothing = evaluate(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    assert nothing.columns() == {}
+    assert nothing.distances(0.01)[0].shape == (0,)

@@ -8,6 +8,8 @@ from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.evaluation.criteria import Similarity
+from pliant.evaluation.nearest_points import nearest
+from pliant.evaluation.surface_columns import SurfaceFigures, surface_columns
 from pliant.evaluation.surface_distance import sample_surface, share_within, thin_out
 from pliant.evaluation.visible_depth import DepthView
 
@@ -69,6 +71,7 @@ class MeshEvaluation:
     _ratios: list[F32] = field(default_factory=list[F32])
     _angles: list[F32] = field(default_factory=list[F32])
     _surface: list[F64] = field(default_factory=list[F64])
+    _floor: list[F64] = field(default_factory=list[F64])
     _known: int = 0
     _views: int = 0
 
@@ -94,7 +97,9 @@ class MeshEvaluation:
         points /= view.inverse_depth[v, u][:, None]
         # Thinned at once: millions of pixels see the same surface.
         spacing = 1e-3 * float(np.median(1.0 / view.inverse_depth[v, u])) if len(v) else 1.0
-        self._surface.append(thin_out(points @ T_true[:3, :3].T + T_true[:3, 3], spacing))
+        T_ours = self.alignment.apply_poses(T_estimate[None])[0]
+        for kept, T in ((self._surface, T_true), (self._floor, T_ours)):
+            kept.append(thin_out(points @ T[:3, :3].T + T[:3, 3], spacing))
 
     def result(self) -> MeshTruth:
         """The figures over all views."""
@@ -103,8 +108,7 @@ class MeshEvaluation:
         angles = np.concatenate([np.zeros(0, np.float32), *self._angles])
         scale = 1.0 / float(np.median(ratios)) if len(ratios) else nan
         errors, fitted = np.abs(ratios - 1.0), np.abs(ratios * scale - 1.0)
-        surface = np.concatenate([np.zeros((0, 3)), *self._surface])
-        diameter = float(np.linalg.norm(np.ptp(surface, axis=0))) if len(surface) else nan
+        surface, diameter = self._true_surface()
         precision, recall = self._surfaces(surface, SURFACE_LIMIT * diameter)
         both = precision + recall
         return MeshTruth(
@@ -123,13 +127,42 @@ class MeshEvaluation:
             f_score=2.0 * precision * recall / both if both > 0.0 else 0.0,
         )
 
+    def columns(self) -> dict[str, SurfaceFigures]:
+        """The surface as the field compares it; empty where there is none."""
+        surface, diameter = self._true_surface()
+        if len(surface) == 0 or len(self.mesh.faces) == 0:
+            return {}
+        spacing = _SPACING * SURFACE_LIMIT * diameter
+        samples, floor = self._samples(spacing), np.concatenate(self._floor)
+        samples, floor, true = (thin_out(each, spacing) for each in (samples, floor, surface))
+        return surface_columns(samples, floor, true, diameter)
+
+    def distances(self, most: float) -> tuple[F64, float]:
+        """(V,) of the vertices to the true surface, infinite beyond a share ``most`` of the
+        diameter; and the diameter, metres."""
+        surface, diameter = self._true_surface()
+        if len(surface) == 0:
+            return np.full(len(self.mesh.points), np.inf), diameter
+        true = thin_out(surface, _SPACING * SURFACE_LIMIT * diameter)
+        return nearest(self._placed(), true, most * diameter)[1], diameter
+
+    def _true_surface(self) -> tuple[F64, float]:
+        """(N, 3) and its diameter."""
+        surface = np.concatenate([np.zeros((0, 3)), *self._surface])
+        extent = float(np.linalg.norm(np.ptp(surface, axis=0))) if len(surface) else float("nan")
+        return surface, extent
+
+    def _placed(self) -> F64:
+        return self.alignment.apply(self.mesh.points.astype(np.float64))
+
+    def _samples(self, spacing: float) -> F64:
+        return sample_surface(self._placed(), self.mesh.faces, spacing)
+
     def _surfaces(self, true: F64, limit: float) -> tuple[float, float]:
         if len(true) == 0 or len(self.mesh.faces) == 0:
             return 0.0, 0.0
         spacing = _SPACING * limit
-        points = self.alignment.apply(self.mesh.points.astype(np.float64))
-        samples = sample_surface(points, self.mesh.faces, spacing)
-        true = thin_out(true, spacing)
+        samples, true = self._samples(spacing), thin_out(true, spacing)
         precision = share_within(samples, true, limit)
         return precision, share_within(true, thin_out(samples, spacing), limit)
 

@@ -5,18 +5,29 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.errors import ResultError
 from pliant.evaluation.mesh_truth import Mesh, MeshEvaluation, MeshTruth, format_mesh
+from pliant.evaluation.presentation import metres
 from pliant.evaluation.run_evaluation import Evaluation
+from pliant.evaluation.surface_columns import format_columns
 from pliant.evaluation.truth import true_frames
 from pliant.formats.ply import read_ply
 from pliant.map_history import MapHistory
-from pliant.results.folder import RECORDING_NAME
-from pliant.results.run import read_run
+from pliant.pictures.caption import with_caption
+from pliant.pictures.mesh import draw_mesh, mesh_view
+from pliant.pictures.movie import write_image
+from pliant.results.folder import MESH_ERROR_NAME, RECORDING_NAME
+from pliant.results.run import Run, read_run
 from pliant.yaml_text import load_yaml
 
+_MOST_ERROR = 0.02
+"""Share of the diameter of the scene that is drawn as wholly wrong."""
 MESHES = {"mesh": "mesh.ply", "mesh_coarse": "mesh_coarse.ply"}
 
 
@@ -35,19 +46,48 @@ def mesh_against_truth(
             if data.faces is None or data.normals is None:
                 raise ResultError(f"{result / name}: without faces or normals")
             mesh = Mesh(points=data.points, normals=data.normals, faces=data.faces)
-            found = compare_mesh(mesh, run.history, run.stream.camera, truth, evaluation)
+            measured = measure_mesh(mesh, run.history, run.stream.camera, truth, evaluation)
+            found = measured.result()
             figures[key] = asdict(found)
             yield f"{name}:"
             yield format_mesh(found)
+            if name == MESHES["mesh"] and (columns := measured.columns()):
+                figures["surface"] = {name: asdict(column) for name, column in columns.items()}
+                yield format_columns(columns)
+                yield _draw_errors(result / MESH_ERROR_NAME, measured, run)
+
+
+def _draw_errors(path: Path, measured: MeshEvaluation, run: Run) -> str:
+    """The mesh, coloured by its distance from the true surface.  Returns what to say of it."""
+    distances, diameter = measured.distances(_MOST_ERROR)
+    levels = np.rint(255.0 * np.minimum(distances / (_MOST_ERROR * diameter), 1.0))
+    turbo = cv2.applyColorMap(levels.astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)
+    colours = np.ascontiguousarray(np.asarray(turbo, np.uint8).reshape(-1, 3)[:, ::-1])
+    mesh = TriangleMesh(
+        positions=measured.mesh.points, normals=measured.mesh.normals, colours=colours,
+        triangles=measured.mesh.faces,
+    )  # fmt: skip
+    longest, poses = run.history.longest_segment(), run.history.keyframe_poses().values()
+    path_poses = pose_to_matrix(np.array([pose for of, pose in poses if of == longest]))
+    picture = draw_mesh(mesh, mesh_view(mesh, path_poses)).colours
+    words = f"Distance from the true surface: blue 0, red {metres(_MOST_ERROR * diameter)} or more"
+    try:
+        write_image(path, with_caption(picture, words))
+    except OSError as error:
+        return f"{path}: cannot be written ({error.strerror})"
+    return f"where the mesh is wrong: {path}"
 
 
 def compare_mesh(
-    mesh: Mesh,
-    history: MapHistory,
-    camera: PinholeCamera,
-    truth: Path,
-    evaluation: Evaluation,
+    mesh: Mesh, history: MapHistory, camera: PinholeCamera, truth: Path, evaluation: Evaluation
 ) -> MeshTruth:
+    """The figures of ``measure_mesh``."""
+    return measure_mesh(mesh, history, camera, truth, evaluation).result()
+
+
+def measure_mesh(
+    mesh: Mesh, history: MapHistory, camera: PinholeCamera, truth: Path, evaluation: Evaluation
+) -> MeshEvaluation:
     """A mesh in the world of the longest segment, at that segment's keyframes."""
     if truth.is_file():
         truth = truth.parent
@@ -61,7 +101,7 @@ def compare_mesh(
         if segment == longest:
             depth, T_true = frames(frame)
             measured.add(depth, T_true, pose_to_matrix(pose))
-    return measured.result()
+    return measured
 
 
 def depth_camera(truth: Path, camera: PinholeCamera) -> PinholeCamera:

@@ -29,7 +29,7 @@ def thin_out(points: F64, spacing: float) -> F64:
     """The first of the (N, 3) points in each cube of that size, in the order of the cubes."""
     if len(points) == 0:
         return points
-    _, first = np.unique(_keys(points, points.min(axis=0), spacing), return_index=True)
+    _, first = np.unique(cell_keys(points, points.min(axis=0), spacing), return_index=True)
     return points[first]
 
 
@@ -38,13 +38,14 @@ def share_within(points: F64, others: F64, distance: float) -> float:
     if len(points) == 0 or len(others) == 0:
         return 0.0
     low = np.minimum(points.min(axis=0), others.min(axis=0)) - 2.0 * distance
-    keys = _keys(others, low, distance)
+    keys = cell_keys(others, low, distance)
     order = np.argsort(keys, kind="stable")
     found = _near(points, np.ascontiguousarray(others[order]), keys[order], low, distance)
     return float(found / len(points))
 
 
-def _keys(points: F64, low: F64, size: float) -> I64:
+def cell_keys(points: F64, low: F64, size: float) -> I64:
+    """(N,) numbers of the cubes in which (N, 3) points lie, 21 bits for each axis."""
     cells = np.clip(((points - low) / size).astype(np.int64), 0, _MAX_CELL)
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 

@@ -49,8 +49,9 @@ _RIGID_FILES = (
 )
 SURFEL_FILES = (TRAJECTORY_NAME, SURFELS_NAME, REPORT_NAME, PAGE_NAME)
 SCALE_NAME = "scale.yaml"
-SOMETIMES = (MAP_NAME, SCALE_NAME)
-"""Of a map that came to its end, and of one whose scale is known."""
+MESH_ERROR_NAME = "mesh_error.png"
+SOMETIMES = (MAP_NAME, SCALE_NAME, MESH_ERROR_NAME)
+"""Of a map that came to its end, of one whose scale is known, and of a mesh that was evaluated."""
 MESH_FILES = ("mesh.ply", "mesh_coarse.ply", "mesh.png", "mesh_shaded.png", "mesh_normals.png")
 _SWITCHING = ".results-whole"
 """Results that are whole, and on their way to their places."""
