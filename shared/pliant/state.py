@@ -30,9 +30,9 @@ _ROOMS = (
     *("pliant.map_history", "pliant.map_depth"),
 )
 _CLASSES = {
-    *("ExtremaTracker", "BriefExtractor"),
-    *("Mapper", "Atlas", "ActiveMap", "Landmarks", "Window", "Path", "TrackLinks", "TrialMapper"),
-    *("EarlierSegments", "Localiser", "MapChanges", "KeyframeChanges"),
+    *("ExtremaTracker", "BriefExtractor", "Mapper", "BootstrapMapper", "Localiser", "Atlas"),
+    *("ActiveMap", "EarlierSegments", "Landmarks", "TrackLinks", "Window", "Path"),
+    *("MapChanges", "KeyframeChanges"),
     *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
 }
 """Those that are no records: neither dataclasses, nor named tuples, nor parameters."""

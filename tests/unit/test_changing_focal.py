@@ -13,8 +13,8 @@ from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.frame_focal import shows_at_once
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.ordinary_frames import OrdinaryFrames
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.passing import PassedFrames
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 
 FRAMES = 60
@@ -88,7 +88,7 @@ def test_the_magnification_of_one_frame_shows_only_what_is_large_and_certain():
 
 def test_frames_between_keyframes_change_as_between_them():
     view = SelfCalibration.of(CAMERA, MappingParameters().calibration).view
-    passed, points_px = PassedFrames(), np.array([[100.0, 50.0]], np.float32)
+    passed, points_px = OrdinaryFrames(), np.array([[100.0, 50.0]], np.float32)
     nothing = {"segment": 0, "T_world_camera": np.eye(4), "rows": np.zeros(0, np.int32)}
     nothing |= dict.fromkeys(("points_px", "rolled_px"), np.zeros((0, 2), np.float32))
     keyframes = [Keyframe(id=k, frame=2 * k, **nothing) for k in (0, 1)]

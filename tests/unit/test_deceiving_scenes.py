@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene
 from test_mapper import Published, trajectory_error
-from test_meetings import PARAMETERS, along, film
 from test_recovery import dark, textures
 from test_relocalisation import Film
+from test_segment_merges import PARAMETERS, along, film
 
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper

@@ -10,15 +10,15 @@ from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.corrected_view import moved_px
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
-from pliant.algorithms.mapping.first_map import WaitingFrame
+from pliant.algorithms.mapping.first_map import BufferedFrame
 from pliant.algorithms.mapping.frame import Frame
+from pliant.algorithms.mapping.initialisation_buffer import InitialisationBuffer
 from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import Path
 from pliant.algorithms.mapping.segment import see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.waiting import Waiting
 
 GIVEN = CalibrationUncertainty()
 KNOWN = SelfCalibration.of(CAMERA, GIVEN)
@@ -84,10 +84,10 @@ def test_earlier_segments_and_waiting_frames_follow(active):
     earlier.see_by(KNOWN, OTHER)
     assert earlier.like(OTHER) == [active.segment]
     px = np.array([[10.0, 20.0], [320.0, 240.0]], np.float32)
-    frame = WaitingFrame(
+    frame = BufferedFrame(
         frame=3, stamp_ns=4, ids=np.arange(2), points_px=px, kappas=np.ones(2, np.float32)
     )
-    (waited,) = Waiting([frame], []).seen_by(KNOWN.view, OTHER.view).frames
+    (waited,) = InitialisationBuffer([frame], []).seen_by(KNOWN.view, OTHER.view).frames
     np.testing.assert_array_equal(waited.points_px, moved_px(px, KNOWN.view, OTHER.view))
     np.testing.assert_allclose(OTHER.view.seen(waited.points_px), px, atol=1e-3)
 

@@ -11,24 +11,24 @@ from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.epipolar import RelativePose
 from pliant.algorithms.mapping import start as start_of_a_map
-from pliant.algorithms.mapping.first_map import Start, WaitingFrame
+from pliant.algorithms.mapping.backfill import backfill
+from pliant.algorithms.mapping.first_map import BufferedFrame, Start
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.reaching_back import reach_back
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, widened
-from pliant.algorithms.mapping.start import find_start, impatient
+from pliant.algorithms.mapping.start import find_start, with_minimum_parallax
 
 CAMERA = PinholeCamera(fx=400.0, fy=400.0, cx=320.0, cy=240.0, width=640, height=480)
 
 
 def frame_of(
     frame: int, points: F64, centre: F64, alive: BoolArray, noise_px: float
-) -> WaitingFrame:
+) -> BufferedFrame:
     """What a camera at ``centre`` that looks along z sees of the points with living tracks."""
     seen = points - centre
     px = CAMERA.project(seen) + np.random.default_rng(frame).normal(0.0, noise_px, (len(seen), 2))
     inside = ((px > 0.0) & (px < (CAMERA.width, CAMERA.height))).all(axis=1)
     ids = np.flatnonzero(inside & alive)
-    return WaitingFrame(
+    return BufferedFrame(
         frame=frame,
         stamp_ns=frame * INTERVAL_NS,
         ids=ids,
@@ -37,7 +37,7 @@ def frame_of(
     )
 
 
-def ride(frames: int, step_m: float, life: int) -> tuple[F64, list[WaitingFrame]]:
+def ride(frames: int, step_m: float, life: int) -> tuple[F64, list[BufferedFrame]]:
     """A camera that looks at a wall and goes along it; its tracks live for so many frames.
 
     Returns where it was (F, 3), and the frames.
@@ -52,7 +52,7 @@ def ride(frames: int, step_m: float, life: int) -> tuple[F64, list[WaitingFrame]
     return centres.astype(np.float64), waiting
 
 
-def started(waiting: list[WaitingFrame]) -> Start:
+def started(waiting: list[BufferedFrame]) -> Start:
     start = find_start(waiting, CAMERA, MappingParameters())
     assert isinstance(start, Start), start
     return start
@@ -66,7 +66,7 @@ def test_what_is_too_little_is_less_than_enough(focal_px: float, noise_px: float
     camera = PinholeCamera(fx=focal_px, fy=focal_px, cx=320.0, cy=240.0, width=640, height=480)
     points = random.uniform((20, 20), (620, 460), (300, 2))
     waiting = [
-        WaitingFrame(
+        BufferedFrame(
             frame=frame,
             stamp_ns=frame * INTERVAL_NS,
             ids=np.arange(300),
@@ -84,7 +84,7 @@ def test_what_is_too_little_is_less_than_enough(focal_px: float, noise_px: float
 
 @pytest.mark.parametrize(
     ("speed", "frames", "parameters"),
-    [(1.0, 8, impatient(MappingParameters())), (0.5, 20, MappingParameters())],
+    [(1.0, 8, with_minimum_parallax(MappingParameters())), (0.5, 20, MappingParameters())],
 )
 @pytest.mark.parametrize("seed", range(8))
 def test_a_floor_at_the_border_never_starts_with_the_wrong_motion(
@@ -100,7 +100,7 @@ def test_a_floor_at_the_border_never_starts_with_the_wrong_motion(
     wall = random.uniform((-0.5, -0.8, 1.6), (0.9, 0.8, 2.0), (12, 3))
     points = np.concatenate([floor, wall])
     way = speed * np.array([-0.06, 0.02, 0.12])
-    waiting: list[WaitingFrame] = []
+    waiting: list[BufferedFrame] = []
     reason = ""
     for frame in range(frames):
         seen = points - frame * way
@@ -111,7 +111,7 @@ def test_a_floor_at_the_border_never_starts_with_the_wrong_motion(
         inside = ((px > 0.0) & (px < (camera.width, camera.height))).all(axis=1)
         ids = np.flatnonzero(inside)
         waiting.append(
-            WaitingFrame(
+            BufferedFrame(
                 frame=frame,
                 stamp_ns=frame * INTERVAL_NS,
                 ids=ids,
@@ -173,7 +173,7 @@ def test_under_a_guessed_focal_length_it_does_not_wait() -> None:
     assert not isinstance(find_start_of(waiting, known, guess), str)
 
 
-def street(frames: int) -> list[WaitingFrame]:
+def street(frames: int) -> list[BufferedFrame]:
     """A walk straight ahead towards what is far, beside what is near and leaves the image soon."""
     random = np.random.default_rng(0)
     near = random.uniform((-6.0, -3.0, 4.0), (6.0, 3.0, 24.0), (4000, 3))
@@ -231,7 +231,7 @@ def test_it_reaches_back_to_frames_whose_tracks_have_ended() -> None:
     centres, waiting = ride(24, 0.06, life=8)
     start = started(waiting[-8:])
     assert len(np.intersect1d(waiting[0].ids, start.ids)) == 0
-    reached = reach_back(start, waiting, CAMERA, MappingParameters())
+    reached = backfill(start, waiting, CAMERA, MappingParameters())
     assert reached.frames[0] == 0
     assert reached.frames[-1] == start.frames[-1]
     moved = reached.T_world_camera[:, :3, 3] - reached.T_world_camera[0, :3, 3]
@@ -246,9 +246,9 @@ def test_it_reaches_back_to_frames_whose_tracks_have_ended() -> None:
 
 def test_it_reaches_back_over_many_lives_of_tracks() -> None:
     centres, waiting = ride(120, 0.03, life=8)
-    start = find_start(waiting[-8:], CAMERA, impatient(MappingParameters()))
+    start = find_start(waiting[-8:], CAMERA, with_minimum_parallax(MappingParameters()))
     assert isinstance(start, Start), start
-    reached = reach_back(start, waiting, CAMERA, MappingParameters())
+    reached = backfill(start, waiting, CAMERA, MappingParameters())
     assert reached.frames[0] == 0
     moved = reached.T_world_camera[:, :3, 3]
     np.testing.assert_allclose(
@@ -262,5 +262,5 @@ def test_it_reaches_no_further_than_tracks_lead() -> None:
     for broken in (2, 15):
         dark = replace(waiting[broken], ids=waiting[broken].ids[:0])
         cut = [dark if each.frame == broken else each for each in waiting]
-        reached = reach_back(start, cut, CAMERA, MappingParameters())
+        reached = backfill(start, cut, CAMERA, MappingParameters())
         assert reached.frames[0] == broken + 1

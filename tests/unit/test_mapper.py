@@ -9,6 +9,7 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 from pliant.algorithms.arrays import check_arrays
 from pliant.algorithms.geometry import align_umeyama, move_by_similarity, pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
+from pliant.algorithms.mapping.calibration_bootstrap import BootstrapMapper
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
@@ -16,8 +17,7 @@ from pliant.algorithms.mapping.parameters import (
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.start import impatient
-from pliant.algorithms.mapping.trial import TrialMapper
+from pliant.algorithms.mapping.start import with_minimum_parallax
 from pliant.algorithms.tracks import FrameExtrema
 
 PARAMETERS = MappingParameters()
@@ -306,7 +306,7 @@ def test_segments_share_what_room_there_is(room, adjusted):
     poses = sideways(40)
     frames = cut(poses, 20)
     window = WindowParameters(kept_observations=room, kept_per_keyframe=100)
-    published, deltas = run(frames, impatient(MappingParameters(window=window)))
+    published, deltas = run(frames, with_minimum_parallax(MappingParameters(window=window)))
     told = deltas[-1].keyframe_segments.tolist()
     assert set(told) == adjusted
     assert told.count(0) < sum(delta.keyframe_segments.tolist().count(0) > 0 for delta in deltas)
@@ -341,7 +341,7 @@ def test_frames_that_are_passed_over_get_no_pose_and_the_next_one_goes_on():
     assert LOST not in published.states
 
 
-@pytest.mark.parametrize("mapper_of", [Mapper, TrialMapper])
+@pytest.mark.parametrize("mapper_of", [Mapper, BootstrapMapper])
 def test_frames_that_are_not_mapped_get_poses_by_their_tracks(mapper_of):
     """Also those that wait for the map, and those that the end finds waiting.  None is a keyframe
     once the map has begun, and none makes a point."""

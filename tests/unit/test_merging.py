@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS
 from test_kept_map import messages
-from test_meetings import PARAMETERS, along, film, wall
 from test_recovery import dark, textures
 from test_relocalisation import Film
+from test_segment_merges import PARAMETERS, along, film, wall
 
 from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.kept_keyframe import KeptKeyframe

@@ -14,8 +14,8 @@ from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.global_adjustment import held
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, WholeMapParameters
+from pliant.algorithms.mapping.place_match import PlaceMatch, match_places
 from pliant.algorithms.mapping.relocalisation import Place
-from pliant.algorithms.mapping.same_place import SamePlace, same_place
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.state import load_state, save_state
 
@@ -150,11 +150,11 @@ def test_two_maps_of_one_place_tell_how_they_lie_to_each_other(known, alike):
     moved[:3, :3] /= 0.6
     keyframe = replace(new.keyframe, rows=shifted, T_world_camera=moved)
     new = replace(new, keyframe=keyframe, segment=[keyframe])
-    found = same_place(old, new, points, CAMERA, parameters, np.random.default_rng(0))
+    found = match_places(old, new, points, CAMERA, parameters, np.random.default_rng(0))
     if not alike:
         assert found == "few_points"
         return
-    assert isinstance(found, SamePlace), found
+    assert isinstance(found, PlaceMatch), found
     np.testing.assert_allclose(found.S_old_new @ S, np.eye(4), atol=5e-3)
     same = dict(zip(shifted.tolist(), place_of(other, 6).keyframe.rows.tolist(), strict=True))
     agree = [same[b] == a for a, b in found.rows.tolist()]
@@ -171,7 +171,7 @@ def test_two_places_are_not_one(known):
     a, b = Mapper(CAMERA, parameters, 0), Mapper(CAMERA, parameters, 0)
     run(film(scene, there, squares), a)
     run(film(elsewhere, there, squares[::-1]), b)
-    why = same_place(
+    why = match_places(
         place_of(a, 3), place_of(b, 3), a.atlas.points, CAMERA, parameters, np.random.default_rng(0)
     )
     assert why in ("few_corners", "few_points")

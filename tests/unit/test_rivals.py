@@ -72,7 +72,7 @@ def ask(
         )
         return [proposed]
 
-    def prove(T_world_camera: F64, *_: object) -> SimpleNamespace:
+    def verify_pose(T_world_camera: F64, *_: object) -> SimpleNamespace:
         count = said[round(T_world_camera[0, 3] / 3.0)][1]
         return SimpleNamespace(T_world_camera=T_world_camera, rows=np.arange(count, dtype=np.int32))
 
@@ -80,7 +80,7 @@ def ask(
         return repeated
 
     monkeypatch.setattr(relocalisation, "_propose", propose)
-    monkeypatch.setattr(relocalisation, "prove", prove)
+    monkeypatch.setattr(relocalisation, "verify_pose", verify_pose)
     monkeypatch.setattr(relocalisation, "repeated_share", share)
     return relocalise(
         NOTHING, places[:first], places[first:], points, NO_MAXIMA, DARK, CAMERA, PARAMETERS,

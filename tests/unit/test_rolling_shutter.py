@@ -17,7 +17,7 @@ from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame, readout_flow
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.start import impatient
+from pliant.algorithms.mapping.start import with_minimum_parallax
 from pliant.map_history import MapHistory
 
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
@@ -202,7 +202,7 @@ class Shaken:
         prior: of the readout.   known: the readout that the mapper is told.
         """
         parameters = MappingParameters(calibration=CalibrationUncertainty(readout=prior))
-        parameters = impatient(parameters)
+        parameters = with_minimum_parallax(parameters)
         calibration = SelfCalibration.of(mapping_scene.CAMERA, parameters.calibration)
         calibration = calibration.with_readout(known, 1e-3)
         mapper = Mapper(mapping_scene.CAMERA, parameters, 0, calibration)

@@ -9,12 +9,12 @@ from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.map_delta import TRACKING, WAITING
-from pliant.algorithms.mapping import start, trial
+from pliant.algorithms.mapping import calibration_bootstrap, start
+from pliant.algorithms.mapping.calibration_bootstrap import BootstrapMapper, mapper_for
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import widened
-from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
 
 PARAMETERS = MappingParameters()
 GUESS_SIGMA = 0.3
@@ -54,7 +54,7 @@ def test_a_wrong_focal_length_is_found_and_the_path_is_that_of_a_calibrated_came
 
 
 def test_frames_on_trial_wait_and_then_all_get_their_poses_at_once(turning, monkeypatch):
-    monkeypatch.setattr(trial, "_KNOWN", 0.1)
+    monkeypatch.setattr(calibration_bootstrap, "_KNOWN", 0.1)
     poses, frames = turning
     published, _ = run(frames, 0.65)
     begun = published.states.index(TRACKING)
@@ -110,7 +110,7 @@ def test_a_turn_alone_starts_no_map_under_any_focal_length():
 def test_only_a_guess_is_tried_and_what_is_held_stays_held():
     assert isinstance(mapper_for(CAMERA, PARAMETERS, 0), Mapper)
     assert isinstance(mapper_for(CAMERA, PARAMETERS, 0, 0.03), Mapper)
-    assert isinstance(mapper_for(CAMERA, PARAMETERS, 0, 0.3), TrialMapper)
+    assert isinstance(mapper_for(CAMERA, PARAMETERS, 0, 0.3), BootstrapMapper)
     held = MappingParameters(calibration=CalibrationUncertainty(focal=0.0))
     assert widened(held, 0.3) is held
     assert widened(PARAMETERS, 0.3).calibration.k1 > PARAMETERS.calibration.k1

@@ -6,7 +6,7 @@ import pytest
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
-from pliant.algorithms.mapping.first_map import WaitingFrame
+from pliant.algorithms.mapping.first_map import BufferedFrame
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, widened
 from pliant.algorithms.turn_of_lens import turn_of_lens
@@ -71,7 +71,7 @@ def test_a_turn_starts_no_map_though_the_lens_is_wide_and_unknown(rate: float) -
     random = np.random.default_rng(0)
     points = random.normal(size=(20_000, 3))
     born = random.integers(-60, 120, len(points))
-    waiting: list[WaitingFrame] = []
+    waiting: list[BufferedFrame] = []
     for frame in range(0, 120, 4):
         R = so3_exp(np.array([0.03 * np.sin(0.2 * frame), rate * frame, 0.0]))
         px = seen(points @ R, 350.0, -0.2)
@@ -79,7 +79,7 @@ def test_a_turn_starts_no_map_though_the_lens_is_wide_and_unknown(rate: float) -
         ids = np.flatnonzero(inside & (born <= frame) & (frame < born + 60))
         noisy = px[ids] + random.normal(0.0, 0.3, (len(ids), 2))
         waiting.append(
-            WaitingFrame(
+            BufferedFrame(
                 frame=frame,
                 stamp_ns=frame * INTERVAL_NS,
                 ids=ids,

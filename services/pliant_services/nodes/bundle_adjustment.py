@@ -27,6 +27,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.image.masks import filled
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.mapping.calibration_bootstrap import BootstrapMapper, mapper_for
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.global_adjustment import (
     AdjustmentJob,
@@ -41,8 +42,7 @@ from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, WindowParameters
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.thinning import thin
-from pliant.algorithms.mapping.trial import TrialMapper, mapper_for
+from pliant.algorithms.mapping.sparsification import sparsify
 from pliant.algorithms.places import PlaceIndex, describe, match
 from pliant.algorithms.tracking.maxima import maxima_of
 from pliant.algorithms.tracking.parameters import TrackingParameters
@@ -74,7 +74,7 @@ _JPEG_QUALITY = 95
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     """Map until the tracks end."""
 
-    def start() -> tuple[Header, Mapper | TrialMapper | Localiser, dict[int, _Kept]]:
+    def start() -> tuple[Header, Mapper | BootstrapMapper | Localiser, dict[int, _Kept]]:
         stream = receive_one(bus, topics.STREAM, CameraStream)
         known: list[MapKeyframe] = []
         if bus.reads(topics.MAP_KNOWN):
@@ -235,8 +235,8 @@ def warm_up() -> None:
     keyframe.follow_aliases(Landmarks())
     assert mapper.atlas.active is not None
     segment, none = mapper.atlas.active.segment, np.zeros(0, np.int32)
-    thin(segment, 1000, WindowParameters(kept_per_keyframe=1), none, whole=1)
-    thin(segment, 1, WindowParameters(kept_per_keyframe=n), none, whole=1)
+    sparsify(segment, 1000, WindowParameters(kept_per_keyframe=1), none, whole=1)
+    sparsify(segment, 1, WindowParameters(kept_per_keyframe=n), none, whole=1)
     maxima_of(grey, TrackingParameters())
     seen, places = describe(grey), PlaceIndex()
     places.add(0, seen)

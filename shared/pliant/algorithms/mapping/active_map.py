@@ -16,7 +16,7 @@ from pliant.algorithms.mapping.covisibility import (
     rows_of,
 )
 from pliant.algorithms.mapping.directions import helping_candidates
-from pliant.algorithms.mapping.first_map import Start, WaitingFrame
+from pliant.algorithms.mapping.first_map import BufferedFrame, Start
 from pliant.algorithms.mapping.frame import IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.keyframe import Keyframe, Observations
 from pliant.algorithms.mapping.keyframe_rule import Overlap
@@ -26,7 +26,7 @@ from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid, Reacquired, cut_patches
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.thinning import thin
+from pliant.algorithms.mapping.sparsification import sparsify
 from pliant.algorithms.mapping.track_links import UNLINKED, TrackLinks
 from pliant.algorithms.mapping.window import Window
 from pliant.algorithms.tracks import FrameExtrema
@@ -94,7 +94,7 @@ class ActiveMap:
         """Those of the segment, oldest first."""
         return self.segment.keyframes
 
-    def begin(self, start: Start, waiting: list[WaitingFrame], latest: IdealFrame) -> None:
+    def begin(self, start: Start, waiting: list[BufferedFrame], latest: IdealFrame) -> None:
         """Take over a start.   latest: the newest of the waiting frames, with its image."""
         newest = waiting[-1]
         rows = self._allocate(len(start.ids))
@@ -214,9 +214,9 @@ class ActiveMap:
         """Put the current frame into the window."""
         self.window.see(placed.T_world_camera, *self._seen(placed))
 
-    def pass_by(self, placed: PlacedFrame) -> None:
+    def add_ordinary(self, placed: PlacedFrame) -> None:
         """The current frame is no keyframe: it hangs on the last one."""
-        self.segment.passed.add(
+        self.segment.ordinary.add(
             placed.frame.number, self.keyframes[-1], placed.T_world_camera, *self._seen(placed),
             self.seen_by.log_focal,
         )  # fmt: skip
@@ -321,10 +321,10 @@ class ActiveMap:
         self.keyframes.append(keyframe)
         return keyframe
 
-    def begin_to_unroll(self, calibration: SelfCalibration) -> None:
+    def begin_global_shutter(self, calibration: SelfCalibration) -> None:
         """The readout has become known: the map is bent until its window is adjusted with it."""
-        self.segment.unroll(self.keyframes, calibration)
-        self.segment.passed.forget()
+        self.segment.to_global_shutter(self.keyframes, calibration)
+        self.segment.ordinary.forget()
         self.window.see_anew()
         self._adjust_window()
 
@@ -368,12 +368,14 @@ class ActiveMap:
         settled = first - 1  # not the one that has just left: it is not published yet
         if adjusted:
             ids = [keyframe.id for keyframe in self.keyframes]
-            newest = min(segment.adjusted, segment.passed.first_keyframe - 1)
+            newest = min(segment.adjusted, segment.ordinary.first_keyframe - 1)
             settled = min(settled, bisect.bisect_right(ids, newest))
         else:
             room = int(_MOST_UNADJUSTED * room)
         whole = len(self.keyframes) - max(settled, 0)
-        thin(segment, room, self.parameters.window, self.links.rows, whole=whole, settled=adjusted)
+        sparsify(
+            segment, room, self.parameters.window, self.links.rows, whole=whole, settled=adjusted
+        )
         segment.adjusted = -1
 
     def _look_at(

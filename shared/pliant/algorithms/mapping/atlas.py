@@ -18,13 +18,13 @@ from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
-from pliant.algorithms.mapping.first_map import Start, WaitingFrame
+from pliant.algorithms.mapping.first_map import BufferedFrame, Start
 from pliant.algorithms.mapping.frame import IdealFrame
 from pliant.algorithms.mapping.frame_focal import refocused
 from pliant.algorithms.mapping.global_adjustment import AdjustmentResult, GlobalAdjustment, held
 from pliant.algorithms.mapping.kept_map import Origin, keep, spans_of, take_in
 from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.known_places import KnownPlaces, Meetings, join
+from pliant.algorithms.mapping.known_places import KnownPlaces, SegmentMerges, join
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -90,10 +90,10 @@ class Atlas:
         return self.points.culled + int(np.count_nonzero(self.points.state == MAPPED))
 
     @property
-    def given_up(self) -> dict[str, int]:
+    def dropped(self) -> dict[str, int]:
         """How many keyframes and points the map had no more room for, where it had not."""
         keyframes = self._earlier.dropped_keyframes
-        keyframes += sum(len(segment.given_up) for segment, _ in self.everything())
+        keyframes += sum(len(segment.dropped) for segment, _ in self.everything())
         counts = {"given_up_keyframes": keyframes, "given_up_points": self.points.culled}
         return counts if self.points.culled or keyframes else {}
 
@@ -101,7 +101,7 @@ class Atlas:
         self,
         start: Start,
         calibration: SelfCalibration,
-        waiting: list[WaitingFrame],
+        waiting: list[BufferedFrame],
         latest: IdealFrame,
     ) -> ActiveMap:
         """A segment begins.  calibration: as the start tells it.   latest: the newest of the frames
@@ -230,7 +230,7 @@ class Atlas:
         moved: list[Moved] = []
         if result.moves is not None:
             same_places = tuple((loop.old, loop.new) for loop in result.loops)
-            moves = self.active.segment.given_up.together_with(result.moves)
+            moves = self.active.segment.dropped.together_with(result.moves)
             at_end = self.move(held(moves, self._spans, self.segment))
             self.active.segment.adjusted = int(result.moves.keyframe_ids[-1])
             moved = [at_end._replace(same_places=same_places)]
@@ -245,8 +245,8 @@ class Atlas:
         if not self.calibration.sees_like(before):
             return [*moved, self._change_lens(self.active, before)]
         if not before.readout:
-            return [*moved, *self.begin_to_unroll()]
-        self.active.segment.unroll(self.active.keyframes, self.calibration)
+            return [*moved, *self.begin_global_shutter()]
+        self.active.segment.to_global_shutter(self.active.keyframes, self.calibration)
         return moved
 
     def _refocus(self, result: AdjustmentResult) -> F64:
@@ -276,13 +276,13 @@ class Atlas:
         assert self.active is not None
         return Moved(self.active.move(moves), moves)
 
-    def begin_to_unroll(self) -> list[Moved]:
+    def begin_global_shutter(self) -> list[Moved]:
         """Map with the readout, where it is known, what was mapped without."""
         if self.active is None or not self.calibration.readout:
             return []
         newest = self.active.keyframes[-1]
         before = newest.T_world_camera
-        self.active.begin_to_unroll(self.calibration)
+        self.active.begin_global_shutter(self.calibration)
         return [Moved(newest.T_world_camera @ inverse(before))]
 
     def focus(self, motion: Motion, stamp_ns: int, tracks: FrameTracks) -> None:
@@ -315,7 +315,7 @@ class Atlas:
 
     def stay(self) -> None:
         """Forget what is about to move the map: nobody has it yet."""
-        self.global_adjustment, self.places.meetings = GlobalAdjustment(), Meetings()
+        self.global_adjustment, self.places.meetings = GlobalAdjustment(), SegmentMerges()
 
     def finish(self, timer: StageTimer = no_stages) -> list[Moved]:
         """What is still to be corrected at the end of the stream."""

@@ -10,7 +10,7 @@ from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.parameters import MappingParameters, WindowParameters
 from pliant.algorithms.mapping.segment import Segment, see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.thinning import observations_of, thin
+from pliant.algorithms.mapping.sparsification import observations_of, sparsify
 
 
 class _Earlier(NamedTuple):
@@ -63,7 +63,7 @@ class EarlierSegments:
         """That of a keyframe of one of them."""
         for segment in (each.segment for each in self._kept):
             known = {k.id for k in segment.keyframes}
-            if keyframe in known or keyframe in segment.given_up.ids:
+            if keyframe in known or keyframe in segment.dropped.ids:
                 return segment.id
         raise ValueError(f"keyframe {keyframe} is in no earlier segment")
 
@@ -83,16 +83,16 @@ class EarlierSegments:
                 break
             rest -= some
 
-        def thinned(whole: int) -> None:
+        def sparsify_earlier(whole: int) -> None:
             for each in own:
-                thin(each.segment, int(size), limits, np.zeros(0, np.int32), whole=whole)
+                sparsify(each.segment, int(size), limits, np.zeros(0, np.int32), whole=whole)
 
-        thinned(limits.keyframes)  # of the newest nobody may have been told yet
+        sparsify_earlier(limits.keyframes)  # of the newest nobody may have been told yet
         if self._observations(own) > room:
-            thinned(1)
+            sparsify_earlier(1)
         while self._observations(own) > room:
             oldest = own.pop(0)
-            self.dropped_keyframes += len(oldest.segment.keyframes) + len(oldest.segment.given_up)
+            self.dropped_keyframes += len(oldest.segment.keyframes) + len(oldest.segment.dropped)
             points.cull(oldest.segment.mapped_rows())
             self._kept = [each for each in self._kept if each is not oldest]
         return limits.kept_observations - self._observations(own)

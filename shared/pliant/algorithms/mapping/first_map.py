@@ -32,7 +32,7 @@ _F = TypeVar("_F", bound=Stamped)
 
 
 @dataclass(frozen=True, kw_only=True)
-class WaitingFrame:
+class BufferedFrame:
     """What is kept of a frame until the map starts."""
 
     frame: int
@@ -64,14 +64,14 @@ class Start:
     newest_px: F32
 
 
-def keep_waiting(waiting: list[_F], newest: _F, parameters: StartParameters) -> list[_F]:
+def keep_newest(waiting: list[_F], newest: _F, parameters: StartParameters) -> list[_F]:
     """The waiting frames without those that are too old, and the newest one."""
     oldest_ns = newest.stamp_ns - 1e9 * parameters.max_s
     young = [frame for frame in waiting if frame.stamp_ns > oldest_ns]
     return [*max(young, waiting[1 - _LEAST_WAITING :], key=len), newest]
 
 
-def table_of(chosen: list[WaitingFrame], ids: I64) -> tuple[F32, F32, BoolArray]:
+def table_of(chosen: list[BufferedFrame], ids: I64) -> tuple[F32, F32, BoolArray]:
     """u, v and whether it is seen there, each (M, N), of the N tracks in M frames."""
     frames, columns, points_px = _observations(chosen, ids)
     u, v = np.zeros((2, len(chosen), len(ids)), np.float32)
@@ -81,7 +81,7 @@ def table_of(chosen: list[WaitingFrame], ids: I64) -> tuple[F32, F32, BoolArray]
     return u, v, seen
 
 
-def _observations(chosen: list[WaitingFrame], ids: I64) -> tuple[I32, I32, F32]:
+def _observations(chosen: list[BufferedFrame], ids: I64) -> tuple[I32, I32, F32]:
     keyframe_index: list[I32] = []
     point_index: list[I32] = []
     points_px: list[F32] = []
@@ -94,7 +94,7 @@ def _observations(chosen: list[WaitingFrame], ids: I64) -> tuple[I32, I32, F32]:
 
 
 def adjusted_start(
-    chosen: list[WaitingFrame],
+    chosen: list[BufferedFrame],
     T_world_camera: F64,
     ids: I64,
     points: F64,
@@ -155,7 +155,7 @@ def adjusted_start(
     )
 
 
-def _kappas(chosen: list[WaitingFrame], ids: I64) -> F32:
+def _kappas(chosen: list[BufferedFrame], ids: I64) -> F32:
     kappas = np.zeros(len(ids), np.float32)
     for frame in chosen:
         _, i, j = np.intersect1d(frame.ids, ids, assume_unique=True, return_indices=True)

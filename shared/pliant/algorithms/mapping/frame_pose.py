@@ -24,9 +24,9 @@ from pliant.algorithms.mapping.localisation import (
     Localisation,
     Motion,
     locate,
-    prove,
     recover,
     refine,
+    verify_pose,
 )
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import (
@@ -94,7 +94,7 @@ def localise(
             before = motion.tracked if helped else motion.to_points
             if not frame.has_image or inliers >= _FEW * before:
                 return Located(located.T_world_camera, inliers >= _FIRM * before)
-            proved = prove(
+            proved = verify_pose(
                 located.T_world_camera, active.nearby(), points, tracks.maxima, frame.image,
                 active.camera, parameters, parameters.recovery.min_agreement,
             )  # fmt: skip

@@ -125,7 +125,7 @@ class GlobalAdjustment:
         count = len(segment.keyframes)
         # While the window has half of the map it does well by itself, but for the calibration.
         least = parameters.start.keyframes if parameters.calibration.sigmas.any() else 2 * window
-        made = count + len(segment.given_up)
+        made = count + len(segment.dropped)
         early = growth == 0.0 or count < least or made < self.due
         # The window would move with what was there before the camera was recognised.
         early = early or (segment.since > 0 and count - segment.since <= window)
@@ -134,7 +134,7 @@ class GlobalAdjustment:
             return
         points = segment.points
         keyframe_ids = np.array([keyframe.id for keyframe in segment.keyframes], np.int64)
-        kept = partial(segment.given_up.host_of, kept=keyframe_ids)
+        kept = partial(segment.dropped.host_of, kept=keyframe_ids)
         loops = [loop._replace(old=kept(loop.old), new=kept(loop.new)) for loop in self.loops]
         loops = [loop for loop in loops if np.isin((loop.old, loop.new), keyframe_ids).all()]
         loops = [loop.living(points) for loop in loops if loop.old != loop.new]

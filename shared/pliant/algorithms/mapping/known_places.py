@@ -31,13 +31,13 @@ from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.mapping.place_match import Refusal, match_places
 from pliant.algorithms.mapping.relocalisation import (
     Place,
     Recognised,
     relocalise,
     rest_is_elsewhere,
 )
-from pliant.algorithms.mapping.same_place import Refusal, same_place
 from pliant.algorithms.mapping.segment import Moved, Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.places import Features, PlaceIndex, describe
@@ -68,7 +68,7 @@ class Comparisons:
     """How often keyframes were compared with places, and what came of it.
 
     compared: pairs of keyframes.   few_corners, few_points, one_spot, repeated: refused, see
-    ``same_place``.   contradicted: agreed, and another place agreed otherwise, or the image did.
+    ``place_match``.   contradicted: agreed, and another place agreed otherwise, or the image did.
     unconfirmed: loops of one keyframe, of which the best counts, that no other one agrees with yet.
     confirmed: by another one.   refused: of these, by the graph of all keyframes.   closed: taken
     in.
@@ -96,7 +96,7 @@ class Comparisons:
 
 
 @dataclass(kw_only=True)
-class Revisits:
+class LoopCandidates:
     """waiting: loops of one keyframe, until another one agrees."""
 
     waiting: list[Loop] = field(default_factory=list[Loop])
@@ -131,7 +131,7 @@ class Revisits:
 
         def ask(some: Iterable[Place]) -> None:
             for old in some:
-                found = same_place(old, new, points, camera, parameters, generator)
+                found = match_places(old, new, points, camera, parameters, generator)
                 comparisons.compared += 1
                 if isinstance(found, str):
                     comparisons.refuse(found)
@@ -185,14 +185,14 @@ def _agree(one: Loop, other: Loop, new: Place, points: Landmarks) -> bool:
 
 
 @dataclass(kw_only=True)
-class Meetings:
+class SegmentMerges:
     """Of the segment that the camera is in with earlier ones.
 
     revisits: of each of those, what awaits a second keyframe.   proved: loops that have been
     confirmed, from places of earlier segments to keyframes of this one, until they are joined.
     """
 
-    revisits: dict[int, Revisits] = field(default_factory=dict[int, Revisits])
+    revisits: dict[int, LoopCandidates] = field(default_factory=dict[int, LoopCandidates])
     proved: list[Loop] = field(default_factory=list[Loop])
 
     def look(
@@ -215,7 +215,7 @@ class Meetings:
         for place in places:
             by_segment.setdefault(place.keyframe.segment, []).append(place)
         for segment, some in by_segment.items():
-            revisits = self.revisits.setdefault(segment, Revisits())
+            revisits = self.revisits.setdefault(segment, LoopCandidates())
             proved = revisits.look(
                 new, some, points, camera, parameters, comparisons, tries=_TRIES,
                 elsewhere=elsewhere(segment),
@@ -253,7 +253,7 @@ def join(
     goes_on.strayed = staying.strayed
     goes_on.take_in(earlier, id)
     if calibration.readout:
-        goes_on.unroll(earlier.keyframes, calibration)
+        goes_on.to_global_shutter(earlier.keyframes, calibration)
     same_places = tuple((loop.old, loop.new) for loop in loops)
     return Moved(S if active_moves else np.eye(4), moves, gone, same_places)
 
@@ -266,8 +266,8 @@ class KnownPlaces:
     """
 
     index: PlaceIndex = field(default_factory=PlaceIndex)
-    revisits: Revisits = field(default_factory=Revisits)
-    meetings: Meetings = field(default_factory=Meetings)
+    revisits: LoopCandidates = field(default_factory=LoopCandidates)
+    meetings: SegmentMerges = field(default_factory=SegmentMerges)
     comparisons: Comparisons = field(default_factory=Comparisons)
 
     def know(self, kept: Iterable[KeptKeyframe], calibration: SelfCalibration) -> None:
@@ -278,7 +278,7 @@ class KnownPlaces:
 
     def enter(self) -> None:
         """The camera is in a segment that it was not in before."""
-        self.revisits, self.meetings = Revisits(), Meetings()
+        self.revisits, self.meetings = LoopCandidates(), SegmentMerges()
 
     def recognise(
         self,

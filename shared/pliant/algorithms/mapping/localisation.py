@@ -126,7 +126,7 @@ def _cost(T_world_camera: F64, points_world: F64, points_n: F64, gate: float) ->
     )  # fmt: skip
 
 
-class Proved(NamedTuple):
+class VerifiedPose(NamedTuple):
     """A pose, and the rows of the points that prove it."""
 
     T_world_camera: F64
@@ -275,7 +275,7 @@ def look_about(
     camera: PinholeCamera,
     parameters: MappingParameters,
     generator: np.random.Generator,
-) -> Proved | None:
+) -> VerifiedPose | None:
     """The pose that points agree on which are looked for about where a pose shows them, and prove.
 
     rows: of the points.   grid: the maxima of the image, for this radius.
@@ -291,13 +291,13 @@ def look_about(
     located = locate([T_world_camera], points.xyz[found], points_px, camera, limits, generator)
     if located.inliers.sum() < own.min_agreeing:
         return None
-    return prove(
+    return verify_pose(
         located.T_world_camera, rows, points, grid.maxima, grey, camera, parameters,
         own.min_agreement,
     )  # fmt: skip
 
 
-def prove(
+def verify_pose(
     T_world_camera: F64,
     rows: I32,
     points: Landmarks,
@@ -306,7 +306,7 @@ def prove(
     camera: PinholeCamera,
     parameters: MappingParameters,
     min_agreement: float,
-) -> Proved | None:
+) -> VerifiedPose | None:
     """The pose refined by all points found where it shows them, None if these are too few of them.
 
     min_agreement: least share of the points found that support it, see ``RecoveryParameters``.
@@ -329,4 +329,4 @@ def prove(
     )
     if inliers < enough:
         return None
-    return Proved(located.T_world_camera, found.rows[located.inliers])
+    return VerifiedPose(located.T_world_camera, found.rows[located.inliers])

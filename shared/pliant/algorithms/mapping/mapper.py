@@ -29,26 +29,30 @@ from pliant.algorithms.mapping.frame_pose import (
     tracks_to_points,
 )
 from pliant.algorithms.mapping.global_adjustment import GlobalAdjustment
+from pliant.algorithms.mapping.initialisation_buffer import (
+    InitialisationBuffer,
+    earlier_poses,
+    returned_poses,
+)
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.keyframe_rule import is_due
 from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.localisation import Motion
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.passing import (
+from pliant.algorithms.mapping.ordinary_frames import (
     STANDING_ROOMS,
-    PassedFrame,
+    OrdinaryFrame,
     refined_poses,
     smoothed_poses,
 )
+from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.pose_quality import doubt
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved, Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of
-from pliant.algorithms.mapping.start import impatient
+from pliant.algorithms.mapping.start import with_minimum_parallax
 from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
-from pliant.algorithms.mapping.waiting import Waiting, earlier_poses, returned_poses
 from pliant.algorithms.stages import StageTimer, no_stages
 
 _LEAST_LOST = 3
@@ -83,7 +87,7 @@ class Mapper:
         self._changes = MapChanges()
         last = known[-1].id if known else -1
         self._keyframe_changes = KeyframeChanges(self.atlas.points, after=last)
-        self._waiting = Waiting()
+        self._waiting = InitialisationBuffer()
         self._stamps_ns: dict[int, int] = {}  # of the frames
         self._motion = Motion.at(0, 0, np.eye(4))  # in the segment that the camera is in
         self._lost_frames = 0
@@ -116,7 +120,7 @@ class Mapper:
     def counters(self) -> dict[str, int]:
         """What came of comparing places, and what the map gave up, see ``Comparisons`` and the
         atlas."""
-        return self.atlas.places.comparisons.counters | self.atlas.given_up
+        return self.atlas.places.comparisons.counters | self.atlas.dropped
 
     def kept(self) -> Iterator[KeptKeyframe]:
         """As of the atlas."""
@@ -143,10 +147,10 @@ class Mapper:
         if self._keyframe_is_new:
             placed = self._insert_keyframe(active, placed, timer)
         else:
-            active.pass_by(placed)
+            active.add_ordinary(placed)
         with timer("passed frames"):
             rooms = 1 if self._keyframe_is_new else STANDING_ROOMS
-            surplus = active.segment.passed.take_surplus(self._parameters, rooms)
+            surplus = active.segment.ordinary.take_surplus(self._parameters, rooms)
             self._correct(active.segment, surplus, self.calibration)
         self._lost_frames = 0
         self._go_on_from(active, placed, self._motion.then)
@@ -184,7 +188,7 @@ class Mapper:
         with timer("keyframe"):
             placed = stand(active, placed)
             if frame.rolled is not None:
-                active.segment.unroll(active.window.keyframes, self.calibration)
+                active.segment.to_global_shutter(active.window.keyframes, self.calibration)
             keyframe = active.insert_keyframe(placed)
         self.follow(self.atlas.calibrate())
         self._keyframe_ns = frame.stamp_ns
@@ -202,7 +206,7 @@ class Mapper:
         keyframe, number = active.keyframes[-1], placed.frame.number
         T_world_camera, support = placed.T_world_camera, placed.support
         self._place_waiting(active, keyframe, T_world_camera)
-        self._waiting = Waiting()
+        self._waiting = InitialisationBuffer()
         to_points = tracks_to_points(active, placed)
         self._motion = then(
             number, placed.frame.stamp_ns, T_world_camera, support.tracked, to_points
@@ -249,7 +253,7 @@ class Mapper:
             ideal = IdealFrame.of(frame, self.calibration)
             self._waiting = self._waiting.then(ideal, self._camera, self._parameters)
             return self.skip(frame.number, otherwise)
-        active.pass_by(found)
+        active.add_ordinary(found)
         self._go_on_from(active, found, self._motion.then_unmapped)
         return self._publish_placed(found)
 
@@ -259,7 +263,7 @@ class Mapper:
         self.follow(self.atlas.finish(timer))
         with timer("skipped frames"):
             for segment, seen_by in self.atlas.everything():
-                self._correct(segment, segment.passed.take_all(), seen_by)
+                self._correct(segment, segment.ordinary.take_all(), seen_by)
                 self._smooth(segment, seen_by)
         if self.atlas.active is None:
             return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
@@ -271,7 +275,7 @@ class Mapper:
         self.atlas.add_pose(frame, keyframe, T_world_camera, inliers)
 
     def _correct(
-        self, segment: Segment, frames: list[PassedFrame], seen_by: SelfCalibration
+        self, segment: Segment, frames: list[OrdinaryFrame], seen_by: SelfCalibration
     ) -> None:
         """Place frames again by the map as it is now.   seen_by: whose pixels they have."""
         for each in refined_poses(frames, segment.points, seen_by, self._parameters):
@@ -317,7 +321,7 @@ class Mapper:
     def start_at_last(self) -> bool:
         """Begin a map with what there is, since nothing more comes.  Whether there is a map."""
         if self.atlas.active is None and self._waiting.frames:
-            self._begin_where_possible(impatient(self._parameters))
+            self._begin_where_possible(with_minimum_parallax(self._parameters))
         return self.atlas.active is not None
 
     def _begin_where_possible(self, parameters: MappingParameters) -> int | str:
@@ -327,7 +331,7 @@ class Mapper:
 
     def _begin(self, start: Start, calibration: SelfCalibration) -> int:
         """Let the map start, and give poses to the frames that waited, backwards."""
-        waiting, self._waiting = self._waiting, Waiting()
+        waiting, self._waiting = self._waiting, InitialisationBuffer()
         assert waiting.newest is not None
         latest = IdealFrame.of(waiting.newest, self.calibration)
         active = self.atlas.begin(start, calibration, waiting.frames, latest)
@@ -347,7 +351,7 @@ class Mapper:
             tracked=newest.inliers,
             to_points=newest.inliers,
         )
-        self.follow(self.atlas.begin_to_unroll())
+        self.follow(self.atlas.begin_global_shutter())
         self._keyframe_ns = waiting.frames[-1].stamp_ns
         self._keyframe_is_new = True
         return newest.inliers

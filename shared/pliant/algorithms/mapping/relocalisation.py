@@ -21,7 +21,13 @@ from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.mapping.covisibility import most_shared, rows_of
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
-from pliant.algorithms.mapping.localisation import NEAR, are_enough, look_about, prove, refine
+from pliant.algorithms.mapping.localisation import (
+    NEAR,
+    are_enough,
+    look_about,
+    refine,
+    verify_pose,
+)
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.reacquisition import MaximaGrid
 from pliant.algorithms.places import Features, match, repeated_share
@@ -113,7 +119,7 @@ def relocalise(
             break
         rows = _rows_near(place.keyframe, place.segment, points)
         for proposed in _propose(seen, place, points, camera, parameters, generator):
-            proved = prove(
+            proved = verify_pose(
                 proposed.T_world_camera, rows, points, maxima, grey, camera, parameters,
                 0.0 if _speaks_for_itself(proposed, camera, parameters) else own.min_agreement,
             )  # fmt: skip
@@ -203,7 +209,7 @@ def rest_is_elsewhere(
     about it then is not where the pose shows it, but all a step aside.
     """
     rows, own = _rows_near(keyframe, segment, points), parameters.recovery
-    seen = prove(T_world_camera, rows, points, maxima, grey, camera, parameters, 0.0)
+    seen = verify_pose(T_world_camera, rows, points, maxima, grey, camera, parameters, 0.0)
     if seen is None:
         return False
     radius_px = camera.width * own.max_radius_share

@@ -37,8 +37,8 @@ from pliant.algorithms.mapping.covisibility import focus_of
 from pliant.algorithms.mapping.final_adjustment import adjust_keyframes
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
+from pliant.algorithms.mapping.ordinary_frames import OrdinaryFrames
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.passing import PassedFrames
 from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.track_links import UNLINKED
@@ -48,7 +48,7 @@ _MIN_DEPTH = 1e-6
 
 
 @dataclass(kw_only=True)
-class GivenUp:
+class DroppedKeyframes:
     """ids: (G,) of the keyframes, ascending.   hosts: (G,) the keyframe that each moves as, by id,
     itself where it lies between others.   centres: (G, 3) where they stood.
     """
@@ -60,7 +60,7 @@ class GivenUp:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def take_in(self, other: "GivenUp") -> None:
+    def take_in(self, other: "DroppedKeyframes") -> None:
         """Those of another segment, or others of this one, are given up as well."""
         ids = np.concatenate([self.ids, other.ids])
         order = np.argsort(ids)
@@ -140,23 +140,23 @@ class Moved(NamedTuple):
 @dataclass(kw_only=True)
 class Segment:
     """points: rows shared by all segments.    keyframes: oldest first.   path: of its frames.
-    passed: those that are no keyframes.
+    ordinary: those of them that are no keyframes.
     since: index of the first keyframe after the camera was last recognised: older ones do not move
     with the window.   adjusted: newest keyframe of an adjustment of all of it that was taken over
-    since the last keyframe was made, by id, or -1.   thinned: whether keyframes or points have been
-    given up (``thinning``).   given_up: those keyframes.   inverse_distance: median of its points
-    from the newest keyframe.   strayed: similarity (4, 4) by which its beginning has moved.
+    since the last keyframe was made, by id, or -1.   sparsified: whether keyframes or points have
+    been dropped (``sparsification``).   dropped: those keyframes.   inverse_distance: median of its
+    points from the newest keyframe.   strayed: similarity (4, 4) by which its beginning has moved.
     """
 
     id: int
     points: Landmarks
     keyframes: list[Keyframe] = field(default_factory=list[Keyframe])
     path: Path = field(default_factory=Path)
-    passed: PassedFrames = field(default_factory=PassedFrames)
+    ordinary: OrdinaryFrames = field(default_factory=OrdinaryFrames)
     since: int = 0
     adjusted: int = -1
-    thinned: bool = False
-    given_up: GivenUp = field(default_factory=GivenUp)
+    sparsified: bool = False
+    dropped: DroppedKeyframes = field(default_factory=DroppedKeyframes)
     inverse_distance: float = 1.0
     strayed: F64 = field(default_factory=lambda: np.eye(4))
 
@@ -206,7 +206,7 @@ class Segment:
         view = calibration.view_at(log_focal)
         return RolledFrame(view, readout, motion, self.inverse_distance)
 
-    def unroll(self, keyframes: list[Keyframe], calibration: SelfCalibration) -> None:
+    def to_global_shutter(self, keyframes: list[Keyframe], calibration: SelfCalibration) -> None:
         """Let keyframes see as if they had been taken at once, as is now known of readout, motion
         and depths; those of which no motion is known any more stay."""
         for keyframe, motion in zip(keyframes, self.path.motions(keyframes), strict=True):
@@ -235,7 +235,7 @@ class Segment:
                 keyframe.focus = move[:3, :3] @ keyframe.focus + move[:3, 3]
         self.points.move(self.id, moves)
         self.path.scale(moves)
-        self.given_up.move(moves)
+        self.dropped.move(moves)
         self.strayed = S[0] @ self.strayed
         return S[-1]
 
@@ -245,7 +245,7 @@ class Segment:
             return None
         first = np.array([self.keyframes[0].id], np.int64)
         move = matrix_to_similarity(np.asarray(np.linalg.inv(self.strayed), np.float64))
-        return self.given_up.together_with(MapMoves(keyframe_ids=first, moves=move[None]))
+        return self.dropped.together_with(MapMoves(keyframe_ids=first, moves=move[None]))
 
     def take_in(self, earlier: "Segment", id: int) -> None:
         """Become one with a segment that rests, in whose world this one lies by now, or the other
@@ -262,10 +262,10 @@ class Segment:
             keyframe.segment = id
         self.since = len(older)
         self.adjusted = -1  # not as one
-        self.thinned |= earlier.thinned
-        self.given_up.take_in(earlier.given_up)
+        self.sparsified |= earlier.sparsified
+        self.dropped.take_in(earlier.dropped)
         self.path.take_in(earlier.path)
-        self.passed.take_in(earlier.passed)
+        self.ordinary.take_in(earlier.ordinary)
 
     def adjust(
         self, known: SelfCalibration, parameters: MappingParameters
@@ -280,17 +280,17 @@ class Segment:
             self.keyframes, self.points, known, parameters, motions
         )
         self.points.remove(gone)
-        self.unroll(self.keyframes, found)
-        self.passed.seen_by(known.view, found.view)
+        self.to_global_shutter(self.keyframes, found)
+        self.ordinary.seen_by(known.view, found.view)
         if found.changes:
             after = np.array([keyframe.log_focal for keyframe in self.keyframes])
-            self.passed.focus(found.view, self.keyframes, after - before)
+            self.ordinary.focus(found.view, self.keyframes, after - before)
         if found.readout and not known.readout:
-            self.passed.forget()
-        if not self.thinned:
+            self.ordinary.forget()
+        if not self.sparsified:
             return found, None
-        moves = self.given_up.together_with(moves)
-        self.given_up.move(moves)
+        moves = self.dropped.together_with(moves)
+        self.dropped.move(moves)
         self.points.move_published(self.mapped_rows(), moves)
         return found, moves
 
@@ -323,11 +323,11 @@ def see_by(
         keyframe.points_px = moved_px(keyframe.points_px, before, known.view, factors)
         keyframe.rolled_px = seen - keyframe.points_px
         keyframe.log_focal += change
-    segment.passed.seen_by(before, known.view)
+    segment.ordinary.seen_by(before, known.view)
     if refocus is not None:
-        segment.passed.focus(known.view, segment.keyframes, refocus)
+        segment.ordinary.focus(known.view, segment.keyframes, refocus)
     if known.readout:
-        segment.unroll(segment.keyframes, known)
+        segment.to_global_shutter(segment.keyframes, known)
 
 
 def bend(

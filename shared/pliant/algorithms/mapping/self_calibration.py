@@ -21,10 +21,10 @@ from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.map_delta import MapDelta
-from pliant.algorithms.mapping.first_map import Start, WaitingFrame
+from pliant.algorithms.mapping.backfill import backfill
+from pliant.algorithms.mapping.first_map import BufferedFrame, Start
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.principal_point import PRINCIPAL_POINT, with_principal_point
-from pliant.algorithms.mapping.reaching_back import reach_back
 from pliant.algorithms.mapping.start import find_start, waits_long, why_no_start
 from pliant.algorithms.tracks import FrameExtrema
 
@@ -233,7 +233,7 @@ def is_guess(uncertainty: CalibrationUncertainty) -> bool:
 
 
 def find_start_of(
-    waiting: list[WaitingFrame], known: SelfCalibration, parameters: MappingParameters
+    waiting: list[BufferedFrame], known: SelfCalibration, parameters: MappingParameters
 ) -> tuple[Start, SelfCalibration] | str:
     """As ``find_start``, and what the start tells of the camera where that is a guess still."""
     if is_guess(parameters.calibration) and not known.next_keyframes:
@@ -242,20 +242,20 @@ def find_start_of(
     found = find_start(waiting, camera, parameters)
     if isinstance(found, str):
         return found
-    return reach_back(found, waiting, camera, parameters), known
+    return backfill(found, waiting, camera, parameters), known
 
 
 def _find_start_of_guess(
-    waiting: list[WaitingFrame], known: SelfCalibration, parameters: MappingParameters
+    waiting: list[BufferedFrame], known: SelfCalibration, parameters: MappingParameters
 ) -> tuple[Start, SelfCalibration] | str:
     """The start under the focal length with which it agrees best with itself.
 
     Where a turn and some lens explain the flow, or any of the focal lengths finds too little
     parallax, it waits: a wrong one sees parallax in every turn.  Angles shrink as a focal length
     grows; after a while the same parallax in px is enough for the longer ones.  Only the motion
-    that two views fit best is asked for: a wrong focal length bends all until they are alike, and
-    the map begins anew with the right one (``trial.py``), which compares them and waits for more
-    parallax: the farther the camera has moved, the fewer tracks agree with a wrong one.
+    that two views fit best is tried: a wrong focal length bends all until they are alike.  The map
+    begins anew with the right one (``calibration_bootstrap.py``), which compares them and waits for
+    more parallax: the farther the camera has moved, the fewer tracks agree with a wrong one.
     """
     sigma = parameters.calibration.focal
     tried = [known.correction + k * sigma * np.eye(6)[0] for k in _HYPOTHESES]

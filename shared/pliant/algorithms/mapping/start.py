@@ -25,7 +25,7 @@ from pliant.algorithms.epipolar import (
     two_view_depths,
 )
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.mapping.first_map import Start, WaitingFrame, adjusted_start, table_of
+from pliant.algorithms.mapping.first_map import BufferedFrame, Start, adjusted_start, table_of
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.parameters import MappingParameters, StartParameters
 from pliant.algorithms.triangulation import triangulate
@@ -79,7 +79,7 @@ class _Parallax(NamedTuple):
 
 
 def find_start(
-    waiting: list[WaitingFrame],
+    waiting: list[BufferedFrame],
     camera: PinholeCamera,
     parameters: MappingParameters,
     *,
@@ -107,19 +107,19 @@ def find_start(
     return reason
 
 
-def impatient(parameters: MappingParameters) -> MappingParameters:
+def with_minimum_parallax(parameters: MappingParameters) -> MappingParameters:
     """With these a map starts as soon as it can."""
     start = parameters.start.model_copy(update={"patient_s": 0.0, "long_s": 0.0})
     return parameters.model_copy(update={"start": start})
 
 
-def waits_long(waiting: list[WaitingFrame], start: StartParameters) -> bool:
+def waits_long(waiting: list[BufferedFrame], start: StartParameters) -> bool:
     """Whether more parallax may never come."""
     return _waited_s(waiting) >= start.long_s
 
 
 def why_no_start(
-    waiting: list[WaitingFrame], camera: PinholeCamera, parameters: MappingParameters
+    waiting: list[BufferedFrame], camera: PinholeCamera, parameters: MappingParameters
 ) -> str:
     """Why a camera of which little is known sees too few tracks or too little parallax for a start
     whatever its lens is; "" where it does not."""
@@ -129,7 +129,7 @@ def why_no_start(
     return _why_not(pairs, waiting, parameters.start)
 
 
-def _why_not(pairs: list[_Pair], waiting: list[WaitingFrame], start: StartParameters) -> str:
+def _why_not(pairs: list[_Pair], waiting: list[BufferedFrame], start: StartParameters) -> str:
     if not pairs:
         lasting = len(np.intersect1d(waiting[-_MIN_FRAMES].ids, waiting[-1].ids))
         return f"too few tracks: {lasting} of {start.min_tracks} last for {_MIN_FRAMES} frames"
@@ -139,7 +139,7 @@ def _why_not(pairs: list[_Pair], waiting: list[WaitingFrame], start: StartParame
 
 
 def _pairs(
-    waiting: list[WaitingFrame],
+    waiting: list[BufferedFrame],
     camera: PinholeCamera,
     parameters: StartParameters,
     unknown: CalibrationUncertainty | None = None,
@@ -202,7 +202,7 @@ def _too_little(parallax: float, least: float, unit: str) -> str:
 
 def _start_from(
     pair: _Pair,
-    waiting: list[WaitingFrame],
+    waiting: list[BufferedFrame],
     camera: PinholeCamera,
     parameters: MappingParameters,
     motions: int | None,
@@ -257,7 +257,7 @@ def _agree(a: Start, b: Start) -> bool:
     return bool(ways[0] @ ways[1] > _ONE_WAY * np.prod(np.linalg.norm(ways, axis=1)))
 
 
-def _wanted_parallax(waiting: list[WaitingFrame], start: StartParameters) -> _Parallax:
+def _wanted_parallax(waiting: list[BufferedFrame], start: StartParameters) -> _Parallax:
     """Under little parallax a start takes noise, and the readout of a rolling shutter, for shape;
     but where tracks end soon there is never more.  Straight ahead what is near leaves the image
     first, so that most of what two views share is always far."""
@@ -267,7 +267,7 @@ def _wanted_parallax(waiting: list[WaitingFrame], start: StartParameters) -> _Pa
     return _Parallax(start.min_parallax_deg, percentile)
 
 
-def _waited_s(waiting: list[WaitingFrame]) -> float:
+def _waited_s(waiting: list[BufferedFrame]) -> float:
     return 1e-9 * (waiting[-1].stamp_ns - waiting[0].stamp_ns)
 
 
@@ -288,7 +288,7 @@ def _parallax_deg(two_views: RelativePose, percentile: float) -> float:
 def _misfit(
     start: Start,
     ids: I64,
-    waiting: list[WaitingFrame],
+    waiting: list[BufferedFrame],
     camera: PinholeCamera,
     parameters: MappingParameters,
 ) -> float:
@@ -304,7 +304,7 @@ def _misfit(
 def _reconstruct(
     pair: _Pair,
     two_views: RelativePose,
-    waiting: list[WaitingFrame],
+    waiting: list[BufferedFrame],
     camera: PinholeCamera,
     parameters: MappingParameters,
     most: int,

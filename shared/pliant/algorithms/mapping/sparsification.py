@@ -22,7 +22,7 @@ from pliant.algorithms.arrays import I32, I64, BoolArray
 from pliant.algorithms.mapping.final_adjustment import MOST_SEEN
 from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.parameters import WindowParameters
-from pliant.algorithms.mapping.segment import GivenUp, Segment
+from pliant.algorithms.mapping.segment import DroppedKeyframes, Segment
 from pliant.compiler.kernel import kernel
 
 _SPARE = 0.1
@@ -47,7 +47,7 @@ def observations_of(segments: list[Segment]) -> int:
     return sum(len(keyframe.rows) for segment in segments for keyframe in segment.keyframes)
 
 
-def thin(
+def sparsify(
     segment: Segment,
     room: int,
     limits: WindowParameters,
@@ -107,7 +107,7 @@ def _let_go(segment: Segment, gone: BoolArray) -> None:
     for keyframe in segment.keyframes:
         keyframe.keep(~gone[keyframe.rows])
     segment.points.cull(np.flatnonzero(gone).astype(np.int32))
-    segment.thinned = True
+    segment.sparsified = True
 
 
 def _give_up_keyframes(segment: Segment, surplus: int, count: int, linked: I32, whole: int) -> None:
@@ -136,13 +136,13 @@ def _give_up_keyframes(segment: Segment, surplus: int, count: int, linked: I32, 
         near = max(shared[before], shared[after])
         hosts[slot] = slot if _NEAR * shared.max() <= near else np.argmax(shared)
     gone = np.flatnonzero(~alive)
-    given_up = GivenUp(
+    dropped = DroppedKeyframes(
         ids=np.array([known[slot].id for slot in gone], np.int64),
         hosts=np.array([known[slot].id for slot in hosts[gone]], np.int64),
         centres=np.array([known[slot].T_world_camera[:3, 3] for slot in gone]).reshape(-1, 3),
     )
-    segment.given_up.take_in(given_up)
-    segment.passed.leave(set(given_up.ids.tolist()))
+    segment.dropped.take_in(dropped)
+    segment.ordinary.leave(set(dropped.ids.tolist()))
     segment.since -= int(np.count_nonzero(gone < segment.since))
     segment.keyframes = [known[slot] for slot in np.flatnonzero(alive)]
     if len(gone):

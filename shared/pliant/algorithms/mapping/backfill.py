@@ -10,7 +10,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.mapping.first_map import Start, WaitingFrame, adjusted_start, table_of
+from pliant.algorithms.mapping.first_map import BufferedFrame, Start, adjusted_start, table_of
 from pliant.algorithms.mapping.keyframe_rule import Overlap, is_due
 from pliant.algorithms.mapping.localisation import refine
 from pliant.algorithms.mapping.parameters import MappingParameters, PointParameters
@@ -24,9 +24,9 @@ _VIEWS, _FEW = 8, 30
 """Points are found from so many frames at the most, spread over those that see so many of them."""
 
 
-def reach_back(
+def backfill(
     start: Start,
-    waiting: list[WaitingFrame],
+    waiting: list[BufferedFrame],
     camera: PinholeCamera,
     parameters: MappingParameters,
 ) -> Start:
@@ -71,7 +71,7 @@ def _more_points(
     ids: I64,
     points_world: F64,
     shared: I64,
-    placed: list[tuple[WaitingFrame, F64]],
+    placed: list[tuple[BufferedFrame, F64]],
     camera: PinholeCamera,
     parameters: PointParameters,
 ) -> tuple[I64, F64]:

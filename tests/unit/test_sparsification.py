@@ -10,7 +10,7 @@ from test_loops import drifted, drifted_once, recognised, there_and_back, world
 from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING, MapMoves
-from pliant.algorithms.mapping import thinning
+from pliant.algorithms.mapping import sparsification
 from pliant.algorithms.mapping.atlas import Atlas
 from pliant.algorithms.mapping.earlier_segments import EarlierSegments
 from pliant.algorithms.mapping.frame import Frame
@@ -22,9 +22,9 @@ from pliant.algorithms.mapping.parameters import (
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.segment import GivenUp, Segment
+from pliant.algorithms.mapping.segment import DroppedKeyframes, Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.thinning import observations_of, thin
+from pliant.algorithms.mapping.sparsification import observations_of, sparsify
 from pliant.state import load_state, save_state
 
 __all__ = ["drifted", "drifted_once", "world"]  # fixtures
@@ -83,42 +83,42 @@ def test_points_that_few_keyframes_see_go_first_and_every_keyframe_keeps_its_sha
     some = segment([long + each for each in short])
     linked = np.array([35, -1], np.int32)  # of a point that only the first two see
     before = observations_of([some])
-    thin(some, 180, limits(180, 10), linked, whole=1)
+    sparsify(some, 180, limits(180, 10), linked, whole=1)
     assert observations_of([some]) <= 180 < before
     assert all(set(long) <= set(k.rows.tolist()) for k in some.keyframes)
     assert all(len(k.rows) >= 20 for k in some.keyframes)
     assert len(some.keyframes[-1].rows) == 40
     assert some.points.state[35] == MAPPED
-    assert len(some.given_up) == 0
+    assert len(some.dropped) == 0
     assert some.points.culled == (some.points.state[:140] == FREE).sum() > 0
-    assert some.thinned
+    assert some.sparsified
 
 
 def test_a_map_that_has_room_stays_as_it_is() -> None:
     some = segment([[0, 1, 2], [1, 2, 3]])
-    thin(some, 6, limits(6, 1), NO_TRACK, whole=1)
+    sparsify(some, 6, limits(6, 1), NO_TRACK, whole=1)
     assert observations_of([some]) == 6
-    assert not some.thinned
+    assert not some.sparsified
 
 
 def test_a_visit_of_a_place_leaves_and_moves_as_another_one() -> None:
     place, way = list(range(30)), [list(range(30 + 15 * k, 60 + 15 * k)) for k in range(5)]
     some = segment([place, *way[:2], place, *way[2:4], place, way[4], way[4]])
     some.since = 5
-    thin(some, 268, limits(268, 30), NO_TRACK, whole=1)
+    sparsify(some, 268, limits(268, 30), NO_TRACK, whole=1)
     assert [k.id for k in some.keyframes] == [0, 1, 2, 4, 5, 6, 7, 8]
-    assert some.given_up.ids.tolist() == [3]
-    assert some.given_up.hosts.tolist() == [0]
+    assert some.dropped.ids.tolist() == [3]
+    assert some.dropped.hosts.tolist() == [0]
     assert some.since == 4
 
 
 def test_keyframes_go_where_their_pairs_take_more_room_than_what_they_see(monkeypatch):
     some = segment([[0, k // 2 + 1] for k in range(30)])
     room = observations_of([some])
-    thin(some, room, limits(room, 1), NO_TRACK, whole=1)
+    sparsify(some, room, limits(room, 1), NO_TRACK, whole=1)
     assert len(some.keyframes) == 30
-    monkeypatch.setattr(thinning, "_PAIRS", 10)
-    thin(some, room, limits(room, 1), NO_TRACK, whole=1)
+    monkeypatch.setattr(sparsification, "_PAIRS", 10)
+    sparsify(some, room, limits(room, 1), NO_TRACK, whole=1)
     assert len(some.keyframes) == int(0.9 * int(np.sqrt(10 * room)))
 
 
@@ -126,12 +126,12 @@ def test_keyframes_go_where_each_has_too_many_neighbours() -> None:
     """Of a place that is seen again and again; a path of any length keeps all of them."""
     few = limits(10_000, 1).model_copy(update={"kept_neighbours": 20})
     place = segment([[0, 1, 2, 3, 10 + k // 2] for k in range(60)])
-    thin(place, 10_000, few, NO_TRACK, whole=1, settled=False)
+    sparsify(place, 10_000, few, NO_TRACK, whole=1, settled=False)
     assert len(place.keyframes) == 60
-    thin(place, 10_000, few, NO_TRACK, whole=1)
+    sparsify(place, 10_000, few, NO_TRACK, whole=1)
     assert len(place.keyframes) == int(0.9 * int(60 * 20 / 59))
     path = segment([list(range(k, k + 5)) for k in range(60)])
-    thin(path, 10_000, few, NO_TRACK, whole=1)
+    sparsify(path, 10_000, few, NO_TRACK, whole=1)
     assert len(path.keyframes) == 60
 
 
@@ -140,8 +140,8 @@ def test_points_that_one_keyframe_is_left_to_see_go_with_those_that_saw_them_too
     some = segment([list(range(10 * k, 10 * k + 25)) for k in range(60)])
     linked = np.array([some.keyframes[30].rows[3]], np.int32)
     alone = seen_by(some) == 1
-    thin(some, 400, limits(400, 20), linked, whole=2)
-    assert 0 < len(some.given_up) < 58
+    sparsify(some, 400, limits(400, 20), linked, whole=2)
+    assert 0 < len(some.dropped) < 58
     needed = np.zeros(len(alone), np.bool_)
     needed[[*linked, *some.keyframes[-2].rows, *some.keyframes[-1].rows]] = True
     now = (some.points.state == MAPPED) & (seen_by(some) == 1)
@@ -153,7 +153,7 @@ def test_the_newest_keyframes_stay_whole_also_where_there_are_no_others() -> Non
     """Of a segment that the camera leaves nobody has been told of them yet."""
     some = segment([list(range(10 * k, 10 * k + 25)) for k in range(5)])
     before = [keyframe.rows.copy() for keyframe in some.keyframes]
-    thin(some, 30, limits(30, 5), NO_TRACK, whole=8)
+    sparsify(some, 30, limits(30, 5), NO_TRACK, whole=8)
     for keyframe, rows in zip(some.keyframes, before, strict=True):
         np.testing.assert_array_equal(keyframe.rows, rows)
 
@@ -182,22 +182,22 @@ def test_what_a_segment_without_room_had_is_given_up_with_it() -> None:
     left = segment([list(range(10 * k, 10 * k + 25)) for k in range(30)])
     atlas = Atlas(SelfCalibration(CAMERA, np.zeros(6), np.zeros((6, 6))), MappingParameters())
     atlas.points = left.points
-    left.given_up.take_in(
-        GivenUp(ids=np.array([30]), hosts=np.array([30]), centres=np.zeros((1, 3)))
+    left.dropped.take_in(
+        DroppedKeyframes(ids=np.array([30]), hosts=np.array([30]), centres=np.zeros((1, 3)))
     )
     atlas._earlier.keep(left, atlas.calibration)
     no_room = WindowParameters(kept_observations=1000).model_copy(update={"kept_observations": 20})
     atlas._earlier.share_room(left.points, no_room)
     assert atlas.everything() == []
-    assert atlas.given_up == {"given_up_keyframes": 31, "given_up_points": 315}
+    assert atlas.dropped == {"given_up_keyframes": 31, "given_up_points": 315}
 
 
 def test_what_has_been_given_up_moves_as_what_is_near_it() -> None:
     """In time, or in what it saw; also where that was given up later."""
-    here = GivenUp()
+    here = DroppedKeyframes()
     for ids, hosts in (([4, 7], [0, 0]), ([2, 8], [2, 4]), ([5], [5])):
         centres = np.column_stack([ids, np.zeros((len(ids), 2))])
-        here.take_in(GivenUp(ids=np.array(ids), hosts=np.array(hosts), centres=centres))
+        here.take_in(DroppedKeyframes(ids=np.array(ids), hosts=np.array(hosts), centres=centres))
     assert here.hosts.tolist() == [2, 0, 5, 0, 0]
     moves = MapMoves(
         keyframe_ids=np.array([0, 1, 3, 6, 9]),
@@ -232,15 +232,15 @@ def test_the_map_keeps_its_size_where_the_camera_comes_back():
         rows.append(mapper.atlas.points.count)
     published.apply(mapper.finish())
     kept = mapper.atlas.active.segment
-    assert len(kept.keyframes) + len(kept.given_up) == len(published.keyframes)
-    assert len(kept.given_up) > len(kept.keyframes)
+    assert len(kept.keyframes) + len(kept.dropped) == len(published.keyframes)
+    assert len(kept.dropped) > len(kept.keyframes)
     assert most < 1.6 * room.kept_observations
     assert max(rows[len(rows) // 2 :]) <= 1.1 * max(rows[: len(rows) // 2])
     assert mapper.point_count == len(published.points)
-    counts = {"given_up_keyframes": len(kept.given_up), "given_up_points": kept.points.culled}
+    counts = {"given_up_keyframes": len(kept.dropped), "given_up_points": kept.points.culled}
     assert counts.items() <= mapper.counters.items()
     again = load_state(save_state(mapper)).atlas.active.segment
-    np.testing.assert_array_equal(again.given_up.centres, kept.given_up.centres)
+    np.testing.assert_array_equal(again.dropped.centres, kept.dropped.centres)
     assert trajectory_error(published, poses)[0] < 1e-3
     assert set(published.states[10:]) == {TRACKING}
 
@@ -256,10 +256,10 @@ def along(poses, window):
     for frame, tracks in enumerate(Scene(points, kappas, death=0.02).frames(poses)):
         px = tracks.points_px + generator.normal(0.0, 0.3, tracks.points_px.shape)
         seen = replace(tracks, points_px=px.astype(np.float32))
-        thinned = mapper.atlas.active is not None and mapper.atlas.active.segment.thinned
+        sparsified = mapper.atlas.active is not None and mapper.atlas.active.segment.sparsified
         delta = mapper.process(Frame(frame, frame * INTERVAL_NS, seen))
         published.apply(delta)
-        moved += [delta.moved_keyframes] if thinned and len(delta.moved_keyframes) else []
+        moved += [delta.moved_keyframes] if sparsified and len(delta.moved_keyframes) else []
     published.apply(mapper.finish())
     return mapper, published, moved
 
@@ -288,11 +288,11 @@ def test_beyond_its_room_the_map_is_adjusted_as_before(whole, room, least):
     some = {"kept_observations": room, "kept_per_keyframe": least}
     mapper, published, moved = along(poses, WINDOW.model_copy(update=some))
     kept = mapper.atlas.active.segment
-    assert len(kept.given_up) > 0
+    assert len(kept.dropped) > 0
     assert kept.points.culled > 0
-    assert len(published.keyframes) == len(kept.keyframes) + len(kept.given_up)
+    assert len(published.keyframes) == len(kept.keyframes) + len(kept.dropped)
     assert len(moved) >= 1
-    assert np.isin(kept.given_up.ids, moved[-1]).any()
+    assert np.isin(kept.dropped.ids, moved[-1]).any()
     assert len(published.poses) == len(poses)
     assert map_error(published, poses) < 2.5 * map_error(all_of_it, poses)
     assert trajectory_error(published, poses)[0] < 2.5 * map_error(all_of_it, poses)
@@ -303,21 +303,21 @@ def test_a_loop_is_closed_in_a_map_that_has_given_up_some(drifted):
     scene, _, mapper, published = drifted
     active = mapper.atlas.active
     before = observations_of([active.segment])
-    thin(active.segment, before // 2, limits(1000, 200), active.links.rows, whole=6)
-    assert len(active.segment.given_up) > 10
+    sparsify(active.segment, before // 2, limits(1000, 200), active.links.rows, whole=6)
+    assert len(active.segment.dropped) > 10
     loop = recognised(scene, mapper)
     mapper.global_adjustment.loops.append(loop)
     last = mapper.finish()
     assert last.same_places.tolist() == [[loop.old, loop.new]]
-    assert np.isin(active.segment.given_up.ids, last.moved_keyframes).all()
+    assert np.isin(active.segment.dropped.ids, last.moved_keyframes).all()
     assert trajectory_error(published.apply(last), there_and_back())[0] < 3e-3
 
 
 def test_a_loop_to_what_was_given_up_is_one_to_its_host(drifted):
     scene, _, mapper, _ = drifted
     active, loop = mapper.atlas.active, recognised(scene, mapper)
-    thin(active.segment, 12_000, limits(1000, 200), active.links.rows, whole=6)
-    gone = active.segment.given_up
+    sparsify(active.segment, 12_000, limits(1000, 200), active.links.rows, whole=6)
+    gone = active.segment.dropped
     mapper.global_adjustment.loops += [loop._replace(old=int(k)) for k in gone.ids[:2]]
     mapper.atlas.request(0)
     kept = np.array([keyframe.id for keyframe in active.keyframes])

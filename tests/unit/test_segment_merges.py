@@ -233,7 +233,7 @@ def ended(mapper, history, shots, poses):
     """The first keyframe of the first segment in the end, and the largest error of its frames, of
     which none is placed anew."""
     for segment, _ in mapper.atlas.everything():
-        segment.passed.forget()
+        segment.ordinary.forget()
     history.apply(mapper.finish(), frame=len(shots) - 1, stamp_ns=0, final=True)
     final = history.final()
     frames = [k for k in sorted(final) if final[k][0] == 0]

@@ -9,7 +9,7 @@ from test_recovery import picture, textures
 from pliant.algorithms.mapping import known_places
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.known_places import Comparisons, Revisits
+from pliant.algorithms.mapping.known_places import Comparisons, LoopCandidates
 from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import (
@@ -18,8 +18,8 @@ from pliant.algorithms.mapping.parameters import (
     WholeMapParameters,
     WindowParameters,
 )
+from pliant.algorithms.mapping.place_match import PlaceMatch
 from pliant.algorithms.mapping.relocalisation import Place
-from pliant.algorithms.mapping.same_place import SamePlace
 from pliant.state import load_state, save_state
 
 PARAMETERS = MappingParameters(window=WindowParameters(keyframes=3))
@@ -58,15 +58,15 @@ def look(own, monkeypatch, segment, newest, proves, alike=None, elsewhere=(), co
     points, keyframes = segment
     asked = []
 
-    def same_place(old, new, *_):
+    def match_places(old, new, *_):
         asked.append(old.keyframe.id)
         S = proves.get(old.keyframe.id)
         if S is None or isinstance(S, str):
             return S or "few_corners"
         rows = np.column_stack([old.keyframe.rows[:40], new.keyframe.rows[:40]])
-        return SamePlace(S_old_new=S, rows=rows)
+        return PlaceMatch(S_old_new=S, rows=rows)
 
-    monkeypatch.setattr(known_places, "same_place", same_place)
+    monkeypatch.setattr(known_places, "match_places", match_places)
     known = keyframes[: newest + 1]
     places = [Place(keyframe=k, corners=None, segment=known) for k in known]
     some = [places[k] for k in alike or proves if k < newest]
@@ -77,7 +77,7 @@ def look(own, monkeypatch, segment, newest, proves, alike=None, elsewhere=(), co
 
 
 def test_two_keyframes_must_tell_the_same(monkeypatch, segment):
-    own = Revisits()
+    own = LoopCandidates()
     assert look(own, monkeypatch, segment, 10, {1: drift(-3.0)})[0] == []
     loops, _ = look(own, monkeypatch, segment, 11, {2: drift(-3.05)})
     assert [(loop.old, loop.new) for loop in loops] == [(1, 10), (2, 11)]
@@ -91,7 +91,7 @@ def test_two_keyframes_must_tell_the_same(monkeypatch, segment):
     "other", [drift(-2.0), drift(-3.0, 1.2), looking((-3.0, 0, 0), (0, 0.1, 0))]
 )
 def test_keyframes_that_contradict_each_other_prove_nothing(monkeypatch, segment, other):
-    own = Revisits()
+    own = LoopCandidates()
     look(own, monkeypatch, segment, 10, {1: drift(-3.0)})
     assert look(own, monkeypatch, segment, 11, {2: other})[0] == []
     # Whichever of them a third one agrees with.
@@ -100,7 +100,7 @@ def test_keyframes_that_contradict_each_other_prove_nothing(monkeypatch, segment
 
 
 def test_what_looks_the_same_elsewhere_proves_neither(monkeypatch, segment):
-    own, proves = Revisits(), {1: drift(-3.0), 6: drift(2.0)}
+    own, proves = LoopCandidates(), {1: drift(-3.0), 6: drift(2.0)}
     for newest in (10, 11):
         loops, asked = look(own, monkeypatch, segment, newest, proves, [1], elsewhere=[6])
         assert loops == []
@@ -111,19 +111,19 @@ def test_what_looks_the_same_elsewhere_proves_neither(monkeypatch, segment):
 
 
 def test_one_keyframe_is_no_witness_for_itself(monkeypatch, segment):
-    own = Revisits()
+    own = LoopCandidates()
     for _ in range(2):
         assert look(own, monkeypatch, segment, 10, {1: drift(-3.0)})[0] == []
 
 
 def test_what_was_told_long_ago_counts_no_more(monkeypatch, segment):
-    own = Revisits()
+    own = LoopCandidates()
     look(own, monkeypatch, segment, 10, {1: drift(-3.0)})
     assert look(own, monkeypatch, segment, 14, {2: drift(-3.0)})[0] == []
 
 
 def test_what_came_of_comparisons_is_counted(monkeypatch, segment):
-    own, counted = Revisits(), Comparisons()
+    own, counted = LoopCandidates(), Comparisons()
 
     def compare(newest, proves, elsewhere=()):
         look(own, monkeypatch, segment, newest, proves, [1], elsewhere, counted)
@@ -147,10 +147,10 @@ def test_what_came_of_comparisons_is_counted(monkeypatch, segment):
 def test_neither_the_window_nor_what_shares_points_is_asked(monkeypatch, segment):
     points, keyframes = segment
     keyframes[10].rows = np.concatenate([keyframes[10].rows, keyframes[5].rows])
-    _, asked = look(Revisits(), monkeypatch, segment, 10, {}, alike=[9, 8, 5, 4, 3, 2, 1])
+    _, asked = look(LoopCandidates(), monkeypatch, segment, 10, {}, alike=[9, 8, 5, 4, 3, 2, 1])
     assert asked == [4]
     points.state[keyframes[5].rows] = 0
-    _, asked = look(Revisits(), monkeypatch, segment, 10, {}, alike=[9, 8, 5, 4, 3, 2, 1])
+    _, asked = look(LoopCandidates(), monkeypatch, segment, 10, {}, alike=[9, 8, 5, 4, 3, 2, 1])
     assert asked == [5]
 
 

@@ -5,15 +5,15 @@ import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 
 from pliant.algorithms.geometry import align_umeyama, inverse, pose_to_matrix, transform
-from pliant.algorithms.mapping import passing
+from pliant.algorithms.mapping import ordinary_frames
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import CANDIDATE, Landmarks
 from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.mapping.ordinary_frames import OrdinaryFrames, refined_poses
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.passing import PassedFrames, refined_poses
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.start import impatient
+from pliant.algorithms.mapping.start import with_minimum_parallax
 from pliant.map_history import MapHistory
 
 PARAMETERS = MappingParameters()
@@ -40,7 +40,7 @@ def passed(points, id=3):
         id=id, frame=20, segment=0, T_world_camera=np.eye(4), rows=rows[:0], points_px=none,
         rolled_px=none,
     )  # fmt: skip
-    frames = PassedFrames()
+    frames = OrdinaryFrames()
     frames.add(23, keyframe, looking((0.35, 0.1, 0.05), (0.0, 0.02, 0.01)), rows, seen)
     return frames
 
@@ -69,7 +69,7 @@ def test_a_frame_that_sees_little_of_the_map_stays(points):
 
 
 def test_what_finds_no_room_goes_first(points, monkeypatch):
-    monkeypatch.setattr(passing, "_ROOM", 500)
+    monkeypatch.setattr(ordinary_frames, "_ROOM", 500)
     frames = passed(points)
     (only,) = passed(points).take_all()
     for number in (24, 25, 26):
@@ -82,21 +82,23 @@ def test_what_finds_no_room_goes_first(points, monkeypatch):
 
 def test_a_camera_that_stands_still_keeps_no_more_and_more(monkeypatch):
     """No keyframe comes, after which what finds no room would go."""
-    monkeypatch.setattr(passing, "_ROOM", 1000)
+    monkeypatch.setattr(ordinary_frames, "_ROOM", 1000)
     poses = sideways(12)
     poses += [poses[-1]] * 20
-    mapper = Mapper(CAMERA, impatient(PARAMETERS), seed=0)
+    mapper = Mapper(CAMERA, with_minimum_parallax(PARAMETERS), seed=0)
     kept = []
     for k, tracks in enumerate(Scene.box().frames(poses)):
         mapper.process(Frame(k, k * INTERVAL_NS, tracks))
         active = mapper.atlas.active
-        kept.append(sum(len(each.rows) for each in active.segment.passed._frames) if active else 0)
+        kept.append(
+            sum(len(each.rows) for each in active.segment.ordinary._frames) if active else 0
+        )
     assert 1000 < max(kept) <= 2000
 
 
 def test_frames_between_keyframes_gain_from_the_whole_map():
     poses = sideways(20)
-    mapper, history = Mapper(CAMERA, impatient(PARAMETERS), seed=0), MapHistory()
+    mapper, history = Mapper(CAMERA, with_minimum_parallax(PARAMETERS), seed=0), MapHistory()
     for k, tracks in enumerate(Scene.box().frames(poses)):
         delta = mapper.process(Frame(k, k * INTERVAL_NS, tracks))
         history.apply(delta, frame=k, stamp_ns=k * INTERVAL_NS)

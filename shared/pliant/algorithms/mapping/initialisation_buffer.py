@@ -14,12 +14,12 @@ from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.epipolar import rotation_between
-from pliant.algorithms.mapping.first_map import Start, WaitingFrame, keep_waiting
+from pliant.algorithms.mapping.first_map import BufferedFrame, Start, keep_newest
 from pliant.algorithms.mapping.frame import Frame, IdealFrame
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.localisation import refine
+from pliant.algorithms.mapping.ordinary_frames import EarlierPose
 from pliant.algorithms.mapping.parameters import LocalisationParameters, MappingParameters
-from pliant.algorithms.mapping.passing import EarlierPose
 
 _SAMPLE = 400
 """Tracks that tell a rotation."""
@@ -41,8 +41,8 @@ class Turn:
 
 
 def turn_between(
-    frame: WaitingFrame,
-    following: WaitingFrame,
+    frame: BufferedFrame,
+    following: BufferedFrame,
     camera: PinholeCamera,
     parameters: LocalisationParameters,
 ) -> Turn:
@@ -60,22 +60,22 @@ def turn_between(
 
 
 @dataclass(frozen=True)
-class Waiting:
+class InitialisationBuffer:
     """Frames from which a map may yet start, and the turns of all since the last that was placed.
 
     turns: one for each of the frames but the newest, and for earlier ones.   newest: with image.
     """
 
-    frames: list[WaitingFrame] = field(default_factory=list[WaitingFrame])
+    frames: list[BufferedFrame] = field(default_factory=list[BufferedFrame])
     turns: list[Turn] = field(default_factory=list[Turn])
     newest: Frame | None = None
 
     def then(
         self, frame: IdealFrame, camera: PinholeCamera, parameters: MappingParameters
-    ) -> "Waiting":
+    ) -> "InitialisationBuffer":
         """With one frame more."""
         tracks = frame.tracks
-        newest = WaitingFrame(
+        newest = BufferedFrame(
             frame=frame.number, stamp_ns=frame.stamp_ns, ids=tracks.ids,
             points_px=tracks.points_px, kappas=tracks.kappas,
         )  # fmt: skip
@@ -83,10 +83,10 @@ class Waiting:
         if self.frames:
             turn = turn_between(self.frames[-1], newest, camera, parameters.localisation)
             turns = [*turns[1 - _KEPT_TURNS :], turn]
-        frames = keep_waiting(self.frames, newest, parameters.start)
-        return Waiting(frames, turns, frame.given)
+        frames = keep_newest(self.frames, newest, parameters.start)
+        return InitialisationBuffer(frames, turns, frame.given)
 
-    def seen_by(self, before: CorrectedView, after: CorrectedView) -> "Waiting":
+    def seen_by(self, before: CorrectedView, after: CorrectedView) -> "InitialisationBuffer":
         """With the pixels of another ideal camera."""
         frames = [replace(f, points_px=moved_px(f.points_px, before, after)) for f in self.frames]
         return replace(self, frames=frames)
@@ -95,7 +95,7 @@ class Waiting:
 def earlier_poses(
     start: Start,
     keyframes: list[Keyframe],
-    waiting: Waiting,
+    waiting: InitialisationBuffer,
     camera: PinholeCamera,
     parameters: LocalisationParameters,
 ) -> Iterator[EarlierPose]:
@@ -132,7 +132,7 @@ def returned_poses(
     T_world_camera: F64,
     ids: I64,
     points_world: F64,
-    waiting: Waiting,
+    waiting: InitialisationBuffer,
     keyframe: Keyframe,
     camera: PinholeCamera,
     parameters: LocalisationParameters,
@@ -156,7 +156,7 @@ def _place(
     T_world_camera: F64,
     ids: I64,
     points_world: F64,
-    frame: WaitingFrame,
+    frame: BufferedFrame,
     camera: PinholeCamera,
     parameters: LocalisationParameters,
 ) -> tuple[F64, int]:

@@ -62,7 +62,7 @@ class RefinedPose(EarlierPose):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PassedFrame:
+class OrdinaryFrame:
     """A frame that hangs on a keyframe, where it was placed (4, 4), and what it saw there: rows
     (n,) of points and candidates, at points_px (n, 2).   log_focal: as of a keyframe."""
 
@@ -75,10 +75,10 @@ class PassedFrame:
 
 
 @dataclass
-class PassedFrames:
+class OrdinaryFrames:
     """Frames of a segment that are no keyframes and are to be placed once more, oldest first."""
 
-    _frames: list[PassedFrame] = field(default_factory=list[PassedFrame])
+    _frames: list[OrdinaryFrame] = field(default_factory=list[OrdinaryFrame])
 
     def add(
         self, frame: int, keyframe: Keyframe, T_world_camera: F64, rows: I32, points_px: F32,
@@ -87,7 +87,7 @@ class PassedFrames:
         """A frame hangs on a keyframe, and saw points and candidates in the rows (n,)."""
         T_keyframe_camera = inverse(keyframe.T_world_camera) @ T_world_camera
         self._frames.append(
-            PassedFrame(
+            OrdinaryFrame(
                 frame=frame, keyframe=keyframe, T_keyframe_camera=T_keyframe_camera, rows=rows,
                 points_px=points_px, log_focal=log_focal,
             )
@@ -118,7 +118,7 @@ class PassedFrames:
                 log_focal = each.log_focal + change
                 self._frames[n] = replace(each, points_px=points_px, log_focal=log_focal)
 
-    def take_in(self, earlier: "PassedFrames") -> None:
+    def take_in(self, earlier: "OrdinaryFrames") -> None:
         """Those of an earlier segment are of this one, too."""
         self._frames = [*earlier._frames, *self._frames]
 
@@ -127,7 +127,7 @@ class PassedFrames:
         """Id of the oldest keyframe on which one hangs; a huge one where there is none."""
         return min((each.keyframe.id for each in self._frames), default=_NONE)
 
-    def take_surplus(self, parameters: MappingParameters, rooms: int = 1) -> list[PassedFrame]:
+    def take_surplus(self, parameters: MappingParameters, rooms: int = 1) -> list[OrdinaryFrame]:
         """The oldest, of which there is no more room for what they saw, so many times over."""
         room = rooms * min(_ROOM, int(_ROOM_SHARE * parameters.window.kept_observations))
         seen = np.cumsum([len(each.rows) for each in reversed(self._frames)])
@@ -137,17 +137,17 @@ class PassedFrames:
         """Those that hang on one of the keyframes, by id, stay where they are."""
         self._frames = [each for each in self._frames if each.keyframe.id not in keyframes]
 
-    def take_all(self) -> list[PassedFrame]:
+    def take_all(self) -> list[OrdinaryFrame]:
         """All of them."""
         return self._take(len(self._frames))
 
-    def _take(self, count: int) -> list[PassedFrame]:
+    def _take(self, count: int) -> list[OrdinaryFrame]:
         taken, self._frames = self._frames[:count], self._frames[count:]
         return taken
 
 
 def refined_poses(
-    frames: Iterable[PassedFrame],
+    frames: Iterable[OrdinaryFrame],
     points: Landmarks,
     seen_by: SelfCalibration,
     parameters: MappingParameters,

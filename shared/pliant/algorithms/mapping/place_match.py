@@ -21,7 +21,7 @@ from pliant.algorithms.places import match
 
 
 @dataclass(frozen=True, kw_only=True)
-class SamePlace:
+class PlaceMatch:
     """What two keyframes both saw.
 
     S_old_new: (4, 4) similarity, ``X_old = S_old_new X_new``, between the worlds of their segments;
@@ -39,14 +39,14 @@ too few points of the two maps, all that agrees lies in one spot of the image, o
 step aside."""
 
 
-def same_place(
+def match_places(
     old: Place,
     new: Place,
     points: Landmarks,
     camera: PinholeCamera,
     parameters: MappingParameters,
     generator: np.random.Generator,
-) -> SamePlace | Refusal:
+) -> PlaceMatch | Refusal:
     """What proves that both keyframes show one place, or why it is not proved.
 
     In both images, corners and points of both maps that look alike must agree on the similarity,
@@ -87,7 +87,7 @@ def same_place(
     agreeing_corners = alike[known][agreeing, 1]
     if repeats(new.features, agreeing_corners, pairs.xyz_b[agreeing], camera, parameters):
         return "repeated"
-    return SamePlace(S_old_new=_between_worlds(S_a_b, old, new), rows=rows)
+    return PlaceMatch(S_old_new=_between_worlds(S_a_b, old, new), rows=rows)
 
 
 def _between_worlds(S_a_b: F64, old: Place, new: Place) -> F64:

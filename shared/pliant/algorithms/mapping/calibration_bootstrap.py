@@ -15,7 +15,7 @@ import numpy as np
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDelta
-from pliant.algorithms.mapping.first_map import keep_waiting
+from pliant.algorithms.mapping.first_map import keep_newest
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.global_adjustment import GlobalAdjustment
 from pliant.algorithms.mapping.kept_map import known_camera
@@ -41,7 +41,7 @@ class _Taken(NamedTuple):
         return self.frame.stamp_ns
 
 
-class TrialMapper:
+class BootstrapMapper:
     """A mapper that waits until it knows its camera: what it is told and tells is a ``Mapper``'s.
 
     mapper: on trial, or for good.    taken: while it is on trial, the newest frames.
@@ -69,7 +69,7 @@ class TrialMapper:
         if not self._on_trial:
             return delta
         taken = _Taken(frame)
-        kept = keep_waiting(self._taken, taken, self._anew[1].start)
+        kept = keep_newest(self._taken, taken, self._anew[1].start)
         uncertain = float(self._mapper.calibration.sigmas[0])
         if delta.state == TRACKING:
             if self._first is None:
@@ -156,7 +156,7 @@ def mapper_for(
     seed: int,
     focal_sigma: float = 0.0,
     known: Sequence[KeptKeyframe] = (),
-) -> Mapper | TrialMapper | Localiser:
+) -> Mapper | BootstrapMapper | Localiser:
     """The mapper of a camera, as well as its calibration is known: see ``widened``.
 
     known: a map of earlier sessions; where it is of this very camera it tells the calibration, too.
@@ -166,7 +166,7 @@ def mapper_for(
         return Localiser(camera, parameters, seed, known=known)
     found = known_camera(known, camera)
     if is_guess(parameters.calibration) and (found is None or found.sigmas[0] > _KNOWN):
-        return TrialMapper(camera, parameters, seed, known)
+        return BootstrapMapper(camera, parameters, seed, known)
     return Mapper(camera, parameters, seed, known=known)
 
 
