@@ -46,13 +46,13 @@ def test_points_all_over_the_image_leave_no_doubt():
 def test_half_an_image_of_tracks_without_points_is_doubtful():
     points = places(1000, right=0.5)
     told = doubt_of(points, np.ones(1000, np.bool_), np.concatenate([points, places(500, 0.5)]))
-    assert told == "doubtful: 50% of the image moves otherwise"
+    assert told == "doubtful: 50% of the image disagrees with the camera motion"
 
 
 def test_few_that_fit_and_all_in_one_place_are_doubtful():
     points = places(1000)
     few = np.arange(1000) < 300
-    assert doubt_of(points, few, points).startswith("doubtful: 30% of the points seen")
+    assert doubt_of(points, few, points).startswith("doubtful: only 30% of the visible map points")
     corner = places(200, right=0.1)
     assert "one place" in doubt_of(corner, np.ones(200, np.bool_), corner)
     assert doubt_of(places(0), np.zeros(0, np.bool_), places(0)).startswith("doubtful")

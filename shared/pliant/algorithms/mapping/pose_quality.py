@@ -67,11 +67,11 @@ def support_of(
 def doubt(support: Support, parameters: SupportParameters) -> str:
     """Why the pose may not be that of the camera in the world; "" where nothing speaks for it."""
     if support.contrary > parameters.max_contrary_share:
-        return f"doubtful: {support.contrary:.0%} of the image moves otherwise"
+        return f"doubtful: {support.contrary:.0%} of the image disagrees with the camera motion"
     if support.share < parameters.min_share:
-        return f"doubtful: {support.share:.0%} of the points seen are where the pose has them"
+        return f"doubtful: only {support.share:.0%} of the visible map points agree with the pose"
     if support.spread < parameters.min_spread:
-        return "doubtful: all that is seen of the map lies in one place of the image"
+        return "doubtful: all visible map points lie in one place of the image"
     return ""
 
 
