@@ -31,7 +31,7 @@ _ROOMS = (
 )
 _CLASSES = {
     *("ExtremaTracker", "BriefExtractor", "Mapper", "BootstrapMapper", "Localiser", "Atlas"),
-    *("ActiveMap", "EarlierSegments", "Landmarks", "TrackLinks", "Window", "Path"),
+    *("ActiveMap", "EarlierSegments", "Landmarks", "TrackLinks", "Window", "FramePoses"),
     *("MapChanges", "KeyframeChanges"),
     *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
 }

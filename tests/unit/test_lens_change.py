@@ -16,7 +16,7 @@ from pliant.algorithms.mapping.initialisation_buffer import InitialisationBuffer
 from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.rolling_shutter import FramePoses
 from pliant.algorithms.mapping.segment import see_by
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 
@@ -67,7 +67,7 @@ def test_what_a_rolling_shutter_moved_goes_along(active):
     keyframe = active.keyframes[3]
     keyframe.rolled_px = keyframe.rolled_px + np.float32(2.0)
     seen, at_once = keyframe.points_px + keyframe.rolled_px, keyframe.points_px
-    active.segment.path = Path()
+    active.segment.path = FramePoses()
     see_by(active.segment, known.view, known.with_lens(FOUND, COVARIANCE))
     # Of a path without frames no motion is known: what was known of it stays.
     whole = OTHER.view.seen(keyframe.points_px + keyframe.rolled_px)

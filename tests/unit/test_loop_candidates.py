@@ -72,7 +72,7 @@ def look(own, monkeypatch, segment, newest, proves, alike=None, elsewhere=(), co
     some = [places[k] for k in alike or proves if k < newest]
     others = (places[k] for k in elsewhere)
     counted = Comparisons() if counted is None else counted
-    told = own.look(places[-1], some, points, CAMERA, PARAMETERS, counted, elsewhere=others)
+    told = own.search(places[-1], some, points, CAMERA, PARAMETERS, counted, elsewhere=others)
     return told, asked
 
 

@@ -128,11 +128,11 @@ def test_points_that_prove_another_pose_about_one_decide(
 ) -> None:
     """More of them place the camera; half as many leave it open."""
 
-    def look_about(*_: object) -> SimpleNamespace:
+    def search_near(*_: object) -> SimpleNamespace:
         rows = np.arange(points, dtype=np.int32)
         return SimpleNamespace(T_world_camera=looking((3.0 * 4, 0.0, 0.0)), rows=rows)
 
-    monkeypatch.setattr(relocalisation, "look_about", look_about)
+    monkeypatch.setattr(relocalisation, "search_near", search_near)
     found = ask(monkeypatch, {0: (170, 2400), 4: (0, points)}, places_with_corners=1)
     if points == 2300:
         assert found is None

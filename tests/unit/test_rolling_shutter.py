@@ -15,7 +15,7 @@ from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame, readout_flow
+from pliant.algorithms.mapping.rolling_shutter import FramePoses, RolledFrame, readout_flow
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.start import with_minimum_parallax
 from pliant.map_history import MapHistory
@@ -42,7 +42,7 @@ def keyframe(number, T_world_camera):
 
 
 def test_the_motion_of_an_earlier_session_is_known_and_scales_with_the_map():
-    path = Path({3: np.concatenate([OMEGA, NU])})
+    path = FramePoses({3: np.concatenate([OMEGA, NU])})
     known, unknown = keyframe(3, np.eye(4)), keyframe(4, np.eye(4))
     np.testing.assert_array_equal(path.motions([known])[0], [*OMEGA, *NU])
     assert not path.motions([unknown]).any()
@@ -52,7 +52,7 @@ def test_the_motion_of_an_earlier_session_is_known_and_scales_with_the_map():
 
 
 def test_the_motion_is_that_of_the_frames_around():
-    path = Path()
+    path = FramePoses()
     middle = keyframe(1, pose(0.0))
     for t in (-2, -1, 0, 1, 2):
         path.add(10 + t, middle, pose(t))
@@ -66,7 +66,7 @@ def test_the_motion_is_that_of_the_frames_around():
 
 
 def test_the_information_of_a_pose_scales_with_the_map():
-    path, host = Path(), keyframe(0, pose(0.0))
+    path, host = FramePoses(), keyframe(0, pose(0.0))
     path.add(10, host, pose(0.0), 50)
     path.add(11, host, pose(1.0), 60)
     path.add(12, keyframe(5, pose(0.0)), pose(2.0), 70)
@@ -83,7 +83,7 @@ def test_the_information_of_a_pose_scales_with_the_map():
 
 
 def test_poses_on_keyframes_of_another_segment_are_passed_over():
-    path = Path()
+    path = FramePoses()
     for t in (-1, 0, 1):
         path.add(10 + t, keyframe(3, pose(0.0)), pose(t))
     assert not path.motions([keyframe(1, pose(0.0))]).any()

@@ -258,7 +258,7 @@ class ActiveMap:
             np.concatenate([points_px, found.points_px]),
             np.concatenate([frame.rolled_px, found.rolled_px]),
         )
-        keyframe.turned = placed.turned
+        keyframe.is_pure_rotation = placed.is_pure_rotation
         self._settle(keyframe, frame)
         return keyframe
 
@@ -359,7 +359,7 @@ class ActiveMap:
         # What was there before the camera was recognised takes the place of what will be.
         count = max(sizes.fixed, sizes.keyframes - len(moving))
         fixed = most_shared(older, moving, self.points)[:count] if older else []
-        self._look_at(older, fixed, moving)
+        self._activate(older, fixed, moving)
 
     def _make_room(self, first: int) -> None:
         """Thin what has left the window, as soon as it has been adjusted with the whole map: as it
@@ -378,7 +378,7 @@ class ActiveMap:
         )
         segment.adjusted = -1
 
-    def _look_at(
+    def _activate(
         self, older: list[Keyframe], fixed: list[Keyframe], moving: list[Keyframe]
     ) -> None:
         chosen = sorted(fixed, key=lambda keyframe: keyframe.id) + moving
@@ -386,15 +386,15 @@ class ActiveMap:
         self.window = self._window(chosen, fixed=prior, outside=len(fixed))
         self._nearby = rows_of(older, self.window.rows, len(self.points.state))
 
-    def look_with(self, seen: Keyframe) -> None:
+    def activate_near_keyframe(self, seen: Keyframe) -> None:
         """The camera has been recognised, and sees what a keyframe saw: the next frame is one, and
         what has been mapped stays where it is."""
         older = most_shared(self.keyframes, [seen], self.points)[:_NEAR_KEYFRAMES]
-        self._look_at(older, older[: self.parameters.window.keyframes], [])
+        self._activate(older, older[: self.parameters.window.keyframes], [])
 
-    def look_around(self, T_world_camera: F64) -> None:
+    def activate_near(self, T_world_camera: F64) -> None:
         """What keyframes see that look where a camera does is looked for from now on."""
-        self._look_at(near_keyframes(self.keyframes, T_world_camera, _NEAR_KEYFRAMES), [], [])
+        self._activate(near_keyframes(self.keyframes, T_world_camera, _NEAR_KEYFRAMES), [], [])
 
     def move(self, moves: MapMoves) -> F64:
         """As ``Segment.move``."""

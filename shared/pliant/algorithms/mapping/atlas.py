@@ -152,7 +152,7 @@ class Atlas:
             self.global_adjustment.withdraw()  # nobody knows how what is new would move
         else:
             self._forget_jobs()
-        active.look_with(seen)
+        active.activate_near_keyframe(seen)
         active.links.follow(ids, self.points)
 
     def leave(self) -> None:

@@ -182,8 +182,8 @@ def adjust_keyframes(
     brought up to date.  The keyframes' pixels become those of the camera that is found, but for the
     readout.
     known: of the camera, whose pixels the keyframes have.    motions: (M, 6) of the keyframes, see
-    ``Path``.    Returns what is known now, the rows of points that too few keyframes see or that
-    are at infinity, and how what hangs on each keyframe moves.
+    ``FramePoses``.    Returns what is known now, the rows of points that too few keyframes see or
+    that are at infinity, and how what hangs on each keyframe moves.
     """
     given, before = known, known.view
     seen = list_observations(keyframes, points, known, parameters)
@@ -298,7 +298,7 @@ def list_observations(
         point=number[seen],
         px=px,
         weights=weigh(px, known.view.camera, _k_sigmas(parameters, known)),
-        fixed=np.array([k.turned for k in keyframes]) | (np.arange(len(keyframes)) == 0),
+        fixed=np.array([k.is_pure_rotation for k in keyframes]) | (np.arange(len(keyframes)) == 0),
         log_focal=np.array([keyframe.log_focal for keyframe in keyframes]),
         gaps_s=gaps_s(keyframes),
     )

@@ -102,11 +102,11 @@ class PlacedFrame:
     """A frame with its pose in the map.
 
     found: points that it sees without a track.   support: for the pose, once that is adjusted.
-    turned: whether it stands where the last keyframe does.
+    is_pure_rotation: since the last keyframe.
     """
 
     frame: IdealFrame
     T_world_camera: F64
     found: Observations = field(default_factory=Observations.none)
     support: Support = field(default_factory=Support)
-    turned: bool = False
+    is_pure_rotation: bool = False

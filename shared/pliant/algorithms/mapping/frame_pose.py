@@ -244,8 +244,8 @@ def _contradicting(active: ActiveMap, T_world_camera: F64, points_px: F32) -> I6
     return candidates[off > _OFF * active.parameters.localisation.inlier_px]
 
 
-def stand(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
-    """Whether the frame stands where the last keyframe does, with its pose then."""
+def check_pure_rotation(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
+    """Whether the camera has only turned since the last keyframe, with its pose then."""
     if active.segment.resumes:
         return placed  # nobody knows where it was before
     points, parameters = active.points, active.parameters
@@ -259,10 +259,10 @@ def stand(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
             parameters.localisation, near=True,
             spread=spread_of(points, rows[some], active.keyframes[-1]),
         )  # fmt: skip
-        if not located.stands:
+        if not located.is_pure_rotation:
             return placed
         T_standing = located.T_world_camera
-    return replace(placed, T_world_camera=T_standing, turned=True)
+    return replace(placed, T_world_camera=T_standing, is_pure_rotation=True)
 
 
 def _spread(active: ActiveMap, rows: I32, directions: I64) -> Spread | None:

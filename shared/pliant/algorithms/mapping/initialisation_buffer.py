@@ -103,8 +103,8 @@ def earlier_poses(
     keyframe_at = {each.frame: each for each in keyframes}
     frames = {each.frame: each for each in waiting.frames}
     turned = {each.frame: each for each in waiting.turns}
-    hanging = keyframes[-1]
-    T_world_camera = hanging.T_world_camera
+    reference = keyframes[-1]
+    T_world_camera = reference.T_world_camera
     unbroken = True
     for frame in sorted(frames.keys() | turned.keys(), reverse=True):
         here, inliers = T_world_camera, 0
@@ -113,8 +113,8 @@ def earlier_poses(
                 T_world_camera, start.ids, start.points_world, frames[frame], camera, parameters
             )
         if frame in keyframe_at:
-            hanging = keyframe_at[frame]
-            here = hanging.T_world_camera
+            reference = keyframe_at[frame]
+            here = reference.T_world_camera
         elif inliers < parameters.min_inliers and unbroken and frame in turned:
             inliers = turned[frame].inliers
             here = T_world_camera.copy()
@@ -124,7 +124,7 @@ def earlier_poses(
             continue
         T_world_camera = here
         yield EarlierPose(
-            frame=frame, keyframe=hanging, T_world_camera=T_world_camera, inliers=inliers
+            frame=frame, keyframe=reference, T_world_camera=T_world_camera, inliers=inliers
         )
 
 

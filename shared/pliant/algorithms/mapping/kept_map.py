@@ -21,7 +21,7 @@ from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.mapping.covisibility import focus_of
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import MAPPED, PATCH_SIDE, Landmarks
-from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.rolling_shutter import FramePoses
 from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.places import Features
@@ -96,7 +96,7 @@ def keep(
             segment=keyframe.segment,
             session=origin.session,
             source_frame=origin.frame,
-            turned=keyframe.turned,
+            turned=keyframe.is_pure_rotation,
             given=np.array([*size, *given.pinhole]),
             correction=calibration.correction.copy(),
             sigmas=calibration.sigmas,
@@ -147,7 +147,7 @@ def take_in(
         for keyframe in keyframes:
             keyframe.focus = focus_of(keyframe, points)
             points.patch_keyframe[keyframe.rows] = keyframe.id
-        path = Path({each.id: each.motion for each in mine if each.motion.any()})
+        path = FramePoses({each.id: each.motion for each in mine if each.motion.any()})
         segment = Segment(
             id=number, points=points, keyframes=keyframes, path=path, since=len(keyframes)
         )
@@ -246,7 +246,7 @@ def _keyframe(kept: KeptKeyframe, ids: I64, rows: I32, calibration: SelfCalibrat
         rolled_px=_moved(kept.seen_px[there] + kept.rolled_px[there], old, new) - points_px
         if old != new
         else kept.rolled_px[there],
-        turned=kept.turned,
+        is_pure_rotation=kept.turned,
     )
 
 

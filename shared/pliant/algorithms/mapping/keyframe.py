@@ -16,8 +16,8 @@ class Keyframe:
     rows: (n,) rows of points or candidates, each at most once.    points_px: (n, 2).
     rolled_px: (n, 2) by how much farther a rolling shutter had moved them, see ``RolledFrame``.
     published_pose: T_world_camera when last published.
-    turned: it stands where the last one does: what turns on the spot tells nothing of depths, and
-    its pose rests on all that it saw when it was made.
+    is_pure_rotation: it is where the last one is: a pure rotation tells no depths, and its pose
+    rests on all that it saw when it was made.
     stamp_ns: when it was taken; -1: nobody knows.   log_focal: of its focal length relative to the
     calibration, with which its pixels are those of an ideal camera: see ``changing_focal``.
     focus: (3,) where it looks: on its axis, at the median depth of its points.  Set when it leaves
@@ -31,7 +31,7 @@ class Keyframe:
     rows: I32
     points_px: F32
     rolled_px: F32
-    turned: bool = False
+    is_pure_rotation: bool = False
     stamp_ns: int = -1
     log_focal: float = 0.0
     published_pose: F64 | None = None

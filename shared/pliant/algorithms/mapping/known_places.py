@@ -101,7 +101,7 @@ class LoopCandidates:
 
     waiting: list[Loop] = field(default_factory=list[Loop])
 
-    def look(
+    def search(
         self,
         new: Place,
         places: Iterable[Place],
@@ -195,7 +195,7 @@ class SegmentMerges:
     revisits: dict[int, LoopCandidates] = field(default_factory=dict[int, LoopCandidates])
     proved: list[Loop] = field(default_factory=list[Loop])
 
-    def look(
+    def search(
         self,
         new: Place,
         places: Iterable[Place],
@@ -216,7 +216,7 @@ class SegmentMerges:
             by_segment.setdefault(place.keyframe.segment, []).append(place)
         for segment, some in by_segment.items():
             revisits = self.revisits.setdefault(segment, LoopCandidates())
-            proved = revisits.look(
+            proved = revisits.search(
                 new, some, points, camera, parameters, comparisons, tries=_TRIES,
                 elsewhere=elsewhere(segment),
             )  # fmt: skip
@@ -320,7 +320,7 @@ class KnownPlaces:
         """
         new = Place(keyframe=keyframe, corners=seen, segment=segment.keyframes)
         rest = segment.points, view.camera, parameters, self.comparisons
-        found = self.revisits.look(new, self._like(seen, [segment], view), *rest) if loops else []
+        found = self.revisits.search(new, self._like(seen, [segment], view), *rest) if loops else []
         if earlier:
             least = parameters.localisation.min_inliers
             near = list(islice(self._like(seen, earlier, view), _PLACES))
@@ -342,7 +342,7 @@ class KnownPlaces:
                     pose, old, among, segment.points, *image, view.camera, parameters, generator
                 )
 
-            self.meetings.look(new, near, elsewhere, *rest, contradicts)
+            self.meetings.search(new, near, elsewhere, *rest, contradicts)
         return found
 
     def remember(

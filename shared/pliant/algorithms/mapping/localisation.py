@@ -44,12 +44,12 @@ NEAR = 0.3
 class Localisation:
     """T_world_camera of a frame, and which of the points (N,) support it.
 
-    stands: there is no sign that it is elsewhere than it stood, see ``Spread``.
+    is_pure_rotation: nothing shows that the camera has moved since, see ``Spread``.
     """
 
     T_world_camera: F64
     inliers: BoolArray
-    stands: bool = False
+    is_pure_rotation: bool = False
 
 
 def locate(
@@ -101,10 +101,10 @@ def refine(
 
     spread: of provisional points, see ``directions``; None: all are certain.
     """
-    inliers, stands = np.zeros(len(points_px), np.bool_), False
+    inliers, is_pure_rotation = np.zeros(len(points_px), np.bool_), False
     for widening in (1.0,) if near else (_COARSE_SIGMAS, 1.0):
         if spread is not None:
-            T_world_camera, squared, stands = refine_pose_spread(
+            T_world_camera, squared, is_pure_rotation = refine_pose_spread(
                 T_world_camera, points_world, spread.vectors, points_px, camera,
                 standing=spread.standing,
                 kernel_sigma_px=widening * parameters.kernel_sigma_px,
@@ -115,7 +115,9 @@ def refine(
         T_world_camera, inliers, _ = refine_pose(
             T_world_camera, points_world, points_px, camera, bundle, inlier_px=parameters.inlier_px
         )
-    return Localisation(T_world_camera=T_world_camera, inliers=inliers, stands=stands)
+    return Localisation(
+        T_world_camera=T_world_camera, inliers=inliers, is_pure_rotation=is_pure_rotation
+    )
 
 
 def _cost(T_world_camera: F64, points_world: F64, points_n: F64, gate: float) -> float:
@@ -185,7 +187,7 @@ class Motion:
         return replace(self, poses=(before, last))
 
     def velocity(self) -> F64:
-        """(6,) between the two, as of ``Path.motions``."""
+        """(6,) between the two, as of ``FramePoses.motions``."""
         frames = max(1, self.frames[1] - self.frames[0])
         return motion_between(*self.poses, self.poses[1]) / frames
 
@@ -247,7 +249,7 @@ def recover(
     for radius in (NEAR * radius_px, radius_px):
         grid = MaximaGrid.build(maxima, camera.width, camera.height, radius)
         for prediction in predictions:
-            proved = look_about(
+            proved = search_near(
                 prediction, rows, points, grid, grey, radius, camera, parameters, generator
             )
             if proved is not None and are_enough(len(proved.rows), parameters):
@@ -265,7 +267,7 @@ def are_enough(points: int, parameters: MappingParameters) -> bool:
     return points >= parameters.start.min_points
 
 
-def look_about(
+def search_near(
     T_world_camera: F64,
     rows: I32,
     points: Landmarks,

@@ -26,7 +26,7 @@ from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.pose_quality import doubt, support_of
+from pliant.algorithms.mapping.pose_quality import support_of, why_doubtful
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import Recognised, is_same_pose
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
@@ -64,9 +64,9 @@ class Localiser:
         self._segments = take_in(known, self._points, self.calibration)
         self._places.know(known, self.calibration)
         self._map: ActiveMap | None = None
-        self._hanging: Keyframe | None = None
+        self._reference: Keyframe | None = None
         self._motion: Motion | None = None
-        self._looked_from: F64 = np.eye(4)
+        self._activated_from: F64 = np.eye(4)
 
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
         """Find a frame in the map."""
@@ -74,37 +74,37 @@ class Localiser:
         if self._map is not None:
             self._map.links.follow(frame.extrema.ids, self._points)
         located = self._locate(ideal, timer)
-        if located is None or self._map is None or self._hanging is None:
+        if located is None or self._map is None or self._reference is None:
             return self._publish(LOST if self._map else WAITING, "not recognised in the map", 0)
         with timer("reacquisition"):
-            looks_anew = self._look_from(self._map, located)
+            has_activated = self._activate_near(self._map, located)
             placed = self._find(self._map, ideal, located)
         inliers = placed.support.inliers
         if inliers < self._parameters.localisation.min_inliers:
             return self._publish(LOST, f"lost: {inliers} points of the map are seen", 0)
         if self._motion is None:
             self._motion = Motion.at(frame.number, frame.stamp_ns, placed.T_world_camera)
-            self._changes.add_same_places([(self._hanging.id, -1)])
+            self._changes.add_same_places([(self._reference.id, -1)])
         else:
             tracked = placed.support.tracked
             self._motion = self._motion.then(
                 frame.number, frame.stamp_ns, placed.T_world_camera, tracked, tracked
             )
-        return self._publish_placed(self._hanging, placed, looks_anew=looks_anew)
+        return self._publish_placed(self._reference, placed, has_activated=has_activated)
 
     def only_localise(self, frame: Frame, otherwise: str) -> MapDelta:
         """As ``Mapper.only_localise``."""
-        active, hanging, motion, found = self._map, self._hanging, self._motion, None
+        active, reference, motion, found = self._map, self._reference, self._motion, None
         if active is not None and motion is not None:
             active.links.follow(frame.extrema.ids, active.points)
             found = pose_by_tracks(active, self.calibration, motion, frame, self._generator)
-        if found is None or hanging is None or motion is None:
+        if found is None or reference is None or motion is None:
             return self.skip(frame.number, otherwise)
         tracked = found.support.tracked
         self._motion = motion.then_unmapped(
             frame.number, frame.stamp_ns, found.T_world_camera, tracked, tracked
         )
-        return self._publish_placed(hanging, found)
+        return self._publish_placed(reference, found)
 
     def recognise(self, maxima: F32, grey: U8, generator: np.random.Generator) -> Recognised | None:
         """Where an image (H, W) of the ideal camera, with its maxima (M, 3) of curvature, is seen
@@ -163,18 +163,18 @@ class Localiser:
             same = found.keyframe.segment == self._map.segment.id
             if same and is_same_pose(there, found.T_world_camera, found.keyframe, self._points):
                 return there
-        self._hanging, self._motion = found.keyframe, None
+        self._reference, self._motion = found.keyframe, None
         segment = next(each for each in self._segments if each.id == found.keyframe.segment)
         self._map = ActiveMap(segment, 0, self.calibration, self._parameters)
         self._map.links.follow(frame.tracks.ids, self._points)
-        self._map.look_around(found.T_world_camera)
-        self._looked_from = found.T_world_camera
+        self._map.activate_near(found.T_world_camera)
+        self._activated_from = found.T_world_camera
         return found.T_world_camera
 
-    def _look_from(self, active: ActiveMap, T_world_camera: F64) -> bool:
+    def _activate_near(self, active: ActiveMap, T_world_camera: F64) -> bool:
         """Whether the camera has moved so far that it may see what others saw."""
         rows = active.links.rows[active.linked(MAPPED)]
-        moved = inverse(self._looked_from) @ T_world_camera
+        moved = inverse(self._activated_from) @ T_world_camera
         turn = float(np.linalg.norm(so3_log(moved[:3, :3])))
         shift, depth = float(np.linalg.norm(moved[:3, 3])), 0.0
         if len(rows):
@@ -184,8 +184,8 @@ class Localiser:
             return False
         if depth > 0.0:
             active.segment.inverse_distance = 1.0 / depth
-        active.look_around(T_world_camera)
-        self._looked_from = T_world_camera
+        active.activate_near(T_world_camera)
+        self._activated_from = T_world_camera
         return True
 
     def _find(self, active: ActiveMap, frame: IdealFrame, T_world_camera: F64) -> PlacedFrame:
@@ -207,29 +207,31 @@ class Localiser:
         return replace(placed, support=support)
 
     def _publish_placed(
-        self, hanging: Keyframe, placed: PlacedFrame, *, looks_anew: bool = False
+        self, reference: Keyframe, placed: PlacedFrame, *, has_activated: bool = False
     ) -> MapDelta:
         support = placed.support
-        self._changes.add_pose(placed.frame.number, hanging, placed.T_world_camera, support.inliers)
-        why = doubt(support, self._parameters.support)
-        return self._publish(TRACKING, why, support.inliers, looks_anew=looks_anew)
+        self._changes.add_pose(
+            placed.frame.number, reference, placed.T_world_camera, support.inliers
+        )
+        why = why_doubtful(support, self._parameters.support)
+        return self._publish(TRACKING, why, support.inliers, has_activated=has_activated)
 
     def _publish(
-        self, state: int, reason: str, inliers: int, *, looks_anew: bool = False
+        self, state: int, reason: str, inliers: int, *, has_activated: bool = False
     ) -> MapDelta:
-        active, hanging = self._map, self._hanging
+        active, reference = self._map, self._reference
         rows = np.zeros(0, np.int32)
-        if active is not None and looks_anew:
+        if active is not None and has_activated:
             rows = active.nearby()
         delta = self._changes.publish(
             state=state,
             reason=reason,
             segment=-1 if active is None else active.segment.id,
             inliers=inliers,
-            keyframes=[] if hanging is None else [hanging],
+            keyframes=[] if reference is None else [reference],
             points=self._points,
             rows=rows,
-            centre=self._looked_from[:3, 3].copy(),
+            centre=self._activated_from[:3, 3].copy(),
             snapshot=False,
         )
         return self.calibration.published_with(delta)

@@ -21,10 +21,10 @@ from pliant.algorithms.mapping.first_map import Start
 from pliant.algorithms.mapping.frame import Frame, IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.frame_pose import (
     adjust,
+    check_pure_rotation,
     limits_of_points,
     localise,
     reacquire_points,
-    stand,
     to_global_shutter,
     tracks_to_points,
 )
@@ -46,7 +46,7 @@ from pliant.algorithms.mapping.ordinary_frames import (
     smoothed_poses,
 )
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.pose_quality import doubt
+from pliant.algorithms.mapping.pose_quality import why_doubtful
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved, Segment
@@ -186,7 +186,7 @@ class Mapper:
         """Make the frame a keyframe.  Returns it where the window has moved it."""
         frame = placed.frame
         with timer("keyframe"):
-            placed = stand(active, placed)
+            placed = check_pure_rotation(active, placed)
             if frame.rolled is not None:
                 active.segment.to_global_shutter(active.window.keyframes, self.calibration)
             keyframe = active.insert_keyframe(placed)
@@ -214,7 +214,7 @@ class Mapper:
         self._add_pose(number, keyframe, T_world_camera, support.inliers)
 
     def _publish_placed(self, placed: PlacedFrame) -> MapDelta:
-        why = doubt(placed.support, self._parameters.support)
+        why = why_doubtful(placed.support, self._parameters.support)
         return self._publish(TRACKING, why, placed.support.inliers)
 
     def follow(self, moved: list[Moved]) -> None:

@@ -21,7 +21,7 @@ from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import MAPPED, MAPPED_SHARE, Landmarks
 from pliant.algorithms.mapping.observation_table import weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.rolling_shutter import Path
+from pliant.algorithms.mapping.rolling_shutter import FramePoses
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.trajectory_smoothing import smooth_trajectory
 
@@ -190,7 +190,7 @@ def refined_poses(
 
 def smoothed_poses(
     keyframes: list[Keyframe],
-    path: Path,
+    path: FramePoses,
     stamps_ns: dict[int, int],
     points: Landmarks,
     seen_by: SelfCalibration,

@@ -64,7 +64,7 @@ def support_of(
     )
 
 
-def doubt(support: Support, parameters: SupportParameters) -> str:
+def why_doubtful(support: Support, parameters: SupportParameters) -> str:
     """Why the pose may not be that of the camera in the world; "" where nothing speaks for it."""
     if support.contrary > parameters.max_contrary_share:
         return f"doubtful: {support.contrary:.0%} of the image disagrees with the camera motion"

@@ -24,8 +24,8 @@ from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.localisation import (
     NEAR,
     are_enough,
-    look_about,
     refine,
+    search_near,
     verify_pose,
 )
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -176,7 +176,7 @@ def _looked_about(
     rows = _rows_near(place.keyframe, place.segment, points)
     radius_px = NEAR * parameters.recovery.max_radius_share * camera.width
     grid = MaximaGrid.build(maxima, camera.width, camera.height, radius_px)
-    proved = look_about(
+    proved = search_near(
         found.T_world_camera, rows, points, grid, grey, radius_px, camera, parameters, generator
     )
     if proved is None or len(proved.rows) <= found.inliers:
@@ -215,7 +215,7 @@ def rest_is_elsewhere(
     radius_px = camera.width * own.max_radius_share
     grid = MaximaGrid.build(maxima, camera.width, camera.height, radius_px)
     rest = np.setdiff1d(rows, seen.rows)
-    other = look_about(
+    other = search_near(
         seen.T_world_camera, rest, points, grid, grey, radius_px, camera, parameters, generator
     )
     return (

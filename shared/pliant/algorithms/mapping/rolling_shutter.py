@@ -57,7 +57,7 @@ class FrameOnKeyframe(NamedTuple):
     inliers: int
 
 
-class Path:
+class FramePoses:
     """Poses of the frames of a segment, each relative to its keyframe, which may still move."""
 
     def __init__(self, known: dict[int, F64] | None = None) -> None:
@@ -99,7 +99,7 @@ class Path:
             np.array([self._information.get(frame, unknown) for frame, _ in hanging]),
         )
 
-    def take_in(self, other: "Path") -> None:
+    def take_in(self, other: "FramePoses") -> None:
         """The frames of another segment are of this one, too."""
         self._poses |= other._poses
         self._inliers |= other._inliers
@@ -151,8 +151,10 @@ class Path:
 
 
 def motion_between(first: F64, last: F64, T_world_camera: F64) -> F64:
-    """(..., 6) as of ``Path.motions``, from one of two poses (..., 4, 4) to the other, in a camera
-    near both."""
+    """(..., 6) as of ``FramePoses.motions``, from one of two poses (..., 4, 4) to the other.
+
+    T_world_camera: (..., 4, 4) a camera near both, in which it is.
+    """
     first, last = inverse(first) @ T_world_camera, inverse(last) @ T_world_camera
     turn = so3_log(last[..., :3, :3] @ np.swapaxes(first[..., :3, :3], -1, -2))
     return np.concatenate([turn, last[..., :3, 3] - first[..., :3, 3]], axis=-1)
@@ -163,7 +165,7 @@ class RolledFrame:
     """What a rolling shutter did to a frame.
 
     view: of the frame; pixels are of its camera, but those of images, which are rectified.
-    readout: share of the frame interval.   motion: (6,) as of ``Path.motions``.
+    readout: share of the frame interval.   motion: (6,) as of ``FramePoses.motions``.
     inverse_depth: of what has no depth of its own.
     """
 

@@ -39,7 +39,7 @@ from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.ordinary_frames import OrdinaryFrames
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.rolling_shutter import Path, RolledFrame
+from pliant.algorithms.mapping.rolling_shutter import FramePoses, RolledFrame
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.track_links import UNLINKED
 from pliant.compiler.kernel import kernel
@@ -151,7 +151,7 @@ class Segment:
     id: int
     points: Landmarks
     keyframes: list[Keyframe] = field(default_factory=list[Keyframe])
-    path: Path = field(default_factory=Path)
+    path: FramePoses = field(default_factory=FramePoses)
     ordinary: OrdinaryFrames = field(default_factory=OrdinaryFrames)
     since: int = 0
     adjusted: int = -1

@@ -134,7 +134,7 @@ class Window:
             }
         )
         problem = self._problem(columns)
-        problem.fixed_cameras[:-1] |= [keyframe.turned for keyframe in self.keyframes]
+        problem.fixed_cameras[:-1] |= [keyframe.is_pure_rotation for keyframe in self.keyframes]
         self._take(columns, solve_schur(problem, bundle))
 
     def place_directions(self, inverse_distance: float) -> float:
