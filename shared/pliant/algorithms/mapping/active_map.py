@@ -15,9 +15,9 @@ from pliant.algorithms.mapping.covisibility import (
     near_keyframes,
     rows_of,
 )
-from pliant.algorithms.mapping.directions import helping_candidates
 from pliant.algorithms.mapping.first_map import BufferedFrame, Start
 from pliant.algorithms.mapping.frame import IdealFrame, PlacedFrame
+from pliant.algorithms.mapping.inverse_depth import helping_candidates
 from pliant.algorithms.mapping.keyframe import Keyframe, Observations
 from pliant.algorithms.mapping.keyframe_rule import Overlap
 from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED
@@ -191,8 +191,8 @@ class ActiveMap:
 
     def helping_candidates(self) -> I64:
         """Indices of the tracks of candidates that help to place the current frame."""
-        directions = helping_candidates(self.points, self.links.rows)
-        return directions if self.candidates_agree else directions[:0]
+        candidates = helping_candidates(self.points, self.links.rows)
+        return candidates if self.candidates_agree else candidates[:0]
 
     def overlap(self, age_s: float, interval_s: float) -> Overlap:
         """Of the frame in the window with the last keyframe.  age_s, interval_s: as of it."""
@@ -206,9 +206,9 @@ class ActiveMap:
         before = max(before, 1)
         return Overlap(shared / before, in_view / before, flow_px / unit, age_s, interval_s)
 
-    def observed(self, placed: PlacedFrame, directions: I64) -> tuple[I32, F32]:
+    def observed(self, placed: PlacedFrame, candidates: I64) -> tuple[I32, F32]:
         """Rows and pixels of the points that place the current frame."""
-        return self._observed(placed, np.concatenate([self.linked(MAPPED), directions]))
+        return self._observed(placed, np.concatenate([self.linked(MAPPED), candidates]))
 
     def see(self, placed: PlacedFrame) -> None:
         """Put the current frame into the window."""
@@ -268,7 +268,7 @@ class ActiveMap:
         self.rebuild_window()
         self.window.triangulate(self.parameters.point)
         self._adjust_window()
-        self._place_directions()
+        self._place_candidates()
         if frame.has_image:
             mapped = self.points.state[newest.rows] == MAPPED
             rows, points_px = newest.rows[mapped], newest.points_px[mapped]
@@ -280,9 +280,9 @@ class ActiveMap:
         self.window.remove_outliers(self.parameters.window.outlier_px)
         self.window.update_statistics()
 
-    def _place_directions(self) -> None:
+    def _place_candidates(self) -> None:
         segment = self.segment
-        segment.inverse_distance = self.window.place_directions(segment.inverse_distance)
+        segment.inverse_distance = self.window.place_candidates(segment.inverse_distance)
 
     def _link_new_tracks(self, points_px: F32) -> I64:
         """Give candidate rows to tracks that have none.  Returns the indices of those tracks."""
@@ -335,7 +335,7 @@ class ActiveMap:
         self.window.T_world_camera[-1] = before.T_world_camera[-1]
         if before.keyframes:
             self._adjust_window()
-            self._place_directions()
+            self._place_candidates()
 
     def collect_garbage(self) -> None:
         """Give back the rows of dead candidates and of merged points.
@@ -407,7 +407,7 @@ class ActiveMap:
         known, moves = self.segment.adjust(known, self.parameters)
         self.seen_by = known
         self.rebuild_window()
-        self._place_directions()  # they were placed in the map that it was
+        self._place_candidates()  # they were placed in the map that it was
         return known, moves
 
     def close(self) -> None:

@@ -15,13 +15,9 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.changing_focal import (
-    evidence_of_change,
-    gaps_s,
-    walk_from,
-)
-from pliant.algorithms.mapping.directions import at_infinity
+from pliant.algorithms.mapping.changing_focal import evidence_of_change, gaps_s, walk_from
 from pliant.algorithms.mapping.focal_search import best_along_focal
+from pliant.algorithms.mapping.inverse_depth import at_infinity
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.observation_table import list_errors, weigh

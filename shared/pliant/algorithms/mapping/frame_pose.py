@@ -11,13 +11,13 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.mapping.active_map import ActiveMap
-from pliant.algorithms.mapping.directions import (
+from pliant.algorithms.mapping.frame import IdealFrame, PlacedFrame
+from pliant.algorithms.mapping.inverse_depth import (
     Spread,
     off_epipolar_line,
     placed_candidates,
     spread_of,
 )
-from pliant.algorithms.mapping.frame import IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.keyframe import Observations
 from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.localisation import (
@@ -29,10 +29,7 @@ from pliant.algorithms.mapping.localisation import (
     verify_pose,
 )
 from pliant.algorithms.mapping.observation_table import reprojection_errors
-from pliant.algorithms.mapping.parameters import (
-    MappingParameters,
-    PointParameters,
-)
+from pliant.algorithms.mapping.parameters import MappingParameters, PointParameters
 from pliant.algorithms.mapping.pose_quality import support_of
 from pliant.algorithms.mapping.reacquisition import reacquire
 from pliant.algorithms.mapping.track_links import UNLINKED
@@ -42,7 +39,7 @@ _AGREEING = 0.5
 """Share of the points of the map that place a frame alone and still fit once candidates help: with
 fewer, what these are on moves by itself."""
 
-_OF_DIRECTION = 0.5
+_OF_CANDIDATE = 0.5
 """Inliers that a direction which fits counts as: any depth will do, so it tells one coordinate of
 its pixel, not two."""
 
@@ -76,8 +73,8 @@ def localise(
     points, parameters, tracks = active.points, active.parameters, frame.tracks
     predictions = motion.predictions(frame.stamp_ns)
     active.candidates_agree = True
-    directions = active.helping_candidates()
-    linked = np.concatenate([active.linked(MAPPED), directions])
+    candidates = active.helping_candidates()
+    linked = np.concatenate([active.linked(MAPPED), candidates])
     limits = parameters.localisation
     if len(linked) >= limits.min_inliers:
         rows, points_px = active.links.rows[linked], tracks.points_px[linked]
@@ -85,12 +82,12 @@ def localise(
             rolled = active.segment.rolled(frame.calibration, motion.velocity())
             depths = active.segment.inverse_depths(rows, predictions[0])
             points_px = points_px - rolled.shifts(points_px, depths)
-        located = _by_tracks(active, predictions, rows, points_px, directions, generator)
+        located = _by_tracks(active, predictions, rows, points_px, candidates, generator)
         inliers = int(located.inliers.sum())
-        of_points = int(located.inliers[: len(linked) - len(directions)].sum())
-        if of_points + _OF_DIRECTION * (inliers - of_points) >= limits.min_inliers:
+        of_points = int(located.inliers[: len(linked) - len(candidates)].sum())
+        if of_points + _OF_CANDIDATE * (inliers - of_points) >= limits.min_inliers:
             # What helps in one frame and not in the next has not been lost in between.
-            helped = len(directions) and active.candidates_agree
+            helped = len(candidates) and active.candidates_agree
             before = motion.tracked if helped else motion.to_points
             if not frame.has_image or inliers >= _FEW * before:
                 return Located(located.T_world_camera, inliers >= _FIRM * before)
@@ -114,11 +111,11 @@ def _by_tracks(
     predictions: list[F64],
     rows: I32,
     points_px: F32,
-    directions: I64,
+    candidates: I64,
     generator: np.random.Generator,
 ) -> Localisation:
     """The pose that tracks tell: those of points, which come first, have the last word."""
-    limits, mapped = active.parameters.localisation, len(rows) - len(directions)
+    limits, mapped = active.parameters.localisation, len(rows) - len(candidates)
 
     def located(count: int, spread: Spread | None) -> Localisation:
         return locate(
@@ -126,9 +123,9 @@ def _by_tracks(
             generator, spread,
         )  # fmt: skip
 
-    together = located(len(rows), _spread(active, rows, directions))
+    together = located(len(rows), _spread(active, rows, candidates))
     still = together.inliers[:mapped].sum()
-    if len(directions) and mapped >= limits.min_inliers and still < _AGREEING * mapped:
+    if len(candidates) and mapped >= limits.min_inliers and still < _AGREEING * mapped:
         alone = located(mapped, None)
         fitting = alone.inliers.sum()
         if fitting >= limits.min_inliers and still < _AGREEING * fitting:
@@ -172,11 +169,11 @@ def reacquire_points(active: ActiveMap, frame: IdealFrame, T_world_camera: F64) 
 
 def refine_by_all(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     """The pose by its tracks and the points found without one, from close by."""
-    directions = active.helping_candidates()
-    rows, points_px = active.observed(placed, directions)
+    candidates = active.helping_candidates()
+    rows, points_px = active.observed(placed, candidates)
     located = refine(
         placed.T_world_camera, active.points.xyz[rows], points_px, active.camera,
-        active.parameters.localisation, near=True, spread=_spread(active, rows, directions),
+        active.parameters.localisation, near=True, spread=_spread(active, rows, candidates),
     )  # fmt: skip
     return replace(placed, T_world_camera=located.T_world_camera)
 
@@ -265,8 +262,8 @@ def check_pure_rotation(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     return replace(placed, T_world_camera=T_standing, is_pure_rotation=True)
 
 
-def _spread(active: ActiveMap, rows: I32, directions: I64) -> Spread | None:
-    return spread_of(active.points, rows, active.keyframes[-1]) if len(directions) else None
+def _spread(active: ActiveMap, rows: I32, candidates: I64) -> Spread | None:
+    return spread_of(active.points, rows, active.keyframes[-1]) if len(candidates) else None
 
 
 def limits_of_points(inliers: int, parameters: MappingParameters) -> PointParameters:

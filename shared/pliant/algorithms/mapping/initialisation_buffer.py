@@ -70,11 +70,9 @@ class InitialisationBuffer:
     turns: list[Turn] = field(default_factory=list[Turn])
     newest: Frame | None = None
 
-    def then(
-        self, frame: IdealFrame, camera: PinholeCamera, parameters: MappingParameters
-    ) -> "InitialisationBuffer":
+    def then(self, frame: IdealFrame, parameters: MappingParameters) -> "InitialisationBuffer":
         """With one frame more."""
-        tracks = frame.tracks
+        tracks, camera = frame.tracks, frame.calibration.view.camera
         newest = BufferedFrame(
             frame=frame.number, stamp_ns=frame.stamp_ns, ids=tracks.ids,
             points_px=tracks.points_px, kappas=tracks.kappas,

@@ -28,8 +28,8 @@ class Landmarks:
     state: FREE, CANDIDATE, MAPPED or MERGED.    ids: of mapped points, never reused; else -1.
     alias: the row that a MERGED one stands for; itself otherwise.
     xyz: world position of mapped points, and of candidates the provisional one.
-    spread: (3,) how uncertain that is, see ``directions``; 0 for mapped points, NaN for candidates
-    that have no place yet.    published_xyz: as last published, NaN before.
+    spread: (3,) how uncertain that is, see ``inverse_depth``; 0 for mapped points, NaN for
+    candidates that have no place yet.    published_xyz: as last published, NaN before.
     published_sigmas: ``sigmas`` when last published.    segment: of the map.
     first_keyframe: keyframe id of the first observation.
     keyframes, parallax_rad, sigmas: as MapDelta defines them.

@@ -18,7 +18,7 @@ from pliant.algorithms.bundle.problem import BundleParameters
 from pliant.algorithms.bundle.subspace import refine_pose
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, move_by_similarity, so3_exp, so3_log
-from pliant.algorithms.mapping.directions import Spread, refine_pose_spread
+from pliant.algorithms.mapping.inverse_depth import Spread, refine_pose_spread
 from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.parameters import (
     LocalisationParameters,
@@ -64,7 +64,7 @@ def locate(
     """The pose that most points agree with: from the best prediction, or by P3P and RANSAC.
 
     predictions: poses (4, 4) to start from, at least one.   points_world: (N, 3).  points_px:
-    (N, 2).  spread: of provisional points, see ``directions``; None: all are certain.
+    (N, 2).  spread: of provisional points, see ``inverse_depth``; None: all are certain.
     The caller judges whether the inliers suffice.
     """
     points_n = camera.normalise(points_px.astype(np.float64))
@@ -99,7 +99,7 @@ def refine(
 ) -> Localisation:
     """Robust refinement of a pose, from a wide kernel to a narrow one; near: narrow at once.
 
-    spread: of provisional points, see ``directions``; None: all are certain.
+    spread: of provisional points, see ``inverse_depth``; None: all are certain.
     """
     inliers, is_pure_rotation = np.zeros(len(points_px), np.bool_), False
     for widening in (1.0,) if near else (_COARSE_SIGMAS, 1.0):

@@ -251,7 +251,7 @@ class Mapper:
             found = pose_by_tracks(active, self.calibration, self._motion, frame, self._generator)
         if active is None or found is None:
             ideal = IdealFrame.of(frame, self.calibration)
-            self._waiting = self._waiting.then(ideal, self._camera, self._parameters)
+            self._waiting = self._waiting.then(ideal, self._parameters)
             return self.skip(frame.number, otherwise)
         active.add_ordinary(found)
         self._go_on_from(active, found, self._motion.then_unmapped)
@@ -306,7 +306,7 @@ class Mapper:
         return [waiting.frame for waiting in self._waiting.frames]
 
     def _wait(self, frame: IdealFrame, timer: StageTimer) -> MapDelta:
-        self._waiting = self._waiting.then(frame, self._camera, self._parameters)
+        self._waiting = self._waiting.then(frame, self._parameters)
         with timer("start"):
             begun = self._begin_where_possible(self._parameters)
         if isinstance(begun, str):
@@ -413,7 +413,7 @@ class Mapper:
         seen = len(active.linked(MAPPED))
         reason = f"lost: the pose of frame {frame.number} is not supported, {seen} mapped tracks"
         self._lost_frames += 1
-        self._waiting = self._waiting.then(frame, self._camera, self._parameters)
+        self._waiting = self._waiting.then(frame, self._parameters)
         delta = self._publish(LOST, self._flaw(frame) or reason, 0)
         long = self._motion.lost_s(frame.stamp_ns) > self._parameters.localisation.max_lost_s
         if long and self._lost_frames >= _LEAST_LOST:

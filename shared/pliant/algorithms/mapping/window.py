@@ -8,7 +8,7 @@ from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.bundle.subspace import solve_subspace
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, move_by_similarity
-from pliant.algorithms.mapping.directions import at_infinity, place
+from pliant.algorithms.mapping.inverse_depth import at_infinity, place
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED, Landmarks
 from pliant.algorithms.mapping.observation_table import (
@@ -137,7 +137,7 @@ class Window:
         problem.fixed_cameras[:-1] |= [keyframe.is_pure_rotation for keyframe in self.keyframes]
         self._take(columns, solve_schur(problem, bundle))
 
-    def place_directions(self, inverse_distance: float) -> float:
+    def place_candidates(self, inverse_distance: float) -> float:
         """Give the candidates their provisional places, about as far as the map is.
 
         inverse_distance: median of the map as the last keyframe found it.  Returns it of this one.

@@ -11,7 +11,9 @@ from test_mapper import Published, run, trajectory_error
 from pliant.algorithms.bundle.projection import move_camera
 from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
 from pliant.algorithms.map_delta import LOST, TRACKING, MapMoves
-from pliant.algorithms.mapping.directions import (
+from pliant.algorithms.mapping.frame import Frame, IdealFrame
+from pliant.algorithms.mapping.frame_pose import localise
+from pliant.algorithms.mapping.inverse_depth import (
     at_infinity,
     linearise,
     off_epipolar_line,
@@ -19,8 +21,6 @@ from pliant.algorithms.mapping.directions import (
     placed_candidates,
     refine_pose_spread,
 )
-from pliant.algorithms.mapping.frame import Frame, IdealFrame
-from pliant.algorithms.mapping.frame_pose import localise
 from pliant.algorithms.mapping.landmarks import MAPPED
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
