@@ -45,7 +45,7 @@ def test_holes_are_filled_faintly_and_the_surface_stays(times: int) -> None:
 
 def test_what_few_agree_on_fills_nothing() -> None:
     before = with_hole(true_depth(pose(0)))
-    after = filled(before, agreed(2, support=0.5), 2)
+    after = filled(before, agreed(2, support=1.0), 2)
     np.testing.assert_array_equal(after.depths, before.depths)
 
 

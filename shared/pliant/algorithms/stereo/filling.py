@@ -14,7 +14,7 @@ from pliant.compiler.kernel import kernel
 
 _WEIGHT = 0.01
 """A surface face on, of certain depth, has 1."""
-_MIN_SUPPORT = 1.0
+_MIN_SUPPORT = 1.5
 """As many confident views agree."""
 _ONE_SURFACE = 0.03
 """Share of the inverse depth by which pixels side by side on one surface differ at most."""
