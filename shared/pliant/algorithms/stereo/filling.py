@@ -2,7 +2,7 @@
 
 Between points that are not sure, across jumps and on slants a keyframe's surface has holes.  What
 its images say there is worth less than any surface, yet better than nothing: it enters with a
-weight so small that one keyframe with a surface outweighs many without.
+weight so small that one keyframe with a sure surface outweighs many without.
 """
 
 import numpy as np
