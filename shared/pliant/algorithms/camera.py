@@ -29,7 +29,7 @@ class PinholeCamera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
-    def pinhole(self) -> F64:
+    def intrinsics(self) -> F64:
         """(4,) fx, fy, cx, cy: what kernels take."""
         return np.array([self.fx, self.fy, self.cx, self.cy])
 

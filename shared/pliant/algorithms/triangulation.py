@@ -34,7 +34,7 @@ def triangulate(
     xyz = np.empty((len(columns), 3))
     errors = np.empty(len(columns), np.float32)
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:, :3])
-    intrinsics = camera.pinhole
+    intrinsics = camera.intrinsics
     _triangulate(
         T_camera_world, np.ascontiguousarray(T_world_camera[:, :3, 3]), u, v, seen, columns,
         intrinsics, xyz, errors,

@@ -282,7 +282,7 @@ def ideal_pixels(points_px: F32, camera: PinholeCamera, correction: F64) -> F32:
     angle; elsewhere the nearest it gets.
     """
     ideal = np.empty((len(points_px), 2), np.float32)
-    K = camera.pinhole
+    K = camera.intrinsics
     _ideal_pixels(points_px, K, correction, np.exp(-correction[0]), ideal)
     return ideal
 

@@ -49,7 +49,7 @@ def refine_focal(
     """
     every = max(1, len(points_px) // _MOST)
     world, px = points_world[::every], points_px[::every].astype(np.float64)
-    lens = np.array([*camera.pinhole, *centre])
+    lens = np.array([*camera.intrinsics, *centre])
     T_camera_world = inverse(T_world_camera)
     motion = np.concatenate([T_camera_world[:3, :3].ravel(), T_camera_world[:3, 3]])
     d, normal, squared = 0.0, np.eye(UNKNOWNS), np.zeros(0)

@@ -194,7 +194,7 @@ class BundleResult:
 
 def shared_intrinsics(camera: PinholeCamera, count: int) -> F64:
     """(count, 6) rows ``fx, fy, cx, cy, 0, 0``: one camera without distortion for all frames."""
-    return np.tile(np.array([*camera.pinhole, 0.0, 0.0]), (count, 1))
+    return np.tile(np.array([*camera.intrinsics, 0.0, 0.0]), (count, 1))
 
 
 def _check_optional(name: str, value: F32 | None, shape: tuple[int, ...]) -> None:

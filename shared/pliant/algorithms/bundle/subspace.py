@@ -131,7 +131,7 @@ def _one_camera(
     R, origin = T_world_camera[:3, :3], T_world_camera[:3, 3]
     motion = np.zeros((1, 12))
     motion[0, :9] = R.T.reshape(-1)
-    pinhole = camera.pinhole[None]
+    pinhole = camera.intrinsics[None]
     u, v, w = np.zeros((3, 1, P), np.float32)
     table = Table(u, v, w, np.zeros((1, P // BLOCK), np.uint8))
     points = np.zeros((3, P))

@@ -129,7 +129,7 @@ def place(
     Returns X (C, 3) and spread (C, 3) in the world; NaN where no camera sees the column.
     """
     xyz, spread = np.full((2, len(columns), 3), np.nan)
-    K = camera.pinhole
+    K = camera.intrinsics
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:, :3])
     _place(T_world_camera, T_camera_world, u, v, seen, columns, K, inverse_distance, xyz, spread)
     return xyz, spread
@@ -212,7 +212,7 @@ def off_epipolar_line(
     """(N,) px by which observations points_px (N, 2) miss the epipolar lines of provisional points,
     which no depth explains; 0 for what is behind the camera.   points_world, spread: (N, 3).
     """
-    K = camera.pinhole
+    K = camera.intrinsics
     off = np.empty(len(points_px))
     _off_lines(inverse(T_world_camera)[:3], points_world, spread, points_px, K, off)
     return off
@@ -249,7 +249,7 @@ def refine_pose_spread(
     turn differ so little that errors which tracks have in common, small as they are, look like one.
     Returns the pose, (N,) ``r^T W r``, px^2, inf behind the camera, and whether it stands.
     """
-    K = camera.pinhole
+    K = camera.intrinsics
     sigma2, squared = kernel_sigma_px**2, np.empty((2, len(points_px)))
     still = T_world_camera.copy()
     still[:3, 3] = standing

@@ -97,7 +97,7 @@ def keep(
             session=origin.session,
             source_frame=origin.frame,
             turned=keyframe.is_pure_rotation,
-            given=np.array([*size, *given.pinhole]),
+            given=np.array([*size, *given.intrinsics]),
             correction=calibration.correction.copy(),
             sigmas=calibration.sigmas,
             T_world_camera=keyframe.T_world_camera.copy(),

@@ -19,7 +19,7 @@ def weigh(points_px: F32, camera: PinholeCamera, k_sigmas: tuple[float, float]) 
     all alike, and depths take it up.
     """
     k1, k3 = k_sigmas
-    lens = np.array([*camera.pinhole, camera.fx * k1, camera.fx * k3], np.float32)
+    lens = np.array([*camera.intrinsics, camera.fx * k1, camera.fx * k3], np.float32)
     return _weigh(points_px, lens)
 
 
@@ -197,7 +197,7 @@ def reprojection_errors(
     """(N,) errors in px of points (N, 3) seen at (N, 2); inf for points behind the camera."""
     errors = np.empty(len(points_world), np.float32)
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:3])
-    _errors(T_camera_world, points_world, points_px, camera.pinhole, errors)
+    _errors(T_camera_world, points_world, points_px, camera.intrinsics, errors)
     return errors
 
 
@@ -214,7 +214,7 @@ def forget_outliers(
     """Let the cameras (M) of the table u, v, seen (., N) not see those of the points (C, 3) in
     ``columns`` that they miss by more than outlier_px, or that lie behind them."""
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:, :3])
-    K, most = camera.pinhole, np.float32(outlier_px)
+    K, most = camera.intrinsics, np.float32(outlier_px)
     _forget_outliers(T_camera_world, points_world, u, v, seen, columns, K, most)
 
 
@@ -229,7 +229,7 @@ def list_errors(
     """(O,) errors in px of a list of observations; inf for points behind their camera."""
     errors = np.empty(len(points_px), np.float32)
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:, :3])
-    K = camera.pinhole
+    K = camera.intrinsics
     _list_errors(T_camera_world, points_world, camera_index, point_index, points_px, K, errors)
     return errors
 

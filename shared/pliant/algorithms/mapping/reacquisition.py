@@ -206,7 +206,7 @@ def _projected(
 ) -> tuple[F32, BoolArray]:
     """Where a frame should show points, px (R, 2), and whether it does."""
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:3])
-    K = np.array([*camera.pinhole, camera.width, camera.height])
+    K = np.array([*camera.intrinsics, camera.width, camera.height])
     projected = np.empty((len(rows), 2), np.float32)
     visible = _project(T_camera_world, rows, points.xyz, K, projected)
     return projected, visible

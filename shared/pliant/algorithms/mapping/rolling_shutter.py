@@ -211,7 +211,7 @@ class RolledFrame:
     def _shifts(self, points_px: F32, inverse_depths: F64 | None, *, seen: bool) -> F32:
         camera = self.camera
         axis, length = _read_out_along(camera)
-        K = np.array([*camera.pinhole, length])
+        K = np.array([*camera.intrinsics, length])
         if inverse_depths is None:
             inverse_depths = np.full(len(points_px), self.inverse_depth)
         shifts = np.empty((len(points_px), 2), np.float32)

@@ -59,7 +59,7 @@ class Window:
         self.fixed = fixed
         self.outside = outside
         self.points = points
-        self.lens: F32 = camera.pinhole.astype(np.float32)
+        self.lens: F32 = camera.intrinsics.astype(np.float32)
         self._camera, self._k_sigmas = camera, k_sigmas
         self.columns: I32 = np.full(len(points.state), OUTSIDE, np.int32)
         for keyframe in keyframes:

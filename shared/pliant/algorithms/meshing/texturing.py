@@ -170,7 +170,7 @@ class TexelColours:
         """
         _add_view(
             self.positions, self.normals, np.ascontiguousarray(image), depths,
-            camera.pinhole, inverse(T_world_camera),
+            camera.intrinsics, inverse(T_world_camera),
             T_world_camera[:3, 3].copy(), 1.0 / (np.ones(3) if gain is None else gain), sharpness,
             self._sums,
         )  # fmt: skip

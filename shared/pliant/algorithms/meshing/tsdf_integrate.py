@@ -78,7 +78,7 @@ def pixel_planes(depth: F32, weight: F32, camera: PinholeCamera) -> PixelPlanes:
     x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
     y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
     _fit(inverse, x, y, (np.float32(camera.fx), np.float32(camera.fy)), planes, depths, furthest)
-    intrinsics = camera.pinhole
+    intrinsics = camera.intrinsics
     return PixelPlanes(planes, depths, weights, furthest, intrinsics)
 
 

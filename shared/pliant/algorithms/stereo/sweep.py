@@ -158,7 +158,7 @@ def _confidences(inverse_depths: F32, winners: Winners, view: StereoView) -> F32
 def cosines_of(inverse_depths: F32, camera: PinholeCamera) -> F32:
     """(H, W) cosines of the angle between a surface's normal and the ray, 0: unknown."""
     cosines = np.zeros(inverse_depths.shape, np.float32)
-    pinhole = camera.pinhole.astype(np.float32)
+    pinhole = camera.intrinsics.astype(np.float32)
     _cosines(inverse_depths, pinhole, cosines)
     return cosines
 
