@@ -19,6 +19,7 @@ from soak_kills import (
     ROUTER,
     SURFELS,
     Kind,
+    long_kind,
     rows,
     undisturbed,
 )
@@ -37,7 +38,7 @@ VICTIMS: dict[str, list[tuple[Kind, str]]] = {
     "surfels": [(SURFELS, name) for name in ("ingest", "surfels", "recorder")],
 }
 FAULTS = {"network": network_rows, "hostile": hostile_rows}
-PARTS = (*VICTIMS, *FAULTS, "latency")
+PARTS = (*VICTIMS, "long", *FAULTS, "latency")
 
 
 def main() -> int:
@@ -50,16 +51,12 @@ def main() -> int:
     compile_kernels(print)
     whole = True
     victims = [pair for part in chosen.parts for pair in VICTIMS.get(part, [])]
-    if victims:
-        print("| killed | times | same bytes |\n|---|---|---|")
-        for (kind, _), tally in zip(victims, rows(victims, chosen.kills, chosen.seed), strict=True):
-            name = tally.victim + {
-                SURFELS: " (deformable)",
-                ROOM: " (room)",
-                ROOM_ONCE: " (room)",
-            }.get(kind, "")
-            print(f"| {name} | {tally.kills} | {tally.same} |", flush=True)
-            whole = whole and tally.same == tally.kills >= chosen.kills
+    with tempfile.TemporaryDirectory(prefix="pliant-soak-") as folder:
+        if "long" in chosen.parts:
+            kind = long_kind(Path(folder) / "room")
+            victims += [(kind, name) for name in (*kind.services, "all at once")]
+        if victims:
+            whole = _kills(victims, chosen.kills, chosen.seed)
     faults: list[Callable[[dict[str, str]], object]] = [
         FAULTS[part] for part in chosen.parts if part in FAULTS
     ]
@@ -68,6 +65,17 @@ def main() -> int:
     if "latency" in chosen.parts:
         print("\n" + markdown(latency.HEADING, latency_rows()), flush=True)
     return 0 if whole else 1
+
+
+def _kills(victims: list[tuple[Kind, str]], kills: int, seed: int) -> bool:
+    print("| killed | times | same bytes |\n|---|---|---|")
+    whole = True
+    for (kind, _), tally in zip(victims, rows(victims, kills, seed), strict=True):
+        of = {SURFELS: " (deformable)", ROOM: " (room)", ROOM_ONCE: " (room)"}
+        name = tally.victim + of.get(kind, f" ({kind.frames} frames)" if kind.each > 5 else "")
+        print(f"| {name} | {tally.kills} | {tally.same} |", flush=True)
+        whole = whole and tally.same == tally.kills >= kills
+    return whole
 
 
 def _faults(faults) -> bool:

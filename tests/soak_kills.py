@@ -20,6 +20,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent / "system"))
 
+from benchmarks.endurance import forth_and_back
 from running import (
     FILES,
     TINY,
@@ -33,6 +34,7 @@ from running import (
 )
 
 from pliant.bus.session import free_endpoint, open_session
+from pliant.datasets.builtin import builtin_folder
 from pliant.messages import codec, topics
 from pliant.messages.types import Status
 from pliant.results.folder import MESH_FILES, SESSION_NAME, SURFELS_NAME
@@ -65,6 +67,7 @@ POINTS = Kind((TINY, "--set", "meshing.enabled=false"), PROFILES["points"], FILE
 ROOM = Kind(("built-in:room", "--set", "meshing.enabled=false"), PROFILES["points"], FILES, 300,
             "bundle_adjustment", each=5)  # fmt: skip
 ROOM_ONCE = replace(ROOM, each=1)
+LONG_FRAMES = 3000
 MESH = Kind((TINY,), ("meshing",), (*FILES, *MESH_FILES), 40, "meshing")
 SURFELS = Kind(
     ("built-in:tiny?frames=20", "--profile", "deformable", "--set", "surfels.max_surfels=300"),
@@ -83,6 +86,12 @@ class Tally:
     kills: int = 0
     same: int = 0
     differing: list[str] = field(default_factory=list[str])
+
+
+def long_kind(folder: Path) -> Kind:
+    """The room, forth and back, killed again and again.   folder: where its source is written."""
+    source = forth_and_back(builtin_folder("built-in:room"), folder, LONG_FRAMES, 30.0)
+    return replace(ROOM, arguments=(str(source), *ROOM.arguments[1:]), frames=LONG_FRAMES, each=20)
 
 
 def results(folder: Path, kind: Kind) -> dict[str, str]:
