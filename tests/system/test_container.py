@@ -108,7 +108,8 @@ def test_a_python_without_venv_is_one_line_with_the_command(machine: Machine, sc
 def test_the_demo_sets_itself_up_and_leaves_what_it_names(machine_with_venv: Machine) -> None:
     done = machine_with_venv.shell("cd ~/pliant && scripts/demo built-in:tiny")
     assert done.returncode == 0, done.stdout + done.stderr
-    _, list_of_files = done.stdout.split("Look at:")
+    _, heading, list_of_files = done.stdout.rpartition("Results:")
+    assert heading
     named = [word for word in list_of_files.split() if word.startswith("results/demo/")]
     assert len(named) == 7  # the mesh is among them
     for name in named:

@@ -42,6 +42,7 @@ from pliant.algorithms.mapping.loops import Loop
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters, WindowParameters
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.mapping.similarity import Pairs, similarity_by_ransac
 from pliant.algorithms.mapping.sparsification import sparsify
 from pliant.algorithms.places import PlaceIndex, describe, match
 from pliant.algorithms.tracking.maxima import maxima_of
@@ -227,7 +228,10 @@ def warm_up() -> None:
     mapper.finish()
     # What few frames need: a pose that no prediction led to, points that have merged.
     px = camera.project(points).astype(np.float32)
-    pose_by_ransac(points, camera.normalise(px), generator, gate=0.1, samples=1)
+    plane = camera.normalise(px)
+    pose_by_ransac(points, plane, generator, gate=0.1, samples=1)
+    pairs = Pairs(xyz_a=points, xyz_b=points, seen_a=plane, seen_b=plane)
+    similarity_by_ransac(pairs, generator, gate=0.1, samples=1)
     keyframe = KeyframeOfMap(
         id=0, frame=0, segment=0, T_world_camera=np.eye(4), rows=np.zeros(1, np.int32),
         points_px=px[:1], rolled_px=px[:1],

@@ -49,26 +49,30 @@ def make_scene(
     places: (L, 2, 3) lines between what shows one place.    frame_path: whether the path is in view
     at first, or the surface alone, which fills the canvas then.
 
-    Places are 16-bit shares of the box that holds all but stray points.
+    Places are 16-bit shares of the box that holds the mesh and all but stray points.
     """
     path = T_world_camera[:, :3, 3]
     cloud = points if len(points) else path
     low, high = np.quantile(cloud, (_RIM, 1.0 - _RIM), axis=0)
     low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
     size = np.maximum(high - low, 1e-9)
-    block = _Block(low, size)
     shown = cloud
+    tints: U8 | None = None
+    uvs: F32 | None = None
+    vertices, triangles = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
+    if isinstance(mesh, TexturedMesh):
+        vertices, triangles, uvs = mesh.positions, mesh.triangles, mesh.uvs
+    elif mesh is not None and len(mesh.triangles):
+        vertices, tints, triangles = decimated(*_outwards(mesh), MAX_TRIANGLES)
+    near = ((vertices >= low - size) & (vertices <= high + size)).all(axis=1)
+    triangles = triangles[near[triangles].all(axis=1)]
+    if len(triangles):
+        shown = vertices[np.unique(triangles)]
+        low, high = np.minimum(low, shown.min(axis=0)), np.maximum(high, shown.max(axis=0))
+        size = np.maximum(high - low, 1e-9)
+    block = _Block(low, size)
     if mesh is not None and len(mesh.triangles):
-        tints: U8 | None = None
-        uvs: F32 | None = None
-        if isinstance(mesh, TexturedMesh):
-            vertices, triangles, uvs = mesh.positions, mesh.triangles, mesh.uvs
-        else:
-            vertices, tints, triangles = decimated(*_outwards(mesh), MAX_TRIANGLES)
-        inside = ((vertices >= low - size) & (vertices <= high + size)).all(axis=1)
-        triangles = triangles[inside[triangles].all(axis=1)]
         block.add("mesh", vertices, tints, triangles, uvs)
-        shown = vertices[np.unique(triangles)] if len(triangles) else cloud
     inside = ((points >= low) & (points <= high)).all(axis=1)
     step = max(1, -(-int(inside.sum()) // MAX_POINTS))
     block.add("points", points[inside][::step], colours[inside][::step])
