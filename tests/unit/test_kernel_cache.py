@@ -14,7 +14,13 @@ from numba.core.caching import NullCache
 
 import pliant
 from pliant import cache, errors
-from pliant.compiler import kernel, kernel_cache, kernel_linking, reference_counts
+from pliant.compiler import (
+    kernel,
+    kernel_cache,
+    kernel_linking,
+    reference_counts,
+    subroutines,
+)
 
 _KERNEL = """
 from pliant.compiler.kernel import kernel
@@ -63,7 +69,7 @@ def _package(root: Path) -> Path:
     package, compiler = (root / "pliant" / name for name in ("algorithms", "compiler"))
     for folder in (package, compiler):
         folder.mkdir(parents=True)
-    for module in (kernel, kernel_cache, kernel_linking, reference_counts):
+    for module in (kernel, kernel_cache, kernel_linking, reference_counts, subroutines):
         source = Path(module.__file__)
         (compiler / source.name).write_bytes(source.read_bytes())
     for module in (cache, errors):
@@ -170,6 +176,21 @@ def test_fast_kernels_are_without_estimates_that_differ_between_processors() -> 
     (code,) = normalised.inspect_asm().values()  # type: ignore[attr-defined]
     assert "sqrt" in code
     assert "rsqrt" not in code
+
+
+def test_a_power_is_as_strict_as_its_kernel_whichever_was_compiled_first() -> None:
+    def power(x: float, n: int) -> float:
+        return x**n
+
+    for order in ("fast", "strict"), ("strict", "fast"):
+        codes: dict[str, str] = {}
+        for name in order:
+            compiled = (kernel.fast_kernel if name == "fast" else kernel.kernel)(power)
+            compiled._cache = NullCache()  # type: ignore[attr-defined]
+            assert compiled(2.0, 3) == 8.0
+            (codes[name],) = compiled.inspect_llvm().values()  # type: ignore[attr-defined]
+        assert "fmul reassoc" in codes["fast"]
+        assert "fmul reassoc" not in codes["strict"]
 
 
 def test_a_kernel_is_strict_whoever_calls_it_first() -> None:
