@@ -82,7 +82,7 @@ class CalibrationUncertainty(Parameters):
         default=0.0,
         ge=0.0,
         description="Standard deviation of the principal point across and down, as a share of the "
-        "focal length; 0 holds it",
+        "focal length; 0 holds it until the images contradict it",
     )
     prior_px: float = Field(
         default=1.0,
