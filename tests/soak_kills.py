@@ -40,7 +40,7 @@ from pliant.messages.types import Status
 from pliant.results.folder import MESH_FILES, SESSION_NAME, SURFELS_NAME
 from pliant_services.profiles import PROFILES
 
-TIMEOUT_S = 300.0
+TIMEOUT_S, LONGEST_S = 300.0, 1800.0
 LATER_S = 0.1
 """The longest time from a frame to the kill: some frames."""
 SETTINGS = ("--on-crash", "restart", "--set", "bus.checkpoint_frames=6")
@@ -102,7 +102,7 @@ def results(folder: Path, kind: Kind) -> dict[str, str]:
 def undisturbed(kind: Kind, folder: Path) -> dict[str, str]:
     """The results of a run in which nobody dies."""
     with running(*kind.arguments, *SETTINGS, "--output", folder) as run:
-        code, _, errors = run.finish()
+        code, _, errors = run.finish(LONGEST_S)
     assert code == 0, errors
     return results(folder, kind)
 

@@ -117,9 +117,9 @@ class Running:
     def send(self, kind: signal.Signals, service: str = "") -> None:
         os.kill(self.services[service] if service else self.process.pid, kind)
 
-    def finish(self) -> tuple[int, str, str]:
+    def finish(self, timeout_s: float = TIMEOUT_S) -> tuple[int, str, str]:
         """Exit code, stdout, and stderr from here on; no service may outlive its launcher."""
-        output, errors = self.process.communicate(timeout=TIMEOUT_S)
+        output, errors = self.process.communicate(timeout=timeout_s)
         survivors = [name for name, pid in self.services.items() if not has_ended(pid, 0.0)]
         assert not survivors, f"{survivors} outlived the launcher"
         assert "Traceback" not in errors, errors
