@@ -10,11 +10,7 @@ from pliant.algorithms.bundle.calibration import SharedCalibration, ideal_pixels
 from pliant.algorithms.bundle.normal_equations import SHARED
 from pliant.algorithms.bundle.packed_layout import build_packed_layout
 from pliant.algorithms.bundle.problem import BundleParameters, CalibrationUncertainty
-from pliant.algorithms.bundle.schur import (
-    SchurSystem,
-    gain_of_principal_point,
-    solve_schur,
-)
+from pliant.algorithms.bundle.schur import SchurSystem, solve_schur, system_at
 from pliant.algorithms.camera import PinholeCamera
 
 EXACT = BundleParameters(kernel_sigma_px=0.0, max_iterations=60, min_relative_decrease=1e-10)
@@ -241,6 +237,6 @@ def test_the_gain_of_a_principal_point_is_what_the_cost_falls_by_with_it():
     believed = with_lens(make_scene(cameras=6, points=150, noise_px=0.3).problem, a=0.01, b=-0.005)
     found = solve_schur(believed, EXACT, uncertainty=held)
     free = solve_schur(believed, EXACT, uncertainty=FREE, start=found.correction)
-    gain = gain_of_principal_point(believed, found, EXACT, FREE)
+    gain = system_at(believed, found, EXACT, FREE).gain_of_principal_point()
     assert gain == pytest.approx(2.0 * (found.final_cost - free.final_cost), rel=0.1)
-    assert gain_of_principal_point(believed, free, EXACT, FREE) < 1e-3 * gain
+    assert system_at(believed, free, EXACT, FREE).gain_of_principal_point() < 1e-3 * gain

@@ -191,6 +191,12 @@ class BundleResult:
     covariance: F64 = field(default_factory=lambda: np.zeros((6, 6)))
     log_focal: F64 = field(default_factory=lambda: np.zeros(0))
 
+    def residual_variance(self, problem: "BundleProblem") -> float:
+        """Of the residuals of the problem that was solved, px^2; 0 where nothing is redundant."""
+        unknowns = 3 * len(self.points_world) + 6 * len(self.T_world_camera)
+        redundancy = 2 * len(problem.points_px) - unknowns
+        return 2.0 * self.final_cost / redundancy if redundancy > 0 else 0.0
+
 
 def shared_intrinsics(camera: PinholeCamera, count: int) -> F64:
     """(count, 6) rows ``fx, fy, cx, cy, 0, 0``: one camera without distortion for all frames."""

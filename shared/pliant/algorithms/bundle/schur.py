@@ -116,44 +116,17 @@ def solve_schur(
     )
 
 
-def gain_of_focal(
+def system_at(
     problem: BundleProblem,
     found: BundleResult,
     parameters: BundleParameters,
     uncertainty: CalibrationUncertainty,
-    walk: FocalWalk,
-) -> tuple[float, F64]:
-    """How much less a linear step from what was found would cost, px^2, if the cameras had focal
-    lengths of their own; and these (M,).  (0, 0) where the step has no solution.
-
-    With b the right side of Eq. 9 and S its matrix that is ``b^T S^-1 b`` with them, less the same
-    without them.
-    """
-    system = _at_result(problem, found, parameters, uncertainty, walk)
-    return system.gain_of_focal(system.start())
-
-
-def gain_of_principal_point(
-    problem: BundleProblem,
-    found: BundleResult,
-    parameters: BundleParameters,
-    uncertainty: CalibrationUncertainty,
-) -> float:
-    """As ``gain_of_focal``, px^2, for the principal point of all cameras.
-
-    uncertainty: with a principal point that is unknown.
-    """
-    system = _at_result(problem, found, parameters, uncertainty, None)
-    return system.gain_of_principal_point(system.start())
-
-
-def _at_result(
-    problem: BundleProblem,
-    found: BundleResult,
-    parameters: BundleParameters,
-    uncertainty: CalibrationUncertainty,
-    walk: FocalWalk | None,
+    walk: FocalWalk | None = None,
 ) -> "SchurSystem":
+    """The system whose ``start`` is where an adjustment ended, to ask what further unknowns gain.
+
+    uncertainty: with these unknowns.   walk: as of ``solve_schur``.
+    """
     moved = replace(problem, T_world_camera=found.T_world_camera, points_world=found.points_world)
     layout = build_packed_layout(moved)
     calibration = SharedCalibration(
@@ -341,23 +314,25 @@ class SchurSystem:
             covariance[:, k] = np.inf if solution is None else solution[-1, :SHARED]
         return covariance
 
-    def gain_of_focal(self, state: State) -> tuple[float, F64]:
-        """As of the function."""
+    def gain_of_focal(self) -> tuple[float, F64]:
+        """How much less a linear step from the start would cost, px^2, for the focal lengths of the
+        cameras; and these (M,).  Zeros where the step has no solution."""
         assert self.focal is not None
-        rows = np.zeros((len(self.pattern.start) - 1, 6), np.bool_)
-        rows[self.focal.position] = True
-        gain, solution = self._gain_of(rows, state)
+        unknowns = np.zeros((len(self.pattern.start) - 1, 6), np.bool_)
+        unknowns[self.focal.position] = True
+        gain, solution = self._gain_of(unknowns)
         return gain, self.focal.steps(solution)
 
-    def gain_of_principal_point(self, state: State) -> float:
-        """As of the function."""
-        rows = np.zeros((len(self.pattern.start) - 1, 6), np.bool_)
-        rows[-1, 4:SHARED] = True
-        return self._gain_of(rows, state)[0]
+    def gain_of_principal_point(self) -> float:
+        """As ``gain_of_focal``, px^2, for the principal point that all cameras share."""
+        unknowns = np.zeros((len(self.pattern.start) - 1, 6), np.bool_)
+        unknowns[-1, 4:SHARED] = True
+        return self._gain_of(unknowns)[0]
 
-    def _gain_of(self, unknowns: BoolArray, state: State) -> tuple[float, F64]:
-        """``b^T S^-1 b`` less the same with some unknowns (N, 6) held, px^2, and ``S^-1 b``; zeros
-        where there is no solution."""
+    def _gain_of(self, unknowns: BoolArray) -> tuple[float, F64]:
+        """With b the right side of Eq. 9 and S its matrix: ``b^T S^-1 b`` less the same with some
+        unknowns (N, 6) held, and ``S^-1 b``."""
+        state = self.start()
         self.linearise(state)
         S, b, diagonal = self._reduced_system(state, _GAUGE_DAMPING)
         small = _GAUGE_DAMPING * diagonal

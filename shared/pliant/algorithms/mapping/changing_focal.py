@@ -21,7 +21,7 @@ from pliant.algorithms.bundle.problem import (
     BundleResult,
     CalibrationUncertainty,
 )
-from pliant.algorithms.bundle.schur import gain_of_focal
+from pliant.algorithms.bundle.schur import system_at
 from pliant.algorithms.bundle.varying_focal import FocalWalk
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.principal_point import with_principal_point
@@ -101,13 +101,12 @@ def evidence_of_change(
     uncertainty: CalibrationUncertainty, gaps: F64,
 ) -> Evidence:  # fmt: skip
     """What an adjustment leaves that focal lengths which change would explain."""
-    M = len(problem.T_world_camera)
-    told = 2 * len(problem.points_px) - 3 * len(problem.points_world) - 6 * M
-    if M < 3 or told <= 0:
+    M, variance = len(problem.T_world_camera), found.residual_variance(problem)
+    if M < 3 or variance == 0.0:
         return Evidence(0.0, np.zeros(M), gaps)
     # One focal length for all may be another one than was given: that is no change.
     wide = with_principal_point(uncertainty)
     wide = wide.model_copy(update={"focal": max(wide.focal, SPREAD)})
-    gain, step = gain_of_focal(problem, found, parameters, wide, walk_from(np.zeros(M), gaps))
-    variance = 2.0 * found.final_cost / told
-    return Evidence(gain / (M * variance) if variance > 0.0 else 0.0, step, gaps)
+    walk = walk_from(np.zeros(M), gaps)
+    gain, step = system_at(problem, found, parameters, wide, walk).gain_of_focal()
+    return Evidence(gain / (M * variance), step, gaps)

@@ -13,7 +13,7 @@ from pliant.algorithms.bundle.problem import (
     BundleResult,
     CalibrationUncertainty,
 )
-from pliant.algorithms.bundle.schur import gain_of_principal_point
+from pliant.algorithms.bundle.schur import system_at
 
 PRINCIPAL_POINT = 0.03
 """Standard deviation of an unknown principal point, as a share of the focal length."""
@@ -35,10 +35,8 @@ def contradicts_principal_point(
     uncertainty: CalibrationUncertainty,
 ) -> bool:  # fmt: skip
     """Whether what an adjustment leaves calls for another principal point than the one it held."""
-    residuals = 2 * len(problem.points_px)
-    redundancy = residuals - 3 * len(problem.points_world) - 6 * len(problem.T_world_camera)
-    if uncertainty.principal_point > 0.0 or redundancy <= 0 or found.final_cost <= 0.0:
+    variance = found.residual_variance(problem)
+    if uncertainty.principal_point > 0.0 or variance == 0.0:
         return False
-    variance = 2.0 * found.final_cost / redundancy
-    wide = with_principal_point(uncertainty)
-    return gain_of_principal_point(problem, found, parameters, wide) > 2.0 * _GAIN * variance
+    system = system_at(problem, found, parameters, with_principal_point(uncertainty))
+    return system.gain_of_principal_point() > 2.0 * _GAIN * variance
