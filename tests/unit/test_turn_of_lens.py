@@ -7,8 +7,9 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.mapping.first_map import BufferedFrame
+from pliant.algorithms.mapping.focal_hypotheses import find_start_of
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of, widened
+from pliant.algorithms.mapping.self_calibration import SelfCalibration, widened
 from pliant.algorithms.turn_of_lens import turn_of_lens
 
 GUESSED = PinholeCamera(fx=554.0, fy=554.0, cx=319.5, cy=239.5, width=640, height=480)

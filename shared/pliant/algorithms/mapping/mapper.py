@@ -18,6 +18,7 @@ from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, 
 from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.atlas import Atlas
 from pliant.algorithms.mapping.first_map import Start
+from pliant.algorithms.mapping.focal_hypotheses import find_start_of
 from pliant.algorithms.mapping.frame import Frame, IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.frame_pose import (
     adjust,
@@ -50,7 +51,7 @@ from pliant.algorithms.mapping.pose_quality import why_doubtful
 from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved, Segment
-from pliant.algorithms.mapping.self_calibration import SelfCalibration, find_start_of
+from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.start import with_minimum_parallax
 from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
 from pliant.algorithms.stages import StageTimer, no_stages

@@ -1,9 +1,8 @@
-"""A camera whose calibration is a guess: found at the start, and refined while the map grows.
+"""The estimate of a camera's calibration, refined while the map grows.
 
-The mapper works on pixels and images of an ideal pinhole camera: those that come, moved by what the
-images have told of the calibration so far.  A start is tried under several focal lengths; then all
-keyframes are adjusted together with the calibration, each time that their number has grown by a
-share, and what comes next is seen by the camera that was found.
+The mapper works on pixels and images of an ideal pinhole camera: the measured ones, corrected by
+the current estimate of the calibration.  All keyframes are adjusted together with the calibration
+each time that their number has grown by a share.  Later frames use the new estimate.
 """
 
 import dataclasses
@@ -11,21 +10,12 @@ import dataclasses
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.bundle.problem import (
-    BundleProblem,
-    BundleResult,
-    CalibrationUncertainty,
-    shared_intrinsics,
-)
-from pliant.algorithms.bundle.schur import solve_schur
+from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.map_delta import MapDelta
-from pliant.algorithms.mapping.backfill import backfill
-from pliant.algorithms.mapping.first_map import BufferedFrame, Start
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.principal_point import PRINCIPAL_POINT, with_principal_point
-from pliant.algorithms.mapping.start import find_start, waits_long, why_no_start
 from pliant.algorithms.tracks import FrameExtrema
 
 _GUESS = 0.05
@@ -33,9 +23,6 @@ _GUESS = 0.05
 
 _LENS = 0.1
 """Standard deviations of k1 and k2 of an unknown lens."""
-
-_HYPOTHESES = np.linspace(-2.0, 2.0, 7)
-"""Focal lengths that a start is tried under, in standard deviations of the prior."""
 
 _OF_LENS = np.arange(6) != 3
 """Which of a correction move pixels: all but the readout."""
@@ -54,7 +41,7 @@ _ROLLING = 1.0
 _SLOWEST = 0.1
 """Readout that a rolling shutter exceeds; less is what other errors look like."""
 
-_GROWTH = 1.4
+GROWTH = 1.4
 """The map is adjusted with its calibration whenever its keyframes are so many times more."""
 
 
@@ -64,7 +51,7 @@ class SelfCalibration:
 
     given: the camera as it was given, of the rectified images.
     correction: (6,) what is wrong with it, see ``solve_schur``.   covariance: (6, 6) of that.
-    next_keyframes: how many a map must have to be asked again.
+    next_keyframes: the number of keyframes at which the calibration is estimated again.
     changes: whether the focal length changes during the clip.   log_focal: of the newest frame
     relative to the correction's: see ``changing_focal``.
     """
@@ -191,8 +178,8 @@ class SelfCalibration:
         )
 
     def corrected(self, correction: F64, covariance: F64, keyframes: int) -> "SelfCalibration":
-        """With what so many keyframes told of it."""
-        following = max(keyframes + 1, int(np.ceil(_GROWTH * keyframes)))
+        """With the estimate of a number of keyframes."""
+        following = max(keyframes + 1, int(np.ceil(GROWTH * keyframes)))
         return dataclasses.replace(
             self, correction=correction, covariance=covariance, next_keyframes=following
         )
@@ -230,72 +217,3 @@ def widened(parameters: MappingParameters, focal_sigma: float) -> MappingParamet
 def is_guess(uncertainty: CalibrationUncertainty) -> bool:
     """Whether a calibration is so uncertain that a map needs a better one first."""
     return uncertainty.focal > _GUESS
-
-
-def find_start_of(
-    waiting: list[BufferedFrame], known: SelfCalibration, parameters: MappingParameters
-) -> tuple[Start, SelfCalibration] | str:
-    """As ``find_start``, and what the start tells of the camera where that is a guess still."""
-    if is_guess(parameters.calibration) and not known.next_keyframes:
-        return _find_start_of_guess(waiting, known, parameters)
-    camera = known.view.camera
-    found = find_start(waiting, camera, parameters)
-    if isinstance(found, str):
-        return found
-    return backfill(found, waiting, camera, parameters), known
-
-
-def _find_start_of_guess(
-    waiting: list[BufferedFrame], known: SelfCalibration, parameters: MappingParameters
-) -> tuple[Start, SelfCalibration] | str:
-    """The start under the focal length with which it agrees best with itself.
-
-    Where a turn and some lens explain the flow, or any of the focal lengths finds too little
-    parallax, it waits: a wrong one sees parallax in every turn.  Angles shrink as a focal length
-    grows; after a while the same parallax in px is enough for the longer ones.  Only the motion
-    that two views fit best is tried: a wrong focal length bends all until they are alike.  The map
-    begins anew with the right one (``calibration_bootstrap.py``), which compares them and waits for
-    more parallax: the farther the camera has moved, the fewer tracks agree with a wrong one.
-    """
-    sigma = parameters.calibration.focal
-    tried = [known.correction + k * sigma * np.eye(6)[0] for k in _HYPOTHESES]
-    cameras = [corrected_view(known.given, tuple(each.tolist())).camera for each in tried]
-    reason = why_no_start(waiting, known.view.camera, parameters)
-    if reason:
-        return reason
-    best: tuple[float, Start, F64] | None = None
-    start = parameters.start
-    for correction, camera in zip(tried, cameras, strict=True):
-        share = min(1.0, known.given.fx / camera.fx) if waits_long(waiting, start) else 1.0
-        wanted = {"patient_s": 0.0, "min_parallax_deg": share * start.min_parallax_deg}
-        limits = parameters.model_copy(update={"start": start.model_copy(update=wanted)})
-        found = find_start(waiting, camera, limits, motions=1)
-        if isinstance(found, str):
-            return found
-        refined = _refine(found, camera, parameters)
-        cost = refined.final_cost / len(found.points_px)
-        if best is None or cost < best[0]:
-            poses, points = refined.T_world_camera, refined.points_world
-            begun = dataclasses.replace(found, T_world_camera=poses, points_world=points)
-            best = cost, begun, correction + refined.correction
-    assert best is not None
-    _, begun, correction = best
-    following = int(np.ceil(_GROWTH * len(begun.frames)))
-    return begun, SelfCalibration(known.given, correction, known.covariance, following)
-
-
-def _refine(start: Start, camera: PinholeCamera, parameters: MappingParameters) -> BundleResult:
-    """The start with its focal length free."""
-    count = len(start.frames)
-    problem = BundleProblem(
-        T_world_camera=start.T_world_camera,
-        points_world=start.points_world,
-        camera_index=start.keyframe_index,
-        point_index=start.point_index,
-        points_px=start.points_px,
-        intrinsics=shared_intrinsics(camera, count),
-        fixed_cameras=np.arange(count) == 0,
-    )
-    held = {"k1": 0.0, "k2": 0.0, "readout": 0.0, "principal_point": 0.0}
-    uncertainty = parameters.calibration.model_copy(update=held)
-    return solve_schur(problem, parameters.bundle, uncertainty=uncertainty)
