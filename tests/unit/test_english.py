@@ -16,7 +16,6 @@ ROOT = Path(__file__).parents[2]
 LATER = {
     "CHANGELOG.md",
     "meshing.md",
-    "results.md",
 }
 PAGES = [
     page
