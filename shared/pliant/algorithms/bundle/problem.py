@@ -21,30 +21,32 @@ class BundleParameters(Parameters):
     kernel_sigma_px: float = Field(
         default=2.0,
         ge=0.0,
-        description="Scale of the Geman-McClure kernel in px; 0 means plain least squares",
+        description="Scale of the Geman-McClure kernel, px; 0: plain least squares",
     )
     min_depth: float = Field(
         default=1e-3,
-        description="Depth in map units under which a point counts as behind a camera and costs "
-        "what the kernel saturates at; a large negative number turns the test off",
+        description=(
+            "Depth, in map units, below which a landmark is behind the camera and costs the "
+            "kernel's maximum; a large negative number disables the test"
+        ),
     )
     max_iterations: int = Field(
         default=30,
         ge=1,
-        description="Most Levenberg-Marquardt iterations of the Schur solver",
+        description="Maximum Levenberg-Marquardt iterations of the Schur solver",
     )
     max_sweeps: int = Field(
-        default=4, ge=0, description="Most sweeps of the subspace solver on its own"
+        default=4, ge=0, description="Maximum sweeps of the subspace solver when it runs alone"
     )
     min_relative_decrease: float = Field(
         default=1e-5,
         ge=0.0,
-        description="Stop when an iteration or a sweep lowers the cost by less than this share",
+        description="Stop when an iteration or a sweep reduces the cost by less than this share",
     )
     initial_damping: float = Field(
         default=1e-4,
         gt=0.0,
-        description="First Levenberg-Marquardt damping, relative to the diagonal of the Hessian",
+        description="Initial Levenberg-Marquardt damping, relative to the diagonal of the Hessian",
     )
     sweep_damping: float = Field(
         default=1e-3,
@@ -59,36 +61,44 @@ class CalibrationUncertainty(Parameters):
     focal: float = Field(
         default=0.01,
         ge=0.0,
-        description="Standard deviation of the focal length, as a share of it; 0 holds it",
+        description="Standard deviation of the focal length, as a share of it; 0: fixed",
     )
     k1: float = Field(
         default=0.02,
         ge=0.0,
-        description="Standard deviation of the radial distortion k1 after rectification, by which "
-        "the border of the image counts less until k1 is found; 0: held",
+        description=(
+            "Standard deviation of the radial distortion k1 after rectification. Observations"
+            " near the border count less by it until k1 is estimated; 0: fixed"
+        ),
     )
     k2: float = Field(
         default=0.0,
         ge=0.0,
-        description="Standard deviation of the radial distortion k2 after rectification; 0: held",
+        description="Standard deviation of the radial distortion k2 after rectification; 0: fixed",
     )
     readout: float = Field(
         default=0.1,
         ge=0.0,
-        description="Standard deviation of the readout of a rolling shutter, as a share of the "
-        "frame interval; 0: every row is taken at once",
+        description=(
+            "Standard deviation of the rolling-shutter readout, as a share of the frame "
+            "interval; 0: global shutter"
+        ),
     )
     principal_point: float = Field(
         default=0.0,
         ge=0.0,
-        description="Standard deviation of the principal point across and down, as a share of the "
-        "focal length; 0 holds it until the images contradict it",
+        description=(
+            "Standard deviation of the principal point in x and y, as a share of the focal "
+            "length; 0: fixed until the images contradict it"
+        ),
     )
     prior_px: float = Field(
         default=1.0,
         gt=0.0,
-        description="Weight of this prior: one standard deviation costs as much as a residual of "
-        "this many px of one observation",
+        description=(
+            "Weight of this prior: one standard deviation costs as much as one observation "
+            "with a residual of this many px"
+        ),
     )
 
     @property

@@ -11,34 +11,47 @@ class NltgvParameters(Parameters):
     """What a user may change about smoothing.  Weights have no unit; see the module."""
 
     data_weight: float = Field(
-        default=0.5, gt=0.0, description="Weight of the data against the smoothness (lambda)."
+        default=0.5, gt=0.0, description="Weight of the data relative to the smoothness (lambda)."
     )
     slope_weight: float = Field(
-        default=3.0, gt=0.0, description="Weight of changes of slope against those of depth."
+        default=3.0, gt=0.0, description="Weight of slope changes relative to depth changes."
     )
     huber_sigmas: float = Field(
-        default=1.0, ge=0.0, description="Data deviate squared up to so many sigmas, then linearly."
+        default=1.0,
+        ge=0.0,
+        description="Data residuals cost quadratically up to this many sigmas, then linearly.",
     )
     edge_sigmas: float = Field(
         default=5.0,
         ge=0.0,
-        description="An edge that misses the surface by so many sigmas weighs half.  0: all alike.",
+        description=(
+            "An edge that misses the surface by this many sigmas has half the weight.  0: "
+            "equal weights."
+        ),
     )
     data_sigmas: float = Field(
         default=5.0,
         ge=0.0,
-        description="Data off the surface by so many sigmas weigh half.  0: all alike.",
+        description=(
+            "Data off the surface by this many sigmas have half the weight.  0: equal weights."
+        ),
     )
     reweightings: int = Field(
-        default=2, ge=1, le=50, description="How often weights are taken from the residuals."
+        default=2,
+        ge=1,
+        le=50,
+        description="Number of times that weights are computed from the residuals.",
     )
     max_iterations: int = Field(
-        default=200, ge=1, description="Most primal-dual iterations for one set of weights."
+        default=200, ge=1, description="Maximum primal-dual iterations for one set of weights."
     )
     min_change_sigmas: float = Field(
         default=0.04,
         ge=0.0,
-        description="Stop when an iteration changes inverse depth less (rms, in median sigmas).",
+        description=(
+            "Stop when an iteration changes the inverse depth by less than this (rms, in "
+            "median sigmas)."
+        ),
     )
     relaxation: float = Field(
         default=1.9, ge=1.0, lt=2.0, description="Over-relaxation of the iteration (rho)."
@@ -49,26 +62,26 @@ class TriangleFilterParameters(Parameters):
     """What a user may change about which triangles are kept."""
 
     max_edge_px: float = Field(
-        default=100.0, gt=0.0, description="Longest edge of a triangle in the image, px."
+        default=100.0, gt=0.0, description="Maximum edge of a triangle in the image, px."
     )
     max_depth_ratio: float = Field(
         default=1.4,
         gt=1.0,
-        description="Largest over smallest depth of a triangle's corners: more is a jump.",
+        description="Maximum ratio of depths of a triangle's corners: more is a discontinuity.",
     )
     max_slant_deg: float = Field(
         default=75.0,
         gt=0.0,
         le=90.0,
-        description="Largest angle between a triangle's normal and the ray to its centre, degrees.",
+        description="Maximum angle between a triangle's normal and the ray to its centre, degrees.",
     )
     max_relative_sigma: float = Field(
         default=0.1,
         gt=0.0,
-        description="Corners whose inverse depth is less certain (sigma over itself) are not used.",
+        description="Maximum relative sigma of a corner's inverse depth.",
     )
     min_observations: int = Field(
-        default=2, ge=1, description="Corners seen in fewer frames are not used."
+        default=2, ge=1, description="Minimum frames that observe a corner."
     )
 
 
@@ -76,15 +89,20 @@ class SurfaceParameters(Parameters):
     """How the points of a keyframe become a surface."""
 
     smoothing: Literal["nltgv", "laplacian", "none"] = Field(
-        default="nltgv", description="How inverse depth is smoothed; the others are to compare."
+        default="nltgv",
+        description=(
+            "Smoothing of the inverse depth; methods other than the default are for comparison."
+        ),
     )
     max_error_px: float = Field(
-        default=2.0, gt=0.0, description="Points that project farther from where they are seen, px"
+        default=2.0,
+        gt=0.0,
+        description="Landmarks with a larger reprojection error are not used, px.",
     )
     noise_px: float = Field(
         default=0.5,
         gt=0.0,
-        description="Standard deviation of an observation, px: scales the uncertainty of points.",
+        description="Standard deviation of an observation, px: scales their uncertainty.",
     )
     nltgv: NltgvParameters = NltgvParameters(data_weight=1.0)
     triangles: TriangleFilterParameters = TriangleFilterParameters()
@@ -100,40 +118,48 @@ class TsdfParameters(Parameters):
         default=1 / 20,
         gt=0.0,
         le=1.0,
-        description="Voxel of the live mesh, as a share of the scene's median depth.",
+        description="Voxel size of the live mesh, as a share of the scene's median depth.",
     )
     fine_voxel: float = Field(
         default=1 / 120,
         gt=0.0,
         le=1.0,
-        description="Voxel of the final mesh, as a share of the scene's median depth.",
+        description="Voxel size of the final mesh, as a share of the scene's median depth.",
     )
     truncation_voxels: float = Field(
         default=4.0,
         ge=2.0,
         le=16.0,
-        description="Distances to the surface are kept up to so many voxels.",
+        description="Truncation distance of the TSDF, voxels.",
     )
     min_weight: float = Field(
         default=0.1,
         ge=0.0,
-        description="Voxels whose weights sum to less are not meshed: one sight, face on, weighs 1 "
-        "where its depth is certain, 0.5 where it may be 1 % off, 0.1 where it may be 3 % off.",
+        description=(
+            "Minimum weight of a meshed voxel: one frontal view has 1 with certain depth, 0.5"
+            " with a sigma of 1 %, 0.1 with 3 %."
+        ),
     )
     dense_min_weight: float = Field(
         default=0.01,
         ge=0.0,
-        description="The same for meshing.depth=dense, which fills with a weight of 0.01 what no "
-        "keyframe has a surface of.",
+        description=(
+            "The same for meshing.depth=dense, which fills areas without any surface with a "
+            "weight of 0.01."
+        ),
     )
     free_space: bool = Field(
-        default=True, description="What a keyframe sees through counts against surface there."
+        default=True,
+        description="Space in front of a keyframe's surface counts against other surface there.",
     )
     max_memory_mb: int = Field(
         default=1000,
         ge=1,
-        description="Memory of one volume, MB.  What the final mesh needs beyond it is on disk, in "
-        "TMPDIR or /var/tmp.  A voxel with which a single keyframe needs more is refused.",
+        description=(
+            "Memory of one volume, MB.  The final mesh stores more in a temporary file "
+            "(TMPDIR or /var/tmp).  A voxel size with which a single keyframe exceeds it is "
+            "refused."
+        ),
     )
 
 

@@ -40,8 +40,10 @@ class SurfelParameters(Parameters):
     strain: float = Field(
         default=0.02,
         gt=0.0,
-        description="Relative change of the distance of neighbours that is as likely as a residual "
-        "of 5 DN.  Less is a stiffer surface.",
+        description=(
+            "Relative change of the distance between neighbours that costs as much as a "
+            "residual of 5 DN.  Smaller values make the surface stiffer."
+        ),
     )
     bend: float = Field(
         default=0.3, gt=0.0, description="The same for the angle between neighbours, rad."
@@ -49,36 +51,47 @@ class SurfelParameters(Parameters):
 
     depth_from: Literal["sensor", "map", "flat"] = Field(
         default="sensor",
-        description="Where surfels start: sensor: depth maps that come with the images.  map: our "
-        "own map of a scene that holds nearly still at first, seen by a camera that moves.  flat: "
-        "a plane in front of the camera, one unit away; then only motion in the image is right.",
+        description=(
+            "Initial depth: sensor: depth maps that come with the images.  map: Pliant's own "
+            "map of a scene that is nearly static at first, with a moving camera.  flat: a "
+            "plane in front of the camera, one unit away; then only motion in the image is "
+            "valid."
+        ),
     )
     map_keyframes: int = Field(
-        default=5, ge=2, description="Keyframes that our own map has before surfels start on it."
+        default=5, ge=2, description="Keyframes of Pliant's own map before surfels start on it."
     )
     map_sigma: float = Field(
         default=0.01,
         gt=0.0,
-        description="Points of our own map count whose depth is known to this share of itself, for "
-        "half a pixel of noise.",
+        description=(
+            "Maximum relative depth sigma of the map points that are used, for half a pixel "
+            "of noise."
+        ),
     )
     map_points: int = Field(
-        default=200, ge=3, description="Such points in the keyframe on which surfels start."
+        default=200,
+        ge=3,
+        description="Minimum number of such points in the keyframe on which surfels start.",
     )
     map_birth_sigma: float = Field(
         default=0.005,
         gt=0.0,
-        description="As map_sigma, for surfels that are born later, on keyframes of our own map "
-        "that the others agree with: new surface has been seen for a short while.",
+        description=(
+            "The same maximum for surfels that are created later, on surface that was "
+            "observed for a short time."
+        ),
     )
     prediction: Literal["auto", "none", "tracks"] = Field(
         default="auto",
-        description="tracks: each surfel starts where the extrema about it went, and else where "
-        "the dominant flow leads (not in the paper; the tracking service runs, too).  auto: where "
-        "the tracking service runs anyway.",
+        description=(
+            "tracks: predict each surfel by the extrema around it, otherwise by the dominant "
+            "flow (not in the paper; needs the tracking service).  auto: tracks if the "
+            "tracking service runs anyway."
+        ),
     )
 
-    max_surfels: int = Field(default=500, ge=1, le=20_000, description="Most surfels at a time.")
+    max_surfels: int = Field(default=500, ge=1, le=20_000, description="Maximum number of surfels.")
     patch_px: int = Field(
         default=23,
         ge=7,
@@ -87,38 +100,47 @@ class SurfelParameters(Parameters):
     )
     levels: int = Field(default=4, ge=1, le=6, description="Levels of the pyramid.")
     spacing_px: int = Field(
-        default=7, ge=1, description="Non-maximum suppression of corners and room of a surfel, px."
+        default=7, ge=1, description="Minimum distance between corners and between surfels, px."
     )
     min_strength: float = Field(
         default=4.0,
         ge=0.0,
-        description="Least smaller eigenvalue of a corner's structure tensor, DN^2 per px^2.",
+        description="Minimum smaller eigenvalue of a corner's structure tensor, DN^2 per px^2.",
     )
     max_depth_residual: float = Field(
         default=0.005,
         gt=0.0,
-        description="Most rms of the fit of a surfel's tangent plane, relative to depth.",
+        description="Maximum rms residual of a surfel's tangent plane, relative to depth.",
     )
     highlight: float = Field(
-        default=250.0, gt=0.0, description="Brighter pixels are highlights and do not count, DN."
+        default=250.0,
+        gt=0.0,
+        description="Pixels brighter than this are highlights and do not count, DN.",
     )
 
     min_zncc: float = Field(
         default=0.85,
         ge=-1.0,
         le=1.0,
-        description="A surfel that correlates less is an outlier (paper: 0.95 for the Kinect "
-        "sequences, 0.85 in the body).",
+        description=(
+            "Minimum ZNCC of a tracked surfel; below it is an outlier (paper: 0.95 for the "
+            "Kinect sequences, 0.85 in the body)."
+        ),
     )
     min_visible: float = Field(
-        default=0.5, ge=0.0, le=1.0, description="With less of its patch seen it is occluded."
+        default=0.5,
+        ge=0.0,
+        le=1.0,
+        description="Minimum visible share of its patch; below it is occluded.",
     )
     lost_after_s: float = Field(
-        default=0.52, ge=0.0, description="Seconds without success until a surfel is lost."
+        default=0.52, ge=0.0, description="Seconds without tracking after which a surfel is lost."
     )
     forget_after_s: float = Field(
-        default=4.99, ge=0.0, description="Seconds lost until a surfel is given up for a new one."
+        default=4.99, ge=0.0, description="Seconds after which a lost surfel is removed."
     )
     min_alive: int = Field(
-        default=8, ge=1, description="With fewer surfels tracked, tracking as a whole is lost."
+        default=8,
+        ge=1,
+        description="Minimum tracked surfels; with fewer, tracking as a whole is lost.",
     )

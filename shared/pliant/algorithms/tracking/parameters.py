@@ -12,17 +12,17 @@ class TrackingParameters(Parameters):
         default=1.0, ge=0.5, le=1.3, description="Gaussian before the derivatives of Eq. 1, px."
     )
     min_curvature: float = Field(
-        default=0.5, ge=0.0, description="Extrema with a smaller |kappa| are not used, DN^3."
+        default=0.5, ge=0.0, description="Minimum |kappa| of an extremum, DN^3."
     )
     both_signs: bool = Field(
         default=True,
-        description="Track minima of kappa (bright features) besides maxima (dark ones).",
+        description="Track minima of kappa (bright features) as well as maxima (dark ones).",
     )
     max_tracks: int = Field(
-        default=10_000, ge=100, le=100_000, description="Most tracks in a frame."
+        default=10_000, ge=100, le=100_000, description="Maximum tracks in a frame."
     )
     spacing_px: int = Field(
-        default=2, ge=0, le=20, description="A new track starts at least this far from every other."
+        default=2, ge=0, le=20, description="Minimum distance of a new track to all others, px."
     )
     cell_px: int = Field(
         default=40,
@@ -36,10 +36,10 @@ class TrackingParameters(Parameters):
         description="Scale of the Geman-McClure kernel of the affine fit (Eq. 3), px.",
     )
     flow_points: int = Field(
-        default=300, ge=20, le=4000, description="Most BRIEF points for the dominant flow."
+        default=300, ge=20, le=4000, description="Maximum BRIEF points for the dominant flow."
     )
     flow_max_shift_px: float = Field(
-        default=180.0, gt=0.0, description="Longest displacement between matched BRIEF points, px."
+        default=180.0, gt=0.0, description="Maximum displacement between matched BRIEF points, px."
     )
     prediction_weight: float = Field(
         default=1.0,
@@ -48,70 +48,81 @@ class TrackingParameters(Parameters):
     )
     prediction_sigma_px: float = Field(default=3.0, gt=0.0, description="Scale of w in Eq. 5, px.")
     max_correction_px: float = Field(
-        default=5.0, gt=0.0, description="Longest distance of an extremum from its prediction, px."
+        default=5.0,
+        gt=0.0,
+        description="Maximum distance between an extremum and its prediction, px.",
     )
 
     local_flow: bool = Field(
         default=True,
-        description="Predict with a coarse-to-fine grid of local flow, not an affine alone.",
+        description="Predict with a coarse-to-fine local flow grid, not one affine motion.",
     )
-    subpixel: bool = Field(default=True, description="Place extrema by a parabola, not on pixels.")
+    subpixel: bool = Field(
+        default=True, description="Locate extrema by a parabola, not on whole pixels."
+    )
     patch_refinement: bool = Field(
         default=True,
-        description="Refine by a small patch, which also carries a track through frames without "
-        "an extremum.",
+        description=(
+            "Refine by a small patch, which also carries a track through frames without an "
+            "extremum."
+        ),
     )
     turn_patches: bool = Field(
         default=True,
-        description="Turn and scale patches with the surface that they show.",
+        description="Rotate and scale patches with their surface.",
     )
     patch_iterations: int = Field(
-        default=4, ge=1, le=20, description="Most Gauss-Newton steps of a patch in a frame."
+        default=4, ge=1, le=20, description="Maximum Gauss-Newton steps of a patch in a frame."
     )
     min_zncc: float = Field(
         default=0.88,
         ge=-1.0,
         le=1.0,
-        description="A patch that correlates less has lost its point.",
+        description="Minimum ZNCC of a patch; below it the track is lost.",
     )
     min_residual: float = Field(
         default=1.5,
         ge=0.0,
-        description="RMS in grey levels under which ZNCC > min_zncc is not required.",
+        description="RMS residual, grey levels, below which min_zncc is not required.",
     )
     min_strength: float = Field(
         default=1.0,
         ge=0.0,
-        description="Smaller eigenvalue of a patch's tensor per pixel, DN^2: births.",
+        description="Minimum smaller eigenvalue of a new patch's structure tensor per pixel, DN^2.",
     )
     min_isotropy: float = Field(
         default=0.05,
         ge=0.0,
         le=1.0,
-        description="Smaller over larger eigenvalue of a patch's tensor: births.  A patch with "
-        "less lies on a contour, and slides along it as the contour turns.",
+        description=(
+            "Minimum ratio of the eigenvalues of a new patch's structure tensor.  A patch "
+            "below it lies on a contour and slides along it."
+        ),
     )
     fine_strength: float = Field(
         default=0.7,
         ge=0.0,
-        description="Patches of less than this are taken at half size, to see twice as far, DN^2.",
+        description="Patches weaker than this are taken at half size, with twice the extent, DN^2.",
     )
     extremum_gate_px: float = Field(
         default=1.0,
         gt=0.0,
-        description="A patch that ends farther from its extremum coasts instead, px.",
+        description="Maximum distance between a patch and its extremum, px; beyond, it coasts.",
     )
     coast_s: float = Field(
-        default=0.68, ge=0.0, description="Most seconds in a row without an extremum."
+        default=0.68, ge=0.0, description="Maximum consecutive seconds without an extremum."
     )
     coast_gate_px: float = Field(
         default=3.0,
         gt=0.0,
-        description="A coasting patch that strays farther from the flow is lost, px.",
+        description="Maximum distance of a coasting patch from the flow, px.",
     )
     backward_gate_px: float = Field(
         default=0.7,
         gt=0.0,
-        description="A coasting patch with a strength of 1 DN^2 must lead back this near to where "
-        "it was, px; others by one over the root of their strength, 0.25 to 1 px.",
+        description=(
+            "Maximum distance between the start and the backward-tracked position of a "
+            "coasting patch with a strength of 1 DN^2, px; it scales with one over the root "
+            "of the strength, 0.25 to 1 px."
+        ),
     )
