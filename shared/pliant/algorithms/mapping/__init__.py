@@ -1,1 +1,1 @@
-"""The map: its start, its growth frame by frame, and the pose of every frame in it."""
+"""The map: how it starts and grows, and the pose of every frame in it."""

@@ -1,4 +1,4 @@
-"""The segment that the camera is in: tracks linked to its points, a window over its keyframes."""
+"""The segment that the camera is in: tracks linked to its landmarks, and a window of keyframes."""
 
 import bisect
 
@@ -48,11 +48,11 @@ _MAX_STRIKES = 3
 
 
 class ActiveMap:
-    """A segment while the camera is followed in it.
+    """A segment while the camera is tracked in it.
 
-    points: rows shared by all segments.   next_keyframe_id: of the keyframe to come.
-    links: rows of the living tracks.   window: the keyframes under adjustment.
-    room: observations that it may have.   seen_by: the calibration whose pixels it has.
+    points: rows shared by all segments.   next_keyframe_id: of the keyframe to come. links: rows of
+    the living tracks.   window: the keyframes under adjustment. room: maximum number of
+    observations.   seen_by: the calibration whose pixels it has.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class ActiveMap:
         self.room = parameters.window.kept_observations
         self.links = TrackLinks()
         self.window = self._window([], fixed=0, outside=0)
-        self.candidates_agree = True  # with the points of the map, in the current frame
+        self.candidates_agree = True  # with the landmarks, in the current frame
         self._nearby: I32 = np.zeros(0, np.int32)
         self._marks: I64 = np.zeros(0, np.int64)
 
@@ -86,16 +86,16 @@ class ActiveMap:
 
     @property
     def camera(self) -> PinholeCamera:
-        """Whose pixels it has."""
+        """The ideal camera whose pixels the segment has."""
         return self.seen_by.view.camera
 
     @property
     def keyframes(self) -> list[Keyframe]:
-        """Those of the segment, oldest first."""
+        """The keyframes of the segment, oldest first."""
         return self.segment.keyframes
 
     def begin(self, start: Start, waiting: list[BufferedFrame], latest: IdealFrame) -> None:
-        """Take over a start.   latest: the newest of the waiting frames, with its image."""
+        """Initialise from a start.   latest: the newest waiting frame, with its image."""
         newest = waiting[-1]
         rows = self._allocate(len(start.ids))
         self.points.kappas[rows] = start.kappas
@@ -120,11 +120,11 @@ class ActiveMap:
                 None,
             )  # fmt: skip
         for keyframe in self.keyframes[: -self.parameters.window.keyframes - 1]:
-            self.segment.leave_window(keyframe)  # one more leaves with each that comes
+            self.segment.leave_window(keyframe)  # rebuild_window removes one more
         self._settle(self.keyframes[-1], latest)
 
     def linked(self, state: int) -> I64:
-        """Indices of the living tracks whose row has the given state."""
+        """Return the indices of the living tracks whose row has this state."""
         return self.links.in_state(self.points.state, state)
 
     def nearby(self) -> I32:
@@ -199,7 +199,7 @@ class ActiveMap:
         shared, before, flow_px = self.window.flow_since_keyframe(MAPPED)
         if shared < self.parameters.start.min_points and len(self.helping_candidates()):
             shared, before, flow_px = self.window.flow_since_keyframe(CANDIDATE)
-            in_view = shared  # the others have no place to look for them
+            in_view = shared  # candidates without a depth have no predicted position
         else:
             in_view = max(shared, self.window.in_view_since_keyframe())
         unit = size_unit(self.camera.width, self.camera.height)
@@ -207,7 +207,9 @@ class ActiveMap:
         return Overlap(shared / before, in_view / before, flow_px / unit, age_s, interval_s)
 
     def observed(self, placed: PlacedFrame, candidates: I64) -> tuple[I32, F32]:
-        """Rows and pixels of the points that place the current frame."""
+        """Return rows and pixels of the landmarks and candidates that determine the current
+        pose.
+        """
         return self._observed(placed, np.concatenate([self.linked(MAPPED), candidates]))
 
     def see(self, placed: PlacedFrame) -> None:
@@ -215,14 +217,14 @@ class ActiveMap:
         self.window.see(placed.T_world_camera, *self._seen(placed))
 
     def add_ordinary(self, placed: PlacedFrame) -> None:
-        """The current frame is no keyframe: it hangs on the last one."""
+        """Attach the current frame, which is no keyframe, to the last keyframe."""
         self.segment.ordinary.add(
             placed.frame.number, self.keyframes[-1], placed.T_world_camera, *self._seen(placed),
             self.seen_by.log_focal,
         )  # fmt: skip
 
     def _seen(self, placed: PlacedFrame) -> tuple[I32, F32]:
-        """Rows and pixels of all points and candidates that the current frame sees."""
+        """Rows and pixels of all landmarks and candidates in the current frame."""
         return self._observed(placed, np.flatnonzero(self.links.rows != UNLINKED))
 
     def _observed(self, placed: PlacedFrame, tracks: I64) -> tuple[I32, F32]:
@@ -231,7 +233,7 @@ class ActiveMap:
         return rows, np.concatenate([points_px[tracks], found.points_px])
 
     def join(self, loop: Loop) -> None:
-        """Points that a loop has shown to be the same become one, as far as they still exist."""
+        """Merge the landmarks that a loop has shown to be the same, if they still exist."""
         points = self.points
         for old, new in loop.living(points).rows[:, :, None]:
             if points.state[old] == MAPPED and points.state[new] == MAPPED and old != new:
@@ -263,7 +265,7 @@ class ActiveMap:
         return keyframe
 
     def _settle(self, newest: Keyframe, frame: IdealFrame) -> None:
-        """Adjust the window after a keyframe has come to it."""
+        """Adjust the window after a new keyframe."""
         self.collect_garbage()
         self.rebuild_window()
         self.window.triangulate(self.parameters.point)
@@ -285,7 +287,7 @@ class ActiveMap:
         segment.inverse_distance = self.window.place_candidates(segment.inverse_distance)
 
     def _link_new_tracks(self, points_px: F32) -> I64:
-        """Give candidate rows to tracks that have none.  Returns the indices of those tracks."""
+        """Give candidate rows to tracks without one.  Returns the indices of those tracks."""
         new = np.flatnonzero(self.links.rows == UNLINKED)
         self.links.rows[new] = self._allocate(len(new))
         return new
@@ -322,14 +324,16 @@ class ActiveMap:
         return keyframe
 
     def begin_global_shutter(self, calibration: SelfCalibration) -> None:
-        """The readout has become known: the map is bent until its window is adjusted with it."""
+        """Convert the segment to a global shutter once the readout is estimated, and adjust the
+        window.
+        """
         self.segment.to_global_shutter(self.keyframes, calibration)
         self.segment.ordinary.forget()
         self.window.see_anew()
         self._adjust_window()
 
     def see_anew(self, seen_by: SelfCalibration) -> None:
-        """The camera is another one by now, and the keyframes have its pixels."""
+        """Use another calibration, in whose pixels the keyframes already are."""
         self.seen_by, before = seen_by, self.window
         self.window = self._window(before.keyframes, fixed=before.fixed, outside=before.outside)
         self.window.T_world_camera[-1] = before.T_world_camera[-1]
@@ -338,16 +342,16 @@ class ActiveMap:
             self._place_candidates()
 
     def collect_garbage(self) -> None:
-        """Give back the rows of dead candidates and of merged points.
+        """Free the rows of dead candidates and of merged landmarks.
 
-        Candidates live while their tracks may come back: after a blurred frame they are most of
-        what there is for a pose.
+        Candidates live while their tracks may come back: after a blurred frame, a pose depends
+        mostly on them.
         """
         living = np.concatenate([self.links.rows, self.links.awaited()])
         collect_garbage(self.points, self.keyframes, living, self.segment.id)
 
     def rebuild_window(self) -> None:
-        """The newest keyframes move; older ones that see the same points are fixed."""
+        """The newest keyframes are free; older covisible ones are fixed."""
         sizes, segment = self.parameters.window, self.segment
         first = segment.first_of_window(sizes.keyframes)
         moving = self.keyframes[first:]
@@ -356,16 +360,18 @@ class ActiveMap:
         self._make_room(first)
         outside = self.keyframes[: len(self.keyframes) - len(moving)]
         older = near_keyframes(outside, moving[-1].T_world_camera, _NEAR_KEYFRAMES)
-        # What was there before the camera was recognised takes the place of what will be.
+        # After recognition, keyframes of the earlier visit fill the window until new ones do.
         count = max(sizes.fixed, sizes.keyframes - len(moving))
         fixed = most_shared(older, moving, self.points)[:count] if older else []
         self._activate(older, fixed, moving)
 
     def _make_room(self, first: int) -> None:
-        """Thin what has left the window, as soon as it has been adjusted with the whole map: as it
-        is found then, it stays.   first: index of the first keyframe of the window."""
+        """Sparsify what has left the window and was adjusted globally: its state is then final.
+
+        first: index of the first keyframe of the window.
+        """
         segment, room, adjusted = self.segment, self.room, self.segment.adjusted >= 0
-        settled = first - 1  # not the one that has just left: it is not published yet
+        settled = first - 1  # the keyframe that has just left is not published yet
         if adjusted:
             ids = [keyframe.id for keyframe in self.keyframes]
             newest = min(segment.adjusted, segment.ordinary.first_keyframe - 1)
@@ -387,13 +393,16 @@ class ActiveMap:
         self._nearby = rows_of(older, self.window.rows, len(self.points.state))
 
     def activate_near_keyframe(self, seen: Keyframe) -> None:
-        """The camera has been recognised, and sees what a keyframe saw: the next frame is one, and
-        what has been mapped stays where it is."""
+        """After recognition: the next frame becomes a keyframe, and the landmarks near ``seen`` are
+        fixed.
+        """
         older = most_shared(self.keyframes, [seen], self.points)[:_NEAR_KEYFRAMES]
         self._activate(older, older[: self.parameters.window.keyframes], [])
 
     def activate_near(self, T_world_camera: F64) -> None:
-        """What keyframes see that look where a camera does is looked for from now on."""
+        """From now on search for the landmarks of keyframes that look at the same place as the
+        camera.
+        """
         self._activate(near_keyframes(self.keyframes, T_world_camera, _NEAR_KEYFRAMES), [], [])
 
     def move(self, moves: MapMoves) -> F64:
@@ -407,12 +416,13 @@ class ActiveMap:
         known, moves = self.segment.adjust(known, self.parameters)
         self.seen_by = known
         self.rebuild_window()
-        self._place_candidates()  # they were placed in the map that it was
+        self._place_candidates()  # their positions are those before the adjustment
         return known, moves
 
     def close(self) -> None:
-        """The camera is not followed here any more: what could only have become a part of the
-        segment is given back."""
+        """The camera has left the segment: free the candidates, which only tracking could have
+        mapped.
+        """
         self.links = TrackLinks()
         self.collect_garbage()
         self.segment.rest(self.parameters.window.keyframes)

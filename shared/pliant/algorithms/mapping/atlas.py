@@ -1,9 +1,10 @@
-"""The atlas: all segments of the map, that which the camera is in and earlier ones.
+"""The atlas: all segments of the map, the active one and earlier ones.
 
-A segment begins where a map starts.  It becomes an earlier one where the camera is lost for long or
-is recognised in another, goes on where the camera is recognised in it, and two become one where
-they see the same place.  What drifts in the one that the camera is in is adjusted as a whole beside
-the frames; what else moves it is told by how its end has moved, for what follows from there.
+A segment begins where a map starts.  It becomes an earlier segment when the camera is lost for long
+or is recognised in another segment.  It becomes active again when the camera is recognised in it.
+Two segments that see the same place are merged.  The active segment is adjusted as a whole in
+parallel with tracking.  Every other correction is reported as the motion of the segment's end,
+which later frames follow.
 """
 
 import heapq
@@ -37,8 +38,10 @@ from pliant.algorithms.tracks import FrameTracks
 
 
 class Atlas:
-    """points: of all segments.   calibration: of the camera.   active: the segment that it is in;
-    None: in none.   segment: number of that, or of the last one; -1 before the first.
+    """All segments of the map.
+
+    points: of all segments.   calibration: of the camera.   active: the segment that the camera is
+    in, or None.   segment: its number, or that of the last one; -1 before the first.
     global_adjustment: of the active segment.   places: where the camera may be recognised.
     """
 
@@ -48,7 +51,7 @@ class Atlas:
         parameters: MappingParameters,
         known: Sequence[KeptKeyframe] = (),
     ) -> None:
-        """known: a map of earlier sessions; what is new is numbered on."""
+        """known: a loaded map; new keyframes and segments continue its numbers."""
         self.points = Landmarks()
         self.calibration = calibration
         self.active: ActiveMap | None = None
@@ -61,14 +64,14 @@ class Atlas:
         self._spans = spans_of(known)
         self._next_segment = 1 + max((each.segment for each in known), default=-1)
         self._next_keyframe = known[-1].id + 1 if known else 0
-        self._adjusted = False  # all of the active segment, and it is not published yet
+        self._adjusted = False  # the whole active segment, not published yet
         self._adjusts = parameters.window.final_adjustment
         for segment in take_in(known, self.points, calibration):
             self._earlier.keep(segment, calibration, known=True)
         self.places.know(known, calibration)
 
     def kept(self) -> Iterator[KeptKeyframe]:
-        """The map as it is to be kept, oldest keyframe first.  Once the stream has ended."""
+        """Yield the keyframes of the map to be saved, oldest first, once the stream has ended."""
         segments = self.everything()
         session = 1 + max((origin.session for origin in self._origins.values()), default=-1)
         made = (keyframe for segment, _ in segments for keyframe in segment.keyframes)
@@ -78,7 +81,7 @@ class Atlas:
         yield from heapq.merge(*each, key=lambda keyframe: keyframe.id)
 
     def everything(self) -> list[tuple[Segment, SelfCalibration]]:
-        """All segments, with the calibration whose pixels each has."""
+        """Return all segments, each with the calibration whose pixels it has."""
         segments = self._earlier.everything()
         if self.active is not None:
             segments.append((self.active.segment, self.calibration))
@@ -86,12 +89,12 @@ class Atlas:
 
     @property
     def point_count(self) -> int:
-        """Points of the map now, of all segments."""
+        """Number of landmarks in all segments."""
         return self.points.culled + int(np.count_nonzero(self.points.state == MAPPED))
 
     @property
     def dropped(self) -> dict[str, int]:
-        """How many keyframes and points the map had no more room for, where it had not."""
+        """Counts of dropped keyframes and landmarks; empty if nothing was dropped."""
         keyframes = self._earlier.dropped_keyframes
         keyframes += sum(len(segment.dropped) for segment, _ in self.everything())
         counts = {"given_up_keyframes": keyframes, "given_up_points": self.points.culled}
@@ -104,8 +107,9 @@ class Atlas:
         waiting: list[BufferedFrame],
         latest: IdealFrame,
     ) -> ActiveMap:
-        """A segment begins.  calibration: as the start tells it.   latest: the newest of the frames
-        that waited, with its image."""
+        """Begin a segment.   calibration: that of the start.   latest: the newest waiting frame,
+        with its image.
+        """
         self.calibration = calibration
         active = self._enter(Segment(id=self._next_segment, points=self.points))
         self._next_segment += 1
@@ -117,7 +121,7 @@ class Atlas:
         return active
 
     def _enter(self, segment: Segment) -> ActiveMap:
-        """The camera is in a segment."""
+        """Make a segment the active one."""
         self.active = ActiveMap(segment, self._next_keyframe, self.calibration, self._parameters)
         self.active.room = self._earlier.share_room(self.points, self._parameters.window)
         self.segment = segment.id
@@ -125,12 +129,12 @@ class Atlas:
         return self.active
 
     def _forget_jobs(self) -> None:
-        """They are of the segment that the camera was in before."""
+        """Drop the jobs of the segment that the camera was in before."""
         self.global_adjustment = GlobalAdjustment()
         self.places.enter()
 
     def recognise(self, grey: U8, maxima: F32, generator: np.random.Generator) -> Recognised | None:
-        """What an image (H, W) with its maxima (M, 3) of curvature shows of any segment."""
+        """Recognise the place in an image (H, W) with curvature maxima (M, 3), in any segment."""
         segments = self._earlier.like(self.calibration)
         if self.active is not None:
             segments = [self.active.segment, *segments]
@@ -141,7 +145,7 @@ class Atlas:
         )
 
     def go_on(self, seen: Keyframe, ids: I64) -> None:
-        """The camera has been recognised: its segment goes on at the place that a keyframe saw.
+        """Continue the segment of a recognised keyframe at its place.
 
         ids: of the tracks.
         """
@@ -149,14 +153,14 @@ class Atlas:
         self.leave()
         active = self._enter(self._earlier.take(seen.segment))
         if stays:
-            self.global_adjustment.withdraw()  # nobody knows how what is new would move
+            self.global_adjustment.withdraw()  # its result would not apply to the new frames
         else:
             self._forget_jobs()
         active.activate_near_keyframe(seen)
         active.links.follow(ids, self.points)
 
     def leave(self) -> None:
-        """The camera is not in its segment any more, which becomes an earlier one."""
+        """Close the active segment, which becomes an earlier one."""
         if self.active is None:
             return
         self.active.close()
@@ -165,13 +169,13 @@ class Atlas:
         self.active = None
 
     def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
-        """A frame has a pose, which hangs on a keyframe of the segment that the camera is in."""
+        """Store the pose of a frame relative to a keyframe of the active segment."""
         assert self.active is not None
         if self._adjusts:
             self.active.segment.path.add(frame, keyframe, T_world_camera, inliers)
 
     def remember(self, keyframe: Keyframe, frame: IdealFrame, *, is_confirmed: bool = True) -> None:
-        """A new keyframe is a place to come back to, and may be one that was seen before.
+        """Store a new keyframe as a place, and compare it with earlier places.
 
         is_confirmed: not at a start.
         """
@@ -188,7 +192,7 @@ class Atlas:
         self.places.remember(keyframe, seen, [segment, *earlier], view)
 
     def request(self, frame: int) -> None:
-        """Ask for the adjustment of the map as it is after a frame, where that is due."""
+        """Request a global bundle adjustment of the map after a frame, if one is due."""
         if self.active is not None and self._adjusts:
             self._request(frame, self.active)
 
@@ -196,13 +200,13 @@ class Atlas:
         self.global_adjustment.request(frame, active.segment, self.calibration, self._parameters)
 
     def catch_up(self, frame: int) -> list[Moved]:
-        """Take over, before a frame, what the keyframes and the adjustment have found."""
+        """Apply, before a frame, finished merges and adjustments."""
         moved = self._join_met(frame)
         result = self.global_adjustment.take(frame)
         return moved if result is None else [*moved, *self.take_over(result)]
 
     def _join_met(self, frame: int) -> list[Moved]:
-        """Become one with an earlier segment that has been met."""
+        """Merge the active segment with an earlier one if the merge is verified."""
         proved = self.places.meetings.proved
         if self.active is None or not proved:
             return []
@@ -223,7 +227,7 @@ class Atlas:
         return [moved]
 
     def take_over(self, result: AdjustmentResult) -> list[Moved]:
-        """Go on with what the adjustment of the whole map has found."""
+        """Apply the result of a global bundle adjustment."""
         assert self.active is not None
         self.places.comparisons.refused += result.refused
         self.places.comparisons.closed += len(result.loops)
@@ -250,8 +254,11 @@ class Atlas:
         return moved
 
     def _refocus(self, result: AdjustmentResult) -> F64:
-        """(K,) by how much the log focal length of each keyframe changes: newer ones follow the
-        last of the job, and all lose theirs where it turns out to be the same for all."""
+        """(K,) change of each keyframe's log focal length.
+
+        Keyframes newer than the job follow its last one.  All changes are undone if the focal
+        length turns out to be constant.
+        """
         assert self.active is not None
         assert result.moves is not None
         if not result.calibration.changes:
@@ -262,22 +269,22 @@ class Atlas:
     def _change_lens(
         self, active: ActiveMap, before: SelfCalibration, refocus: F64 | None = None
     ) -> Moved:
-        """Go on under the lens that is known now.   refocus: as of ``see_by``."""
+        """Continue with the new calibration.   refocus: as of ``see_by``."""
         newest = active.keyframes[-1]
         pose = newest.T_world_camera
         see_by(active.segment, before.view, self.calibration, refocus)
         active.see_anew(self.calibration)
         self._earlier.see_by(before, self.calibration)
-        self._adjusted = True  # readers have the points as the other lens had them
+        self._adjusted = True  # readers have the landmarks of the previous calibration
         return Moved(newest.T_world_camera @ inverse(pose))
 
     def move(self, moves: MapMoves) -> Moved:
-        """Move the segment that the camera is in."""
+        """Move the active segment."""
         assert self.active is not None
         return Moved(self.active.move(moves), moves)
 
     def begin_global_shutter(self) -> list[Moved]:
-        """Map with the readout, where it is known, what was mapped without."""
+        """Convert what was mapped without the readout, once the readout is estimated."""
         if self.active is None or not self.calibration.readout:
             return []
         newest = self.active.keyframes[-1]
@@ -286,23 +293,23 @@ class Atlas:
         return [Moved(newest.T_world_camera @ inverse(before))]
 
     def focus(self, motion: Motion, stamp_ns: int, tracks: FrameTracks) -> None:
-        """Find the focal length of a frame, where it changes, by its tracks."""
+        """Estimate the focal length of a frame from its tracks, if it changes during the clip."""
         if self.active is None or not self._parameters.calibration.focal:
             return
         before = self.calibration
         self.calibration = refocused(self.active, before, motion, stamp_ns, tracks)
         if self.calibration.changes and not before.changes:
-            self.global_adjustment.due = 0.0  # how the map is bent is to be found at once
+            self.global_adjustment.due = 0.0  # correct the map immediately
 
     def calibrate(self) -> list[Moved]:
-        """Adjust the whole segment with its calibration where that is a guess, and due."""
+        """Adjust the whole segment with its calibration if that is a guess and due."""
         active = self.active
         if active is None or not is_guess(self._parameters.calibration):
             return []
         due = len(active.keyframes) >= self.calibration.next_keyframes
         if not (due and self._adjusts):
             return []
-        self.global_adjustment = GlobalAdjustment()  # the job is of another map
+        self.global_adjustment = GlobalAdjustment()  # the running job is of the map before
         return [self._adjust(active)]
 
     def _adjust(self, active: ActiveMap) -> Moved:
@@ -314,11 +321,11 @@ class Atlas:
         return Moved(newest.T_world_camera @ inverse(before), published)
 
     def stay(self) -> None:
-        """Forget what is about to move the map: nobody has it yet."""
+        """Drop corrections that are under way and not published."""
         self.global_adjustment, self.places.meetings = GlobalAdjustment(), SegmentMerges()
 
     def finish(self, timer: StageTimer = no_stages) -> list[Moved]:
-        """What is still to be corrected at the end of the stream."""
+        """Apply the remaining corrections at the end of the stream."""
         with timer("merging"):
             moved = self._join_met(0)
         active = self.active
@@ -335,7 +342,7 @@ class Atlas:
 
     def _close_at_last(self, active: ActiveMap) -> list[Moved]:
         """Close the loops that are still open."""
-        self.global_adjustment.withdraw()  # the final adjustment does its work
+        self.global_adjustment.withdraw()  # the final adjustment replaces it
         if not self.global_adjustment.loops:
             return []
         self._request(0, active)
@@ -343,7 +350,7 @@ class Atlas:
         return [] if result is None else self.take_over(result)
 
     def _adjust_at_last(self, active: ActiveMap) -> list[Moved]:
-        """Adjust the segment that the camera was in last, in the frame of its beginning."""
+        """Adjust the last active segment in the frame of its beginning."""
         moved: list[Moved] = []
         if self._adjusts:
             back = active.segment.back()
@@ -354,9 +361,9 @@ class Atlas:
         return moved
 
     def take_changed(self, *, everything: bool) -> tuple[list[Keyframe], I32]:
-        """The keyframes, and rows of the points, that may have to be published.
+        """Return the keyframes, and rows of the landmarks, that may need to be published.
 
-        everything: not only points that are new, of those that the last frame sees.
+        everything: all landmarks of the window, not only the new ones of the last frame.
         """
         adjusted, self._adjusted = self._adjusted, False
         keyframes: list[Keyframe] = []

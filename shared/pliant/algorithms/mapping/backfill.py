@@ -1,8 +1,9 @@
-"""A start reaches back to the frames before it, which saw too little of what it is made of.
+"""Backfill: frames before a start join it.
 
-Two frames with enough parallax may come long after the first, and share few tracks with it.  So the
-frames before are placed one by one, the newest first, by the points that are known and by those
-that the ones already placed tell of.  Some become keyframes, and all are adjusted together.
+Two frames with enough parallax may come long after the first frame, and share few tracks with it.
+So the frames before them are placed one by one, the newest first, by the known landmarks and by
+those that the frames placed so far determine.  Some become keyframes, and all are adjusted
+together.
 """
 
 import numpy as np
@@ -17,11 +18,12 @@ from pliant.algorithms.mapping.parameters import MappingParameters, PointParamet
 from pliant.algorithms.triangulation import triangulate
 
 _OVERLAP = 0.7
-"""Where fewer of the tracks that a frame shares with the next are points, as a share, more are
-looked for; and where it has fewer of those of the last keyframe, it becomes one."""
+"""Minimum share of a frame's tracks with the next frame that have landmarks: below it, more
+landmarks are triangulated; below it with the last keyframe, the frame becomes a keyframe.
+"""
 
 _VIEWS, _FEW = 8, 30
-"""Points are found from so many frames at the most, spread over those that see so many of them."""
+"""Frames from which landmarks are triangulated at most, and landmarks that each of them sees."""
 
 
 def backfill(
@@ -30,7 +32,7 @@ def backfill(
     camera: PinholeCamera,
     parameters: MappingParameters,
 ) -> Start:
-    """The start with what can be placed of the frames that waited longer than it takes."""
+    """Return the start with the earlier frames that could be placed."""
     limits = parameters.localisation
     rule = parameters.keyframe.model_copy(update={"min_shared_share": _OVERLAP})
     frames = {each.frame: each for each in waiting}
@@ -75,9 +77,11 @@ def _more_points(
     camera: PinholeCamera,
     parameters: PointParameters,
 ) -> tuple[I64, F64]:
-    """With those of the tracks in ``shared`` that the frames which are placed tell of."""
+    """Return the start with landmarks of the tracks in ``shared`` that the placed frames
+    determine.
+    """
     other = np.setdiff1d(shared, ids, assume_unique=True)
-    lasting = 0  # of the frames that are placed, the last ones that see some of them
+    lasting = 0  # placed frames, counted from the last, that observe some of them
     for frame, _ in reversed(placed):
         if np.isin(other, frame.ids, assume_unique=True).sum() < _FEW:
             break

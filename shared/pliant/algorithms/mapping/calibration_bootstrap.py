@@ -1,9 +1,9 @@
 """The mapper of a camera whose calibration is a guess.
 
-A map that begins under a wrong focal length keeps what that cost it: points that were turned down,
-poses of frames between keyframes.  So a first map is made on trial, only to find the calibration,
-and the frames that it took wait as they do for a start.  Once the focal length is known, or no more
-frames can wait, the map begins anew with all of them and with the camera that was found.
+A map that begins with a wrong focal length loses landmarks and poses for good.  So a first map is
+made on trial, only to estimate the calibration, while its frames wait as they do for a start.  Once
+the focal length is certain, or no more frames can wait, the map begins again with all of them and
+with the estimated camera.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ from pliant.algorithms.mapping.self_calibration import is_guess, widened
 from pliant.algorithms.stages import StageTimer, no_stages
 
 _KNOWN = 0.01
-"""Standard deviation of the log focal length under which a map can begin for good."""
+"""Standard deviation of the log focal length below which the final map can begin."""
 
 
 class _Taken(NamedTuple):
@@ -42,10 +42,10 @@ class _Taken(NamedTuple):
 
 
 class BootstrapMapper:
-    """A mapper that waits until it knows its camera: what it is told and tells is a ``Mapper``'s.
+    """A mapper that waits for its calibration, with the interface of ``Mapper``.
 
-    mapper: on trial, or for good.    taken: while it is on trial, the newest frames.
-    first: of those that the trial gave a pose.
+    mapper: the trial, or the final one.    taken: during the trial, the newest frames. first: the
+    first of them that the trial gave a pose.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class BootstrapMapper:
         seed: int,
         known: Sequence[KeptKeyframe] = (),
     ) -> None:
-        """known: as of ``Mapper``; the trial does without."""
+        """known: as of ``Mapper``; the trial ignores it."""
         self._anew = (camera, parameters, seed)
         self._known = list(known)
         self._mapper = Mapper(camera, parameters, seed)
@@ -82,7 +82,7 @@ class BootstrapMapper:
         return _nothing(delta, reason)
 
     def only_localise(self, frame: Frame, otherwise: str) -> MapDelta:
-        """As ``Mapper.only_localise``; a trial goes on until the next frame that is mapped."""
+        """As ``Mapper.only_localise``; a trial continues until the next mapped frame."""
         delta = self._mapper.only_localise(frame, otherwise)
         if not self._on_trial:
             return delta
@@ -117,14 +117,14 @@ class BootstrapMapper:
         return {} if self._on_trial else self._mapper.counters
 
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
-        """As ``Mapper.finish``; a trial that lasts until then ends with it."""
+        """As ``Mapper.finish``; a trial still running ends first."""
         begins = self._on_trial and (self._first is not None or self._mapper.start_at_last())
         begun = self._begin(no_stages) if begins else None
         final = self._mapper.finish(timer)
         return final if begun is None else _joined([begun, final])
 
     def kept(self) -> Iterator[KeptKeyframe]:
-        """As ``Mapper.kept``; what was known, where nothing came of the trial."""
+        """As ``Mapper.kept``; the loaded map if the trial found none."""
         return iter(self._known) if self._on_trial else self._mapper.kept()
 
     def publish_keyframes(self) -> KeyframeDelta:
@@ -134,7 +134,7 @@ class BootstrapMapper:
         return self._mapper.publish_keyframes()
 
     def _begin(self, timer: StageTimer) -> MapDelta:
-        """Map all that was taken with the camera that the trial has found."""
+        """Map all waiting frames with the camera that the trial has estimated."""
         self._mapper = Mapper(*self._anew, calibration=self._mapper.calibration, known=self._known)
         self._on_trial = False
         deltas: list[MapDelta] = []
@@ -157,9 +157,9 @@ def mapper_for(
     focal_sigma: float = 0.0,
     known: Sequence[KeptKeyframe] = (),
 ) -> Mapper | BootstrapMapper | Localiser:
-    """The mapper of a camera, as well as its calibration is known: see ``widened``.
+    """Return the mapper for a camera, depending on how certain its calibration is: see ``widened``.
 
-    known: a map of earlier sessions; where it is of this very camera it tells the calibration, too.
+    known: a loaded map; if it is of the same camera, its calibration is used.
     """
     parameters = widened(parameters, focal_sigma)
     if parameters.only_localise:
@@ -172,11 +172,11 @@ def mapper_for(
 
 _ARRAYS = [field.name for field in dataclasses.fields(MapDelta) if "Annotated" in str(field.type)]
 _KEYS = {"pose": "pose_frames", "keyframe": "keyframe_ids", "point": "point_ids"}
-"""By what the rows of arrays are told apart whose names begin so."""
+"""Key fields of the row arrays, by the prefix of their names."""
 
 
 def _nothing(delta: MapDelta, reason: str) -> MapDelta:
-    """What is told of a frame on trial."""
+    """The update of a frame on trial."""
     empty: dict[str, Any] = {name: getattr(delta, name)[:0] for name in _ARRAYS}
     return dataclasses.replace(
         delta, state=WAITING, reason=reason, segment=-1, inliers=0, snapshot=False,
@@ -185,9 +185,9 @@ def _nothing(delta: MapDelta, reason: str) -> MapDelta:
 
 
 def _joined(deltas: list[MapDelta]) -> MapDelta:
-    """The changes of the first frames of a map as one: of what changed more than once, the last.
+    """Combine the changes of a map's first frames; of repeated changes the last counts.
 
-    Points that went before anybody heard of them are left out.
+    Landmarks that were removed before publication are left out.
     """
     removed = np.concatenate([delta.removed_point_ids for delta in deltas])
     joined: dict[str, Any] = {"removed_point_ids": removed[:0]}

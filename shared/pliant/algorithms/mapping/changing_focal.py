@@ -1,13 +1,13 @@
-"""Whether the focal length changes during a clip, and by how much at each keyframe.
+"""Detection of a focal length that changes during a clip, and its value at each keyframe.
 
-Zoom, focus breathing and cropped stabilisation do it, and a map with one focal length bends at
-residuals that hardly grow.  The adjustment of all keyframes asks whether a focal length z_m of each
-would explain what it leaves: how much less one linear step would cost with them (a score test), in
-units of the variance of the residuals.  Errors of other kinds, of the rolling shutter for instance,
-look like a z that jumps from keyframe to keyframe; what a camera does lasts for a while.  So z must
-also vary by more than calibrations are believed, averaged over half a second; or else explain so
-much that nothing else does.  It is asked at each adjustment of all keyframes while the clip runs,
-since a bent map keeps only the observations that agree with it, and ``frame_focal`` says sooner.
+Zoom, focus breathing and cropped stabilisation change it, and a map with one focal length bends
+while its residuals hardly grow.  The adjustment of all keyframes tests whether a focal length z_m
+of each keyframe would explain its residuals: by how much one linear step would reduce the cost (a
+score test), in units of the variance of the residuals.  Other errors, for instance of a rolling
+shutter, look like a z that jumps between keyframes; a real change lasts for a while.  So z,
+averaged over half a second, must also vary by more than the uncertainty of a calibration, or the
+gain must be certain. The test runs at each adjustment of all keyframes during the clip, because a
+bent map keeps only observations that agree with it; ``frame_focal`` detects large changes sooner.
 """
 
 from typing import NamedTuple
@@ -27,43 +27,45 @@ from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.principal_point import with_principal_point
 
 RATE = 0.05
-"""Standard deviation of the log focal length a second later: weak beside what keyframes tell."""
+"""Standard deviation of the log focal length after a second: weak compared with the keyframes."""
 
 SPREAD = 0.3
-"""Of the log focal length in a clip."""
+"""Standard deviation of the log focal length within a clip."""
 
 _GAIN = 25.0
-"""Times what noise would gain by each focal length: real clips with one focal length gain up to 21,
-zoomed ones from 30 on."""
+"""Minimum gain in units of what noise gains: real clips with one focal length reach 21, zoomed ones
+begin at 30.
+"""
 
 _CERTAIN = 50.0
-"""As ``_GAIN``, from which on the range does not matter: stabilised clips gain from 100 on."""
+"""Gain from which the range does not matter: stabilised clips begin at 100."""
 
 _RANGE = CalibrationUncertainty().focal
-"""Of the log focal length: a standard deviation of a calibration that is believed.  Where errors of
-other kinds gain more than 10 they range over up to 0.9 % in real clips."""
+"""Minimum range of the log focal length: a standard deviation of a trusted calibration.  Other
+errors with a gain above 10 have a range of up to 0.9 % in real clips.
+"""
 
 _ONE_STEP = 0.35
-"""Share of the range that one step of the robust adjustment shows at least."""
+"""Minimum share of the range that one step of the robust adjustment shows."""
 
 _AVERAGED_S = 0.5
 _PERCENTILES = (5.0, 95.0)
 
 
 def gaps_s(keyframes: list[Keyframe]) -> F64:
-    """(M - 1,) seconds between keyframes; inf where nobody knows."""
+    """(M - 1,) seconds between keyframes; inf where unknown."""
     stamps = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
     known = (stamps[:-1] >= 0) & (stamps[1:] > stamps[:-1])
     return np.where(known, 1e-9 * np.diff(stamps), np.inf)
 
 
 def walk_from(start: F64, gaps: F64) -> FocalWalk:
-    """The prior of the focal lengths of keyframes, and where they begin (M,)."""
+    """Return the prior of the keyframes' focal lengths, and their initial values (M,)."""
     return FocalWalk(gaps_s=gaps, rate=RATE, spread=SPREAD, start=start)
 
 
 def focal_range(log_focals: F64, gaps: F64) -> tuple[float, float]:
-    """The least and the greatest log focal length (M,) that lasts for a while."""
+    """Return the smallest and the largest log focal length (M,) that lasts for a while."""
     times = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(gaps), gaps, _AVERAGED_S))])
     first = np.searchsorted(times, times - 0.5 * _AVERAGED_S)
     stop = np.searchsorted(times, times + 0.5 * _AVERAGED_S, side="right")
@@ -73,8 +75,9 @@ def focal_range(log_focals: F64, gaps: F64) -> tuple[float, float]:
 
 
 class Evidence(NamedTuple):
-    """gain: what focal lengths of their own would explain, times what noise would gain by them.
-    log_focals: (M,) by one step.   gaps_s: (M - 1,)."""
+    """gain: of separate focal lengths, in units of what noise would gain. log_focals: (M,) by one
+    step.   gaps_s: (M - 1,).
+    """
 
     gain: float
     log_focals: F64
@@ -82,14 +85,15 @@ class Evidence(NamedTuple):
 
     @property
     def calls_for_more(self) -> bool:
-        """Whether an adjustment with these unknowns is worth its time."""
+        """Whether an adjustment with these unknowns is worthwhile."""
         return self.confirmed_by(self.log_focals, _ONE_STEP)
 
     def confirmed_by(self, log_focals: F64, share: float = 1.0, known: bool = False) -> bool:
-        """Whether log focal lengths (M,) range over as much as changes do, or the gain is certain.
+        """Whether the log focal lengths (M,) have the range of a real change, or the gain is
+        certain.
 
-        share: of that range.   known: they were found to change before, and the gain alone
-        decides: focal lengths that hold a map together may have drifted over any range.
+        share: of that range.   known: a change was found before, so the gain alone decides: the
+        focal lengths that hold a map together may have drifted over any range.
         """
         low, high = focal_range(log_focals, self.gaps_s)
         ranges = known or (high - low) / _RANGE > share
@@ -100,11 +104,11 @@ def evidence_of_change(
     problem: BundleProblem, found: BundleResult, parameters: BundleParameters,
     uncertainty: CalibrationUncertainty, gaps: F64,
 ) -> Evidence:  # fmt: skip
-    """What an adjustment leaves that focal lengths which change would explain."""
+    """Return the evidence of changing focal lengths in the residuals of an adjustment."""
     M, variance = len(problem.T_world_camera), found.residual_variance(problem)
     if M < 3 or variance == 0.0:
         return Evidence(0.0, np.zeros(M), gaps)
-    # One focal length for all may be another one than was given: that is no change.
+    # A common error of the given focal length is no change.
     wide = with_principal_point(uncertainty)
     wide = wide.model_copy(update={"focal": max(wide.focal, SPREAD)})
     walk = walk_from(np.zeros(M), gaps)

@@ -1,7 +1,7 @@
-"""Which keyframes look at the same place: what a frame may see, and what the map may forget.
+"""Covisibility: which keyframes look at the same place, and which landmarks a frame may see.
 
-Points are looked for only where they are seen by keyframes of the window and near it, so that the
-work for a frame does not grow with the length of the run.
+Landmarks are searched only if keyframes of the window, or near it, observe them.  So the work for a
+frame does not grow with the length of the run.
 """
 
 import numpy as np
@@ -12,14 +12,14 @@ from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED, MERGED, Landm
 from pliant.compiler.kernel import kernel
 
 MAX_MISSES = 8
-"""Frames in which a point may be looked for in vain before it waits."""
+"""Failed searches after which a landmark waits."""
 
 _RETRY_FRAMES = 8
-"""Frames between two searches for a point that waits."""
+"""Frames between two searches for a waiting landmark."""
 
 
 def focus_of(keyframe: Keyframe, points: Landmarks) -> F64:
-    """(3,) the point on the axis of a keyframe at the median depth of what it sees, or NaN."""
+    """(3,) point on the axis of a keyframe at the median depth of its landmarks, or NaN."""
     rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
     centre, axis = keyframe.T_world_camera[:3, 3], keyframe.T_world_camera[:3, 2]
     if len(rows) == 0:
@@ -28,9 +28,9 @@ def focus_of(keyframe: Keyframe, points: Landmarks) -> F64:
 
 
 def near_keyframes(keyframes: list[Keyframe], T_world_camera: F64, count: int) -> list[Keyframe]:
-    """At most ``count`` of the keyframes, those that look where a camera does, in their order.
+    """Return at most ``count`` of the keyframes that look at the camera's place, in their order.
 
-    Nearness: how far the places looked at lie apart, added to half of how far the cameras do.
+    Their distance is that of the observed places plus half of that of the cameras.
     """
     if len(keyframes) <= count:
         return keyframes
@@ -48,7 +48,7 @@ def near_keyframes(keyframes: list[Keyframe], T_world_camera: F64, count: int) -
 
 
 def most_shared(older: list[Keyframe], moving: list[Keyframe], points: Landmarks) -> list[Keyframe]:
-    """Older keyframes that share points with the moving ones, those that share most first."""
+    """Return older keyframes by the number of landmarks that they share with the moving ones."""
     marked = np.zeros(len(points.state), np.bool_)
     for keyframe in moving:
         marked[keyframe.rows] = True
@@ -59,7 +59,7 @@ def most_shared(older: list[Keyframe], moving: list[Keyframe], points: Landmarks
 
 
 def rows_of(keyframes: list[Keyframe], rows: I32, capacity: int) -> I32:
-    """Ascending rows that any of the keyframes observes, and the rows given."""
+    """Return in ascending order the rows that any of the keyframes observes, and the given rows."""
     marked = np.zeros(capacity, np.bool_)
     marked[rows] = True
     for keyframe in keyframes:
@@ -80,7 +80,7 @@ def marks_fewer(marked: BoolArray, rows: I32, least: int) -> bool:
 
 @kernel
 def missing_rows(rows: I32, linked: I32, state: U8, misses: U8, marks: I64, frame: int) -> I32:
-    """Those of the rows that are mapped, are due to be looked for and have no track.
+    """Return the given rows that are mapped, due for a search, and without a track.
 
     linked: row of each track, negative where it has none.   marks: (capacity,) written: the last
     frame in which a row had a track.
@@ -102,7 +102,7 @@ def missing_rows(rows: I32, linked: I32, state: U8, misses: U8, marks: I64, fram
 def collect_garbage(
     points: Landmarks, keyframes: list[Keyframe], linked: I32, segment: int
 ) -> None:
-    """Give back the rows of dead candidates and of merged points.
+    """Free the rows of dead candidates and of merged landmarks.
 
     linked: row of each living track, negative where it has none.    keyframes: of the segment.
     """
@@ -111,7 +111,7 @@ def collect_garbage(
     dead[linked[linked >= 0]] = False
     merged = used == MERGED
     gone = np.flatnonzero(dead | merged).astype(np.int32)
-    # A point may have been merged into one that was merged in its turn.
+    # Merges may be chained.
     while (points.alias[points.alias[gone]] != points.alias[gone]).any():
         points.alias[gone] = points.alias[points.alias[gone]]
     first = points.first_keyframe[: points.count]

@@ -1,5 +1,4 @@
-"""Segments of the map that lost their camera: kept until they are recognised, or until the end,
-when each is adjusted as a whole."""
+"""Segments that the camera has left: kept until they are recognised, or adjusted at the end."""
 
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from pliant.algorithms.mapping.sparsification import observations_of, sparsify
 class _Earlier(NamedTuple):
     """A segment, and the calibration whose pixels its keyframes have.
 
-    known: it is as an earlier session left it.
+    known: unchanged since an earlier session.
     """
 
     segment: Segment
@@ -25,8 +24,9 @@ class _Earlier(NamedTuple):
 
 
 class EarlierSegments:
-    """adjusted: those that have been adjusted, oldest first.   dropped_keyframes: of those for
-    which there was no room."""
+    """adjusted: the adjusted ones, oldest first.   dropped_keyframes: of segments that exceeded the
+    memory.
+    """
 
     def __init__(self) -> None:
         self.adjusted: list[Segment] = []
@@ -34,33 +34,34 @@ class EarlierSegments:
         self._kept: list[_Earlier] = []
 
     def keep(self, segment: Segment, calibration: SelfCalibration, *, known: bool = False) -> None:
-        """A segment has lost its camera, or an earlier session has mapped it."""
+        """Add a segment that lost its camera, or one of a loaded map."""
         self._kept.append(_Earlier(segment, calibration, known))
 
     def everything(self) -> list[tuple[Segment, SelfCalibration]]:
-        """All of them, oldest first."""
+        """Return all of them, oldest first."""
         return [(each.segment, each.calibration) for each in self._kept]
 
     def like(self, calibration: SelfCalibration) -> list[Segment]:
-        """Those whose keyframes have the pixels of a calibration, whatever its readout was, oldest
-        first."""
+        """Return the segments with the pixels of a calibration, whatever its readout,
+        oldest first.
+        """
         return [each.segment for each in self._kept if each.calibration.sees_like(calibration)]
 
     def see_by(self, before: SelfCalibration, known: SelfCalibration) -> None:
-        """Those with the pixels of a calibration get those of a better one."""
+        """Convert the segments with the pixels of a calibration to those of a better one."""
         for n, each in enumerate(self._kept):
             if each.calibration.sees_like(before):
                 see_by(each.segment, each.calibration.view, known)
                 self._kept[n] = each._replace(calibration=known)
 
     def take(self, id: int) -> Segment:
-        """A segment goes on."""
+        """Remove and return a segment that becomes active again."""
         (taken,) = (each for each in self._kept if each.segment.id == id)
         self._kept = [each for each in self._kept if each is not taken]
         return taken.segment
 
     def segment_of(self, keyframe: int) -> int:
-        """That of a keyframe of one of them."""
+        """Return the segment of one of their keyframes."""
         for segment in (each.segment for each in self._kept):
             known = {k.id for k in segment.keyframes}
             if keyframe in known or keyframe in segment.dropped.ids:
@@ -68,10 +69,10 @@ class EarlierSegments:
         raise ValueError(f"keyframe {keyframe} is in no earlier segment")
 
     def share_room(self, points: Landmarks, limits: WindowParameters) -> int:
-        """Observations that the segment that the camera is in may have.
+        """Return the maximum number of observations of the active segment.
 
-        At least half of all that there is room for: the others are thinned beyond the rest, each to
-        the same size, and where even that does not do, the oldest are as they were published.
+        It is at least half of the whole.  The others are sparsified to share the rest equally; if
+        that is not enough, the oldest stay as they were published.
         """
         room = limits.kept_observations // 2
         own = [each for each in self._kept if not each.known]
@@ -87,7 +88,7 @@ class EarlierSegments:
             for each in own:
                 sparsify(each.segment, int(size), limits, np.zeros(0, np.int32), whole=whole)
 
-        sparsify_earlier(limits.keyframes)  # of the newest nobody may have been told yet
+        sparsify_earlier(limits.keyframes)  # the newest may not be published yet
         if self._observations(own) > room:
             sparsify_earlier(1)
         while self._observations(own) > room:
@@ -102,10 +103,9 @@ class EarlierSegments:
         return observations_of([each.segment for each in some])
 
     def adjust(self, parameters: MappingParameters) -> list[tuple[int, MapMoves]]:
-        """Adjust each of them, no earlier than the end of the stream; what nobody has gone on in
-        is as an earlier session left it.
+        """Adjust each of them at the end of the stream, except unchanged segments of a loaded map.
 
-        Returns how segments, by their number, and what they have given up move.
+        Returns the moves of each segment, by its number, and of what it has dropped.
         """
         moves: list[tuple[int, MapMoves]] = []
         for n, earlier in enumerate(self._kept):

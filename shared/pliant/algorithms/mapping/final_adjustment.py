@@ -1,6 +1,6 @@
 """The final adjustment of a segment: all its keyframes together, and the calibration.
 
-Everything works on the list of observations, so that time and memory grow with their number.
+Everything works on a list of observations, so time and memory grow with their number.
 """
 
 from dataclasses import dataclass, field, replace
@@ -32,22 +32,23 @@ from pliant.algorithms.triangulation import spread_of_rays
 from pliant.compiler.kernel import kernel
 
 _CHUNK = 4096
-"""Points whose rays are compared at a time: bounds a dense table of keyframes x points."""
+"""Landmarks whose rays are compared at a time: bounds a dense table of keyframes x landmarks."""
 
 MOST_SEEN = 32
-"""Keyframes that tell where a point is.  Each pair of them costs time, so that a room that is seen
-again and again would take the square of it, and the mean of 32 is known as well as need be."""
+"""Maximum keyframes that determine a landmark.  Time grows with the square of their number, for
+instance in a room that is seen again and again, and 32 are as accurate as necessary.
+"""
 
 _MIN_DEPTH = 1e-6
 
 
 @dataclass(kw_only=True)
 class ObservationList:
-    """What the keyframes see of the map, keyframe by keyframe, and the state of both.
+    """The observations of all keyframes, keyframe by keyframe, and the state of both.
 
-    rows: (N,) of the points.     xyz: (N, 3).     T_world_camera: (M, 4, 4).
-    camera, point: (O,) of each observation.    px: (O, 2).   weights: (O,).   flow: (O, 2) px.
-    log_focal: (M,) and gaps_s: (M - 1,) of the keyframes, see ``changing_focal``.
+    rows: (N,) of the landmarks.     xyz: (N, 3).     T_world_camera: (M, 4, 4). camera, point: (O,)
+    of each observation.    px: (O, 2).   weights: (O,).   flow: (O, 2) px. log_focal: (M,) and
+    gaps_s: (M - 1,) of the keyframes, see ``changing_focal``.
     """
 
     rows: I32
@@ -68,12 +69,13 @@ class ObservationList:
             self.gaps_s = np.full(max(len(self.T_world_camera) - 1, 0), np.inf)
 
     def see_by(self, view: CorrectedView) -> None:
-        """The pixels, which are those of the ideal camera of a view, become those of the image."""
+        """Convert the pixels from a view's ideal camera to the image."""
         self.px = view.magnified(view.seen(self.px), self.log_focal[self.camera])
 
     def most_seen(self, per_keyframe: int) -> "ObservationList":
-        """With the fewest points, those that most keyframes see first, that leave every keyframe
-        so many of its own, or all that another one sees, too."""
+        """Return the problem with the fewest landmarks, the most observed first, that leave each
+        keyframe this many, or all that another keyframe observes too.
+        """
         counts = np.bincount(self.point, minlength=len(self.rows))
         order = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts >= 2)]
         chosen = _enough(
@@ -93,11 +95,11 @@ class ObservationList:
         )
 
     def depths(self) -> F64:
-        """(O,) of each observed point in the camera that observes it."""
+        """(O,) depth of each observed landmark in the camera that observes it."""
         return _depths(self.T_world_camera, self.xyz, self.camera, self.point)
 
     def scales(self, before: F64) -> F64:
-        """(M,) by how much what each keyframe sees has grown: the median.
+        """(M,) median growth of the depths in each keyframe.
 
         before: (O,) depths.
         """
@@ -106,9 +108,9 @@ class ObservationList:
         return self.medians(after[usable] / before[usable], self.camera[usable])
 
     def medians(self, values: F64, camera: I32) -> F64:
-        """(M,) of what keyframes say; 1 of those that say nothing.
+        """(M,) median of each keyframe's values; 1 without values.
 
-        values: (n,).   camera: (n,) whose each is, ascending.
+        values: (n,).   camera: (n,) keyframe of each value, ascending.
         """
         ends = np.searchsorted(camera, np.arange(len(self.T_world_camera) + 1))
         medians = np.ones(len(self.T_world_camera))
@@ -133,7 +135,8 @@ def _depths(T_world_camera: F64, xyz: F64, camera: I32, point: I32) -> F64:
 def _enough(
     camera: I32, point: I32, counts: I64, order: I64, cameras: int, per_camera: int
 ) -> BoolArray:
-    """(N,) whether a point is chosen: in the given order, each of which a camera has too few yet.
+    """(N,) whether a landmark is chosen: in the given order, if one of its cameras has too few so
+    far.
 
     counts: (N,) observations of each.
     """
@@ -156,8 +159,9 @@ def _enough(
 
 
 def moves_between(keyframe_ids: I64, before: F64, after: F64, scales: F64) -> MapMoves:
-    """What hangs on keyframes (M,) moves as they do, from poses (M, 4, 4) to others, and scales by
-    (M,) about them."""
+    """Return how the map around keyframes (M,) moves: from poses (M, 4, 4) to others, and by the
+    scales (M,) about them.
+    """
     moved = after @ inverse(before)
     turned = (moved[:, :3, :3] @ before[:, :3, 3, None])[:, :, 0]
     moved[:, :3, 3] = after[:, :3, 3] - scales[:, None] * turned
@@ -172,14 +176,13 @@ def adjust_keyframes(
     parameters: MappingParameters,
     motions: F64,
 ) -> tuple[SelfCalibration, I32, MapMoves]:
-    """Schur LM over all but the first keyframe, their points and the calibration.
+    """Adjust all but the first keyframe, their landmarks and the calibration by Schur LM.
 
-    Observations that then miss their point are forgotten, and what is said of the points is
-    brought up to date.  The keyframes' pixels become those of the camera that is found, but for the
-    readout.
-    known: of the camera, whose pixels the keyframes have.    motions: (M, 6) of the keyframes, see
-    ``FramePoses``.    Returns what is known now, the rows of points that too few keyframes see or
-    that are at infinity, and how what hangs on each keyframe moves.
+    Outlying observations are removed, and the landmarks' statistics updated.  The keyframes' pixels
+    become those of the estimated camera, except for the readout. known: of the camera, whose pixels
+    the keyframes have.    motions: (M, 6) of the keyframes, see ``FramePoses``.    Returns the new
+    calibration, the rows of landmarks that are at infinity or seen by too few keyframes, and how
+    the map around each keyframe moves.
     """
     given, before = known, known.view
     seen = list_observations(keyframes, points, known, parameters)
@@ -227,11 +230,11 @@ def adjust_list(
     start: F64,
     varying: bool = False,
 ) -> BundleResult:
-    """Schur LM over all but the first keyframe, all points that two see, and the calibration.
+    """Adjust all but the first keyframe, all landmarks of two keyframes, and the calibration.
 
-    ``seen`` is changed, but for its observations, which are pixels of the rectified image.
-    known: of the camera.   start: (6,) correction of the calibration to begin from.   varying: the
-    focal length may change between keyframes, see ``changing_focal``.
+    ``seen`` is changed, except for its observations, which are pixels of the rectified image.
+    known: of the camera.   start: (6,) initial correction of the calibration.   varying: the focal
+    length may change between keyframes, see ``changing_focal``.
     """
     counts = np.bincount(seen.point, minlength=len(seen.rows))
     chosen = counts >= 2
@@ -270,8 +273,8 @@ def list_observations(
     known: SelfCalibration,
     parameters: MappingParameters,
 ) -> ObservationList:
-    """px: as the rolling shutter saw them.   known: of the camera, whose pixels the keyframes have.
-    parameters: of the adjustment that follows.
+    """px: as the rolling shutter recorded them.   known: of the camera, whose pixels the keyframes
+    have. parameters: of the adjustment that follows.
     """
     mapped = [points.state[keyframe.rows] == MAPPED for keyframe in keyframes]
     pairs = list(zip(keyframes, mapped, strict=True))
@@ -282,7 +285,7 @@ def list_observations(
     number = np.zeros(len(points.state), np.int32)
     number[seen] = 1
     rows = np.flatnonzero(number).astype(np.int32)
-    # Oldest first, which decides among points that are observed as often.
+    # Oldest first: this order decides between landmarks with equally many observations.
     order = np.argsort(points.first_keyframe[rows], kind="stable")
     rows = rows[order]
     number[rows] = np.arange(len(rows), dtype=np.int32)
@@ -301,23 +304,26 @@ def list_observations(
 
 
 def _k_sigmas(parameters: MappingParameters, known: SelfCalibration) -> tuple[float, float]:
-    """What an adjustment leaves of a lens.  It explains the error of k1 itself; but not while that
-    is a guess: far from the truth it is no small error, which the images explain step by step, and
-    the border would lead it astray."""
+    """Uncertainty of the lens that an adjustment leaves.
+
+    It estimates the error of k1 itself, but not while k1 is a guess: a large error is explained
+    only step by step, and the border would lead it astray.
+    """
     k1, k3 = known.k_sigmas(parameters.calibration)
     return k1 if known.is_guess else 0.0, k3
 
 
 @kernel
 def _spread_out(point: I32, counts: I64, most: int) -> BoolArray:
-    """(O,) which observations of each point tell where it is: no more than so many, from all of the
-    time that it was seen.   counts: (N,) observations of each."""
+    """(O,) whether an observation takes part: at most this many of each landmark, from all of the
+    time that it was seen.   counts: (N,) observations of each.
+    """
     kept = np.ones(point.size, np.bool_)
     rank = np.zeros(counts.size, np.int64)
     for o in range(point.size):
         n = counts[point[o]]
         if n > most:
-            at = most * rank[point[o]] + point[o] % n  # not of all points the same keyframes
+            at = most * rank[point[o]] + point[o] % n  # different keyframes for different landmarks
             kept[o] = at // n != (at - most) // n
             rank[point[o]] += 1
     return kept
@@ -326,7 +332,9 @@ def _spread_out(point: I32, counts: I64, most: int) -> BoolArray:
 def _problem(
     seen: ObservationList, chosen: BoolArray, kept: BoolArray, camera: PinholeCamera
 ) -> BundleProblem:
-    """Of the chosen points and kept observations; the first keyframe does not move."""
+    """Return the problem of the chosen landmarks and kept observations; the first keyframe is
+    fixed.
+    """
     number = np.cumsum(chosen, dtype=np.int32) - 1
     M = len(seen.T_world_camera)
     return BundleProblem(
@@ -349,7 +357,7 @@ def _forget_outliers(
     camera: PinholeCamera,
     outlier_px: float,
 ) -> BoolArray:
-    """(O,) mask of the observations that hit their point; the keyframes forget the others."""
+    """(O,) mask of the inliers; the keyframes forget the other observations."""
     errors = list_errors(seen.T_world_camera, seen.xyz, seen.camera, seen.point, seen.px, camera)
     good = errors <= outlier_px
     ends = np.cumsum(np.bincount(seen.camera, minlength=len(keyframes)))
@@ -364,7 +372,9 @@ def _forget_outliers(
 def _update_statistics(
     seen: ObservationList, good: BoolArray, count: I64, points: Landmarks, camera: PinholeCamera
 ) -> None:
-    """Keyframes, parallax and uncertainty of the points, as ``MapDelta`` defines them."""
+    """Update observations, parallax and uncertainty of the landmarks, as ``MapDelta``
+    defines them.
+    """
     rows, N = seen.rows, len(seen.rows)
     points.base_keyframes[rows], points.base_parallax_rad[rows] = 0, 0.0
     points.keyframes[rows] = count
@@ -374,7 +384,7 @@ def _update_statistics(
     for lo in range(0, N, _CHUNK):
         hi = min(lo + _CHUNK, N)
         some = order[(ends[lo - 1] if lo else 0) : ends[hi - 1]]
-        # Only the keyframes that see some of them: all of them would be the square of a long map.
+        # Only the keyframes that see some of them: all would be quadratic in the map's length.
         cameras, slots = np.unique(seen.camera[some], return_inverse=True)
         table = np.zeros((len(cameras), hi - lo), np.bool_)
         table[slots, seen.point[some] - lo] = True

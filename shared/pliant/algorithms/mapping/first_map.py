@@ -1,4 +1,4 @@
-"""A first map, made of the frames that wait for one."""
+"""A first map of the waiting frames."""
 
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -15,14 +15,14 @@ from pliant.algorithms.mapping.parameters import MappingParameters, StartParamet
 _MIN_DEPTH = 1e-6
 
 _ADJUSTMENTS = 3
-"""Rounds of adjusting and removing outliers."""
+"""Rounds of adjustment and removal of outliers."""
 
 _LEAST_WAITING = 12
-"""Frames that wait for a start however old they are: a time lapse has no more."""
+"""Minimum waiting frames, however old: a time lapse has no more."""
 
 
 class Stamped(Protocol):
-    """A frame and when it was taken."""
+    """A frame and its capture time."""
 
     @property
     def stamp_ns(self) -> int: ...
@@ -33,7 +33,7 @@ _F = TypeVar("_F", bound=Stamped)
 
 @dataclass(frozen=True, kw_only=True)
 class BufferedFrame:
-    """What is kept of a frame until the map starts."""
+    """What is stored of a frame until the map starts."""
 
     frame: int
     stamp_ns: int
@@ -46,11 +46,11 @@ class BufferedFrame:
 class Start:
     """A first map.  The world is the camera of the first keyframe; the median depth in it is 1.
 
-    frames: (K,) frame numbers of the keyframes, ascending.   T_world_camera: (K, 4, 4).
-    ids: (N,) track of each point, ascending.   points_world: (N, 3).
-    keyframe_index, point_index, points_px: (O,) observations that support the points.
-    kappas, newest_px: (N,) and (N, 2) of the points: their curvature where they were seen last, and
-    where in the image of the last keyframe they are, or next to where they have left it.
+    frames: (K,) frame numbers of the keyframes, ascending.   T_world_camera: (K, 4, 4). ids: (N,)
+    track of each landmark, ascending.   points_world: (N, 3). keyframe_index, point_index,
+    points_px: (O,) observations that support the landmarks. kappas, newest_px: (N,) and (N, 2): the
+    landmark's curvature where it was last detected, and its position in the image of the last
+    keyframe, or near where it left the image.
     """
 
     frames: I64
@@ -65,14 +65,14 @@ class Start:
 
 
 def keep_newest(waiting: list[_F], newest: _F, parameters: StartParameters) -> list[_F]:
-    """The waiting frames without those that are too old, and the newest one."""
+    """Return the waiting frames that are not too old, and the newest one."""
     oldest_ns = newest.stamp_ns - 1e9 * parameters.max_s
     young = [frame for frame in waiting if frame.stamp_ns > oldest_ns]
     return [*max(young, waiting[1 - _LEAST_WAITING :], key=len), newest]
 
 
 def table_of(chosen: list[BufferedFrame], ids: I64) -> tuple[F32, F32, BoolArray]:
-    """u, v and whether it is seen there, each (M, N), of the N tracks in M frames."""
+    """Return u, v and visibility, each (M, N), of the N tracks in M frames."""
     frames, columns, points_px = _observations(chosen, ids)
     u, v = np.zeros((2, len(chosen), len(ids)), np.float32)
     seen = np.zeros(u.shape, np.bool_)
@@ -101,7 +101,8 @@ def adjusted_start(
     camera: PinholeCamera,
     parameters: MappingParameters,
 ) -> Start | str:
-    """The start of these keyframes (K,) and points, all adjusted; or a reason why there is none.
+    """Return the adjusted start of these keyframes (K,) and points, or the reason why there is
+    none.
 
     T_world_camera: (K, 4, 4), the first the world.    ids, points: (N,) tracks and (N, 3).
     """

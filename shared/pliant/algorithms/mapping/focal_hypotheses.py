@@ -1,4 +1,4 @@
-"""The start of a map whose focal length is a guess: several focal lengths are tried."""
+"""The start of a map whose focal length is a guess: several hypotheses are tried."""
 
 import dataclasses
 
@@ -16,13 +16,13 @@ from pliant.algorithms.mapping.self_calibration import GROWTH, SelfCalibration, 
 from pliant.algorithms.mapping.start import find_start, waits_long, why_no_start
 
 _HYPOTHESES = np.linspace(-2.0, 2.0, 7)
-"""Focal lengths that a start is tried under, in standard deviations of the prior."""
+"""Focal length hypotheses of a start, in standard deviations of the prior."""
 
 
 def find_start_of(
     waiting: list[BufferedFrame], known: SelfCalibration, parameters: MappingParameters
 ) -> tuple[Start, SelfCalibration] | str:
-    """As ``find_start``, and what the start tells of the camera where that is a guess still."""
+    """As ``find_start``, and the camera that the start estimates if its calibration is a guess."""
     if is_guess(parameters.calibration) and not known.next_keyframes:
         return _find_start_of_guess(waiting, known, parameters)
     camera = known.view.camera
@@ -35,14 +35,15 @@ def find_start_of(
 def _find_start_of_guess(
     waiting: list[BufferedFrame], known: SelfCalibration, parameters: MappingParameters
 ) -> tuple[Start, SelfCalibration] | str:
-    """The start under the focal length with which it agrees best with itself.
+    """Return the start under the focal length that is most consistent with it.
 
-    Where a turn and some lens explain the flow, or any of the focal lengths finds too little
-    parallax, it waits: a wrong one sees parallax in every turn.  Angles shrink as a focal length
-    grows; after a while the same parallax in px is enough for the longer ones.  Only the motion
-    that two views fit best is tried: a wrong focal length bends all until they are alike.  The map
-    begins anew with the right one (``calibration_bootstrap.py``), which compares them and waits for
-    more parallax: the farther the camera has moved, the fewer tracks agree with a wrong one.
+    It waits while some rotation and lens explain the flow, or any focal length has too little
+    parallax: a wrong one sees parallax in every rotation.  Angles shrink as a focal length grows;
+    after a while the same parallax in px is enough for the longer ones.  Only the motion that fits
+    two views best is tried, because a wrong focal length bends all motions until they are alike.
+    The map begins again with the right one (``calibration_bootstrap.py``), which compares motions
+    and waits for more parallax: the farther the camera has moved, the fewer tracks agree with a
+    wrong one.
     """
     sigma = parameters.calibration.focal
     tried = [known.correction + k * sigma * np.eye(6)[0] for k in _HYPOTHESES]
@@ -72,7 +73,7 @@ def _find_start_of_guess(
 
 
 def _refine(start: Start, camera: PinholeCamera, parameters: MappingParameters) -> BundleResult:
-    """The start with its focal length free."""
+    """Return the start with its focal length free."""
     count = len(start.frames)
     problem = BundleProblem(
         T_world_camera=start.T_world_camera,

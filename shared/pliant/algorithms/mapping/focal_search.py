@@ -1,10 +1,10 @@
-"""Where an adjustment with an unknown focal length begins: the best along a line of focal lengths.
+"""Initial focal length of an adjustment: the best along a line of focal lengths.
 
 A change of the focal length f changes every depth, the rotations and the slope of a plane with it.
 So the cost has a long curved valley along f.  Damped Gauss-Newton steps are straight: they stop far
-from the minimum, and of a plane seen for a second they keep whatever f they begin with.  With f
-held there is no such valley.  So the map is adjusted at one held f after the other, in steps of the
-logarithm, downhill until the next one costs more.
+from the minimum, and for a plane seen for a second f stays at its initial value.  With f fixed
+there is no such valley.  So the map is adjusted at a sequence of fixed f, in steps of the
+logarithm, downhill until the cost increases.
 """
 
 from dataclasses import replace
@@ -21,7 +21,7 @@ from pliant.algorithms.bundle.problem import (
 from pliant.algorithms.bundle.schur import solve_schur
 
 _STEP = 0.2
-"""Of the log focal length, from where the minimum is near enough for an adjustment to find it."""
+"""Step of the log focal length: an adjustment finds a minimum within it."""
 
 
 def best_along_focal(
@@ -30,9 +30,9 @@ def best_along_focal(
     uncertainty: CalibrationUncertainty,
     start: F64,
 ) -> tuple[BundleProblem, F64]:
-    """The problem and the correction (6,) to begin from with a free focal length.
+    """Return the problem and the correction (6,) from which to adjust with a free focal length.
 
-    start: (6,) correction that the problem's poses and points were made with.
+    start: (6,) correction that the problem's poses and landmarks were made with.
     """
     held = uncertainty.model_copy(update={"focal": 0.0})
 

@@ -1,4 +1,4 @@
-"""A frame on its way through the mapper: as tracking gives it, in ideal pixels, with its pose."""
+"""A frame in the mapper: from tracking, in ideal pixels, and with its pose."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,9 +16,9 @@ from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 
 @dataclass(frozen=True)
 class Frame:
-    """What ingest and tracking give, in pixels of the rectified image.
+    """The output of ingest and tracking, in pixels of the rectified image.
 
-    stamp_ns: when it was taken, increasing.   grey: (H, W).   colour: (H, W, 3) RGB.
+    stamp_ns: capture time, increasing.   grey: (H, W).   colour: (H, W, 3) RGB.
     """
 
     number: int
@@ -29,17 +29,17 @@ class Frame:
 
     @staticmethod
     def of_tracks(number: int, stamp_ns: int, tracks: FrameTracks) -> "Frame":
-        """A frame of which there is time for the tracks alone."""
+        """A frame without images, if there is only time for the tracks."""
         return Frame(number, stamp_ns, FrameExtrema.without_maxima(tracks))
 
 
 @dataclass(frozen=True, kw_only=True)
 class IdealFrame:
-    """A frame as an ideal pinhole camera sees it, at first with the readout of the given one.
+    """A frame as an ideal pinhole camera sees it, at first with its rolling shutter.
 
-    calibration: by which it is corrected.   tracks: in pixels of the ideal camera.
-    rolled: the readout that ``to_global_shutter`` has taken out; None: none.
-    rolled_px: (N, 2) by how much farther that had moved the tracks.
+    calibration: by which it is corrected.   tracks: in pixels of the ideal camera. rolled: the
+    readout that ``to_global_shutter`` has removed, or None. rolled_px: (N, 2) rolling-shutter
+    offset of the tracks that was removed.
     """
 
     given: Frame
@@ -50,7 +50,7 @@ class IdealFrame:
 
     @staticmethod
     def of(frame: Frame, calibration: SelfCalibration) -> "IdealFrame":
-        """Correct the lens."""
+        """Correct the lens of a frame."""
         tracks = calibration.ideal(frame.extrema)
         none = np.zeros_like(tracks.points_px)
         return IdealFrame(given=frame, calibration=calibration, tracks=tracks, rolled_px=none)
@@ -66,7 +66,7 @@ class IdealFrame:
         return self.given.stamp_ns
 
     def to_global_shutter(self, rolled: RolledFrame, inverse_depths: F64) -> "IdealFrame":
-        """The frame, had it been taken at once.   inverse_depths: (N,) of the tracks."""
+        """Return the frame with a global shutter.   inverse_depths: (N,) of the tracks."""
         before = self.tracks
         maxima = before.maxima.copy()
         maxima[:, :2] -= rolled.shifts(np.ascontiguousarray(maxima[:, :2]))
@@ -76,18 +76,18 @@ class IdealFrame:
 
     @property
     def has_image(self) -> bool:
-        """Whether there is more than tracks."""
+        """Whether the frame has images."""
         return self.given.grey is not None
 
     @cached_property
     def image(self) -> U8:
-        """The grey image (H, W) where the tracks are.  Only if it has one."""
+        """The grey image (H, W) in the tracks' pixels, if the frame has images."""
         assert self.given.grey is not None
         return self._moved(self.given.grey).whole
 
     @property
     def colours(self) -> MovedImage | None:
-        """The colour image, or else the grey one, where the tracks are."""
+        """The colour image, or otherwise the grey one, in the tracks' pixels."""
         given = self.given
         pixels = given.grey if given.colour is None else given.colour
         return None if pixels is None else self._moved(pixels)
@@ -101,7 +101,7 @@ class IdealFrame:
 class PlacedFrame:
     """A frame with its pose in the map.
 
-    found: points that it sees without a track.   support: for the pose, once that is adjusted.
+    found: visible landmarks without a track.   support: of the pose, after its adjustment.
     is_pure_rotation: since the last keyframe.
     """
 

@@ -1,9 +1,9 @@
-"""The focal length of each frame, where it changes during a clip (see ``changing_focal``).
+"""The focal length of each frame, if it changes during a clip (see ``changing_focal``).
 
-A frame that looks magnified against the map by far more than one step of the camera explains says
-at once that it changes, long before an adjustment of all keyframes would be due.  From then on each
-frame is seen by the focal length that its tracks tell, with a random walk from that of the frame
-before as its prior.
+A frame that is magnified relative to the map by far more than one step of the camera explains shows
+the change immediately, long before an adjustment of all keyframes would be due.  From then on each
+frame gets the focal length that fits its tracks, with a random walk from that of the frame before
+as its prior.
 """
 
 from dataclasses import replace
@@ -20,11 +20,12 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.tracks import FrameTracks
 
 _AT_ONCE = 50.0
-"""Standard deviations of the magnification of one frame: real clips with one focal length have up
-to 33, zoomed ones from 70 on."""
+"""Standard deviations of one frame's magnification: real clips with one focal length reach 33,
+zoomed ones begin at 70.
+"""
 
 _LEAST = 2.0 * CalibrationUncertainty().focal
-"""Of the log magnification: two standard deviations of a calibration that is believed."""
+"""Minimum log magnification: two standard deviations of a trusted calibration."""
 
 _LEAST_GAP_S = 1e-3
 
@@ -36,7 +37,7 @@ def refocused(
     stamp_ns: int,
     tracks: FrameTracks,
 ) -> SelfCalibration:
-    """With the focal length of a frame, where it changes, by its tracks of mapped points.
+    """Return the calibration with a frame's focal length, estimated from its tracks of landmarks.
 
     tracks: of the rectified image.
     """
@@ -62,5 +63,5 @@ def refocused(
 
 
 def shows_at_once(log_focal: float, sigma: float) -> bool:
-    """Whether the magnification of one frame against the map is certainly a change."""
+    """Whether the magnification of one frame relative to the map is certainly a change."""
     return abs(log_focal) > max(_LEAST, _AT_ONCE * sigma)

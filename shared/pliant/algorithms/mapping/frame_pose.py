@@ -1,7 +1,7 @@
 """The pose of a frame in the map.
 
-The pose comes from the tracks that the frame shares with the map, then from points that are found
-again, then it is adjusted together with the window (VITAMIN-E section 3.2, Eq. 6).
+It is estimated from the tracks of landmarks, refined by reacquired landmarks, and adjusted together
+with the window (VITAMIN-E section 3.2, Eq. 6).
 """
 
 from dataclasses import replace
@@ -36,26 +36,29 @@ from pliant.algorithms.mapping.track_links import UNLINKED
 from pliant.algorithms.tracks import FrameTracks
 
 _AGREEING = 0.5
-"""Share of the points of the map that place a frame alone and still fit once candidates help: with
-fewer, what these are on moves by itself."""
+"""Minimum share of the inlying landmarks that still fit once candidates help; with fewer, the
+landmarks are on a moving object.
+"""
 
 _OF_CANDIDATE = 0.5
-"""Inliers that a direction which fits counts as: any depth will do, so it tells one coordinate of
-its pixel, not two."""
+"""Inliers that a fitting candidate counts as: any depth will do, so it constrains one coordinate of
+its pixel, not two.
+"""
 
 _OFF = 2.0
-"""Of the error of an inlier: a track that is farther from its epipolar line contradicts a pose."""
+"""In errors of an inlier: a track farther from its epipolar line contradicts a pose."""
 
 _TELLING = 500
-"""Points at the least that tell whether a camera stands where it stood."""
+"""Minimum tracks that decide whether a camera stands still."""
 
 _FEW, _FIRM = 0.05, 0.2
-"""Of the tracks that led to the last frame: where a film is cut, 0.3 to 2 % agree on a pose by
-chance, and 9 % where the views overlap; the fastest turns with blur leave 11 to 20 %."""
+"""Minimum shares of the last frame's tracks that fit a pose: after a cut, 0.3 to 2 % fit by chance,
+and 9 % where the views overlap; the fastest rotations with blur leave 11 to 20 %.
+"""
 
 
 class Located(NamedTuple):
-    """T_world_camera of a frame.   is_firm: so much leads there that the view has not been cut."""
+    """T_world_camera of a frame.   is_firm: it has so many tracks that the view was not cut."""
 
     T_world_camera: F64
     is_firm: bool
@@ -64,11 +67,11 @@ class Located(NamedTuple):
 def localise(
     active: ActiveMap, motion: Motion, frame: IdealFrame, generator: np.random.Generator
 ) -> Located | None:
-    """The frame from the tracks of mapped points, or else from the map's points in the image; None
-    where both fail.
+    """Return a frame's pose from the tracks of landmarks, or by searching landmarks in the image;
+    None if both fail.
 
-    Few tracks prove nothing by themselves: where the view changes at once, those that some extremum
-    carries on have all been moved alike, as if by a camera.
+    Few tracks are no evidence by themselves: after a cut, those that continue on some extremum have
+    all moved alike, as if by a camera.
     """
     points, parameters, tracks = active.points, active.parameters, frame.tracks
     predictions = motion.predictions(frame.stamp_ns)
@@ -86,7 +89,7 @@ def localise(
         inliers = int(located.inliers.sum())
         of_points = int(located.inliers[: len(linked) - len(candidates)].sum())
         if of_points + _OF_CANDIDATE * (inliers - of_points) >= limits.min_inliers:
-            # What helps in one frame and not in the next has not been lost in between.
+            # Candidates that help in one frame and not in the next were not lost in between.
             helped = len(candidates) and active.candidates_agree
             before = motion.tracked if helped else motion.to_points
             if not frame.has_image or inliers >= _FEW * before:
@@ -114,7 +117,7 @@ def _by_tracks(
     candidates: I64,
     generator: np.random.Generator,
 ) -> Localisation:
-    """The pose that tracks tell: those of points, which come first, have the last word."""
+    """Return the pose that fits the tracks: landmarks come first and decide."""
     limits, mapped = active.parameters.localisation, len(rows) - len(candidates)
 
     def located(count: int, spread: Spread | None) -> Localisation:
@@ -137,7 +140,7 @@ def _by_tracks(
 def to_global_shutter(
     active: ActiveMap, motion: Motion, frame: IdealFrame, T_world_camera: F64
 ) -> IdealFrame:
-    """The frame at this pose, had all its rows been taken at once.  motion: before it."""
+    """Return the frame at this pose with a global shutter.  motion: before it."""
     if not frame.calibration.readout:
         return frame
     velocity = motion.velocity_at(frame.number, T_world_camera)
@@ -147,7 +150,7 @@ def to_global_shutter(
 
 
 def reacquire_points(active: ActiveMap, frame: IdealFrame, T_world_camera: F64) -> PlacedFrame:
-    """Find points without a track among the maxima, and refine the pose with them."""
+    """Find landmarks without a track among the maxima, and refine the pose with them."""
     placed = PlacedFrame(frame=frame, T_world_camera=T_world_camera)
     points, parameters, tracks = active.points, active.parameters, frame.tracks
     if not parameters.reacquisition.enabled:
@@ -168,7 +171,7 @@ def reacquire_points(active: ActiveMap, frame: IdealFrame, T_world_camera: F64) 
 
 
 def refine_by_all(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
-    """The pose by its tracks and the points found without one, from close by."""
+    """Refine the pose by its tracks and the landmarks found without one."""
     candidates = active.helping_candidates()
     rows, points_px = active.observed(placed, candidates)
     located = refine(
@@ -179,7 +182,7 @@ def refine_by_all(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
 
 
 def adjust(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFrame:
-    """Eq. 6 over the window and this frame.  motion: before it."""
+    """Adjust the window and this frame (Eq. 6).  motion: before it."""
     judge_tracks(active, placed)
     active.see(placed)
     if active.parameters.window.sweeps > 0 and not len(active.helping_candidates()):
@@ -188,13 +191,13 @@ def adjust(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFram
 
 
 def judge_tracks(active: ActiveMap, placed: PlacedFrame) -> None:
-    """Take tracks from the points of the map that they miss again and again."""
+    """Unlink tracks from landmarks that they miss repeatedly."""
     linked, errors = _track_errors(active, placed)
     active.judge_tracks(linked, errors)
 
 
 def _track_errors(active: ActiveMap, placed: PlacedFrame) -> tuple[I64, F32]:
-    """Indices of the tracks of points of the map, and by how many px they miss these."""
+    """Indices of the tracks of landmarks, and their reprojection errors in px."""
     linked = active.linked(MAPPED)
     xyz = active.points.xyz[active.links.rows[linked]]
     points_px = placed.frame.tracks.points_px[linked]
@@ -202,7 +205,7 @@ def _track_errors(active: ActiveMap, placed: PlacedFrame) -> tuple[I64, F32]:
 
 
 def supported(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFrame:
-    """With what there is for its pose.  motion: before it."""
+    """Return the frame with the quality of its pose.  motion: before it."""
     T_world_camera, tracks = placed.T_world_camera, placed.frame.tracks
     rows, points_px = active.observed(placed, active.helping_candidates())
     errors = reprojection_errors(T_world_camera, active.points.xyz[rows], points_px, active.camera)
@@ -215,13 +218,13 @@ def supported(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedF
 
 
 def tracks_to_points(active: ActiveMap, placed: PlacedFrame) -> int:
-    """How many tracks lead on to points of the map that are where the pose has them."""
+    """Number of tracks that lead to landmarks at their predicted position."""
     _, errors = _track_errors(active, placed)
     return int(np.count_nonzero(errors < active.parameters.localisation.inlier_px))
 
 
 def _settled(active: ActiveMap, motion: Motion, tracks: FrameTracks) -> BoolArray:
-    """Which tracks (N,) had time to become points, and keyframes enough that saw them."""
+    """Which tracks (N,) had enough time and keyframes to become landmarks."""
     points, parameters = active.points, active.parameters
     rows = active.links.rows
     newest = active.keyframes[-1].id
@@ -231,7 +234,7 @@ def _settled(active: ActiveMap, motion: Motion, tracks: FrameTracks) -> BoolArra
 
 
 def _contradicting(active: ActiveMap, T_world_camera: F64, points_px: F32) -> I64:
-    """Indices of the tracks of candidates that are where the pose has them at no depth."""
+    """Indices of the tracks of candidates that no depth makes consistent with the pose."""
     points = active.points
     candidates = placed_candidates(points, active.links.rows)
     rows = active.links.rows[candidates]
@@ -242,14 +245,14 @@ def _contradicting(active: ActiveMap, T_world_camera: F64, points_px: F32) -> I6
 
 
 def check_pure_rotation(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
-    """Whether the camera has only turned since the last keyframe, with its pose then."""
+    """Whether the camera has only rotated since the last keyframe, with its pose in that case."""
     if active.segment.resumes:
-        return placed  # nobody knows where it was before
+        return placed  # its previous pose is unknown
     points, parameters = active.points, active.parameters
     candidates = placed_candidates(points, active.links.rows)
     rows, points_px = active.observed(placed, candidates)
     T_standing = placed.T_world_camera
-    for every in (max(1, len(rows) // _TELLING), 1):  # a few tell of most that they moved
+    for every in (max(1, len(rows) // _TELLING), 1):  # a few tracks reveal most motions
         some = np.arange(0, len(rows), every)
         located = refine(
             placed.T_world_camera, points.xyz[rows[some]], points_px[some], active.camera,
@@ -267,8 +270,11 @@ def _spread(active: ActiveMap, rows: I32, candidates: I64) -> Spread | None:
 
 
 def limits_of_points(inliers: int, parameters: MappingParameters) -> PointParameters:
-    """Of a frame that sees fewer points than a map starts with, two observations make one: what few
-    tracks there are may not live to a third, and then the map ends."""
+    """Return the limits for new landmarks.
+
+    In a frame with fewer landmarks than a start needs, two observations are enough: its few tracks
+    may not survive to a third, and then the map ends.
+    """
     if inliers >= parameters.start.min_points:
         return parameters.point
     return parameters.point.model_copy(update={"min_observations": 2})

@@ -1,21 +1,21 @@
 """Global bundle adjustment, in parallel with tracking: when it is requested, run, and applied.
 
-The window corrects what is new.  Drift beyond it takes all keyframes.  Their adjustment takes
-longer than a frame, so it works on a copy of the map.  Its result is applied a number of frames
-later that the size of the map decides, not the time that it took: whoever does not have it by then
-waits.  Where the shutter may roll the first adjustment comes with the first keyframes, for the
-readout.
+The window corrects what is new; drift beyond it requires all keyframes.  Their adjustment takes
+longer than a frame, so it works on a copy of the map.  Its result is applied a fixed number of
+frames later, which depends on the size of the map and not on the time that it took: a mapper that
+does not have it by then waits.  If the shutter may be rolling, the first adjustment follows the
+first keyframes, to estimate the readout.
 
-Meanwhile the map has grown and the window has moved.  So the result is not where the points are,
-but how the map around each keyframe moves: one similarity for each, as drift is small within what
-a keyframe sees.  The keyframes that were in the window move, too: in a map of a few dozen most of
-the drift is there.  What is newer moves rigidly with the last of them.  All of it moves as little
-as it can, so that poses from before and after fit together; at the end the beginning is back in
-its place (``Segment.strayed``).  Lens, focal length and readout are estimated anew each time, and
-used for what comes next once they certainly differ from those in use.
+Meanwhile the map has grown and the window has moved.  So the result does not state where the
+landmarks are, but how the map around each keyframe moves: one similarity per keyframe, because
+drift is small within a view.  The keyframes of the window move too: in a map of a few dozen
+keyframes most of the drift is there.  Newer ones move rigidly with the last of them.  All of it
+moves as little as it can, so that poses from before and after are consistent; at the end the
+beginning returns to its place (``Segment.strayed``).  Lens, focal length and readout are estimated
+each time, and used for later frames once they differ significantly from those in use.
 
-A loop requests an adjustment at once, and gets its result sooner: the pose graph of ``loops`` says
-how the map moves, and an adjustment after it does the rest.  Where the graph refuses all loops
+A loop requests an adjustment immediately, and gets its result sooner: the pose graph of ``loops``
+determines how the map moves, and a later adjustment refines it.  If the graph rejects all loops,
 nothing moves.
 """
 
@@ -41,10 +41,12 @@ from pliant.algorithms.mapping.segment import Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 
 _LEAST_TOLD = 0.2
-"""Share of what is known of the readout that the images must tell, and not the prior."""
+"""Minimum share of the information about the readout that must come from the images, not
+the prior.
+"""
 
 _GRAPH_SHARE = 0.1
-"""Of the time that an adjustment takes: the graph of its keyframes."""
+"""Time of the pose graph, as a share of an adjustment."""
 
 
 _NONE: F64 = np.zeros(0)
@@ -52,11 +54,11 @@ _NONE: F64 = np.zeros(0)
 
 @dataclass(frozen=True, kw_only=True)
 class AdjustmentJob:
-    """A copy of the map as it is after a frame, to be adjusted.
+    """A copy of the map after a frame, to be adjusted.
 
-    keyframe_ids: (M,).   seen: what they see.   known: of the camera; ``seen`` has pixels of the
-    rectified image.   loops: to be closed; where there are none all of it is adjusted.
-    closed: whether some have just been.   sigmas: (N,) of the points that are seen.
+    keyframe_ids: (M,).   seen: their observations.   known: of the camera; ``seen`` has pixels of
+    the rectified image.   loops: to be closed; without loops everything is adjusted. closed:
+    whether loops have just been closed.   sigmas: (N,) of the landmarks.
     """
 
     frame: int
@@ -70,19 +72,19 @@ class AdjustmentJob:
 
     @property
     def distance_frames(self) -> int:
-        """Frames after which the result is taken over: the time that it takes to find grows with
-        the observations."""
+        """Frames after which the result is applied: its time grows with the observations."""
         limits = self.parameters.whole_map
-        # Few keyframes take little time, and say what those that follow wait for.
+        # Few keyframes take little time, and later ones depend on the result.
         least = min(limits.distance_frames, len(self.keyframe_ids))
         distance = max(least, len(self.seen.px) // limits.observations_per_frame)
         return round(_GRAPH_SHARE * distance) if self.loops else distance
 
 
 class AdjustmentResult(NamedTuple):
-    """How the map moves, None where it does not; the loops that were closed, whose points are to be
-    joined; what is known of the camera by now; how many loops the others contradict; by how much
-    the log focal length of each keyframe changes, (0,) where it is the same for all."""
+    """How the map moves, or None; the closed loops, whose landmarks are to be merged; the new
+    calibration; the number of loops that the others contradict; the change of each keyframe's log
+    focal length, (0,) if the focal length is constant.
+    """
 
     moves: MapMoves | None
     loops: list[Loop]
@@ -93,12 +95,12 @@ class AdjustmentResult(NamedTuple):
 
 @dataclass(kw_only=True)
 class GlobalAdjustment:
-    """Requests an adjustment whenever the segment has grown by a share: all of them together cost
-    a small multiple of the last.
+    """Requests an adjustment when the segment has grown by a share: all of them together cost a
+    small multiple of the last.
 
-    due: keyframes made at which it requests the next.    job: requested, and not yet applied.
-    result: of the job, where a worker has finished it.    loops: to be closed by the next job,
-    alone.    closed: whether some have been, and nothing was adjusted since.
+    due: number of keyframes at which the next one is requested.    job: requested, not applied yet.
+    result: of the job, once a worker has finished it.    loops: to be closed by the next job,
+    alone. closed: whether loops were closed since the last adjustment.
     """
 
     due: float = 0.0
@@ -119,15 +121,15 @@ class GlobalAdjustment:
         calibration: SelfCalibration,
         parameters: MappingParameters,
     ) -> None:
-        """Request the adjustment of the map as it is after a frame, where that is due."""
+        """Request the adjustment of the map after a frame, if it is due."""
         camera = calibration.view.camera
         window, growth = parameters.window.keyframes, parameters.whole_map.growth
         count = len(segment.keyframes)
-        # While the window has half of the map it does well by itself, but for the calibration.
+        # A window of half the map needs no global adjustment, except for the calibration.
         least = parameters.start.keyframes if parameters.calibration.sigmas.any() else 2 * window
         made = count + len(segment.dropped)
         early = growth == 0.0 or count < least or made < self.due
-        # The window would move with what was there before the camera was recognised.
+        # The window would move with the part mapped before the camera was recognised.
         early = early or (segment.since > 0 and count - segment.since <= window)
         early = early and not self.closed
         if self.job is not None or (early and not self.loops):
@@ -172,18 +174,18 @@ class GlobalAdjustment:
         self.job = self.result = None
 
     def is_due(self, frame: int) -> bool:
-        """Whether the result is applied before a frame is worked on."""
+        """Whether the result is applied before this frame."""
         job = self.job
         if job is None:
             return False
         return frame >= job.frame + job.distance_frames
 
     def take(self, frame: int) -> AdjustmentResult | None:
-        """The result, where it is applied before a frame is worked on."""
+        """Return the result if it is applied before this frame."""
         return self.settle() if self.is_due(frame) else None
 
     def settle(self) -> AdjustmentResult | None:
-        """As ``take``, no matter how long ago it was requested."""
+        """As ``take``, however recent the request."""
         if self.job is None:
             return None
         result = find_moves(self.job) if self.result is None else self.result
@@ -194,14 +196,14 @@ class GlobalAdjustment:
         return result
 
     def move(self, moves: MapMoves) -> None:
-        """The worlds that loops tell of have moved."""
+        """The world frames of the loops have moved."""
         for n, loop in enumerate(self.loops):
             old, new = moves.matrices(np.array([loop.old, loop.new]))
             self.loops[n] = loop._replace(S_old_new=old @ loop.S_old_new @ np.linalg.inv(new))
 
 
 def find_moves(job: AdjustmentJob) -> AdjustmentResult:
-    """How each keyframe moves with what hangs on it, and the readout."""
+    """Run a job: how the map around each keyframe moves, and the readout."""
     if job.loops:
         return _close(job)
     before, xyz = job.seen.T_world_camera, job.seen.xyz
@@ -213,14 +215,12 @@ def find_moves(job: AdjustmentJob) -> AdjustmentResult:
         varying=True,
     )  # fmt: skip
     after = _learned(known, found, parameters.calibration)
-    # A window that is half of the map does as well, unless it did not know the camera or the loops.
+    # A window of half the map is as good, unless it lacked the calibration or the loops.
     bent = (known.readout == 0.0 and after.readout != 0.0) or not after.sees_like(known)
     refocus = seen.log_focal - job.seen.log_focal
     bent = bent or job.closed or after.changes or bool(refocus.any())
     moving = bent or len(job.keyframe_ids) >= 2 * parameters.window.keyframes
-    nothing = AdjustmentResult(
-        None, [], known, 0
-    )  # poses that are not finite would spread to the whole map
+    nothing = AdjustmentResult(None, [], known, 0)  # non-finite poses would spread
     if not np.isfinite(seen.T_world_camera).all():
         return nothing
     moves = _moves(job, seen, before, depths) if moving else None
@@ -230,7 +230,7 @@ def find_moves(job: AdjustmentJob) -> AdjustmentResult:
 
 
 def _close(job: AdjustmentJob) -> AdjustmentResult:
-    """What the graph makes of the loops; nothing where it refuses all of them."""
+    """Return the result of the pose graph; no moves if it rejects all loops."""
     moves, loops = close_loops(
         job.seen, job.keyframe_ids, job.sigmas, job.loops,
         job.known.view.camera.fx,
@@ -242,8 +242,10 @@ def _close(job: AdjustmentJob) -> AdjustmentResult:
 def _learned(
     known: SelfCalibration, found: BundleResult, prior: CalibrationUncertainty
 ) -> SelfCalibration:
-    """What is known with what was found.  Focal lengths that change are relative to a lens, which
-    then is the one that was found with them."""
+    """Return the calibration with the new estimate.
+
+    Focal lengths that change are relative to a lens, which then is the one estimated with them.
+    """
     correction, covariance = found.correction, found.covariance
     changes = len(found.log_focal) > 0
     readout, sigma = float(correction[3]), float(np.sqrt(covariance[3, 3]))
@@ -258,10 +260,10 @@ def _learned(
 def _without_prior(
     readout: float, sigma: float, prior: CalibrationUncertainty
 ) -> tuple[float, float]:
-    """The readout that the images alone tell, and its standard deviation.
+    """Return the readout that the images alone determine, and its standard deviation.
 
-    A prior at 0 draws it there, and few keyframes are drawn far: of a Gaussian of precision p that
-    remains from one of precision p - p_0 and the prior's, the mean is (p - p_0) / p of the first.
+    A prior at 0 draws it there, the more the fewer keyframes there are: if a Gaussian of precision
+    p results from one of precision p - p_0 and the prior, its mean is (p - p_0) / p of the first.
     """
     if sigma == 0.0:
         return 0.0, 0.0
@@ -272,14 +274,15 @@ def _without_prior(
 
 
 def _moves(job: AdjustmentJob, seen: ObservationList, before: F64, depths: F64) -> MapMoves:
-    """How the map moves, which is as little as it can.
+    """Return how the map moves, which is as little as possible.
 
-    Nothing holds its place, turn and scale.  Held by its beginning, which is known least, all that
-    the camera sees now would jump with what is learnt of that.  So the turns of the keyframes
-    cancel out, by R, and their centres c and the scales r of what they see, at the median depth d
-    of all, change least: ``min over s, t: sum of |s R c' + t - c|^2 + d^2 (s r - 1)^2``.
+    Nothing fixes its position, rotation and scale.  If the beginning, the least certain part, were
+    fixed, all that the camera sees now would jump by each correction of it.  So the rotations of
+    the keyframes cancel out, by R, and their centres c and the scales r of their views, at the
+    median depth d of all, change least: ``min over s, t: sum of |s R c' + t - c|^2 + d^2 (s r -
+    1)^2``.
 
-    before: (M, 4, 4) poses and depths: (O,) of the observations until now.
+    before: (M, 4, 4) poses and depths: (O,) of the observations so far.
     """
     scales, d = seen.scales(depths), float(np.median(depths)) if len(depths) else 1.0
     T = seen.T_world_camera.copy()
@@ -296,10 +299,10 @@ def _moves(job: AdjustmentJob, seen: ObservationList, before: F64, depths: F64) 
 
 
 def held(moves: MapMoves, spans: list[tuple[int, int]], segment: int) -> MapMoves:
-    """The moves of one segment, told so that what hangs on others' keyframes stays.
+    """Return the moves of one segment so that content of other segments' keyframes stays.
 
-    spans: (first keyframe id, segment) of all keyframes, ascending: a segment that was recognised
-    goes on after others.
+    spans: (first keyframe id, segment) of all keyframes, ascending: a recognised segment continues
+    after others.
     """
     ids, rows = moves.keyframe_ids, moves.moves
     still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0])

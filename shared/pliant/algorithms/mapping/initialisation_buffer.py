@@ -1,8 +1,8 @@
-"""Poses of the frames that waited for a map: backwards from where it starts, or goes on.
+"""Poses of the frames that waited for a map: backwards from its start, or from where it resumes.
 
-They are placed by the points of the start.  Those before, which see too few of them, have but
-turned, or the start would reach back to them: they stand where the first one that is placed does,
-turned as the tracks that each shares with the next one tell.
+They are placed by the landmarks of the start.  Earlier ones, with too few of them, have only
+rotated, otherwise backfill would have placed them: they get the position of the first placed frame,
+and the rotations between consecutive frames from the tracks that these share.
 """
 
 from collections.abc import Iterator
@@ -22,15 +22,15 @@ from pliant.algorithms.mapping.ordinary_frames import EarlierPose
 from pliant.algorithms.mapping.parameters import LocalisationParameters, MappingParameters
 
 _SAMPLE = 400
-"""Tracks that tell a rotation."""
+"""Tracks that determine a rotation."""
 
 _KEPT_TURNS = 2000
-"""Bounds the memory of a camera that never moves."""
+"""Bounds the memory for a camera that never moves."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Turn:
-    """How the camera turned from a frame to the next.
+    """The rotation of the camera from a frame to the next.
 
     R_next_frame: (3, 3) maps rays of the frame to the next one's.   inliers: tracks that agree.
     """
@@ -46,7 +46,7 @@ def turn_between(
     camera: PinholeCamera,
     parameters: LocalisationParameters,
 ) -> Turn:
-    """The rotation that explains the tracks of two frames best."""
+    """Return the rotation that fits the tracks of two frames best."""
     _, i, j = np.intersect1d(frame.ids, following.ids, assume_unique=True, return_indices=True)
     if len(i) < parameters.min_inliers:
         return Turn(frame=frame.frame, R_next_frame=np.eye(3), inliers=0)
@@ -61,7 +61,7 @@ def turn_between(
 
 @dataclass(frozen=True)
 class InitialisationBuffer:
-    """Frames from which a map may yet start, and the turns of all since the last that was placed.
+    """Frames from which a map may start, and the rotations of all since the last placed one.
 
     turns: one for each of the frames but the newest, and for earlier ones.   newest: with image.
     """
@@ -71,7 +71,7 @@ class InitialisationBuffer:
     newest: Frame | None = None
 
     def then(self, frame: IdealFrame, parameters: MappingParameters) -> "InitialisationBuffer":
-        """With one frame more."""
+        """Return the buffer with one more frame."""
         tracks, camera = frame.tracks, frame.calibration.view.camera
         newest = BufferedFrame(
             frame=frame.number, stamp_ns=frame.stamp_ns, ids=tracks.ids,
@@ -85,7 +85,7 @@ class InitialisationBuffer:
         return InitialisationBuffer(frames, turns, frame.given)
 
     def seen_by(self, before: CorrectedView, after: CorrectedView) -> "InitialisationBuffer":
-        """With the pixels of another ideal camera."""
+        """Return the buffer in the pixels of another ideal camera."""
         frames = [replace(f, points_px=moved_px(f.points_px, before, after)) for f in self.frames]
         return replace(self, frames=frames)
 
@@ -97,7 +97,7 @@ def earlier_poses(
     camera: PinholeCamera,
     parameters: LocalisationParameters,
 ) -> Iterator[EarlierPose]:
-    """The newest first.  keyframes: of the map that starts."""
+    """Yield the poses, the newest first.  keyframes: of the map that starts."""
     keyframe_at = {each.frame: each for each in keyframes}
     frames = {each.frame: each for each in waiting.frames}
     turned = {each.frame: each for each in waiting.turns}
@@ -135,11 +135,11 @@ def returned_poses(
     camera: PinholeCamera,
     parameters: LocalisationParameters,
 ) -> Iterator[EarlierPose]:
-    """Of the frames that waited until a lost camera was found in its map, the newest first: those
-    that follow enough of what it sees there.
+    """Return poses of the frames that waited until a lost camera was recognised, the newest first,
+    as far as they share enough of the landmarks seen there.
 
-    T_world_camera: where it was found.   ids, points_world: (n,) and (n, 3) of the tracks of points
-    that it sees.   keyframe: on which they hang.
+    T_world_camera: where it was recognised.   ids, points_world: (n,) and (n, 3) of the tracks of
+    landmarks in view.   keyframe: their reference keyframe.
     """
     for frame in reversed(waiting.frames):
         here, inliers = _place(T_world_camera, ids, points_world, frame, camera, parameters)
