@@ -272,7 +272,7 @@ def test_a_map_that_cannot_be_is_refused_in_one_line(
     write_map(path, MapHeader(), blind)
     assert "without a place" in why()
     write_map(path, MapHeader(), kept[::-1])
-    assert "not in order" in why()
+    assert "out of order" in why()
     with map_file.RecordingWriter(path, {"map": {"version": "1"}}):
         pass
     assert "empty" in why()

@@ -88,7 +88,7 @@ class MapFile:
                 keyframe = codec.decode(MapKeyframe, item.data, max_bytes=MAP_KEPT.max_bytes)
                 check(keyframe)
                 if keyframe.id <= last:
-                    raise ValueError("keyframes that are not in order")
+                    raise ValueError("keyframes out of order")
                 last, places = keyframe.id, places + bool(len(keyframe.descriptors))
                 yield keyframe
         except (RecordingError, MessageError, ValueError) as error:

@@ -1,9 +1,9 @@
-"""A map that is kept: its keyframes as places, each with the points that hang on it, and back.
+"""A saved map: its keyframes as places, each with the landmarks of which it is the reference.
 
-What is kept is what a camera may come back to: poses, what they saw, corners, points with the
-patches by which they are found again.  Pixels are those of the ideal camera of the calibration that
-is kept with them, so that another camera, with a calibration of its own, can use the map.  Each
-keyframe stands for itself: no part grows with the map.
+It stores what relocalisation needs: poses, observations, corners, and landmarks with their
+re-acquisition patches.  Pixels are those of the ideal camera of the calibration stored with them,
+so another camera with its own calibration can use the map.  Each keyframe is independent: no part
+grows with the map.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,40 +28,40 @@ from pliant.algorithms.places import Features
 
 
 class Origin(NamedTuple):
-    """Where a keyframe comes from: the number of the run, and the frame there."""
+    """The origin of a keyframe: the number of the run, and the frame in its source."""
 
     session: int
     frame: int
 
 
 def view_of(kept: KeptKeyframe) -> CorrectedView:
-    """Whose pixels a keyframe has."""
+    """Return the camera view whose pixels a keyframe has."""
     return corrected_view(kept.given_camera, tuple(kept.correction.tolist()))
 
 
 _MOST, _MOST_POINTS, _LONGEST_SIDE_PX = 1 << 30, 1 << 62, 32767
-"""What numbers of keyframes, of points and of pixels may be, so that what comes later fits, too."""
+"""Limits for numbers of keyframes and landmarks, with room for later ones, and for pixels."""
 
 
 def check(kept: KeptKeyframe) -> None:
-    """Raise ValueError where a keyframe is none that this module has made."""
+    """Raise ValueError if this module cannot have written the keyframe."""
     check_arrays(kept)
     if kept.point_patches.shape[1:] != (PATCH_SIDE, PATCH_SIDE):
         raise ValueError(f"patches of {kept.point_patches.shape[1]} pixels")
     numbers = (kept.id, kept.segment, kept.session, kept.source_frame)
     if not all(0 <= number < _MOST for number in numbers) or kept.given[:4].min() <= 0.0:
-        raise ValueError("numbers or a camera that cannot be")
+        raise ValueError("invalid numbers or camera")
     real = (kept.given, kept.correction, kept.T_world_camera, kept.motion, kept.points_world)
     if not all(np.isfinite(each).all() for each in (*real, kept.seen_px, kept.corners_px)):
-        raise ValueError("values that are not finite")
+        raise ValueError("non-finite values")
     if kept.given[:2].max() > _LONGEST_SIDE_PX:
-        raise ValueError("a camera that cannot be")
+        raise ValueError("an invalid camera")
     R, last = kept.T_world_camera[:3, :3], kept.T_world_camera[3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or last.tolist() != [0.0, 0.0, 0.0, 1.0]:
-        raise ValueError("a pose that is none")
+        raise ValueError("an invalid pose")
     for ids in (kept.seen_ids, kept.point_ids):
         if len(ids) and (ids[0] < 0 or ids[-1] >= _MOST_POINTS or (np.diff(ids) <= 0).any()):
-            raise ValueError("points that are not in order")
+            raise ValueError("points out of order")
 
 
 def keep(
@@ -70,14 +70,14 @@ def keep(
     features: dict[int, Features],
     origins: dict[int, Origin],
 ) -> Iterator[KeptKeyframe]:
-    """The keyframes of a segment, oldest first.
+    """Yield the keyframes of a segment, oldest first.
 
     features: of keyframes by their ids, at the pixels of the rectified image.   origins: of all.
     """
     points, given, view = segment.points, calibration.given, calibration.view
     ids = np.array([keyframe.id for keyframe in segment.keyframes], np.int64)
     rows = points.mapped(segment.id)
-    # What hung on a keyframe that the map has forgotten moves with the one before it.
+    # Landmarks of a dropped keyframe move with the keyframe before it.
     hosts = np.maximum(np.searchsorted(ids, points.first_keyframe[rows], side="right") - 1, 0)
     rows = rows[np.lexsort([points.ids[rows], hosts])]
     ends = np.cumsum(np.bincount(hosts, minlength=len(ids)))
@@ -121,10 +121,11 @@ def keep(
 def take_in(
     kept: Sequence[KeptKeyframe], points: Landmarks, calibration: SelfCalibration
 ) -> list[Segment]:
-    """The segments of a kept map, their points in rows that are new; those without a point are
-    left out.
+    """Return the segments of a saved map, with their landmarks in new rows; segments without
+    landmarks are left out.
 
-    calibration: of the camera that goes on in it.   Raises ValueError where a point comes twice.
+    calibration: of the camera that continues the map.   Raises ValueError if a landmark occurs
+    twice.
     """
     rows = points.allocate(sum(len(each.point_ids) for each in kept))
     first = 0
@@ -157,7 +158,9 @@ def take_in(
 
 
 def spans_of(kept: Sequence[KeptKeyframe]) -> list[tuple[int, int]]:
-    """(first keyframe id, segment) of each stretch of keyframes of one segment, see ``held``."""
+    """Return (first keyframe id, segment) of each stretch of keyframes of one segment, see
+    ``held``.
+    """
     spans: list[tuple[int, int]] = []
     for each in kept:
         if not spans or spans[-1][1] != each.segment:
@@ -168,8 +171,9 @@ def spans_of(kept: Sequence[KeptKeyframe]) -> list[tuple[int, int]]:
 def numbered_after(
     kept: Sequence[KeptKeyframe], known: Sequence[KeptKeyframe]
 ) -> list[KeptKeyframe]:
-    """The keyframes of a map under numbers that follow on those of another one: of keyframes,
-    segments, sessions and points."""
+    """Return a map's keyframes with numbers that continue those of another map: keyframes,
+    segments, sessions and landmarks.
+    """
     ids = [ids for each in known for ids in (each.seen_ids, each.point_ids) if len(ids)]
     points = 1 + max((int(each[-1]) for each in ids), default=-1)
     segments = 1 + max(each.segment for each in known)
@@ -186,11 +190,11 @@ def numbered_after(
 
 
 def corrected_as(kept: KeptKeyframe, calibration: SelfCalibration) -> KeptKeyframe:
-    """The keyframe with what another session has found wrong with the same camera: what was seen
-    stays where it was in the image.  One of another camera stays as it is, and one with the same.
+    """Return the keyframe with the calibration that another session estimated for the same camera.
 
-    Two sessions differ by a thousandth in the focal length, and rays by as much: as rays the same
-    image would be seen from two places.
+    Observations keep their position in the image.  A keyframe of another camera, or with the same
+    calibration, is unchanged.  Two sessions differ by a thousandth in the focal length, and rays by
+    as much: as rays the same image would be seen from two places.
     """
     same = np.array_equal(kept.correction, calibration.correction)
     if same or kept.given_camera != calibration.given:
@@ -205,14 +209,15 @@ def corrected_as(kept: KeptKeyframe, calibration: SelfCalibration) -> KeptKeyfra
 
 
 def features_for(kept: KeptKeyframe, calibration: SelfCalibration) -> Features:
-    """Its corners at the pixels of the rectified image of a camera."""
+    """Return the corners at the pixels of the rectified image of a camera."""
     moved = _moved(kept.corners_px, view_of(kept).camera, calibration.view.camera)
     return Features(points_px=calibration.view.seen(moved), descriptors=kept.descriptors)
 
 
 def known_camera(kept: Sequence[KeptKeyframe], camera: PinholeCamera) -> SelfCalibration | None:
-    """What the last session of a map knew of a camera that was given in the same words; None where
-    it is another one."""
+    """Return the last session's calibration for a camera with the same description, or None for
+    another camera.
+    """
     for each in reversed(kept):
         if each.given_camera == camera:
             found = SelfCalibration(camera, each.correction.copy(), np.diag(each.sigmas**2))
@@ -221,7 +226,9 @@ def known_camera(kept: Sequence[KeptKeyframe], camera: PinholeCamera) -> SelfCal
 
 
 def _inverse_distance(keyframes: list[Keyframe]) -> float:
-    """Of the points from the newest keyframe that sees some, as of ``Segment``."""
+    """Inverse distance of the landmarks from the newest keyframe with landmarks, as of
+    ``Segment``.
+    """
     for keyframe in reversed(keyframes):
         if keyframe.focus is not None and np.isfinite(keyframe.focus).all():
             distance = np.linalg.norm(keyframe.focus - keyframe.T_world_camera[:3, 3])
@@ -251,7 +258,7 @@ def _keyframe(kept: KeptKeyframe, ids: I64, rows: I32, calibration: SelfCalibrat
 
 
 def _moved(points_px: F32, old: PinholeCamera, new: PinholeCamera) -> F32:
-    """Pixels of one pinhole camera in another one that stands where it stood."""
+    """Convert pixels of one pinhole camera to another one at the same pose."""
     if old == new:
         return points_px
     seen = old.normalise(points_px)
@@ -259,7 +266,9 @@ def _moved(points_px: F32, old: PinholeCamera, new: PinholeCamera) -> F32:
 
 
 def _zoomed(patches: U8, zoom: float) -> U8:
-    """Patches as a camera with so many times the focal length sees them, their border repeated."""
+    """Return patches as a camera with this multiple of the focal length sees them, the border
+    repeated.
+    """
     if zoom == 1.0 or not len(patches):
         return patches
     middle = 0.5 * (PATCH_SIDE - 1)

@@ -11,17 +11,16 @@ from pliant.compiler.kernel import kernel
 
 @dataclass(kw_only=True)
 class Keyframe:
-    """A keyframe and what it observed.
+    """A keyframe and its observations.
 
-    rows: (n,) rows of points or candidates, each at most once.    points_px: (n, 2).
-    rolled_px: (n, 2) by how much farther a rolling shutter had moved them, see ``RolledFrame``.
-    published_pose: T_world_camera when last published.
-    is_pure_rotation: it is where the last one is: a pure rotation tells no depths, and its pose
-    rests on all that it saw when it was made.
-    stamp_ns: when it was taken; -1: nobody knows.   log_focal: of its focal length relative to the
-    calibration, with which its pixels are those of an ideal camera: see ``changing_focal``.
-    focus: (3,) where it looks: on its axis, at the median depth of its points.  Set when it leaves
-    the window; NaN where it sees no point of the map.
+    rows: (n,) rows of landmarks or candidates, each at most once.    points_px: (n, 2). rolled_px:
+    (n, 2) rolling-shutter offset that was removed, see ``rolling_shutter``. published_pose:
+    T_world_camera when last published. is_pure_rotation: it has the position of the last one: a
+    pure rotation determines no depths, and its pose depends on all its observations when it was
+    made. stamp_ns: capture time; -1: unknown.   log_focal: its focal length relative to the
+    calibration, with which its pixels are those of an ideal camera: see ``changing_focal``. focus:
+    (3,) the point on its axis at the median depth of its landmarks.  Set when it leaves the window;
+    NaN without landmarks.
     """
 
     id: int
@@ -38,13 +37,13 @@ class Keyframe:
     focus: F64 | None = None
 
     def keep(self, mask: BoolArray) -> None:
-        """Forget the observations that are not in the mask."""
+        """Remove the observations outside the mask."""
         self.rows, self.points_px, self.rolled_px = _kept(
             self.rows, self.points_px, self.rolled_px, mask
         )
 
     def follow_aliases(self, points: Landmarks) -> None:
-        """Let observations of merged rows stand for the rows that took them in."""
+        """Replace merged rows by the rows that they were merged into."""
         self.rows, self.points_px, self.rolled_px = _follow_aliases(
             self.rows, self.points_px, self.rolled_px, points.alias
         )
@@ -75,12 +74,12 @@ def _room_for(count: int) -> tuple[I32, F32, F32]:
 
 @kernel
 def _follow_aliases(rows: I32, points_px: F32, rolled_px: F32, alias: I32) -> tuple[I32, F32, F32]:
-    """Ascending rows stay so, each once: of two observations that of the lower row is kept."""
+    """Keep the rows ascending and unique: of two observations, the one of the lower row is kept."""
     merged = np.empty(rows.size, np.int32)
     count = 0
     for i in range(rows.size):
         if alias[rows[i]] != rows[i]:
-            # Few have merged since the last keyframe, so that they are sorted as they come.
+            # Few were merged since the last keyframe, so insertion sort is fast.
             at = count
             while at > 0 and alias[rows[merged[at - 1]]] > alias[rows[i]]:
                 merged[at] = merged[at - 1]
@@ -111,7 +110,7 @@ def _follow_aliases(rows: I32, points_px: F32, rolled_px: F32, alias: I32) -> tu
 
 @dataclass(frozen=True, kw_only=True)
 class Observations:
-    """What a frame sees of the map: rows (n,), each once, points_px and rolled_px (n, 2)."""
+    """Observations of a frame: rows (n,), each once, points_px and rolled_px (n, 2)."""
 
     rows: I32
     points_px: F32
@@ -119,6 +118,6 @@ class Observations:
 
     @staticmethod
     def none() -> "Observations":
-        """Nothing."""
+        """Return no observations."""
         no_px = np.zeros((0, 2), np.float32)
         return Observations(rows=np.zeros(0, np.int32), points_px=no_px, rolled_px=no_px)

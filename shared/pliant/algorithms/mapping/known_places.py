@@ -1,14 +1,14 @@
-"""The keyframes of all segments as places: which of them an image shows, or a keyframe comes to.
+"""The keyframes of all segments as places: which of them an image shows, or a new keyframe
+revisits.
 
-Within a segment.  Where the map has not drifted by more than a few pixels, points are found again
-by where they are, and the keyframes share them.  A place that looks like a new keyframe without
-sharing points with it has drifted away, or only looks alike.  One that is the same goes on being
-so: keyframes that follow each other must tell of the same drift, so that what is found at one is
-believed when a second one confirms it.
+Within a segment.  If the map has drifted by no more than a few pixels, landmarks are reacquired by
+position, and the keyframes share them.  A place that looks like a new keyframe without sharing
+landmarks with it has drifted, or only looks alike.  A true revisit lasts: consecutive keyframes
+must show the same drift, so a loop candidate of one keyframe counts when a second one confirms it.
 
-Between segments.  A segment begins where the camera was lost for long.  Where it comes to a place
-of an earlier one, keyframes tell how the two worlds lie to each other, as they do of loops; one is
-moved into the other, and what is left between them the loops take out that told so.
+Between segments.  A segment begins after a long loss of the camera.  When it reaches a place of an
+earlier segment, keyframes determine the similarity between the two world frames, as they do for
+loops. One segment is moved into the other, and the remaining error is corrected as a loop.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -43,35 +43,35 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.places import Features, PlaceIndex, describe
 
 _WITHIN = 3
-"""Keyframes within which another one must tell the same."""
+"""Keyframes within which another one must confirm a candidate."""
 
 _SAME_TURN_RAD = np.radians(2.0)
 _SAME_SHIFT = 0.05
-"""Drifts are the same within this turn, and this share of the depth: of scale, too."""
+"""Two drifts agree within this rotation, and this share of the depth and of the scale."""
 
 _TRIES = 3
 """Places of a segment that are compared with a keyframe: none of them may contradict."""
 
 _PLACES = 5
-"""That look most like a frame are looked at more closely."""
+"""Number of most similar places that are verified for a frame."""
 
 _LOOKED_AT = 64
-"""Places that look most like a keyframe: whether one of these shares points with it.  Where more
-look so much alike and all share points, the map has not drifted there."""
+"""Number of most similar places in which one without shared landmarks is searched.  If more places
+are as similar and all share landmarks, the map has not drifted there.
+"""
 
 _ELSEWHERE = 2
-"""Places more where one of these is proved: what looks the same is often seen by many keyframes."""
+"""Further places that are compared after a verified one: many keyframes may see the same room."""
 
 
 @dataclass(kw_only=True)
 class Comparisons:
-    """How often keyframes were compared with places, and what came of it.
+    """Counts of comparisons between keyframes and places, and their results.
 
-    compared: pairs of keyframes.   few_corners, few_points, one_spot, repeated: refused, see
-    ``place_match``.   contradicted: agreed, and another place agreed otherwise, or the image did.
-    unconfirmed: loops of one keyframe, of which the best counts, that no other one agrees with yet.
-    confirmed: by another one.   refused: of these, by the graph of all keyframes.   closed: taken
-    in.
+    compared: pairs of keyframes.   few_corners, few_points, one_spot, repeated: rejected, see
+    ``place_match``.   contradicted: matches that another place or the image contradicts.
+    unconfirmed: loop candidates of one keyframe, of which the best counts, not confirmed yet.
+    confirmed: by another keyframe.   refused: of these, by the pose graph.   closed: applied.
     """
 
     compared: int = 0
@@ -86,18 +86,18 @@ class Comparisons:
     closed: int = 0
 
     def refuse(self, why: Refusal) -> None:
-        """A pair is not proved to show one place."""
+        """Count a rejected pair."""
         setattr(self, why, getattr(self, why) + 1)
 
     @property
     def counters(self) -> dict[str, int]:
-        """By the names that ``report.json`` has."""
+        """The counts by their names in ``report.json``."""
         return {f"places_{name}": count for name, count in vars(self).items()}
 
 
 @dataclass(kw_only=True)
 class LoopCandidates:
-    """waiting: loops of one keyframe, until another one agrees."""
+    """waiting: loop candidates of one keyframe, until another one confirms them."""
 
     waiting: list[Loop] = field(default_factory=list[Loop])
 
@@ -112,12 +112,11 @@ class LoopCandidates:
         tries: int = 1,
         elsewhere: Iterable[Place] = (),
     ) -> list[Loop]:
-        """The loops that a new keyframe proves: with a place that looks like it, if any.
+        """Return the loops that a new keyframe confirms.
 
-        places: of one segment that look like it, the most alike first.   comparisons: are counted
-        there.   tries: how many of them are asked; if they contradict each other, what is alike in
-        both proves neither.   elsewhere: others, which are asked as well where one of these is
-        proved.
+        places: of one segment, the most similar first.   comparisons: counted there.   tries: how
+        many of them are compared; if they contradict each other, none counts.   elsewhere: others,
+        which are compared as well after a match.
         """
         keyframe = new.keyframe
         mine = np.zeros(len(points.state), np.bool_)
@@ -125,7 +124,7 @@ class LoopCandidates:
         mine &= points.state == MAPPED
         self.waiting = [loop for loop in self.waiting if keyframe.id - loop.new <= _WITHIN]
         window = {k.id for k in new.segment[-parameters.window.keyframes :]}
-        # Its own, so that no frame is located otherwise because something was looked at here.
+        # Its own generator: a comparison must not change the pose of a frame.
         generator = np.random.default_rng(keyframe.id)
         least, found_loops = parameters.localisation.min_inliers, list[Loop]()
 
@@ -169,7 +168,7 @@ class LoopCandidates:
 
 
 def _agree(one: Loop, other: Loop, new: Place, points: Landmarks) -> bool:
-    """Whether two loops take what the new keyframe sees to the same place."""
+    """Whether two loops move the view of the new keyframe to the same place."""
     keyframe = new.keyframe
     between: F64 = np.linalg.inv(other.S_old_new) @ one.S_old_new
     scale = float(np.cbrt(np.linalg.det(between[:3, :3])))
@@ -186,10 +185,10 @@ def _agree(one: Loop, other: Loop, new: Place, points: Landmarks) -> bool:
 
 @dataclass(kw_only=True)
 class SegmentMerges:
-    """Of the segment that the camera is in with earlier ones.
+    """Merges of the active segment with earlier ones.
 
-    revisits: of each of those, what awaits a second keyframe.   proved: loops that have been
-    confirmed, from places of earlier segments to keyframes of this one, until they are joined.
+    revisits: candidates of each of those, waiting for a second keyframe.   proved: confirmed loops,
+    from places of earlier segments to keyframes of this one, until the segments are merged.
     """
 
     revisits: dict[int, LoopCandidates] = field(default_factory=dict[int, LoopCandidates])
@@ -206,10 +205,10 @@ class SegmentMerges:
         comparisons: Comparisons,
         contradicts: Callable[[Loop], bool],
     ) -> None:
-        """Compare a new keyframe with places of earlier segments, the most alike first.
+        """Compare a new keyframe with places of earlier segments, the most similar first.
 
-        elsewhere: others of a segment, which must not tell otherwise.   comparisons: are counted
-        there.   contradicts: whether the keyframe's image does, to what is proved.
+        elsewhere: other places of a segment, which must not contradict.   comparisons: counted
+        there. contradicts: whether the keyframe's image contradicts a match.
         """
         by_segment: dict[int, list[Place]] = {}
         for place in places:
@@ -234,10 +233,10 @@ def join(
     spans: list[tuple[int, int]],
     calibration: SelfCalibration,
 ) -> Moved:
-    """Make two segments one, in the world of the older one: its first keyframe goes on holding it.
+    """Merge two segments in the world frame of the older one, which its first keyframe defines.
 
-    loops: from the earlier one to the one that goes on.   spans: as of ``held``.   calibration: of
-    the segment that goes on.
+    loops: from the earlier one to the active one.   spans: as of ``held``.   calibration: of the
+    active segment.
     """
     goes_on = active.segment
     to_earlier = max(loops, key=lambda loop: len(loop.rows)).S_old_new
@@ -260,9 +259,8 @@ def join(
 
 @dataclass(kw_only=True)
 class KnownPlaces:
-    """index: of their corners, at the pixels of the rectified image.   revisits: of the segment
-    that the camera is in with itself.   meetings: with earlier ones.   comparisons: of all, from
-    the beginning.
+    """index: of their corners, at the pixels of the rectified image.   revisits: of the active
+    segment with itself.   meetings: with earlier ones.   comparisons: all so far.
     """
 
     index: PlaceIndex = field(default_factory=PlaceIndex)
@@ -271,13 +269,13 @@ class KnownPlaces:
     comparisons: Comparisons = field(default_factory=Comparisons)
 
     def know(self, kept: Iterable[KeptKeyframe], calibration: SelfCalibration) -> None:
-        """Take in the places of a map that was kept.   calibration: of the camera that has come."""
+        """Add the places of a loaded map.   calibration: of the current camera."""
         for each in kept:
             if len(each.descriptors):
                 self.index.add(each.id, features_for(each, calibration))
 
     def enter(self) -> None:
-        """The camera is in a segment that it was not in before."""
+        """The camera is in another segment than before."""
         self.revisits, self.meetings = LoopCandidates(), SegmentMerges()
 
     def recognise(
@@ -290,8 +288,8 @@ class KnownPlaces:
         parameters: MappingParameters,
         generator: np.random.Generator,
     ) -> Recognised | None:
-        """Which keyframe of the segments saw what an image shows, and where that was taken; None
-        where no single one is proved.   grey: (H, W).   maxima: (M, 3) of its curvature.
+        """Return the keyframe whose place an image shows, and the pose of the image; None unless
+        exactly one place is verified.   grey: (H, W).   maxima: (M, 3) of its curvature.
         """
         seen, view = describe(grey), calibration.view
         ranked = self._like(seen, segments, view)
@@ -314,9 +312,10 @@ class KnownPlaces:
         loops: bool,
         image: tuple[F32, U8] | None = None,
     ) -> list[Loop]:
-        """What a new keyframe, which sees these corners, shows again: returns the loops that it
-        proves in its own segment, where these are asked for; what it has in common with earlier
-        ones waits in ``meetings``.   image: its maxima (M, 3), and itself (H, W).
+        """Compare a new keyframe, with these corners, with earlier places.
+
+        Returns the loops that it confirms in its own segment, if requested; matches with earlier
+        segments wait in ``meetings``.   image: its maxima (M, 3), and the image (H, W).
         """
         new = Place(keyframe=keyframe, corners=seen, segment=segment.keyframes)
         rest = segment.points, view.camera, parameters, self.comparisons
@@ -336,7 +335,7 @@ class KnownPlaces:
                 known = ((k, each.keyframes) for each in earlier for k in each.keyframes)
                 old, among = next(each for each in known if each[0].id == loop.old)
                 pose = move_by_similarity(loop.S_old_new, keyframe.T_world_camera)
-                # Its own, so that no frame is located otherwise because something was looked at.
+                # Its own generator: a comparison must not change the pose of a frame.
                 generator = np.random.default_rng(keyframe.id)
                 return rest_is_elsewhere(
                     pose, old, among, segment.points, *image, view.camera, parameters, generator
@@ -348,7 +347,7 @@ class KnownPlaces:
     def remember(
         self, keyframe: Keyframe, seen: Features, segments: list[Segment], view: CorrectedView
     ) -> None:
-        """A keyframe is a place to come back to; those that the segments have forgotten are not."""
+        """Add a keyframe as a place; remove keyframes that the segments have dropped."""
         self.index.add(keyframe.id, replace(seen, points_px=view.seen(seen.points_px)))
         known = {k.id for segment in segments for k in segment.keyframes}
         self.index.forget(self.index.features.keys() - known)
@@ -356,7 +355,7 @@ class KnownPlaces:
     def _like(
         self, seen: Features, segments: list[Segment], view: CorrectedView
     ) -> Iterator[Place]:
-        """Keyframes of the segments that look like an image, the most alike first."""
+        """Keyframes of the segments that look like an image, the most similar first."""
         known = {k.id: (k, each.keyframes) for each in segments for k in each.keyframes}
         for keyframe, segment in (known[i] for i in self.index.query(seen) if i in known):
             corners = self.index.features[keyframe.id]
@@ -366,7 +365,7 @@ class KnownPlaces:
 def _showing_else(
     ranked: Iterable[Place], places: list[Place], points: Landmarks, least: int
 ) -> Iterator[Place]:
-    """The next places that show hardly a point, fewer than ``least``, of those before."""
+    """The next places that share fewer than ``least`` landmarks with the former."""
     shown = np.zeros(len(points.state), np.bool_)
     for place in places:
         shown[place.keyframe.rows] = True

@@ -1,10 +1,10 @@
-"""The pose of a frame from the points of the map that it sees, and where no track leads to them.
+"""The pose of a frame from visible landmarks, and without tracks after a loss.
 
-A camera that is covered, blurred or dark for a moment goes on moving.  Where it is afterwards lies
-the farther from any prediction the longer that took, so that points are looked for in a radius that
-grows with the time since the last pose.  Of the many maxima in it a point takes the one whose patch
-fits best; P3P and RANSAC find the pose that the good ones among these agree on, and all points that
-are found where it shows them must prove it.
+A camera that is covered, blurred or dark for a moment keeps moving.  The longer that takes, the
+farther it may be from any prediction, so landmarks are searched in a radius that grows with the
+time since the last pose.  Of the many maxima in it a landmark takes the one whose patch fits best.
+P3P and RANSAC find the pose on which the good ones agree, and all landmarks found at their
+projection must verify it.
 """
 
 from dataclasses import dataclass, replace
@@ -34,17 +34,17 @@ _COARSE_SIGMAS = 4.0
 _PREDICTION_GATE_PX = 20.0
 
 _SPEEDING_UP = 0.5
-"""Share of its last acceleration that a camera is taken to keep: all of it lets noise grow."""
+"""Share of its last acceleration that a prediction keeps: all of it amplifies noise."""
 
 NEAR = 0.3
-"""Share of the radius that is searched first: mostly enough, and far less to confuse."""
+"""Share of the radius that is searched first: usually sufficient, with far fewer false matches."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Localisation:
     """T_world_camera of a frame, and which of the points (N,) support it.
 
-    is_pure_rotation: nothing shows that the camera has moved since, see ``Spread``.
+    is_pure_rotation: no translation is significant, see ``Spread``.
     """
 
     T_world_camera: F64
@@ -61,11 +61,11 @@ def locate(
     generator: np.random.Generator,
     spread: Spread | None = None,
 ) -> Localisation:
-    """The pose that most points agree with: from the best prediction, or by P3P and RANSAC.
+    """Return the pose on which most points agree, from the best prediction or by P3P and RANSAC.
 
-    predictions: poses (4, 4) to start from, at least one.   points_world: (N, 3).  points_px:
-    (N, 2).  spread: of provisional points, see ``inverse_depth``; None: all are certain.
-    The caller judges whether the inliers suffice.
+    predictions: poses (4, 4) to start from, at least one.   points_world: (N, 3).  points_px: (N,
+    2).  spread: of provisional points, see ``inverse_depth``; None: all are certain. The caller
+    decides whether the inliers suffice.
     """
     points_n = camera.normalise(points_px.astype(np.float64))
     gate = _PREDICTION_GATE_PX / camera.fx
@@ -97,7 +97,7 @@ def refine(
     near: bool = False,
     spread: Spread | None = None,
 ) -> Localisation:
-    """Robust refinement of a pose, from a wide kernel to a narrow one; near: narrow at once.
+    """Refine a pose robustly, from a wide kernel to a narrow one; near: narrow immediately.
 
     spread: of provisional points, see ``inverse_depth``; None: all are certain.
     """
@@ -129,7 +129,7 @@ def _cost(T_world_camera: F64, points_world: F64, points_n: F64, gate: float) ->
 
 
 class VerifiedPose(NamedTuple):
-    """A pose, and the rows of the points that prove it."""
+    """A pose, and the rows of the landmarks that verify it."""
 
     T_world_camera: F64
     rows: I32
@@ -137,11 +137,11 @@ class VerifiedPose(NamedTuple):
 
 @dataclass(kw_only=True)
 class Motion:
-    """How the camera moved last: T_world_camera (4, 4) of two frames, the newer one last.
+    """The last motion of the camera: T_world_camera (4, 4) of two frames, the newer one last.
 
-    tracked: points and helping candidates that support the newer one and have tracks, as far as
-    that is known.   to_points: tracks that lead from it to points of the map alone.
-    unmapped_s: from the last frame that was mapped to the newer one.
+    tracked: tracked landmarks and helping candidates that support the newer one, as far as known.
+    to_points: tracks that lead from it to landmarks alone. unmapped_s: from the last mapped frame
+    to the newer one.
     """
 
     frames: tuple[int, int]
@@ -153,7 +153,7 @@ class Motion:
 
     @staticmethod
     def at(frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
-        """Of a camera of which one pose is known."""
+        """Return the motion of a camera with one known pose."""
         twice = (T_world_camera, T_world_camera)
         return Motion(frames=(frame, frame), stamps_ns=(stamp_ns, stamp_ns), poses=twice)
 
@@ -165,7 +165,7 @@ class Motion:
         tracked: int = 0,
         to_points: int = 0,
     ) -> "Motion":
-        """The motion after one more pose."""
+        """Return the motion after one more pose."""
         return Motion(
             frames=(self.frames[1], frame),
             stamps_ns=(self.stamps_ns[1], stamp_ns),
@@ -177,26 +177,26 @@ class Motion:
     def then_unmapped(
         self, frame: int, stamp_ns: int, T_world_camera: F64, tracked: int, to_points: int
     ) -> "Motion":
-        """The motion after one more pose, of a frame that is not mapped."""
+        """Return the motion after one more pose, of an unmapped frame."""
         after = self.then(frame, stamp_ns, T_world_camera, tracked, to_points)
         return replace(after, unmapped_s=self.unmapped_s + self.lost_s(stamp_ns))
 
     def moved(self, S: F64) -> "Motion":
-        """The motion after the world has moved by a similarity (4, 4)."""
+        """Return the motion after the world has moved by a similarity (4, 4)."""
         before, last = (move_by_similarity(S, pose) for pose in self.poses)
         return replace(self, poses=(before, last))
 
     def velocity(self) -> F64:
-        """(6,) between the two, as of ``FramePoses.motions``."""
+        """(6,) between the two frames, as of ``FramePoses.motions``."""
         frames = max(1, self.frames[1] - self.frames[0])
         return motion_between(*self.poses, self.poses[1]) / frames
 
     def velocity_at(self, frame: int, T_world_camera: F64) -> F64:
-        """(6,) at a frame that follows with this pose."""
+        """(6,) at a later frame with this pose."""
         between = self.then(frame, 0, T_world_camera).velocity()
         if self.frames[0] == self.frames[1]:
             return between
-        # The velocity that was between the frames has changed since.
+        # The velocity between the frames has changed since.
         share = (frame - self.frames[1]) / (frame - self.frames[0])
         return between + _SPEEDING_UP * share * (between - self.velocity())
 
@@ -209,7 +209,7 @@ class Motion:
         return 1e-9 * (stamp_ns - self.stamps_ns[1])
 
     def predictions(self, stamp_ns: int) -> list[F64]:
-        """T_world_camera by constant velocity, and that of a camera that has stopped since."""
+        """Predict T_world_camera by constant velocity, and for a camera that has stopped."""
         before, last = self.poses
         elapsed = self.stamps_ns[1] - self.stamps_ns[0]
         if elapsed <= 0:
@@ -223,7 +223,7 @@ class Motion:
 
 
 def search_radius_px(lost_s: float, camera: PinholeCamera, parameters: RecoveryParameters) -> float:
-    """How far from its prediction a point may be, px, this long after the last pose."""
+    """Search radius around a prediction, px, this long after the last pose."""
     grown = parameters.radius_share + parameters.growth_share_per_s * lost_s
     return camera.width * min(grown, parameters.max_radius_share)
 
@@ -239,10 +239,10 @@ def recover(
     parameters: MappingParameters,
     generator: np.random.Generator,
 ) -> F64 | None:
-    """T_world_camera of a frame that no track leads to, None where the image does not prove one.
+    """Return T_world_camera of a frame without tracks, or None if the image does not verify a pose.
 
-    motion: before.   stamp_ns: of the frame.   rows: of points that it may show.   maxima: (M, 3)
-    of the frame.   grey: (H, W).
+    motion: before.   stamp_ns: of the frame.   rows: of landmarks that may be in view.   maxima:
+    (M, 3) of the frame.   grey: (H, W).
     """
     predictions = motion.predictions(stamp_ns)
     radius_px = search_radius_px(motion.lost_s(stamp_ns), camera, parameters.recovery)
@@ -258,11 +258,10 @@ def recover(
 
 
 def are_enough(points: int, parameters: MappingParameters) -> bool:
-    """Whether so many points that prove a pose, or corners that tell it, place a camera to which no
-    tracks lead.
+    """Whether this many verified landmarks, or corners, place a camera without tracks.
 
-    A few dozen agree on a pose a step aside as well, by what looks alike there.  No map starts with
-    so few, and none goes on by them.
+    A few dozen also agree on a pose a step aside, if the scene repeats there.  No map starts with
+    so few, and none continues by them.
     """
     return points >= parameters.start.min_points
 
@@ -278,9 +277,9 @@ def search_near(
     parameters: MappingParameters,
     generator: np.random.Generator,
 ) -> VerifiedPose | None:
-    """The pose that points agree on which are looked for about where a pose shows them, and prove.
+    """Search landmarks around their projection in a pose, and return the pose that they verify.
 
-    rows: of the points.   grid: the maxima of the image, for this radius.
+    rows: of the landmarks.   grid: the maxima of the image, for this radius.
     """
     own = parameters.recovery
     limits = parameters.localisation.model_copy(update={"ransac_samples": own.ransac_samples})
@@ -309,10 +308,10 @@ def verify_pose(
     parameters: MappingParameters,
     min_agreement: float,
 ) -> VerifiedPose | None:
-    """The pose refined by all points found where it shows them, None if these are too few of them.
+    """Refine a pose by all landmarks found at their projection; None if too few support it.
 
-    min_agreement: least share of the points found that support it, see ``RecoveryParameters``.
-    Wrong poses find points as well: wherever a maximum is near and its patch looks alike.
+    min_agreement: minimum share of the found landmarks that support it, see ``RecoveryParameters``.
+    A wrong pose finds landmarks too: wherever a maximum is near and its patch looks alike.
     """
     found = reacquire(
         T_world_camera, rows, points, maxima, maxima, grey, camera, parameters.reacquisition

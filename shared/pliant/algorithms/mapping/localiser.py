@@ -1,8 +1,8 @@
-"""Finds frames in a map of earlier sessions, which stays as it is.
+"""Localises frames in a loaded map, which does not change.
 
-A frame is recognised by what it looks like; those that follow are found by the points of the map:
-those that tracks lead to, and those found again at the maxima of curvature, as when a map grows.
-Nothing is triangulated or adjusted.
+A frame is recognised by its appearance.  Later frames are localised by landmarks: tracked ones, and
+those reacquired at the maxima of curvature, as during mapping.  Nothing is triangulated or
+adjusted.
 """
 
 from collections.abc import Sequence
@@ -35,13 +35,13 @@ from pliant.algorithms.stages import StageTimer, no_stages
 
 _LOOK_TURN_RAD = np.radians(5.0)
 _LOOK_SHIFT = 0.05
-"""Of the depth: a camera that has moved or turned by more may see what others saw."""
+"""Share of the depth: after a larger motion or rotation, other keyframes may be covisible."""
 
 
 class Localiser:
-    """What it is told and tells is a ``Mapper``'s.
+    """Has the interface of ``Mapper``.
 
-    A pure function of camera, map, parameters, seed and the frames given, one after the other.
+    A pure function of camera, map, parameters, seed and the frames in their order.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Localiser:
         seed: int,
         known: Sequence[KeptKeyframe] = (),
     ) -> None:
-        """known: the map; where it is of this very camera, it tells the calibration, too."""
+        """known: the map; if it is of the same camera, its calibration is used."""
         self._parameters = parameters
         self.calibration = known_camera(known, camera) or SelfCalibration.of(
             camera, parameters.calibration
@@ -69,7 +69,7 @@ class Localiser:
         self._activated_from: F64 = np.eye(4)
 
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
-        """Find a frame in the map."""
+        """Localise a frame in the map."""
         ideal = IdealFrame.of(frame, self.calibration)
         if self._map is not None:
             self._map.links.follow(frame.extrema.ids, self._points)
@@ -107,8 +107,9 @@ class Localiser:
         return self._publish_placed(reference, found)
 
     def recognise(self, maxima: F32, grey: U8, generator: np.random.Generator) -> Recognised | None:
-        """Where an image (H, W) of the ideal camera, with its maxima (M, 3) of curvature, is seen
-        from, by what it looks like alone."""
+        """Return the pose of an image (H, W) of the ideal camera, with its maxima (M, 3) of
+        curvature, by its appearance alone.
+        """
         return self._places.recognise(
             grey, maxima, self._segments, self._points, self.calibration, self._parameters,
             generator,
@@ -120,21 +121,21 @@ class Localiser:
 
     @property
     def waiting_frames(self) -> list[int]:
-        """None: no map will start."""
+        """None, because no map will start."""
         return []
 
     @property
     def point_count(self) -> int:
-        """Points of the map."""
+        """Number of landmarks in the map."""
         return int(np.count_nonzero(self._points.state == MAPPED))
 
     @property
     def counters(self) -> dict[str, int]:
-        """None: the map is as it was."""
+        """None, because the map is unchanged."""
         return {}
 
     def kept(self) -> list[KeptKeyframe]:
-        """Nothing: the map is as it was."""
+        """Nothing, because the map is unchanged."""
         return []
 
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
@@ -142,7 +143,7 @@ class Localiser:
         return self._publish(WAITING if self._map is None else TRACKING, "", 0)
 
     def publish_keyframes(self) -> KeyframeDelta:
-        """None are made."""
+        """There are no new keyframes."""
         return KeyframeChanges(self._points).publish(None, self.calibration)
 
     def _locate(self, frame: IdealFrame, timer: StageTimer) -> F64 | None:
@@ -172,7 +173,7 @@ class Localiser:
         return found.T_world_camera
 
     def _activate_near(self, active: ActiveMap, T_world_camera: F64) -> bool:
-        """Whether the camera has moved so far that it may see what others saw."""
+        """Whether the camera has moved so far that other keyframes may be covisible."""
         rows = active.links.rows[active.linked(MAPPED)]
         moved = inverse(self._activated_from) @ T_world_camera
         turn = float(np.linalg.norm(so3_log(moved[:3, :3])))
@@ -189,7 +190,7 @@ class Localiser:
         return True
 
     def _find(self, active: ActiveMap, frame: IdealFrame, T_world_camera: F64) -> PlacedFrame:
-        """The pose by all points that are found again, and what there is for it."""
+        """The pose by all reacquired landmarks, and its quality."""
         parameters, camera = self._parameters, active.camera
         if self._motion is not None:
             frame = to_global_shutter(active, self._motion, frame, T_world_camera)

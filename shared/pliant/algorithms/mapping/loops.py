@@ -1,9 +1,10 @@
-"""A place that the map has seen before: where the drift since then goes, and which points are one.
+"""Loop closing: how the drift since an earlier visit is distributed, and which landmarks are
+merged.
 
-Place recognition proves that two keyframes look at the same thing, and how the world of the newer
-one lies in that of the older one.  That is spread over all keyframes between them by the graph of
-their similarities, points move with the keyframes on which they hang, those that are the same
-become one, and the adjustment of the whole map that comes next does the rest.
+Place recognition verifies that two keyframes see the same place, and the similarity between the
+world as each of them maps it.  A pose graph of similarities distributes the drift over all
+keyframes between them, landmarks move with their reference keyframes, common ones are merged, and
+the next global bundle adjustment refines the result.
 """
 
 from typing import NamedTuple
@@ -19,27 +20,27 @@ from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.compiler.kernel import kernel
 
 _COVISIBLE_SHARE = 0.3
-"""Share of the points of the lesser keyframe that two share which have an edge."""
+"""Minimum share of common landmarks, of the keyframe with fewer, for an edge."""
 
 _FOLLOWING_SHARE = 0.02
-"""The same of one that follows another in time: with fewer the camera was elsewhere meanwhile."""
+"""The same for consecutive keyframes: with fewer the camera was elsewhere in between."""
 
 _DEPTHS = 10.0
-"""Square root of how many depths of a keyframe have errors that nothing shares."""
+"""Square root of the number of a keyframe's depths with independent errors."""
 
 _ACCEPTED = 0.5
-"""Weight of a loop under which the others contradict it."""
+"""Weight of a loop below which the others contradict it."""
 
 _LEAST = 1e-6
-"""Depth and its sigma that a keyframe has at the least."""
+"""Minimum depth of a keyframe, and of its sigma."""
 
 
 class Loop(NamedTuple):
-    """Two keyframes that look at the same place.
+    """Two keyframes that see the same place.
 
-    old, new: ids of the keyframes.    S_old_new: (4, 4) similarity that moves the world as the new
-    one knows it to where the old one knows it.    rows, ids: (n, 2) of points that are the same,
-    the old one first.
+    old, new: ids of the keyframes.    S_old_new: (4, 4) similarity that moves the world of the new
+    one to that of the old one.    rows, ids: (n, 2) of landmarks that are the same, the old one
+    first.
     """
 
     old: int
@@ -49,7 +50,7 @@ class Loop(NamedTuple):
     ids: I64
 
     def living(self, points: Landmarks) -> "Loop":
-        """With those of its points that still exist."""
+        """Return the loop with the landmarks that still exist."""
         alive = points.ids[self.rows] == self.ids
         alive &= points.state[self.rows] == MAPPED
         alive = alive.all(axis=1)
@@ -59,10 +60,11 @@ class Loop(NamedTuple):
 def close_loops(
     seen: ObservationList, keyframe_ids: I64, sigmas: F64, loops: list[Loop], focal_px: float
 ) -> tuple[MapMoves, list[Loop]]:
-    """How the map moves with its keyframes where loops are closed; the first one stays.
+    """Return how the map moves with its keyframes when loops are closed; the first keyframe is
+    fixed.
 
-    keyframe_ids: (M,) of its cameras, ascending.   sigmas: (N,) of depths, a share of them.
-    Returns it with the loops that were not contradicted.
+    keyframe_ids: (M,) of its cameras, ascending.   sigmas: (N,) relative sigmas of depths. Also
+    returns the loops that were not contradicted.
     """
     ends = np.searchsorted(keyframe_ids, [(loop.old, loop.new) for loop in loops])
     edges = _edges(seen, sigmas, loops, ends.astype(np.int32), focal_px)
@@ -77,14 +79,14 @@ def close_loops(
 def _edges(
     seen: ObservationList, sigmas: F64, loops: list[Loop], ends: I32, focal_px: float
 ) -> Edges:
-    """Between keyframes that follow each other or meet again, then the loops.
+    """Edges between consecutive and covisible keyframes, then the loops.
 
-    Where the camera was lost between two that follow each other, where the second one lies is known
-    by what it sees of earlier ones, or by the loops: the step itself tells nothing.
+    If the camera was lost between two consecutive keyframes, the second one is placed by landmarks
+    of earlier ones, or by the loops: the step itself is no information.
 
-    How well two keyframes lie to each other is what one point tells, at 1 px: the errors that add
-    up to drift are those that all their points share.  But of depths, and so of scale, each point
-    has an error of its own, as little as its parallax tells.
+    The uncertainty between two keyframes is that of one point, at 1 px: drift is the sum of errors
+    that all their points share.  Depths, and so the scale, have independent errors, as small as the
+    parallax allows.
     """
     M = len(seen.T_world_camera)
     order = np.argsort(seen.point, kind="stable")
@@ -99,7 +101,7 @@ def _edges(
     enough[following, following - 1] = follow
     jumps = following[~follow]
     if len(jumps):
-        # A camera that was recognised stands where it was, whatever a loop says.
+        # A recognised camera keeps its place, whatever a loop says.
         before = np.where(np.arange(M) < jumps[:, None], shared[jumps], 0)
         best = before.argmax(axis=1)
         enough[jumps, best] |= before.max(axis=1) >= _FOLLOWING_SHARE * np.minimum(
@@ -125,7 +127,7 @@ def _edges(
 
 
 def _apart(edges: BoolArray, ends: I32, jumps: I64) -> BoolArray:
-    """Which of the jumps to a keyframe from the one before alone keep the graph together.
+    """Which of the steps to a keyframe from the one before alone keep the graph connected.
 
     edges: (M, M).   ends: (L, 2) of the loops.
     """
@@ -143,8 +145,9 @@ def _apart(edges: BoolArray, ends: I32, jumps: I64) -> BoolArray:
 
 @kernel
 def _meet_again(shared: I32, share: float, enough: BoolArray) -> None:
-    """Mark pairs that see enough of the same, the newer one first.  Of those that do without a
-    break, each next pair has told all."""
+    """Mark pairs with enough common landmarks, the newer one first.  Within an uninterrupted
+    series, consecutive pairs are sufficient.
+    """
     for new in range(len(shared)):
         unbroken = True
         for old in range(new - 1, -1, -1):

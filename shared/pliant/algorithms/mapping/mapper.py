@@ -1,8 +1,8 @@
 """The mapper: from the tracks of each frame to its pose and a dense map.
 
-VITAMIN-E section 3: start by essential matrix, poses by P3P and RANSAC, points by triangulation,
-and bundle adjustment on every frame by the subspace Gauss-Newton method; on top of it, Schur LM
-over the window at keyframes and re-acquisition of points that lost their track.
+VITAMIN-E section 3: start by essential matrix, poses by P3P and RANSAC, landmarks by triangulation,
+and bundle adjustment on every frame by the subspace Gauss-Newton method.  In addition, Schur LM
+over the window at keyframes, and reacquisition of landmarks that lost their track.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -57,13 +57,15 @@ from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
 from pliant.algorithms.stages import StageTimer, no_stages
 
 _LEAST_LOST = 3
-"""Frames without a pose before a map is given up, however long that takes: of a time lapse."""
+"""Minimum frames without a pose before a segment is closed, however long that takes: for time
+lapses.
+"""
 
 
 class Mapper:
     """Builds the map and localises every frame in it.
 
-    A pure function of camera, parameters, seed and the frames given, one after the other.
+    A pure function of camera, parameters, seed and the frames in their order.
     """
 
     def __init__(
@@ -74,8 +76,8 @@ class Mapper:
         calibration: SelfCalibration | None = None,
         known: Sequence[KeptKeyframe] = (),
     ) -> None:
-        """calibration: what is known of the camera already; None: what the map or else the
-        parameters say.   known: a map of earlier sessions, in which the camera may be recognised.
+        """calibration: estimated so far; None: that of the map, or of the parameters.   known: a
+        loaded map in which the camera may be recognised.
         """
         calibration = (
             calibration
@@ -89,27 +91,27 @@ class Mapper:
         last = known[-1].id if known else -1
         self._keyframe_changes = KeyframeChanges(self.atlas.points, after=last)
         self._waiting = InitialisationBuffer()
-        self._stamps_ns: dict[int, int] = {}  # of the frames
-        self._motion = Motion.at(0, 0, np.eye(4))  # in the segment that the camera is in
+        self._stamps_ns: dict[int, int] = {}  # capture time of each frame
+        self._motion = Motion.at(0, 0, np.eye(4))  # in the active segment
         self._lost_frames = 0
         self._keyframe_ns = 0
         self._keyframe_is_new = False
-        self._recognised: int | None = None  # by which keyframe, until the frame is one
+        self._recognised: int | None = None  # the keyframe, until this frame becomes one
         self._published_frames = 0
 
     @property
     def calibration(self) -> SelfCalibration:
-        """What is known of the camera."""
+        """The current calibration."""
         return self.atlas.calibration
 
     @property
     def _camera(self) -> PinholeCamera:
-        """Whose pixels are worked on."""
+        """The ideal camera in whose pixels the mapper works."""
         return self.calibration.view.camera
 
     @property
     def global_adjustment(self) -> GlobalAdjustment:
-        """Of the segment that the camera is in."""
+        """Global bundle adjustment of the active segment."""
         return self.atlas.global_adjustment
 
     @property
@@ -119,8 +121,7 @@ class Mapper:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What came of comparing places, and what the map gave up, see ``Comparisons`` and the
-        atlas."""
+        """Results of place comparisons, and numbers of dropped keyframes and landmarks."""
         return self.atlas.places.comparisons.counters | self.atlas.dropped
 
     def kept(self) -> Iterator[KeptKeyframe]:
@@ -128,7 +129,7 @@ class Mapper:
         return self.atlas.kept()
 
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
-        """Localise a frame and let the map grow."""
+        """Localise a frame and extend the map."""
         ideal = self._catch_up(frame, timer)
         located = self._locate(ideal, timer)
         active = self.atlas.active
@@ -160,7 +161,7 @@ class Mapper:
         return self._publish_placed(placed)
 
     def _catch_up(self, frame: Frame, timer: StageTimer) -> IdealFrame:
-        """Take over what has been found of map and camera, by which the frame is corrected."""
+        """Apply finished corrections of map and calibration, and correct the frame by them."""
         atlas = self.atlas
         self._stamps_ns[frame.number] = frame.stamp_ns
         if atlas.active is not None:
@@ -184,7 +185,7 @@ class Mapper:
     def _insert_keyframe(
         self, active: ActiveMap, placed: PlacedFrame, timer: StageTimer
     ) -> PlacedFrame:
-        """Make the frame a keyframe.  Returns it where the window has moved it."""
+        """Make the frame a keyframe.  Returns it if the window has moved it."""
         frame = placed.frame
         with timer("keyframe"):
             placed = check_pure_rotation(active, placed)
@@ -203,7 +204,7 @@ class Mapper:
     def _go_on_from(
         self, active: ActiveMap, placed: PlacedFrame, then: Callable[..., Motion]
     ) -> None:
-        """The frame has its pose: so have those that waited for it, and the next goes on there."""
+        """The frame has a pose: place the frames that waited for it, and predict from it."""
         keyframe, number = active.keyframes[-1], placed.frame.number
         T_world_camera, support = placed.T_world_camera, placed.support
         self._place_waiting(active, keyframe, T_world_camera)
@@ -219,7 +220,7 @@ class Mapper:
         return self._publish(TRACKING, why, placed.support.inliers)
 
     def follow(self, moved: list[Moved]) -> None:
-        """The map has moved under the camera, and readers are told."""
+        """Move the motion model with the map, and publish the move."""
         for each in moved:
             self._motion = self._motion.moved(each.S)
             if each.moves is not None:
@@ -229,18 +230,18 @@ class Mapper:
             self._changes.add_same_places(each.same_places)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
-        """Pass over a frame, without pixels (dropped or broken) or without time: it gets no pose.
+        """Skip a frame without pixels (dropped or broken) or without time: it gets no pose.
 
-        Whether the camera is lost is for frames that are mapped to decide: the state stays as it
-        was.  The tracks that live on are taken up again by the next frame.
+        Only mapped frames decide whether the camera is lost: the state is unchanged.  Surviving
+        tracks continue in the next frame.
         """
         state = LOST if self._lost_frames else TRACKING
         return self._publish(WAITING if self.atlas.active is None else state, reason, 0)
 
     def only_localise(self, frame: Frame, otherwise: str) -> MapDelta:
-        """Localise a frame in the map as it stands, by its tracks: there is no time to map it.
+        """Localise a frame by its tracks in the map as it is, when there is no time to map it.
 
-        One that finds no pose waits until the next mapped frame has one.  otherwise: the reason
+        A frame without a pose waits until the next mapped frame has one.  otherwise: the reason
         that it is published with.
         """
         active, found = self.atlas.active, None
@@ -259,7 +260,7 @@ class Mapper:
         return self._publish_placed(found)
 
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
-        """What is still to be corrected at the end of the stream."""
+        """Apply the remaining corrections at the end of the stream."""
         self.start_at_last()
         self.follow(self.atlas.finish(timer))
         with timer("skipped frames"):
@@ -278,14 +279,14 @@ class Mapper:
     def _correct(
         self, segment: Segment, frames: list[OrdinaryFrame], seen_by: SelfCalibration
     ) -> None:
-        """Place frames again by the map as it is now.   seen_by: whose pixels they have."""
+        """Place frames again in the current map.   seen_by: the calibration of their pixels."""
         for each in refined_poses(frames, segment.points, seen_by, self._parameters):
             pose = each.frame, each.keyframe, each.T_world_camera, each.inliers
             self._changes.add_pose(*pose)
             segment.path.refine(*pose, each.information)
 
     def _smooth(self, segment: Segment, seen_by: SelfCalibration) -> None:
-        """Smooth the poses of a segment that nothing will change any more."""
+        """Smooth the poses of a segment that is final."""
         smoothed = smoothed_poses(
             segment.keyframes, segment.path, self._stamps_ns, segment.points, seen_by,
             self._parameters,
@@ -294,7 +295,7 @@ class Mapper:
             self._changes.add_pose(each.frame, each.keyframe, each.T_world_camera, each.inliers)
 
     def publish_keyframes(self) -> KeyframeDelta:
-        """What is to be published of keyframes after the last frame, or after ``finish``."""
+        """Return the keyframe changes after the last frame, or after ``finish``."""
         active = self.atlas.active
         if active is None:
             return self._keyframe_changes.publish(None, self.calibration)
@@ -303,7 +304,7 @@ class Mapper:
 
     @property
     def waiting_frames(self) -> list[int]:
-        """Numbers of the frames from which a map may yet start."""
+        """Numbers of the frames from which a map may still start."""
         return [waiting.frame for waiting in self._waiting.frames]
 
     def _wait(self, frame: IdealFrame, timer: StageTimer) -> MapDelta:
@@ -315,23 +316,25 @@ class Mapper:
         return self._publish(TRACKING, "", begun)
 
     def _flaw(self, frame: IdealFrame) -> str:
-        """Why the image has fewer tracks than a map starts with, if that shows."""
+        """Why the image has fewer tracks than a start needs, if it is visible."""
         few = len(frame.tracks.ids) < self._parameters.start.min_tracks
         return flaw_of(frame.given.grey) if frame.given.grey is not None and few else ""
 
     def start_at_last(self) -> bool:
-        """Begin a map with what there is, since nothing more comes.  Whether there is a map."""
+        """Begin a map with the existing frames, at the end of the stream.  Whether there is
+        a map.
+        """
         if self.atlas.active is None and self._waiting.frames:
             self._begin_where_possible(with_minimum_parallax(self._parameters))
         return self.atlas.active is not None
 
     def _begin_where_possible(self, parameters: MappingParameters) -> int | str:
-        """The inliers of the newest frame of the map that starts; or why none does."""
+        """Return the inliers of the newest frame if a map starts, or else the reason why not."""
         found = find_start_of(self._waiting.frames, self.calibration, parameters)
         return found if isinstance(found, str) else self._begin(*found)
 
     def _begin(self, start: Start, calibration: SelfCalibration) -> int:
-        """Let the map start, and give poses to the frames that waited, backwards."""
+        """Start the map, and give poses to the waiting frames, backwards."""
         waiting, self._waiting = self._waiting, InitialisationBuffer()
         assert waiting.newest is not None
         latest = IdealFrame.of(waiting.newest, self.calibration)
@@ -358,7 +361,7 @@ class Mapper:
         return newest.inliers
 
     def _locate(self, frame: IdealFrame, timer: StageTimer) -> F64 | None:
-        """T_world_camera of the frame where it goes on, or else where it was seen before."""
+        """T_world_camera of the frame, by continuing or by recognition."""
         active, located = self.atlas.active, None
         if active is not None:
             with timer("localisation"):
@@ -369,9 +372,9 @@ class Mapper:
             return self._recognise(frame, None if located is None else located.T_world_camera)
 
     def _recognise(self, frame: IdealFrame, there: F64 | None) -> F64 | None:
-        """T_world_camera in the segment that the image shows, which then goes on.
+        """T_world_camera in the segment that the image shows, which becomes active.
 
-        there: where a few tracks lead, which counts where the image shows no other place.
+        there: the pose of a few tracks, which counts if the image shows no other place.
         """
         if not frame.has_image:
             return there
@@ -393,8 +396,9 @@ class Mapper:
         return pose
 
     def _place_waiting(self, active: ActiveMap, keyframe: Keyframe, T_world_camera: F64) -> None:
-        """The camera was lost, and has been found: so are the frames between that follow what it
-        sees now."""
+        """Place the frames between a loss and the recognition, if their tracks lead to landmarks in
+        the current view.
+        """
         if not self._waiting.frames:
             return
         linked = active.linked(MAPPED)
@@ -409,7 +413,7 @@ class Mapper:
     def _lost(self, active: ActiveMap, frame: IdealFrame) -> MapDelta:
         """The frame has no pose.  After some time without one the segment is closed.
 
-        Frames are kept meanwhile, so that a new segment has the poses of those that are its own.
+        Frames are stored meanwhile, so that a new segment has the poses of its own frames.
         """
         seen = len(active.linked(MAPPED))
         reason = f"lost: the pose of frame {frame.number} is not supported, {seen} mapped tracks"
@@ -424,10 +428,10 @@ class Mapper:
         return delta
 
     def _publish(self, state: int, reason: str, inliers: int, snapshot: bool = False) -> MapDelta:
-        # Now and then everything active is published, for those who came late.
+        # Regularly everything active is published, for late readers.
         self._published_frames += 1
         snapshot = snapshot or self._published_frames % self._parameters.snapshot_frames == 0
-        # Between keyframes points are new; how they move is told with the next one.
+        # Between keyframes only new landmarks are published; motions follow with the next one.
         keyframes, rows = self.atlas.take_changed(everything=snapshot or self._keyframe_is_new)
         centre = np.zeros(3)
         if self.atlas.active is not None:

@@ -1,9 +1,9 @@
-"""Two kept maps that show the same places become one.
+"""Two saved maps that show the same places become one.
 
-The second one is taken as a session whose segments all lie before us: its keyframes are compared
-with the places of the first map as those of a new segment are (``known_places``), what is proved
-moves it into the world of the first one, and what is left between the two its loops take out, with
-the adjustment of the whole map (``loops``, ``global_adjustment``).
+The second map is treated as a session whose segments are all complete: its keyframes are compared
+with the places of the first map as those of a new segment are (``known_places``).  A verified match
+moves a segment into the world frame of the first map; loops and global bundle adjustment correct
+the remaining error (``loops``, ``global_adjustment``).
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,9 +33,9 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 
 @dataclass(frozen=True, kw_only=True)
 class Merged:
-    """joined: (segment of the second map, segment of the first map in whose world it lies now).
-    apart: (segment of the second map that was not recognised, its number now).   proofs: pairs of
-    keyframes that show one place.   keyframes: of the one map, oldest first.
+    """joined: (segment of the second map, segment of the first map in whose world it is now).
+    apart: (unmatched segment of the second map, its new number).   proofs: matched pairs of
+    keyframes. keyframes: of the merged map, oldest first.
     """
 
     joined: list[tuple[int, int]]
@@ -47,11 +47,11 @@ class Merged:
 def merge(
     first: Sequence[KeptKeyframe], second: Sequence[KeptKeyframe], parameters: MappingParameters
 ) -> Merged | None:
-    """One map of two, each with its keyframes oldest first; None where no place of the first one is
-    proved to be in the second.
+    """Merge two maps, each with its keyframes oldest first; None if no place of the first one is
+    verified in the second.
 
-    Worlds, scales and the camera are those of the first map, numbers of the second follow on it.
-    Raises ValueError where a map has a point twice.
+    World frames, scales and the camera are those of the first map; numbers of the second continue
+    them.  Raises ValueError if a landmark occurs twice in a map.
     """
     camera = known_camera(first, first[-1].given_camera)
     assert camera is not None, "of its own last session"
@@ -59,8 +59,9 @@ def merge(
 
 
 class _Merging:
-    """worlds: segments of the first map and what has been joined to them.   rest: segments of the
-    second one that have not been recognised yet.   proved: keyframes that show one place."""
+    """worlds: segments of the first map, with those merged into them.   rest: segments of the
+    second one that are not matched yet.   proved: matched keyframes.
+    """
 
     def __init__(
         self,
@@ -88,8 +89,8 @@ class _Merging:
         self._proved = GlobalAdjustment()
 
     def result(self) -> Merged | None:
-        """What has become of both."""
-        joined: dict[int, Keyframe] = {}  # numbers of segments, and a keyframe of each
+        """Return the merged map."""
+        joined: dict[int, Keyframe] = {}  # a keyframe of each segment number
         while found := self._next_joined():
             joined |= found
         if not joined:
@@ -104,7 +105,7 @@ class _Merging:
         )
 
     def _next_joined(self) -> dict[int, Keyframe]:
-        """Let the next segment that shows a known place become a part of what is known."""
+        """Merge the next segment with a matched place."""
         for each in self._rest:
             number = each.id
             proved = self._met(each)
@@ -115,7 +116,7 @@ class _Merging:
         return {}
 
     def _met(self, segment: Segment) -> list[Loop]:
-        """What proves that keyframes of a segment show places of the worlds."""
+        """Matches of a segment's keyframes with places of the worlds."""
         self._places.enter()
         view = self._calibration.view
         for keyframe in segment.keyframes:
@@ -128,7 +129,7 @@ class _Merging:
         return self._places.meetings.proved
 
     def _join(self, segment: Segment, proved: list[Loop]) -> None:
-        """Become one with all worlds of which a place was seen."""
+        """Merge with all worlds that have a matched place."""
         self._proved.loops += proved
         seen = {loop.old for loop in proved}
         for world in [w for w in self._worlds if any(k.id in seen for k in w.keyframes)]:
@@ -146,7 +147,7 @@ class _Merging:
         return ActiveMap(segment, 0, self._calibration, self._parameters)
 
     def _kept(self) -> Iterator[KeptKeyframe]:
-        """Of all segments: those that have met nothing are as they were given."""
+        """Keyframes of all segments: unmatched ones are unchanged."""
         features, changed = self._places.index.features, set[int]()
         origins = {each.id: Origin(each.session, each.source_frame) for each in self._given}
         for each in self._worlds:
@@ -158,7 +159,7 @@ class _Merging:
         yield from (each for each in self._given if each.id not in changed)
 
     def _close(self, segment: Segment, loops: list[Loop]) -> SelfCalibration:
-        """Take out what is left between maps that were joined.  Returns what is known then."""
+        """Correct the remaining error between merged maps.  Returns the calibration afterwards."""
         active, closing = self._active(segment), GlobalAdjustment(loops=loops)
         closing.request(0, segment, self._calibration, self._parameters)
         result = closing.settle()

@@ -1,4 +1,4 @@
-"""Kernels over the dense camera x point table of a window's observations."""
+"""Kernels over the dense camera x landmark table of a window's observations."""
 
 import math
 
@@ -13,10 +13,10 @@ from pliant.compiler.kernel import fast_kernel, kernel
 def weigh(points_px: F32, camera: PinholeCamera, k_sigmas: tuple[float, float]) -> F32:
     """(n,) weights of observations at points_px (n, 2), 1 on the axis.
 
-    k_sigmas: standard deviations of the distortions k1 and k3.  So what is seen at the distance r
-    from the axis, on the plane z = 1, may be off by f k1 r^3 + f k3 r^7 px beside its noise of 1
-    px: the weight is the inverse of all three variances together.  A focal length that is off moves
-    all alike, and depths take it up.
+    k_sigmas: standard deviations of the distortions k1 and k3.  An observation at distance r from
+    the axis, on the plane z = 1, may be off by f k1 r^3 + f k3 r^7 px beside its noise of 1 px: the
+    weight is the inverse of the sum of the three variances.  An error of the focal length moves all
+    observations alike, and depths absorb it.
     """
     k1, k3 = k_sigmas
     lens = np.array([*camera.intrinsics, camera.fx * k1, camera.fx * k3], np.float32)
@@ -63,7 +63,7 @@ def observe(
 def gather(
     columns: I32, u: F32, v: F32, w: F32, seen: BoolArray, out_u: F32, out_v: F32, out_w: F32
 ) -> None:
-    """Copy some columns of the table; the weight is 0 where nothing is seen."""
+    """Copy some columns of the table; the weight is 0 where there is no observation."""
     for m in range(u.shape[0]):
         for i in range(columns.size):
             n = columns[i]
@@ -73,7 +73,7 @@ def gather(
 
 @kernel
 def count_cameras(columns: I32, seen: BoolArray, first: int, last: int) -> I32:
-    """(C,) how many of the cameras first, ..., last - 1 see each of the columns."""
+    """(C,) number of the cameras first, ..., last - 1 that see each of the columns."""
     counts = np.zeros(columns.size, np.int32)
     for m in range(first, last):
         for i in range(columns.size):
@@ -83,7 +83,7 @@ def count_cameras(columns: I32, seen: BoolArray, first: int, last: int) -> I32:
 
 @kernel
 def columns_in_state(rows: I32, state: U8, wanted: int) -> I32:
-    """Columns of the rows (N,) whose state is the wanted one, ascending."""
+    """Columns of the rows (N,) in the wanted state, ascending."""
     columns = np.empty(rows.size, np.int32)
     count = 0
     for n in range(rows.size):
@@ -113,8 +113,9 @@ def seen_in_state(rows: I32, state: U8, wanted: int, seen: BoolArray, slot: int,
 def flows(
     rows: I32, state: U8, least: int, u: F32, v: F32, seen: BoolArray, H: F64
 ) -> tuple[int, F32]:
-    """Points whose state is at least the given one that the last but one slot sees, and how far
-    those moved, px, that the last one sees too, beside the turn H (3, 3) of its pixels."""
+    """Number of points in at least the given state that the second last slot sees, and the motions,
+    px, of those that the last one also sees, without the rotation H (3, 3) of its pixels.
+    """
     moved = np.empty(rows.size, np.float32)
     before, both = 0, 0
     last = seen.shape[0] - 1
@@ -135,7 +136,7 @@ def flows(
 def count_in_view(
     T_camera_world: F64, rows: I32, xyz: F64, lens: F32, width: int, height: int
 ) -> int:
-    """How many points a camera (4, 4) has in its image.   rows: of ``xyz`` (capacity, 3)."""
+    """Number of points in the image of a camera (4, 4).   rows: of ``xyz`` (capacity, 3)."""
     T, count = T_camera_world, 0
     for row in rows:
         x, y, z = xyz[row, 0], xyz[row, 1], xyz[row, 2]
@@ -158,7 +159,7 @@ def has_parallax(
     lens: F32,
     cosine: float,
 ) -> I64:
-    """Those columns whose ray of the slot and some other one differ by more than an angle.
+    """Which columns have rays of the slot and of another camera that differ by more than an angle.
 
     R_world_camera: (M, 3, 3).   cosine: of the angle.
     """
@@ -211,8 +212,9 @@ def forget_outliers(
     camera: PinholeCamera,
     outlier_px: float,
 ) -> None:
-    """Let the cameras (M) of the table u, v, seen (., N) not see those of the points (C, 3) in
-    ``columns`` that they miss by more than outlier_px, or that lie behind them."""
+    """Remove observations of the cameras (M) in the table u, v, seen (., N): those of the points
+    (C, 3) in ``columns`` with an error above outlier_px, or behind the camera.
+    """
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:, :3])
     K, most = camera.intrinsics, np.float32(outlier_px)
     _forget_outliers(T_camera_world, points_world, u, v, seen, columns, K, most)

@@ -1,9 +1,9 @@
-"""Frames between keyframes are placed once more, by the map as it has become.
+"""Frames between keyframes are placed a second time, in the map as it has become.
 
-A frame is placed as it comes, by what the map is then: young points are uncertain, and after a
-return hardly any is in view.  Every adjustment mends keyframes; a frame between them moves with the
-one on which it hangs, and would keep the error relative to it.  So what frames have seen is kept
-for as long as there is room, and then places them by the points that have been adjusted since.
+A frame is first placed in the map of its time: young landmarks are uncertain, and after a return
+hardly any is in view.  Every adjustment corrects keyframes; a frame between them moves with its
+reference keyframe and would keep its error relative to it.  So the observations of frames are
+stored as long as there is memory, and then place them by the adjusted landmarks.
 """
 
 from collections.abc import Iterable
@@ -26,26 +26,27 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.trajectory_smoothing import smooth_trajectory
 
 _ROOM = 2_000_000
-"""Most observations that are kept, 24 MB: some 250 frames of 8000."""
+"""Maximum stored observations, 24 MB: some 250 frames of 8000."""
 
 _ROOM_SHARE = 1 / 3
-"""And of those that the map has room for."""
+"""And as a share of the map's maximum."""
 
 STANDING_ROOMS = 2
-"""How often that room is filled where no keyframe comes, as while a camera stands still."""
+"""Multiple of that memory if no keyframe comes, as while a camera stands still."""
 
 _COMMON_ERROR = 0.5
-"""Largest error that all points of a frame may share, as a share of the inlier limit: with more,
-half of them would be outliers.  Real video shows 0.10 to 0.15."""
+"""Maximum common error of a frame's landmarks, as a share of the inlier limit: with more, half of
+them would be outliers.  Real video shows 0.10 to 0.15.
+"""
 
 _NONE = np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True, kw_only=True)
 class EarlierPose:
-    """T_world_camera of a frame, and the keyframe that it hangs on.
+    """T_world_camera of a frame, and its reference keyframe.
 
-    inliers: points that support it.
+    inliers: landmarks that support it.
     """
 
     frame: int
@@ -63,8 +64,9 @@ class RefinedPose(EarlierPose):
 
 @dataclass(frozen=True, kw_only=True)
 class OrdinaryFrame:
-    """A frame that hangs on a keyframe, where it was placed (4, 4), and what it saw there: rows
-    (n,) of points and candidates, at points_px (n, 2).   log_focal: as of a keyframe."""
+    """A frame with its reference keyframe, its first pose (4, 4), and its observations: rows (n,)
+    of landmarks and candidates, at points_px (n, 2).   log_focal: as of a keyframe.
+    """
 
     frame: int
     keyframe: Keyframe
@@ -76,7 +78,7 @@ class OrdinaryFrame:
 
 @dataclass
 class OrdinaryFrames:
-    """Frames of a segment that are no keyframes and are to be placed once more, oldest first."""
+    """Frames of a segment that are no keyframes and are to be placed again, oldest first."""
 
     _frames: list[OrdinaryFrame] = field(default_factory=list[OrdinaryFrame])
 
@@ -84,7 +86,7 @@ class OrdinaryFrames:
         self, frame: int, keyframe: Keyframe, T_world_camera: F64, rows: I32, points_px: F32,
         log_focal: float = 0.0,
     ) -> None:  # fmt: skip
-        """A frame hangs on a keyframe, and saw points and candidates in the rows (n,)."""
+        """Add a frame with its reference keyframe and observations in the rows (n,)."""
         T_keyframe_camera = inverse(keyframe.T_world_camera) @ T_world_camera
         self._frames.append(
             OrdinaryFrame(
@@ -94,18 +96,18 @@ class OrdinaryFrames:
         )  # fmt: skip
 
     def forget(self) -> None:
-        """They stay where they are: nobody knows any more where they saw what."""
+        """Leave the frames where they are: their observations are no longer valid."""
         self._frames = []
 
     def seen_by(self, before: CorrectedView, after: CorrectedView) -> None:
-        """The pixels become those of another ideal camera."""
+        """Convert the pixels to those of another ideal camera."""
         self._frames = [
             replace(each, points_px=moved_px(each.points_px, before, after))
             for each in self._frames
         ]
 
     def focus(self, view: CorrectedView, keyframes: list[Keyframe], refocus: F64) -> None:
-        """Log focal lengths change as between the keyframes.
+        """Change the log focal lengths as between the keyframes.
 
         view: whose pixels they have.   refocus: (K,) change of each keyframe.
         """
@@ -119,26 +121,26 @@ class OrdinaryFrames:
                 self._frames[n] = replace(each, points_px=points_px, log_focal=log_focal)
 
     def take_in(self, earlier: "OrdinaryFrames") -> None:
-        """Those of an earlier segment are of this one, too."""
+        """Add the frames of a merged segment."""
         self._frames = [*earlier._frames, *self._frames]
 
     @property
     def first_keyframe(self) -> int:
-        """Id of the oldest keyframe on which one hangs; a huge one where there is none."""
+        """Id of the oldest reference keyframe; a huge one without frames."""
         return min((each.keyframe.id for each in self._frames), default=_NONE)
 
     def take_surplus(self, parameters: MappingParameters, rooms: int = 1) -> list[OrdinaryFrame]:
-        """The oldest, of which there is no more room for what they saw, so many times over."""
+        """Remove and return the oldest frames beyond this multiple of the memory."""
         room = rooms * min(_ROOM, int(_ROOM_SHARE * parameters.window.kept_observations))
         seen = np.cumsum([len(each.rows) for each in reversed(self._frames)])
         return self._take(len(seen) - int(np.searchsorted(seen, room, side="right")))
 
     def leave(self, keyframes: set[int]) -> None:
-        """Those that hang on one of the keyframes, by id, stay where they are."""
+        """Leave the frames of these reference keyframes, by id, where they are."""
         self._frames = [each for each in self._frames if each.keyframe.id not in keyframes]
 
     def take_all(self) -> list[OrdinaryFrame]:
-        """All of them."""
+        """Remove and return all frames."""
         return self._take(len(self._frames))
 
     def _take(self, count: int) -> list[OrdinaryFrame]:
@@ -152,7 +154,7 @@ def refined_poses(
     seen_by: SelfCalibration,
     parameters: MappingParameters,
 ) -> list[RefinedPose]:
-    """Poses of those of the frames that see enough of the map as it is now.
+    """Return poses of the frames with enough observations of the current map.
 
     seen_by: whose pixels the frames have.
     """
@@ -160,7 +162,7 @@ def refined_poses(
     placed: list[RefinedPose] = []
     for each in frames:
         keyframe = each.keyframe
-        # A row that was given back and used anew begins with a later keyframe.
+        # A reused row begins with a later keyframe.
         still = points.first_keyframe[each.rows] <= keyframe.id
         still &= points.segment[each.rows] == keyframe.segment
         still &= points.state[each.rows] == MAPPED
@@ -196,11 +198,12 @@ def smoothed_poses(
     seen_by: SelfCalibration,
     parameters: MappingParameters,
 ) -> list[EarlierPose]:
-    """Poses of all frames of a segment, smoothed by how the camera moves (``smooth_trajectory``).
+    """Return the poses of all frames of a segment, smoothed by the motion model
+    (``smooth_trajectory``).
 
-    The map stays as it is: a keyframe's frame may differ from its keyframe by what the observations
-    leave open.   path: where all other frames have been placed for the last time.
-    stamps_ns: of the frames.   seen_by: whose pixels the keyframes have.
+    The map is unchanged: a keyframe's frame may differ from its keyframe within the uncertainty of
+    the observations.   path: final poses of all other frames. stamps_ns: of the frames.   seen_by:
+    whose pixels the keyframes have.
     """
     for keyframe in keyframes:
         if not path.has(keyframe.frame, keyframe):
