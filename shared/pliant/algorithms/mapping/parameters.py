@@ -55,7 +55,7 @@ class StartParameters(Parameters):
 
 
 class LocalisationParameters(Parameters):
-    """How the pose of a new frame is found."""
+    """How the pose of a new frame is estimated."""
 
     min_inliers: int = Field(default=30, ge=6, description="Minimum inliers of a pose")
     inlier_px: float = Field(
@@ -80,7 +80,7 @@ class LocalisationParameters(Parameters):
 
 
 class ReacquisitionParameters(Parameters):
-    """How mapped points that lost their track are found again among the maxima of a frame."""
+    """How landmarks that lost their track are reacquired at the maxima of a frame."""
 
     enabled: bool = Field(default=True, description="Search for lost landmarks in every frame")
     radius_px: float = Field(
@@ -99,7 +99,7 @@ class ReacquisitionParameters(Parameters):
 
 
 class RecoveryParameters(Parameters):
-    """How the camera is found again after frames without a pose."""
+    """How the camera is localised again after frames without a pose."""
 
     points: int = Field(
         default=400, ge=30, description="Landmarks that are searched far from their prediction"
@@ -277,7 +277,7 @@ class WindowParameters(Parameters):
 
 
 class WholeMapParameters(Parameters):
-    """Adjustments of the whole map while it grows."""
+    """Global bundle adjustments while the map grows."""
 
     growth: float = Field(
         default=0.2,
@@ -317,7 +317,7 @@ class WholeMapParameters(Parameters):
 
 
 class PointParameters(Parameters):
-    """When a tracked candidate becomes a point of the map."""
+    """When a candidate becomes a landmark."""
 
     min_parallax_deg: float = Field(
         default=1.0, gt=0.0, description="Minimum angle between two of its rays, degrees"
@@ -333,7 +333,7 @@ class PointParameters(Parameters):
 
 
 class MappingParameters(Parameters):
-    """Everything that the mapper needs to know."""
+    """All parameters of the mapper."""
 
     start: StartParameters = StartParameters()
     localisation: LocalisationParameters = LocalisationParameters()

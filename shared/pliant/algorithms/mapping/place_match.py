@@ -1,6 +1,6 @@
-"""Two keyframes that look alike: whether they show one place, and how their maps lie to each other.
+"""Two similar keyframes: whether they show the same place, and the similarity between their maps.
 
-For loops and for segments that meet.  Corners propose a similarity; the map's own points count.
+For loops and for merges of segments.  Corners propose a similarity; the map's landmarks decide.
 """
 
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ from pliant.algorithms.places import match
 
 @dataclass(frozen=True, kw_only=True)
 class PlaceMatch:
-    """What two keyframes both saw.
+    """What two keyframes have in common.
 
     S_old_new: (4, 4) similarity, ``X_old = S_old_new X_new``, between the worlds of their segments;
-    of one segment: how far what is new has drifted.
-    rows: (n, 2) rows of points that are the same, old and new; a row at most once in each column.
+    in one segment: the drift of the newer one. rows: (n, 2) rows of landmarks that are the same,
+    old and new; a row at most once in each column.
     """
 
     S_old_new: F64
@@ -34,9 +34,10 @@ class PlaceMatch:
 
 
 Refusal = Literal["few_corners", "few_points", "one_spot", "repeated"]
-"""Why it is not proved that two keyframes show one place: too few corners agree on a similarity,
-too few points of the two maps, all that agrees lies in one spot of the image, or is seen again a
-step aside."""
+"""Why two keyframes do not verifiably show the same place: too few corners agree on a similarity,
+too few landmarks agree, all agreeing ones lie in one spot of the image, or the image repeats a step
+aside.
+"""
 
 
 def match_places(
@@ -47,10 +48,10 @@ def match_places(
     parameters: MappingParameters,
     generator: np.random.Generator,
 ) -> PlaceMatch | Refusal:
-    """What proves that both keyframes show one place, or why it is not proved.
+    """Return the evidence that both keyframes show the same place, or why there is none.
 
-    In both images, corners and points of both maps that look alike must agree on the similarity,
-    as many as a pose needs, and not in one spot.
+    Similar corners and landmarks in both images must agree on the similarity, as many as a pose
+    needs, and not in one spot.
     """
     limits = parameters.localisation
     alike = match(old.features, new.features)
@@ -91,7 +92,7 @@ def match_places(
 
 
 def _between_worlds(S_a_b: F64, old: Place, new: Place) -> F64:
-    """A similarity between two keyframes as one between their worlds."""
+    """Convert a similarity between two keyframes to one between their worlds."""
     return old.keyframe.T_world_camera @ S_a_b @ inverse(new.keyframe.T_world_camera)
 
 
@@ -104,10 +105,11 @@ def _guided(
     gate_px: float,
     min_zncc: float,
 ) -> tuple[I32, Pairs, F32]:
-    """Points of the old keyframe and of the new that each shows where the other one saw its own,
-    and that look alike: where two dense maps only have the same surfaces, many lie near another.
+    """Match similar landmarks of the old and the new keyframe that each sees where the other one
+    has its own: two dense maps of the same surfaces have many neighbours by position alone.
 
-    Returns their rows (n, 2), themselves, and where the old keyframe saw them."""
+    Returns their rows (n, 2), themselves, and where the old keyframe saw them.
+    """
     rows: list[I32] = []
     places: list[F32] = []
     here: list[F64] = []
@@ -133,7 +135,7 @@ def _guided(
 
 
 def _nearest(points_camera: F64, points_px: F32, camera: PinholeCamera, gate_px: float) -> I32:
-    """(N,) which of the pixels is nearest to where a camera has a point, -1 without one."""
+    """(N,) index of the pixel nearest to the projection of a landmark, -1 without one."""
     seen = np.column_stack([points_px, np.zeros(len(points_px), np.float32)])
     grid = MaximaGrid.build(seen, camera.width, camera.height, gate_px)
     front = points_camera[:, 2] > 0.0

@@ -1,8 +1,8 @@
-"""Whether points of two maps look alike: the patches by which they are found again.
+"""Whether landmarks of two maps look alike, by their re-acquisition patches.
 
-A patch is what the last keyframe that sees the point has seen about it.  Two cameras that stand
-closer or are turned about their axis see the same patch larger or turned: one is compared with the
-other as a small plane would be that faces the first camera, in as much of it as both have.
+A patch shows the surroundings of a landmark in its last keyframe.  A camera that is closer, or
+rotated about its axis, sees it larger or rotated.  So one patch is compared with the other as a
+small plane that faces the first camera, where both have pixels.
 """
 
 import numpy as np
@@ -24,10 +24,10 @@ def look_alike(
     points: Landmarks,
     min_zncc: float,
 ) -> BoolArray:
-    """(n,) whether points look as others do.
+    """(n,) whether landmarks look alike.
 
     S_old_new: (4, 4) similarity between their worlds, ``X_old = S_old_new X_new``.   rows: (n, 2),
-    old and new.   old, new: keyframes of their segments, oldest first.   min_zncc: least
+    old and new.   old, new: keyframes of their segments, oldest first.   min_zncc: minimum
     correlation of the patches.
     """
     T_old, T_new = (
@@ -35,11 +35,11 @@ def look_alike(
         for some, segment in ((rows[:, 0], old), (rows[:, 1], new))
     )
     X_old = transform_each(inverse(T_old), points.xyz[rows[:, 0]])
-    # Of the old point as it lies before the new camera: where both cameras stand at one place
-    # nothing holds the scale, and it matters to nothing that they see.
+    # The old landmark before the new camera: with both cameras at one place the scale is
+    # undetermined, and does not affect the image.
     into_new = inverse(T_new) @ np.linalg.inv(S_old_new) @ T_old
     X_new = transform_each(into_new, X_old)
-    # Of a step in the old image, at the depth of the point, the step in the new one.
+    # The step in the new image for a step in the old one, at the depth of the landmark.
     seen = X_new[:, :2] / X_new[:, 2:]
     steps = into_new[:, :2, :2] - seen[:, :, None] * into_new[:, 2:3, :2]
     steps *= (X_old[:, 2] / X_new[:, 2])[:, None, None]
@@ -48,8 +48,9 @@ def look_alike(
 
 
 def _seen_from(ids: I32, segment: list[Keyframe]) -> F64:
-    """(n, 4, 4) poses of keyframes of a segment by their ids (n,), of the one before where the map
-    has given one up."""
+    """(n, 4, 4) poses of keyframes of a segment by their ids (n,); for a dropped keyframe that of
+    the one before.
+    """
     known = np.array([keyframe.id for keyframe in segment])
     unique, each = np.unique(ids, return_inverse=True)
     at = np.maximum(np.searchsorted(known, unique, side="right") - 1, 0)
@@ -58,8 +59,9 @@ def _seen_from(ids: I32, segment: list[Keyframe]) -> F64:
 
 @kernel
 def _correlations(a: U8, b: U8, steps: F64) -> F64:
-    """(n,) ZNCC of patches (n, PATCH_SIDE, PATCH_SIDE), 0 where one is flat.   steps: (n, 2, 2)
-    from pixels of a to those of b."""
+    """(n,) ZNCC of patches (n, PATCH_SIDE, PATCH_SIDE), 0 for flat ones.   steps: (n, 2, 2) from
+    pixels of a to those of b.
+    """
     found = np.zeros(len(a))
     reach = 0.5 * (PATCH_SIZE - 1)
     for i in range(len(a)):
@@ -83,7 +85,7 @@ def _correlations(a: U8, b: U8, steps: F64) -> F64:
 
 @kernel
 def _at(patch: U8, u: float, v: float) -> float:
-    """A patch's grey level so far from its centre."""
+    """A patch's grey level at an offset from its centre."""
     u, v = u + 0.5 * (PATCH_SIDE - 1), v + 0.5 * (PATCH_SIDE - 1)
     x, y = int(u), int(v)
     a, b = u - x, v - y

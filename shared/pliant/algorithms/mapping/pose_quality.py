@@ -1,9 +1,9 @@
-"""The quality of a pose: whether what supports it is the world.
+"""The quality of a pose: whether the static world supports it.
 
 A few dozen inliers always agree with some motion, and those of a large moving object agree well.
-What does not belong to them shows it: parts of the image where tracks live on and no point of the
-map is, or where no depth lets tracks be where the pose has them.  They are counted by area, so that
-the texture of a thing does not decide how large it is.
+The rest of the image contradicts it: areas where tracks survive without a landmark, or where no
+depth makes tracks consistent with the pose.  Areas are counted, so the texture of an object does
+not matter.
 """
 
 from dataclasses import dataclass
@@ -19,20 +19,20 @@ _COLUMNS, _LINES = 8, 6
 """Cells of the image: each is for a pose, against it, or shows too little."""
 
 _LEAST_SEEN = 5
-"""Tracks without which a cell says nothing."""
+"""Minimum tracks in a cell that counts."""
 
 _AGAINST = 0.2
-"""A cell is against a pose with fewer inliers than this share of its tracks."""
+"""A cell contradicts a pose with a smaller share of inliers among its tracks."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Support:
-    """What there is for a pose.
+    """The support of a pose.
 
-    inliers: points where the pose shows them.   tracked: those that tracks lead on to the next
-    frame.   share: of the points seen.   contrary: share of the
-    cells with tracks in which hardly any point is where the pose shows it.   spread: standard
-    deviation of the inliers as a share of width or height, whichever is less.
+    inliers: landmarks at their projection.   tracked: those with tracks into the next frame.
+    share: of the visible landmarks.   contrary: share of the cells with tracks in which hardly any
+    landmark is at its projection.   spread: standard deviation of the inliers as a share of width
+    or height, whichever is less.
     """
 
     inliers: int = 0
@@ -45,9 +45,9 @@ class Support:
 def support_of(
     points_px: F32, inliers: BoolArray, tracked: int, telling_px: F32, camera: PinholeCamera
 ) -> Support:
-    """points_px: (N, 2) of the points seen, of which ``inliers`` (N,) fit.   tracked: so many, the
-    first, have tracks.   telling_px: (M, 2) of the tracks that belong to points if the pose is
-    right, or contradict it.
+    """points_px: (N, 2) of the visible landmarks, of which ``inliers`` (N,) fit.   tracked: number
+    of them, the first ones, with tracks.   telling_px: (M, 2) of the tracks that have landmarks if
+    the pose is right, or contradict it.
     """
     count = int(np.count_nonzero(inliers))
     fitting = points_px[inliers]
@@ -65,7 +65,7 @@ def support_of(
 
 
 def why_doubtful(support: Support, parameters: SupportParameters) -> str:
-    """Why the pose may not be that of the camera in the world; "" where nothing speaks for it."""
+    """Why the pose may be wrong; "" if it is well supported."""
     if support.contrary > parameters.max_contrary_share:
         return f"doubtful: {support.contrary:.0%} of the image disagrees with the camera motion"
     if support.share < parameters.min_share:

@@ -1,4 +1,4 @@
-"""What has been published of the map, and so what the next MapDelta and KeyframeDelta say."""
+"""What has been published of the map, and therefore the next MapDelta and KeyframeDelta."""
 
 import bisect
 from collections.abc import Iterable, Sequence
@@ -15,24 +15,26 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.compiler.kernel import kernel
 
 _MOVED_SHARE = 2e-3
-"""Points are published again when they moved by this share of their distance to the camera: across
-the ray, about a px of an image with 640 columns."""
+"""A landmark is published again when it moved across the ray by this share of its distance, about a
+px of an image with 640 columns.
+"""
 
 _MOVED_SIGMAS = 0.25
-"""Along the ray, where they are known worse than that: this share of their standard deviation for a
-noise of 1 px."""
+"""Along the ray, if that is less certain: by this share of its standard deviation, for a noise of 1
+px.
+"""
 
 _KNOWN_SHARE = 0.8
-"""Or when their standard deviation has become this share of what was published, or the reverse."""
+"""Or when its standard deviation has become this share of the published one, or the reverse."""
 
 _TINY = 1e-300
 
 _BITS = 12
-"""Significant ones of how well a point is known."""
+"""Significant bits of the uncertainty of a landmark."""
 
 
 class MapChanges:
-    """Collects what one frame changes and makes its MapDelta."""
+    """Collects the changes of one frame and makes its MapDelta."""
 
     def __init__(self) -> None:
         self._poses: dict[int, tuple[int, int, int, F64, int]] = {}
@@ -42,25 +44,27 @@ class MapChanges:
         self._same_places: list[tuple[int, int]] = []
 
     def move(self, moves: MapMoves) -> None:
-        """The whole map moves, before anything else of the frame."""
+        """Move the whole map, before anything else of the frame."""
         self._moves = moves if self._moves is None else self._moves.then(moves)
 
     def join(self, gone: int, segment: int) -> None:
-        """What belongs to a segment that is gone belongs to another one, after all moves."""
+        """Assign the content of a merged segment to another one, after all moves."""
         self._joined.append((gone, segment))
 
     def add_same_places(self, pairs: Iterable[tuple[int, int]]) -> None:
-        """Keyframes show one place, the older one first; -1: this frame, which is none."""
+        """Add pairs of keyframes at the same place, the older one first; -1: this frame, no
+        keyframe.
+        """
         self._same_places += pairs
 
     def add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
-        """The pose of a frame is new, and hangs on a keyframe.  The last one of a frame counts."""
+        """Add a pose with its reference keyframe.  The last one of a frame counts."""
         T_keyframe_camera = inverse(keyframe.T_world_camera) @ T_world_camera
         pose = matrix_to_pose(T_keyframe_camera)
         self._poses[frame] = frame, keyframe.segment, keyframe.id, pose, inliers
 
     def remove_points(self, ids: I64) -> None:
-        """Points are gone; those that were never published are left out later."""
+        """Remove landmarks; those that were never published are left out later."""
         self._removed.append(ids)
 
     def publish(
@@ -76,9 +80,10 @@ class MapChanges:
         centre: F64,
         snapshot: bool,
     ) -> MapDelta:
-        """What differs, of ``keyframes`` and the points in ``rows``, from what was published.
+        """Return the differences of ``keyframes`` and the landmarks in ``rows`` from what was
+        published.
 
-        centre: (3,) camera position, which says how much a movement matters.  snapshot: all.
+        centre: (3,) camera position, which determines the significance of a motion.  snapshot: all.
         """
         poses = [pose for _, pose in sorted(self._poses.items())]
         self._poses = {}
@@ -139,15 +144,15 @@ def _unpublished(
     centre: F64,
     snapshot: bool,
 ) -> I32:
-    """Those of the mapped rows that must be published; they are noted as published.
+    """Return the mapped rows that must be published, and record them as published.
 
-    Each keyframe moves every point of the window a little, mostly along its ray and far less than
-    the point is known: told each time, such moves would be most of what is told of the map.  So a
-    move m of a point at distance d along the unit ray r is small when
+    Each keyframe moves every landmark of the window a little, mostly along its ray and by far less
+    than its uncertainty: published each time, such moves would be most of the map's data.  So a
+    move m of a landmark at distance d along the unit ray r is insignificant if
 
         |m - (r^T m) r|^2 / s^2 + (r^T m)^2 / max(s, k sigma)^2  <=  d^2
 
-    with s the least share that is told, sigma the deviation along the ray as a share of d.
+    with s the smallest significant share, sigma the deviation along the ray as a share of d.
     """
     chosen = np.empty(rows.size, np.int32)
     count = 0
@@ -164,7 +169,7 @@ def _unpublished(
         deep2 = along * along / max(distance2, _TINY)
         sigma, before = sigmas[row], published_sigmas[row]
         deep = _MOVED_SHARE / max(_MOVED_SHARE, _MOVED_SIGMAS * sigma)
-        # What was never published compares with NaN, which is never small.
+        # Unpublished values are NaN, which compares as significant.
         still = moved2 - (1.0 - deep * deep) * deep2 <= _MOVED_SHARE * _MOVED_SHARE * distance2
         known = before * _KNOWN_SHARE <= sigma and sigma * _KNOWN_SHARE <= before
         if snapshot or not (still and known):
@@ -182,25 +187,25 @@ def _differs(keyframe: Keyframe) -> bool:
 
 
 class KeyframeChanges:
-    """Remembers what has been published, and makes each KeyframeDelta."""
+    """Records what has been published, and makes each KeyframeDelta."""
 
     def __init__(self, points: Landmarks, after: int = -1) -> None:
-        """after: id of the last keyframe of earlier sessions, of which nothing is told."""
+        """after: id of the last keyframe of the loaded map, which is not published."""
         self._points = points
         self._newest = after
         self._settled = after
         self._final: list[Keyframe] = []
 
     def settle(self, keyframes: Sequence[Keyframe]) -> None:
-        """These keyframes, in the order of their ids, will not change any more."""
+        """These keyframes, in the order of their ids, are final."""
         first = bisect.bisect_right(keyframes, self._settled, key=lambda keyframe: keyframe.id)
         self._final += keyframes[first:]
         self._settled = max([self._settled, *(keyframe.id for keyframe in keyframes[first:])])
 
     def publish(self, newest: Keyframe | None, known: SelfCalibration) -> KeyframeDelta:
-        """What has not been published yet, in pixels of the rectified image.
+        """Return what has not been published yet, in pixels of the rectified image.
 
-        newest: the last keyframe that was made, if any.   known: of the camera, whose pixels they
+        newest: the last keyframe that was made, if any.   known: the calibration whose pixels they
         have.
         """
         new = -1

@@ -1,9 +1,9 @@
-"""Mapped points that lost their track are found again among the maxima of a frame.
+"""Landmarks that lost their track are reacquired at the maxima of a frame.
 
-A point is projected with the pose of the frame; the maximum near it whose patch fits best takes it.
-Of the curvature only the sign counts: its size is the cube of the exposure.  The patch then refines
-the position, since an extremum alone is known to half a pixel only.  Not in the paper;
-docs/results.md says what it is worth.
+A landmark is projected with the pose of the frame, and matched to the nearby maximum whose patch
+fits best.  Only the sign of the curvature counts: its size grows with the cube of the exposure.
+The patch then refines the position, because an extremum alone is accurate to half a pixel.  Not in
+the paper; docs/results.md has its value.
 """
 
 import math
@@ -35,7 +35,7 @@ _ALIGN_REACH_PX = np.float32(1.5)
 _ITERATIONS = 4
 
 FLAT = np.float32(1.0)
-"""Standard deviation, in grey levels, under which a patch says nothing."""
+"""Standard deviation, in grey levels, below which a patch is not used."""
 
 
 class MaximaGrid(NamedTuple):
@@ -106,10 +106,10 @@ def _nearest(points_px: F32, grid: MaximaGrid, radius_px: float, found: I32) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class Reacquired:
-    """Points found again, each at most once.
+    """Reacquired landmarks, each at most once.
 
-    rows: (R,) of the points.   points_px: (R, 2) where they are.   maxima: (R,) index of theirs.
-    visible: (V,) rows that should have been in the image.
+    rows: (R,) of the landmarks.   points_px: (R, 2) their positions.   maxima: (R,) index of
+    theirs. visible: (V,) rows that should have been in the image.
     """
 
     rows: I32
@@ -119,11 +119,11 @@ class Reacquired:
 
 
 class _Wanted(NamedTuple):
-    """Points looked for.
+    """Landmarks to search.
 
-    projected: (W, 2) where they should be, px.     rows: (W,) of the points.
-    kappas: curvature of every row, of which the sign counts.
-    patches: (..., PATCH_SIDE, PATCH_SIDE) grey levels around every row then.
+    projected: (W, 2) predicted position, px.     rows: (W,) of the landmarks. kappas: curvature of
+    every row, of which the sign counts. patches: (..., PATCH_SIDE, PATCH_SIDE) grey levels around
+    every row.
     """
 
     projected: F32
@@ -149,11 +149,11 @@ def reacquire(
     camera: PinholeCamera,
     parameters: ReacquisitionParameters,
 ) -> Reacquired:
-    """Match points to the maxima of a frame whose pose is known.
+    """Match landmarks to the maxima of a frame with a known pose.
 
-    rows: (R,) points looked for.  maxima: (M, 3) of the frame.  seen: (M, 3) the same where grey
-    (H, W) shows them, which may be an image that nothing has corrected: what is found lies as far
-    from its maximum there as here.  grey None: distance and the sign of the curvature alone decide.
+    rows: (R,) landmarks to search.  maxima: (M, 3) of the frame.  seen: (M, 3) the same in the
+    pixels of grey (H, W), which may be an uncorrected image: the offset of a match from its maximum
+    is the same in both.  grey None: only distance and the sign of the curvature decide.
     """
     projected, visible = _projected(T_world_camera, rows, points, camera)
     visible_rows = rows[visible]
@@ -184,11 +184,10 @@ def match_widely(
     count: int,
     min_zncc: float,
 ) -> tuple[I32, F32]:
-    """Match points to the maxima of a frame whose pose is hardly known, by their patches.
+    """Match landmarks to the maxima of a frame with an uncertain pose, by their patches.
 
-    rows, grey: as for ``reacquire``.   radius_px: from where T_world_camera
-    shows a point.   count: points looked for, at most.   Returns rows (F,) and pixels (F, 2); some
-    of them are wrong.
+    rows, grey: as for ``reacquire``.   radius_px: around the projection by T_world_camera. count:
+    maximum number of landmarks.   Returns rows (F,) and pixels (F, 2); some of them are wrong.
     """
     projected, inside = _projected(T_world_camera, rows, points, camera)
     visible = np.flatnonzero(inside)
@@ -204,7 +203,7 @@ def match_widely(
 def _projected(
     T_world_camera: F64, rows: I32, points: Landmarks, camera: PinholeCamera
 ) -> tuple[F32, BoolArray]:
-    """Where a frame should show points, px (R, 2), and whether it does."""
+    """Projections of landmarks, px (R, 2), and whether they are in the image."""
     T_camera_world = np.ascontiguousarray(inverse(T_world_camera)[:3])
     K = np.array([*camera.intrinsics, camera.width, camera.height])
     projected = np.empty((len(rows), 2), np.float32)
@@ -214,8 +213,9 @@ def _projected(
 
 @fast_kernel
 def cut_patches(grey: U8, points_px: F32, rows: I32, patches: U8) -> None:
-    """Store the patch around each point (N, 2), and the margin that its gradients need, in
-    ``patches[rows[n]]``; zeros at the border of the image."""
+    """Store the patch around each landmark (N, 2), with the margin for its gradients, in
+    ``patches[rows[n]]``; zeros beyond the border of the image.
+    """
     height, width = grey.shape
     for i in range(rows.size):
         patch = patches[rows[i]]
@@ -260,7 +260,9 @@ def _match(
     choice: I32,
     points_px: F32,
 ) -> None:
-    """Give each maximum to the point that fits it best; writes its choice, -1, and its place."""
+    """Assign each maximum to the landmark that fits it best; writes its choice, -1, and its
+    position.
+    """
     maxima = grid.maxima
     owner = np.full(maxima.shape[0], -1, np.int32)
     scores = np.zeros(maxima.shape[0])
@@ -308,7 +310,7 @@ def _match_patches(
     min_zncc: float,
     points_px: F32,
 ) -> BoolArray:
-    """Whether each point has a maximum whose patch is like its own; writes the best one's place."""
+    """Whether each landmark has a maximum with a similar patch; writes the best one's position."""
     found = np.zeros(wanted.rows.size, np.bool_)
     window = Pixels(np.empty(PATCH_SIDE * PATCH_SIDE, np.float32), PATCH_SIDE, PATCH_SIDE)
     values = np.empty(TEMPLATE_FLOATS, np.float32)
@@ -348,14 +350,15 @@ def _match_patches(
 def _two_nearest(
     wanted: _Wanted, i: int, grid: MaximaGrid, limits: _Limits
 ) -> tuple[int, int, float]:
-    """The nearest two maxima whose curvature has the point's sign, -1 where there is none, and the
-    squared distance of the first."""
+    """The nearest two maxima whose curvature has the landmark's sign, -1 without one, and the
+    squared distance of the first.
+    """
     u, v, known = wanted.projected[i, 0], wanted.projected[i, 1], wanted.kappas[wanted.rows[i]]
     column, line = int(u) // grid.cell_px, int(v) // grid.cell_px
     first, second = -1, -1
     nearest = next_nearest = limits.radius_px * limits.radius_px
     for y in range(max(line - 1, 0), min(line + 2, grid.lines)):
-        # The cells of a line lie one after the other.
+        # The cells of a line are contiguous.
         begin = y * grid.columns + max(column - 1, 0)
         end = y * grid.columns + min(column + 1, grid.columns - 1)
         for k in range(grid.starts[begin], grid.starts[end + 1]):
@@ -375,7 +378,7 @@ def _two_nearest(
 
 @fast_kernel
 def _template_of(patch: U8, window: Pixels, values: F32) -> np.float32:
-    """Make the template of a kept patch; returns its energy, 0 where it cannot be placed by."""
+    """Make the template of a stored patch; returns its energy, 0 if it cannot be aligned."""
     for r in range(PATCH_SIDE):
         for c in range(PATCH_SIDE):
             window.values[r * PATCH_SIDE + c] = np.float32(patch[r, c])

@@ -1,8 +1,8 @@
-"""A camera that nobody can predict: recognised by what its image looks like.
+"""Relocalisation of a camera without a predicted pose, by the appearance of its image.
 
-Keyframes are remembered as places.  One that looks like the frame proposes a pose by P3P and RANSAC
-over corners that look alike; it counts only where the map's own points prove it, as after any loss,
-and where no other place is proved nearly as well: what looks the same in two places shows neither.
+Keyframes are stored as places.  One that looks like the frame proposes a pose by P3P and RANSAC
+over similar corners.  The pose counts only if the map's landmarks verify it, as after any loss, and
+no other place is verified nearly as well: an image that fits two places identifies neither.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -33,25 +33,26 @@ from pliant.algorithms.mapping.reacquisition import MaximaGrid
 from pliant.algorithms.places import Features, match, repeated_share
 
 _NEAR_SHARE = 0.0125
-"""Of the image's width: a corner is as far as the nearest point of the map within."""
+"""Share of the image's width: a corner has the depth of the nearest landmark within it."""
 
 _NEAR_KEYFRAMES = 16
-"""Whose points prove a pose."""
+"""Number of keyframes whose landmarks verify a pose."""
 
 _SAME_TURN_RAD = np.radians(5.0)
 _SAME_SHIFT = 0.1
-"""Poses closer than this, as a share of the depth, are one."""
+"""Poses closer than this, as a share of the depth, are the same."""
 
 _AS_GOOD = 0.5
-"""A place with this share of the inliers of another one, or of its corners, is as good."""
+"""A place with this share of another one's inliers or corners is as good."""
 
 _MOST = 0.5
-"""Of the corners that look alike: in another place a tenth agrees on a pose."""
+"""Minimum share of the similar corners: in a wrong place a tenth agrees on a pose."""
 
 
 class _Proposed(NamedTuple):
-    """A pose, the place that proposes it, the corners (n,) of the frame that agree on it, their
-    pixels, where in the world they are, and their share of those that look alike."""
+    """A pose, the place that proposes it, the frame's agreeing corners (n,), their pixels and world
+    positions, and their share of the similar ones.
+    """
 
     T_world_camera: F64
     place: "Place"
@@ -63,8 +64,8 @@ class _Proposed(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """A keyframe that may be what the camera sees, the corners of its image, and all keyframes of
-    its segment, oldest first.
+    """A keyframe that the camera may see, the corners of its image, and all keyframes of its
+    segment, oldest first.
 
     view: whose pixels the keyframe has; the corners are at those of the rectified image.  None: the
     corners are at the keyframe's.
@@ -77,7 +78,7 @@ class Place:
 
     @cached_property
     def features(self) -> Features:
-        """The corners at the pixels that the keyframe has."""
+        """The corners at the keyframe's pixels."""
         if self.view is None:
             return self.corners
         return replace(self.corners, points_px=self.view.pixels(self.corners.points_px))
@@ -85,8 +86,9 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class Recognised:
-    """T_world_camera of a frame that sees what a keyframe saw, and how many points of the map and
-    corners of that keyframe prove it."""
+    """T_world_camera of a frame in a keyframe's place, and the numbers of landmarks and of the
+    keyframe's corners that verify it.
+    """
 
     keyframe: Keyframe
     T_world_camera: F64
@@ -105,10 +107,10 @@ def relocalise(
     parameters: MappingParameters,
     generator: np.random.Generator,
 ) -> Recognised | None:
-    """The pose of a frame from the places that look like it, None where no single one is proved.
+    """Return the pose of a frame from similar places, or None unless exactly one is verified.
 
-    seen, maxima (M, 3), grey (H, W): of the frame.   elsewhere: places that are asked as well
-    where one of the others is proved.
+    seen, maxima (M, 3), grey (H, W): of the frame.   elsewhere: places that are compared as well
+    after a verified one.
     """
     own = parameters.recovery
     best: Recognised | None = None
@@ -167,11 +169,11 @@ def _looked_about(
     parameters: MappingParameters,
     generator: np.random.Generator,
 ) -> Recognised:
-    """The pose that most of the map's points prove, of the one that corners tell and of one that
-    points tell which are looked for about it.
+    """Return the better verified of two poses: that of the corners, and that of landmarks searched
+    around it.
 
-    A few blurred corners on one wall leave a turn open that a step aside makes up for, and points
-    on it are found within their radius then, too.
+    A few blurred corners on one wall leave a rotation open that a step aside compensates, and
+    landmarks on the wall are within their radius then, too.
     """
     rows = _rows_near(place.keyframe, place.segment, points)
     radius_px = NEAR * parameters.recovery.max_radius_share * camera.width
@@ -185,7 +187,7 @@ def _looked_about(
 
 
 def _rows_near(keyframe: Keyframe, segment: list[Keyframe], points: Landmarks) -> I32:
-    """Rows of the points that may be seen from about a keyframe of a segment."""
+    """Rows of the landmarks that may be visible from near a keyframe of a segment."""
     near = most_shared(segment, [keyframe], points)[:_NEAR_KEYFRAMES]
     rows = rows_of(near, np.zeros(0, np.int32), len(points.state))
     return rows[points.state[rows] == MAPPED]
@@ -202,11 +204,12 @@ def rest_is_elsewhere(
     parameters: MappingParameters,
     generator: np.random.Generator,
 ) -> bool:
-    """Whether half as many points prove another pose nearby, of those that this one leaves over.
+    """Whether the landmarks that this pose leaves over verify another pose nearby, with half as
+    many.
 
-    keyframe: of a segment, which sees the place.   maxima (M, 3), grey (H, W): of the frame.
-    What shows a place may have been moved in it, and be nearly all that has corners; what stands
-    about it then is not where the pose shows it, but all a step aside.
+    keyframe: of a segment, which sees the place.   maxima (M, 3), grey (H, W): of the frame. The
+    recognised object may have been moved in its place, and have nearly all corners; everything else
+    is then a step aside of its projection.
     """
     rows, own = _rows_near(keyframe, segment, points), parameters.recovery
     seen = verify_pose(T_world_camera, rows, points, maxima, grey, camera, parameters, 0.0)
@@ -228,9 +231,10 @@ def rest_is_elsewhere(
 def repeats(
     seen: Features, corners: I64, xyz: F64, camera: PinholeCamera, parameters: MappingParameters
 ) -> bool:
-    """Whether as much speaks for a pose a step aside, for the image shows the same again there.
+    """Whether the evidence is as good for a pose a step aside, because the image repeats itself
+    there.
 
-    corners, xyz: what speaks for a pose, as of ``repeated_share``.
+    corners, xyz: the evidence for a pose, as of ``repeated_share``.
     """
     share = repeated_share(
         seen, corners, xyz, camera, gate_px=parameters.localisation.ransac_gate_px,
@@ -242,8 +246,9 @@ def repeats(
 def corners_in_map(
     keyframe: Keyframe, features: Features, points: Landmarks, camera: PinholeCamera
 ) -> tuple[F64, BoolArray]:
-    """(n, 3) where in the world the corners of a keyframe are, and whether that is known: as deep
-    as the point of the map beside them."""
+    """(n, 3) world positions of a keyframe's corners, and whether they are known: with the depth of
+    the nearby landmark.
+    """
     seen = points.state[keyframe.rows] == MAPPED
     rows, points_px = keyframe.rows[seen], keyframe.points_px[seen]
     radius_px = _NEAR_SHARE * camera.width
@@ -268,10 +273,10 @@ def _propose(
     parameters: MappingParameters,
     generator: np.random.Generator,
 ) -> Iterator[_Proposed]:
-    """The pose that most corners agree on which look like those of a place, and then that of the
-    rest of them, as long as enough agree.
+    """Yield the pose on which most similar corners of a place agree, then that of the remaining
+    ones, while enough agree.
 
-    What has been moved takes its corners along, which may be the most.
+    Moved objects take their corners along, which may be the majority.
     """
     limits, own = parameters.localisation, parameters.recovery
     pairs = match(seen, place.features)
@@ -298,9 +303,9 @@ def _propose(
 def _speaks_for_itself(
     proposed: _Proposed, camera: PinholeCamera, parameters: MappingParameters
 ) -> bool:
-    """Whether the corners leave no doubt: many, most of those that look alike, all over the image.
+    """Whether the corners are conclusive: many, most of the similar ones, all over the image.
 
-    The map's points agree less where a shutter that rolls or motion blurs the frame.
+    Landmarks agree less if a rolling shutter or motion blurs the frame.
     """
     size = np.array([camera.width, camera.height])
     spread = (proposed.corners_px.std(axis=0) / size).min()
@@ -314,10 +319,10 @@ def _speaks_for_itself(
 def _is_as_good(
     rival: Recognised, best: Recognised, points: Landmarks, parameters: MappingParameters
 ) -> bool:
-    """Whether as much speaks for another pose.
+    """Whether the evidence for another pose is as good.
 
-    Of points some places have far more than others: those that were mapped from nearby, and slowly.
-    Of corners each has as many, so that they tell, too, what is the same in two places.
+    Places mapped from nearby, and slowly, have far more landmarks than others, but not more
+    corners. So corners reveal when two places look the same.
     """
     if rival.inliers > _AS_GOOD * best.inliers:
         return True
@@ -333,7 +338,7 @@ def _is_same(a: Recognised, b: Recognised, place: Place, points: Landmarks) -> b
 
 
 def is_same_pose(a: F64, b: F64, keyframe: Keyframe, points: Landmarks) -> bool:
-    """Whether two poses of a frame are one, before what a keyframe sees."""
+    """Whether two poses of a frame are the same, relative to the depth of a keyframe."""
     between = inverse(a) @ b
     rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
     depth = np.median(transform(inverse(b), points.xyz[rows])[:, 2])

@@ -1,18 +1,18 @@
-"""How a rolling shutter moves observations: the rows of a frame are taken one after the other.
+"""How a rolling shutter moves observations: the rows of a frame are exposed one after the other.
 
 The pose of a frame is that of its middle row.  With the readout as a share of the frame interval,
-row v is taken ``readout (v - middle) / height`` frame intervals later, when the camera has moved on
-by as much of its motion.  A map that is built without regard to this bends and drifts in scale, at
-residuals that hardly grow.  Rows lie along the longer side of a sensor: an upright image has been
-turned and is read out across, so that u and the width take the place of v and the height.
+row v is exposed ``readout (v - middle) / height`` frame intervals later, when the camera has moved
+by this share of its motion.  A map that ignores this bends and drifts in scale, while the residuals
+hardly grow.  Rows lie along the longer side of a sensor: an upright image is rotated and read out
+across, so u and the width replace v and the height.
 
-Once the readout is known, everything is mapped as if each frame had been taken at once: what is
-seen at p was, when the middle row was taken, at the q with
+Once the readout is known, everything is mapped as with a global shutter: an observation at p was at
+q when the middle row was exposed, with
 
     p = q + readout (v_p - middle) / height flow(q),
 
-the flow that of the camera's motion and of the depth at q: that of its point, or a common one.
-Keyframes remember p - q, so that a better readout, motion or depth can take its place.
+where the flow follows from the camera's motion and the depth at q: that of its landmark, or a
+common one.  Keyframes store p - q, so that a better readout, motion or depth can replace it.
 """
 
 from dataclasses import dataclass
@@ -31,16 +31,19 @@ from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.compiler.kernel import fast_kernel, kernel
 
 _SPAN = 1
-"""Frames before and after a keyframe over which its motion is measured: hands shake faster than
-more of them would show."""
+"""Frames before and after a keyframe over which its motion is measured: a hand-held camera shakes
+faster than more of them would show.
+"""
 
 _MIN_DEPTH = 1e-6
 
 _STEPS = 2
-"""Of the fixed point: a shift of a hundredth of the image changes itself by a hundredth."""
+"""Iterations of the fixed point: a shift of a hundredth of the image changes itself by a
+hundredth.
+"""
 
 _GRID_PX = 16
-"""Between these the move of an image is interpolated: it is nearly quadratic."""
+"""Grid over which the offsets of an image are interpolated: they are nearly quadratic."""
 
 
 def _read_out_along(camera: PinholeCamera) -> tuple[int, float]:
@@ -50,7 +53,7 @@ def _read_out_along(camera: PinholeCamera) -> tuple[int, float]:
 
 
 class FrameOnKeyframe(NamedTuple):
-    """A frame whose pose is relative to a keyframe.   inliers: points that support it."""
+    """A frame with its pose relative to a keyframe.   inliers: landmarks that support it."""
 
     frame: int
     keyframe: Keyframe
@@ -58,36 +61,40 @@ class FrameOnKeyframe(NamedTuple):
 
 
 class FramePoses:
-    """Poses of the frames of a segment, each relative to its keyframe, which may still move."""
+    """Poses of a segment's frames, each relative to its reference keyframe, which may still
+    move.
+    """
 
     def __init__(self, known: dict[int, F64] | None = None) -> None:
-        """known: motions (6,) of keyframes by their ids, whose frames nobody has any more."""
+        """known: motions (6,) of keyframes by their ids whose frames are not stored."""
         self._poses: dict[int, tuple[int, F64]] = {}
         self._inliers: dict[int, int] = {}
         self._information: dict[int, F64] = {}
         self._known = known or {}
 
     def add(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int = 0) -> None:
-        """A frame whose pose hangs on a keyframe.   inliers: points that support it."""
+        """Add a frame's pose with its reference keyframe.   inliers: landmarks that support it."""
         self._poses[frame] = (keyframe.id, inverse(keyframe.T_world_camera) @ T_world_camera)
         self._inliers[frame] = inliers
 
     def has(self, frame: int, keyframe: Keyframe) -> bool:
-        """Whether the frame hangs on the keyframe.  Keyframes of earlier sessions have none."""
+        """Whether the frame has this reference keyframe.  Keyframes of a loaded map have none."""
         return self._poses.get(frame, (-1,))[0] == keyframe.id
 
     def refine(
         self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int, information: F64
     ) -> None:
-        """A frame that hangs on the keyframe is placed again.   information: (6, 6) of the pose, as
-        ``refine_pose`` returns it."""
+        """Replace the pose of a frame with this reference keyframe.   information: (6, 6) of the
+        pose, as ``refine_pose`` returns it.
+        """
         if self.has(frame, keyframe):
             self.add(frame, keyframe, T_world_camera, inliers)
             self._information[frame] = information
 
     def frames_on(self, keyframes: list[Keyframe]) -> tuple[list[FrameOnKeyframe], F64, F64]:
-        """All frames that hang on one of the keyframes, by number, with T_world_camera (N, 4, 4)
-        and its information (N, 6, 6), NaN where that is unknown."""
+        """Return all frames of these reference keyframes, by number, with T_world_camera (N, 4, 4)
+        and its information (N, 6, 6), NaN where unknown.
+        """
         hosts = {keyframe.id: keyframe for keyframe in keyframes}
         hanging = [(frame, of) for frame, (of, _) in sorted(self._poses.items()) if of in hosts]
         T_world_host = np.array([hosts[of].T_world_camera for _, of in hanging])
@@ -100,14 +107,14 @@ class FramePoses:
         )
 
     def take_in(self, other: "FramePoses") -> None:
-        """The frames of another segment are of this one, too."""
+        """Add the frames of a merged segment."""
         self._poses |= other._poses
         self._inliers |= other._inliers
         self._information |= other._information
         self._known |= other._known
 
     def scale(self, moves: MapMoves) -> None:
-        """The whole map moves: distances to a keyframe scale with it."""
+        """Scale the distances to a keyframe when the whole map moves."""
         hanging = np.array([keyframe for keyframe, _ in self._poses.values()], np.int64)
         scales = np.cbrt(np.linalg.det(moves.matrices(hanging)[:, :3, :3]))
         for frame, scale in zip(self._poses, scales, strict=True):
@@ -153,7 +160,7 @@ class FramePoses:
 def motion_between(first: F64, last: F64, T_world_camera: F64) -> F64:
     """(..., 6) as of ``FramePoses.motions``, from one of two poses (..., 4, 4) to the other.
 
-    T_world_camera: (..., 4, 4) a camera near both, in which it is.
+    T_world_camera: (..., 4, 4) a camera near both, in whose frame the motion is.
     """
     first, last = inverse(first) @ T_world_camera, inverse(last) @ T_world_camera
     turn = so3_log(last[..., :3, :3] @ np.swapaxes(first[..., :3, :3], -1, -2))
@@ -162,11 +169,11 @@ def motion_between(first: F64, last: F64, T_world_camera: F64) -> F64:
 
 @dataclass(frozen=True)
 class RolledFrame:
-    """What a rolling shutter did to a frame.
+    """The effect of a rolling shutter on a frame.
 
-    view: of the frame; pixels are of its camera, but those of images, which are rectified.
+    view: of the frame; pixels are those of its camera, except in images, which are rectified.
     readout: share of the frame interval.   motion: (6,) as of ``FramePoses.motions``.
-    inverse_depth: of what has no depth of its own.
+    inverse_depth: for observations without their own.
     """
 
     view: CorrectedView
@@ -176,29 +183,32 @@ class RolledFrame:
 
     @property
     def camera(self) -> PinholeCamera:
-        """Of the view."""
+        """The camera of the view."""
         return self.view.camera
 
     def shifts(self, points_px: F32, inverse_depths: F64 | None = None) -> F32:
-        """(N, 2) px by which that moved what is seen at points_px (N, 2)."""
+        """(N, 2) rolling-shutter offsets, px, of observations at points_px (N, 2)."""
         return self._shifts(points_px, inverse_depths, seen=True)
 
     def found(self, points_px: F32, inverse_depths: F64) -> tuple[F32, F32]:
-        """What is found at points_px (N, 2) of ``image`` where its own depth puts it, and its
-        shifts."""
+        """Move matches at points_px (N, 2) of ``image`` to the position for their own depth;
+        returns it with their offsets.
+        """
         seen = points_px + self._shifts(points_px, None, seen=False)
         shifts = self.shifts(seen, inverse_depths)
         return seen - shifts, shifts
 
     def image(self, pixels: U8) -> U8:
-        """The rectified image (H, W) or (H, W, 3) as the view would have it, had it been taken at
-        once: all of it at one depth."""
+        """The rectified image (H, W) or (H, W, 3) in the view's pixels with a global shutter, at
+        one depth.
+        """
         return moved_image(pixels, self.places)
 
     @cached_property
     def places(self) -> Move:
-        """(H, W) columns and rows of the rectified image in which the pixels of the image taken at
-        once are seen."""
+        """(H, W) columns and rows of the rectified image for the pixels of the global-shutter
+        image.
+        """
         width, height = self.camera.width, self.camera.height
         columns, rows = -(-width // _GRID_PX) + 1, -(-height // _GRID_PX) + 1
         v, u = np.mgrid[:rows, :columns].astype(np.float32) * _GRID_PX
@@ -270,7 +280,7 @@ def _flow(
 
 @fast_kernel
 def _velocity(motion: F64, x: float, y: float, inverse_depth: float) -> tuple[float, float]:
-    """Of a point on the plane z = 1, per frame interval."""
+    """Velocity of a point on the plane z = 1, per frame interval."""
     a = motion[1] - motion[2] * y + motion[3] * inverse_depth
     b = motion[2] * x - motion[0] + motion[4] * inverse_depth
     c = motion[0] * y - motion[1] * x + motion[5] * inverse_depth
@@ -281,7 +291,7 @@ def _velocity(motion: F64, x: float, y: float, inverse_depth: float) -> tuple[fl
 def _shifts(
     points_px: F32, inverse_depths: F64, motion: F64, K: F64, axis: int, shifts: F32, seen: bool
 ) -> None:
-    """Write p - q of the points p, where they are seen; or else of the points q."""
+    """Write p - q for the observed points p, or else for the points q."""
     middle = 0.5 * (K[4] - 1.0)
     for n in range(points_px.shape[0]):
         u, v = float(points_px[n, 0]), float(points_px[n, 1])
@@ -301,9 +311,9 @@ def _shifts(
 
 @kernel
 def _interpolate(moves: F32, places: F32) -> None:
-    """Write the place (2, H, W) of each pixel by moves (., ., 2) that are given at the nodes.
+    """Write the position (2, H, W) of each pixel by offsets (., ., 2) at the grid nodes.
 
-    By whole rows, which are SIMD code, from the corners of the cell that each pixel lies in.
+    Row by row, in SIMD code, from the corners of each pixel's cell.
     """
     height, width = places.shape[1:]
     cell = np.arange(width) // _GRID_PX

@@ -1,19 +1,18 @@
-"""A segment of the map: keyframes and points that lie in one world.
+"""A segment of the map: keyframes and landmarks in one world frame.
 
-A segment begins where a map starts, and rests where the camera is lost.  The camera may come back
-to it, other segments may become a part of it, and at the end all of it is adjusted.
+A segment begins where a map starts, and rests while the camera is lost.  The camera may return to
+it, other segments may be merged into it, and at the end all of it is adjusted.
 
-Keyframes that it has given up have been published, with frames and points that hang on them: they
-move when those that it has kept do.  One on a path moves as the map between the keyframes before
-and after it: in between, by what share of the way lies behind it.  Where others of another time see
-more of what it saw, it moves as the one that sees most.
+Dropped keyframes have been published with their frames and landmarks, and move with the kept ones.
+One on a path moves as the map between its neighbours, interpolated by the distance travelled.  If
+keyframes of another time share more of its view, it moves as the one that shares most.
 
-It goes on under another lens where the adjustment of the whole map has found that the one in use is
-wrong.  Tracks come as pixels of the rectified image, and the mapper works on those of an ideal
-camera, see ``self_calibration``.  So what keyframes have seen is moved to where the new ideal
-camera sees it, and a point to where the keyframe on which it hangs sees it, as far away as it was:
-the moves of ``global_adjustment`` say how distances change.  The adjustment of the window takes out
-what is left.
+The segment continues with another calibration if a global bundle adjustment refutes the one in use.
+Tracks have pixels of the rectified image, and the mapper works on those of an ideal camera, see
+``self_calibration``.  So the observations of keyframes are converted to the new ideal camera.  A
+landmark moves to where its reference keyframe then sees it, at the same distance; the moves of
+``global_adjustment`` contain the change of distances.  The adjustment of the window corrects the
+rest.
 """
 
 from dataclasses import dataclass, field
@@ -49,8 +48,8 @@ _MIN_DEPTH = 1e-6
 
 @dataclass(kw_only=True)
 class DroppedKeyframes:
-    """ids: (G,) of the keyframes, ascending.   hosts: (G,) the keyframe that each moves as, by id,
-    itself where it lies between others.   centres: (G, 3) where they stood.
+    """ids: (G,) of the keyframes, ascending.   hosts: (G,) the keyframe that each moves with, by
+    id; itself if it is interpolated between others.   centres: (G, 3) their positions.
     """
 
     ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -61,13 +60,13 @@ class DroppedKeyframes:
         return len(self.ids)
 
     def take_in(self, other: "DroppedKeyframes") -> None:
-        """Those of another segment, or others of this one, are given up as well."""
+        """Add dropped keyframes of this or of another segment."""
         ids = np.concatenate([self.ids, other.ids])
         order = np.argsort(ids)
         self.ids = ids[order]
         self.centres = np.concatenate([self.centres, other.centres])[order]
         hosts, before = np.concatenate([self.hosts, other.hosts])[order], None
-        while before is None or (hosts != before).any():  # a host may have been given up since
+        while before is None or (hosts != before).any():  # a host may have been dropped since
             before = hosts
             gone = np.isin(hosts, self.ids)
             hosts = hosts.copy()
@@ -75,7 +74,7 @@ class DroppedKeyframes:
         self.hosts = hosts
 
     def host_of(self, keyframe: int, kept: I64) -> int:
-        """A keyframe, or where it has been given up one that has been kept and is near it, by id.
+        """Return the id of a keyframe, or of a kept one near it if it was dropped.
 
         kept: (M,) all of these, ascending.
         """
@@ -86,7 +85,7 @@ class DroppedKeyframes:
         return keyframe
 
     def together_with(self, moves: MapMoves) -> MapMoves:
-        """The moves of all keyframes of the segment from those of the ones that had been kept."""
+        """Extend the moves of the kept keyframes to all keyframes of the segment."""
         new = ~np.isin(self.ids, moves.keyframe_ids)
         if not new.any():
             return moves
@@ -95,13 +94,15 @@ class DroppedKeyframes:
         order = np.argsort(ids)
         ids, rows = ids[order], rows[order]
         hosted = new & (self.hosts != self.ids)
-        # A host that is newer than all of these moves as the last of them.
+        # A newer host moves as the last of these.
         host = np.searchsorted(ids, self.hosts[hosted], side="right") - 1
         rows[np.searchsorted(ids, self.ids[hosted])] = rows[host]
         return MapMoves(keyframe_ids=ids, moves=rows)
 
     def _between(self, moves: MapMoves, some: BoolArray) -> F64:
-        """(S, 8) of some of them, as of ``MapMoves``, in between those of what was kept."""
+        """(S, 8) moves of some of them, as of ``MapMoves``, interpolated between those of kept
+        ones.
+        """
         ids, kept = self.ids[some], moves.keyframe_ids
         b = np.clip(np.searchsorted(kept, ids), 1, len(kept) - 1) if len(kept) > 1 else 0 * ids
         a = np.maximum(b - 1, 0)
@@ -112,23 +113,23 @@ class DroppedKeyframes:
         T = np.tile(np.eye(4), (len(ids), 1, 1))
         T[:, :3, :3] = R_a @ so3_exp(share * so3_log(np.swapaxes(R_a, 1, 2) @ R_b))
         scales = scale_a ** (1.0 - share) * scale_b**share
-        # What happens where it stood lies in between; elsewhere R and scale say.
+        # Its own position is interpolated; R and scale apply around it.
         at = self.centres[some]
         moved = (1.0 - share) * transform_each(first, at) + share * transform_each(last, at)
         T[:, :3, 3] = moved - scales * (T[:, :3, :3] @ at[:, :, None])[:, :, 0]
         return np.column_stack([matrix_to_pose(T), scales])
 
     def move(self, moves: MapMoves) -> None:
-        """The map moves."""
+        """Move the positions with the map."""
         self.centres = moves.points(self.centres, self.ids)
 
 
 class Moved(NamedTuple):
-    """What has moved the end of a segment, by a similarity S (4, 4).
+    """A motion of the end of a segment, by a similarity S (4, 4).
 
-    moves: of all that readers have; None where they learn of it by what is published anyway.
-    gone: the segment that has become a part of this one.   same_places: pairs of keyframes, the
-    older one first, that told so.
+    moves: of all published content; None if its publication includes them anyway. gone: the segment
+    that was merged into this one.   same_places: pairs of keyframes, the older one first, that are
+    the reason.
     """
 
     S: F64
@@ -140,12 +141,12 @@ class Moved(NamedTuple):
 @dataclass(kw_only=True)
 class Segment:
     """points: rows shared by all segments.    keyframes: oldest first.   path: of its frames.
-    ordinary: those of them that are no keyframes.
-    since: index of the first keyframe after the camera was last recognised: older ones do not move
-    with the window.   adjusted: newest keyframe of an adjustment of all of it that was taken over
-    since the last keyframe was made, by id, or -1.   sparsified: whether keyframes or points have
-    been dropped (``sparsification``).   dropped: those keyframes.   inverse_distance: median of its
-    points from the newest keyframe.   strayed: similarity (4, 4) by which its beginning has moved.
+    ordinary: those of them that are no keyframes. since: index of the first keyframe after the last
+    recognition: older ones do not move with the window.   adjusted: id of the newest keyframe in a
+    global adjustment applied since the last keyframe, or -1.   sparsified: whether keyframes or
+    landmarks were dropped (``sparsification``). dropped: those keyframes.   inverse_distance:
+    median of its landmarks from the newest keyframe. strayed: similarity (4, 4) by which its
+    beginning has moved.
     """
 
     id: int
@@ -162,32 +163,34 @@ class Segment:
 
     @property
     def resumes(self) -> bool:
-        """Whether no keyframe has been made since the camera was recognised."""
+        """Whether there is no keyframe since the camera was recognised."""
         return self.since == len(self.keyframes)
 
     def first_of_window(self, size: int) -> int:
-        """Index of the first keyframe that may move with a window of so many."""
+        """Index of the first free keyframe in a window of this size."""
         return max(self.since, len(self.keyframes) - size)
 
     def leave_window(self, keyframe: Keyframe) -> None:
-        """A keyframe does not move with the window any more."""
+        """A keyframe leaves the window and is no longer free."""
         self.points.base_keyframes[keyframe.rows] += 1
         self.points.base_parallax_rad[keyframe.rows] = self.points.parallax_rad[keyframe.rows]
         keyframe.focus = focus_of(keyframe, self.points)
 
     def rest(self, window: int) -> None:
-        """The camera is not in it any more: the keyframes of a window of that size leave it."""
+        """The camera leaves the segment: the keyframes of a window of this size leave it too."""
         for keyframe in self.keyframes[self.first_of_window(window) :]:
             self.leave_window(keyframe)
         self.since = len(self.keyframes)
 
     def mapped_rows(self) -> I32:
-        """Rows of all its points, oldest first."""
+        """Rows of all its landmarks, oldest first."""
         rows = self.points.mapped(self.id)
         return rows[np.argsort(self.points.first_keyframe[rows], kind="stable")]
 
     def inverse_depths(self, rows: I32, T_world_camera: F64) -> F64:
-        """(n,) of the rows (UNLINKED among them) in a camera; the map's where they are unknown."""
+        """(n,) of the rows (UNLINKED among them) in a camera; the median of the map where
+        unknown.
+        """
         depths = np.full(len(rows), self.inverse_distance)
         _inverse_depths(rows, self.points.state, self.points.xyz, T_world_camera, depths)
         return depths
@@ -195,20 +198,21 @@ class Segment:
     def rolled(
         self, calibration: SelfCalibration, motion: F64, log_focal: float | None = None
     ) -> RolledFrame:
-        """What the readout does to a frame that moves so.
+        """Return the effect of the readout on a frame with this motion.
 
         log_focal: None: that of the newest frame.
         """
         log_focal = calibration.log_focal if log_focal is None else log_focal
         readout = calibration.readout
-        if log_focal:  # of a magnified image fewer rows are seen
+        if log_focal:  # a magnified image shows fewer rows
             readout *= float(np.exp(log_focal))
         view = calibration.view_at(log_focal)
         return RolledFrame(view, readout, motion, self.inverse_distance)
 
     def to_global_shutter(self, keyframes: list[Keyframe], calibration: SelfCalibration) -> None:
-        """Let keyframes see as if they had been taken at once, as is now known of readout, motion
-        and depths; those of which no motion is known any more stay."""
+        """Convert keyframes to a global shutter by the current readout, motion and depths;
+        keyframes without a known motion are unchanged.
+        """
         for keyframe, motion in zip(keyframes, self.path.motions(keyframes), strict=True):
             if not motion.any():
                 continue
@@ -219,8 +223,9 @@ class Segment:
             keyframe.points_px = seen - keyframe.rolled_px
 
     def move(self, moves: MapMoves) -> F64:
-        """Move keyframes, points and frames.  Returns the similarity (4, 4) of the newest
-        keyframe."""
+        """Move keyframes, landmarks and frames.  Returns the similarity (4, 4) of the newest
+        keyframe.
+        """
         keyframes = self.keyframes
         S = moves.matrices(np.array([keyframe.id for keyframe in keyframes], np.int64))
         poses = move_by_similarity(S, np.array([keyframe.T_world_camera for keyframe in keyframes]))
@@ -229,7 +234,7 @@ class Segment:
                 keyframe.published_pose, keyframe.T_world_camera
             )
             keyframe.T_world_camera = T_world_camera
-            if still:  # who reads of the move finds the pose
+            if still:  # readers of the move need the pose
                 keyframe.published_pose = T_world_camera.copy()
             if keyframe.focus is not None:
                 keyframe.focus = move[:3, :3] @ keyframe.focus + move[:3, 3]
@@ -240,7 +245,9 @@ class Segment:
         return S[-1]
 
     def back(self) -> MapMoves | None:
-        """What moves its beginning to where it was, and all of it likewise; None where it is."""
+        """Return the moves that bring its beginning, and all of it, back; None if it has
+        not moved.
+        """
         if np.array_equal(self.strayed, np.eye(4)):
             return None
         first = np.array([self.keyframes[0].id], np.int64)
@@ -248,10 +255,9 @@ class Segment:
         return self.dropped.together_with(MapMoves(keyframe_ids=first, moves=move[None]))
 
     def take_in(self, earlier: "Segment", id: int) -> None:
-        """Become one with a segment that rests, in whose world this one lies by now, or the other
-        way round.
+        """Merge with a resting segment, in whose world frame this one already is, or the reverse.
 
-        id: of both, from now on.  What was mapped there does not move with the window.
+        id: of both, from now on.  The content mapped there does not move with the window.
         """
         both = np.isin(self.points.segment, (self.id, earlier.id))
         self.points.segment[both] = self.id = id
@@ -261,7 +267,7 @@ class Segment:
         for keyframe in self.keyframes:
             keyframe.segment = id
         self.since = len(older)
-        self.adjusted = -1  # not as one
+        self.adjusted = -1  # not as a whole
         self.sparsified |= earlier.sparsified
         self.dropped.take_in(earlier.dropped)
         self.path.take_in(earlier.path)
@@ -270,9 +276,9 @@ class Segment:
     def adjust(
         self, known: SelfCalibration, parameters: MappingParameters
     ) -> tuple[SelfCalibration, MapMoves | None]:
-        """Adjust all but the first keyframe and the calibration, from what is known of it.
+        """Adjust all but the first keyframe and the calibration, from the current estimate.
 
-        Returns what is known now, and how what has been given up moves: None where that is nothing.
+        Returns the new calibration, and how dropped content moves, or None.
         """
         motions = self.path.motions(self.keyframes)
         before = np.array([keyframe.log_focal for keyframe in self.keyframes])
@@ -310,10 +316,10 @@ def _inverse_depths(rows: I32, state: U8, xyz: F64, T_world_camera: F64, depths:
 def see_by(
     segment: Segment, before: CorrectedView, known: SelfCalibration, refocus: F64 | None = None
 ) -> None:
-    """Let a segment that was made in one view be as another camera sees it.
+    """Convert a segment made with one view to another camera.
 
-    before: whose pixels its keyframes have.   known: of the camera by now.   refocus: (K,) change
-    of the log focal length of each keyframe; None: of none.
+    before: whose pixels its keyframes have.   known: the new calibration.   refocus: (K,) change of
+    the log focal length of each keyframe; None: no changes.
     """
     bend(segment, before, known.view, refocus)
     changes = np.zeros(len(segment.keyframes)) if refocus is None else refocus
@@ -333,12 +339,14 @@ def see_by(
 def bend(
     segment: Segment, before: CorrectedView, after: CorrectedView, refocus: F64 | None = None
 ) -> None:
-    """Move the points to where another camera would have mapped what it sees at the same places of
-    the image, candidates with their provisional places among them.   refocus: as of ``see_by``."""
+    """Move landmarks and candidates to where another camera would have mapped the same pixels.
+
+    refocus: as of ``see_by``.
+    """
     points, keyframes = segment.points, segment.keyframes
     rows = points.used(segment.id)
     ids = np.array([keyframe.id for keyframe in keyframes], np.int64)
-    # What hung on a keyframe that the map has forgotten hangs on the one before it.
+    # The reference of a dropped keyframe's landmarks is the keyframe before it.
     slots = np.maximum(np.searchsorted(ids, points.first_keyframe[rows], side="right") - 1, 0)
     T_world_keyframe = np.array([keyframe.T_world_camera for keyframe in keyframes])
     T_world_host, T_host_world = T_world_keyframe[slots], inverse(T_world_keyframe)[slots]

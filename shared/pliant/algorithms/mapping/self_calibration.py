@@ -22,38 +22,37 @@ _GUESS = 0.05
 """Standard deviation of the log focal length from which on a calibration is a guess."""
 
 _LENS = 0.1
-"""Standard deviations of k1 and k2 of an unknown lens."""
+"""Standard deviations of k1 and k2 of an unknown camera."""
 
 _OF_LENS = np.arange(6) != 3
-"""Which of a correction move pixels: all but the readout."""
+"""Which unknowns of a correction move pixels: all but the readout."""
 
 _CERTAIN = 4.0
-"""Standard deviations by which the readout of a rolling shutter differs from none, and a lens from
-the one in use."""
+"""Significance of a rolling shutter's readout, and of a new lens, in standard deviations."""
 
 _UNLIKELY = 1.0
-"""Standard deviations of the given calibration by which a lens that is taken over differs from it:
-what changes under way costs more than a smaller error does."""
+"""Standard deviations of the given calibration by which a new lens must differ from it: a change
+during a run costs more than a small error.
+"""
 
 _ROLLING = 1.0
-"""Standard deviation of the readout of a shutter that is known to roll."""
+"""Standard deviation of the readout of a known rolling shutter."""
 
 _SLOWEST = 0.1
-"""Readout that a rolling shutter exceeds; less is what other errors look like."""
+"""Minimum readout of a rolling shutter; other errors look like smaller ones."""
 
 GROWTH = 1.4
-"""The map is adjusted with its calibration whenever its keyframes are so many times more."""
+"""The map is adjusted with its calibration whenever its keyframes have multiplied by this."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SelfCalibration:
-    """What is known of a camera.
+    """The current estimate of a camera's calibration.
 
-    given: the camera as it was given, of the rectified images.
-    correction: (6,) what is wrong with it, see ``solve_schur``.   covariance: (6, 6) of that.
-    next_keyframes: the number of keyframes at which the calibration is estimated again.
-    changes: whether the focal length changes during the clip.   log_focal: of the newest frame
-    relative to the correction's: see ``changing_focal``.
+    given: the given camera of the rectified images. correction: (6,) of it, see ``solve_schur``.
+    covariance: (6, 6) of that. next_keyframes: the number of keyframes at which the calibration is
+    estimated again. changes: whether the focal length changes during the clip.   log_focal: of the
+    newest frame relative to the correction's: see ``changing_focal``.
     """
 
     given: PinholeCamera
@@ -65,7 +64,7 @@ class SelfCalibration:
 
     @staticmethod
     def of(camera: PinholeCamera, uncertainty: CalibrationUncertainty) -> "SelfCalibration":
-        """Before anything was seen."""
+        """Return the calibration before any frame."""
         return SelfCalibration(camera, np.zeros(6), np.diag(uncertainty.sigmas**2))
 
     @property
@@ -74,24 +73,28 @@ class SelfCalibration:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     def k_sigmas(self, given: CalibrationUncertainty) -> tuple[float, float]:
-        """Standard deviations of the distortions k1, no worse than given, and of k3, which nobody
-        looks for: a lens that may have a k2 may have as much of it."""
+        """Standard deviations of the distortion k1, no more than given, and of k3, which is never
+        estimated: a lens with an unknown k2 may have a k3 of the same size.
+        """
         return min(float(self.sigmas[1]), given.k1), given.k2
 
     @property
     def is_guess(self) -> bool:
-        """Whether the focal length is so uncertain still."""
+        """Whether the focal length is still a guess."""
         return bool(self.sigmas[0] > _GUESS)
 
     @property
     def readout(self) -> float:
-        """Share of the frame interval that frames are read out in, as they are mapped: 0 where
-        nothing says that the shutter rolls."""
+        """Readout with which frames are mapped, as a share of the frame interval: 0 unless the
+        shutter significantly rolls.
+        """
         readout = float(self.correction[3])
         return readout if is_certain(readout, self.sigmas[3]) else 0.0
 
     def with_readout(self, readout: float, sigma: float) -> "SelfCalibration":
-        """With a readout that was found with its standard deviation, where that is certain."""
+        """Return it with an estimated readout and its standard deviation, if that is
+        significant.
+        """
         correction, covariance = self.correction.copy(), self.covariance.copy()
         correction[3] = readout if is_certain(readout, sigma) else 0.0
         covariance[3, 3] = sigma**2
@@ -99,21 +102,23 @@ class SelfCalibration:
 
     @property
     def in_use(self) -> F64:
-        """(6,) the correction that is mapped with."""
+        """(6,) the correction in use for mapping."""
         correction = self.correction.copy()
         correction[3] = self.readout
         return correction
 
     def is_refuted(self, correction: F64, covariance: F64, given: CalibrationUncertainty) -> bool:
-        """Whether a correction (6,) that was found with its covariance (6, 6) is certainly of
-        another lens than that in use, and hardly one that is given with this uncertainty."""
+        """Whether an estimated correction (6,) with its covariance (6, 6) differs significantly
+        from the lens in use, and is unlikely under the given uncertainty.
+        """
         far = _is_far(correction - self.correction, covariance, _CERTAIN)
         believed = with_principal_point(given)
         return far and _is_far(correction, np.diag(believed.sigmas**2), _UNLIKELY)
 
     def prior(self, given: CalibrationUncertainty, start: F64) -> CalibrationUncertainty:
-        """What draws an adjustment that begins from a correction (6,) to the calibration as it was
-        given: next to nothing, where that has been refuted already."""
+        """The prior of an adjustment from a correction (6,) towards the given calibration:
+        negligible once that is refuted.
+        """
         wider: dict[str, float] = {}
         if given.readout > 0.0 and start[3]:
             wider["readout"] = max(given.readout, _ROLLING)
@@ -132,7 +137,7 @@ class SelfCalibration:
         return given.model_copy(update=wider)
 
     def with_lens(self, correction: F64, covariance: F64) -> "SelfCalibration":
-        """With a lens that was found, with its covariance; the readout stays."""
+        """Return it with an estimated lens and its covariance; the readout is unchanged."""
         correction = np.where(_OF_LENS, correction, self.correction)
         both = _OF_LENS[:, None] & _OF_LENS
         return dataclasses.replace(
@@ -140,26 +145,26 @@ class SelfCalibration:
         )
 
     def sees_like(self, other: "SelfCalibration") -> bool:
-        """Whether both have the same pixels, whatever their readouts are."""
+        """Whether both have the same pixels, whatever their readouts."""
         one, view = self.view, other.view
         return (one.camera, one.lens) == (view.camera, view.lens)
 
     @property
     def view(self) -> CorrectedView:
-        """Moves what is seen to where the camera found so far, were it ideal, would see it."""
+        """The view from pixels of the rectified image to those of the ideal camera."""
         return self.view_at(0.0)
 
     @property
     def frame_view(self) -> CorrectedView:
-        """As ``view``, of the newest frame with its own focal length."""
+        """As ``view``, for the newest frame with its own focal length."""
         return self.view_at(self.log_focal)
 
     def view_at(self, log_focal: float) -> CorrectedView:
-        """As ``view``, of what was seen with another focal length."""
+        """As ``view``, for another focal length."""
         return corrected_view(self.given, tuple(self.correction.tolist()), log_focal)
 
     def ideal(self, tracks: FrameExtrema) -> FrameExtrema:
-        """Tracks of the camera found so far."""
+        """Convert tracks to the ideal camera."""
         view = self.frame_view
         if view.lens == (0.0, 0.0) and self.log_focal == 0.0:
             return tracks
@@ -168,7 +173,7 @@ class SelfCalibration:
         return dataclasses.replace(tracks, points_px=view.pixels(tracks.points_px), maxima=maxima)
 
     def published_with(self, delta: MapDelta) -> MapDelta:
-        """What is published, with what the map was made with."""
+        """Return the published form, with the calibration that the map was made with."""
         if not self.correction.any():
             return delta
         return dataclasses.replace(
@@ -178,7 +183,7 @@ class SelfCalibration:
         )
 
     def corrected(self, correction: F64, covariance: F64, keyframes: int) -> "SelfCalibration":
-        """With the estimate of a number of keyframes."""
+        """Return it with the estimate from a number of keyframes."""
         following = max(keyframes + 1, int(np.ceil(GROWTH * keyframes)))
         return dataclasses.replace(
             self, correction=correction, covariance=covariance, next_keyframes=following
@@ -186,7 +191,7 @@ class SelfCalibration:
 
 
 def _is_far(step: F64, covariance: F64, sigmas: float) -> bool:
-    """By the Mahalanobis distance of all but the readout."""
+    """Whether the Mahalanobis distance, without the readout, is significant."""
     unknown = (np.diag(covariance) > 0.0) & _OF_LENS
     C = covariance[np.ix_(unknown, unknown)]
     if not unknown.any() or not np.isfinite(C).all():
@@ -195,14 +200,15 @@ def _is_far(step: F64, covariance: F64, sigmas: float) -> bool:
 
 
 def is_certain(readout: float, sigma: float) -> bool:
-    """Whether a readout with this standard deviation is that of a rolling shutter."""
+    """Whether a readout with this standard deviation is significant."""
     return abs(readout) > max(_CERTAIN * sigma, _SLOWEST)
 
 
 def widened(parameters: MappingParameters, focal_sigma: float) -> MappingParameters:
-    """For a camera whose source says how far its log focal length may be wrong; 0: calibrated.
+    """Return the uncertainty for a source with this standard deviation of the log focal length; 0:
+    calibrated.
 
-    Who guesses the focal length knows nothing of the lens either.  What is held stays held.
+    A guessed focal length implies an unknown lens.  Fixed parameters stay fixed.
     """
     prior = parameters.calibration
     if focal_sigma <= prior.focal or prior.focal == 0.0:

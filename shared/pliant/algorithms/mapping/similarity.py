@@ -1,11 +1,11 @@
-"""The similarity between what two cameras have of pairs of points, of which most may be wrong.
+"""The similarity between two cameras' coordinates of paired points, most of which may be wrong.
 
-Three pairs give one in closed form (Umeyama, PAMI 1991); RANSAC (Fischler and Bolles 1981) takes
-the one under which most points are seen where both cameras saw them, as ORB-SLAM does for loops
-(Mur-Artal et al., T-RO 2015, section VII.B).  Depths of a map are far less certain than directions,
-so errors are counted, and then minimised, in the images and not in space.  Where both cameras stand
-at one place images say nothing of the scale, so that what both maps say of depths has a little say,
-too.
+Three pairs give one in closed form (Umeyama, PAMI 1991).  RANSAC (Fischler and Bolles 1981) selects
+the one under which most points project to their observations in both cameras, as ORB-SLAM does for
+loops (Mur-Artal et al., T-RO 2015, section VII.B).  Depths of a map are far less certain than
+directions, so errors are counted, and then minimised, in the images and not in space.  Two cameras
+at the same position do not determine the scale by their images, so the depths of both maps
+contribute with a small weight.
 """
 
 from dataclasses import dataclass
@@ -17,26 +17,27 @@ from pliant.compiler.kernel import kernel
 
 _ROUNDS = 10
 _MOST = 1.0
-"""Turn and change of the log scale within one round."""
+"""Maximum rotation and change of the log scale within one round."""
 
 _SETTLED = 1e-10
 _SMALL_RAD = 1e-6
 _MIN_DEPTH = 1e-6
 
 _FLAT = 1e-9
-"""Of the larger singular value the smaller one of three points that lie on a line."""
+"""Ratio of the singular values of three points below which they are collinear."""
 
 _DEPTH_SIGMA = 0.1
-"""By what share two maps differ in the distance of a point.  Whatever parallax there is between
-the keyframes says more: of a tenth of the depth, a pixel of 500 tells it to 2 %."""
+"""Relative difference of a point's distance between two maps.  Any parallax between the keyframes
+outweighs it: with a tenth of the depth, a pixel of 500 determines it to 2 %.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pairs:
-    """Points that may be the same, as each of two cameras has them.
+    """Points that may be the same, in the coordinates of two cameras.
 
     xyz_a, xyz_b: (N, 3) in the frame of the camera, whose maps differ in scale.   seen_a, seen_b:
-    (N, 2) where it saw them, on the plane z = 1.
+    (N, 2) their observations, on the plane z = 1.
     """
 
     xyz_a: F64
@@ -45,7 +46,7 @@ class Pairs:
     seen_b: F64
 
     def of(self, rows: BoolArray) -> "Pairs":
-        """Some of them."""
+        """Select some of them."""
         return Pairs(
             xyz_a=self.xyz_a[rows], xyz_b=self.xyz_b[rows], seen_a=self.seen_a[rows],
             seen_b=self.seen_b[rows],
@@ -55,8 +56,8 @@ class Pairs:
 def similarity_by_ransac(
     pairs: Pairs, generator: np.random.Generator, *, gate: float, samples: int
 ) -> tuple[F64, BoolArray] | None:
-    """S_a_b (4, 4), ``xyz_a ~ S_a_b xyz_b``, and which pairs agree with it; None for fewer than
-    four pairs, or where fewer than four agree.
+    """Return S_a_b (4, 4), ``xyz_a ~ S_a_b xyz_b``, and which pairs agree with it; None for fewer
+    than four pairs, or if fewer than four agree.
 
     gate: largest error of a pair in either image, on the plane z = 1.
     """
@@ -68,7 +69,7 @@ def similarity_by_ransac(
     if not len(S):
         return None
     best = S[_least_cost(S, pairs.xyz_a, pairs.xyz_b, pairs.seen_a, pairs.seen_b, gate * gate)]
-    for _ in range(2):  # with those that agree after the first round
+    for _ in range(2):  # the second round uses the agreeing pairs
         agreeing = _squared(best, pairs) < gate * gate
         if agreeing.sum() < 4:
             return None
@@ -78,9 +79,10 @@ def similarity_by_ransac(
 
 
 def refine_similarity(S_a_b: F64, pairs: Pairs, *, scale: float) -> F64:
-    """Gauss-Newton on the errors in both images and of distances, with Geman-McClure weights.
+    """Minimise the errors in both images and of distances by Gauss-Newton, with Geman-McClure
+    weights.
 
-    scale: of these, on the plane z = 1.
+    scale: of the kernel, on the plane z = 1.
     """
     found = S_a_b.copy()
     _refine(found, pairs.xyz_a, pairs.xyz_b, pairs.seen_a, pairs.seen_b, scale)
@@ -100,7 +102,7 @@ def _refine(S: F64, xyz_a: F64, xyz_b: F64, seen_a: F64, seen_b: F64, scale: flo
         for k in range(3):
             largest = max(largest, abs(step[k]))
         if not largest < _MOST:
-            break  # nothing holds it
+            break  # undetermined
         _move(S, step, R)
         if np.abs(step).max() < _SETTLED:
             break
@@ -142,7 +144,7 @@ def residuals_of(S_a_b: F64, pairs: Pairs) -> tuple[F64, F64]:
     """(N, 5) errors in the image of a, in that of b, and of the logarithm of the distance from a;
     (N, 5, 7) derivatives by ``moved``.
 
-    With Y = S X_b: ``dY = -[Y] domega + dtau + Y dsigma``; S^-1 X_a turns with the opposite step;
+    With Y = S X_b: ``dY = -[Y] domega + dtau + Y dsigma``; S^-1 X_a moves with the opposite step;
     ``d log |Y| = Y . dY / |Y|^2``.
     """
     count = len(pairs.xyz_a)
@@ -187,7 +189,7 @@ def _linearise(
 
 @kernel
 def _derivatives(X: F64, dX: F64) -> None:
-    """(3, 7) of a point by ``moved``."""
+    """(3, 7) derivatives of a point by ``moved``."""
     dX[:] = 0.0
     dX[0, 1], dX[0, 2], dX[1, 2] = X[2], -X[1], X[0]
     dX[1, 0], dX[2, 0], dX[2, 1] = -X[2], X[1], -X[0]
@@ -207,8 +209,9 @@ def _project_into(X: F64, dX: F64, seen: F64, error: F64, J: F64) -> None:
 
 @kernel
 def _normal_equations(residuals: F64, J: F64, scale: float, as_image: float) -> tuple[F64, F64]:
-    """(7, 7), its lower half, and (7,) with Geman-McClure weights.   as_image: what distances count
-    as."""
+    """(7, 7), its lower half, and (7,) with Geman-McClure weights.   as_image: scale of the
+    distance errors.
+    """
     H, g = np.zeros((7, 7)), np.zeros(7)
     for n in range(len(residuals)):
         r = residuals[n]
@@ -226,8 +229,9 @@ def _normal_equations(residuals: F64, J: F64, scale: float, as_image: float) -> 
 
 @kernel
 def _solve(H: F64, g: F64, step: F64) -> None:
-    """``H step = -g`` for 7 unknowns by Cholesky, of which only the lower half of H is read, and
-    overwritten; where nothing holds some of them, they do not move far."""
+    """Solve ``H step = -g`` for 7 unknowns by Cholesky; only the lower half of H is read, and
+    overwritten. Undetermined unknowns do not move far.
+    """
     trace = 0.0
     for i in range(7):
         trace += H[i, i]
@@ -267,8 +271,9 @@ def _squared(S_a_b: F64, pairs: Pairs) -> F64:
 
 @kernel
 def _least_cost(S: F64, xyz_a: F64, xyz_b: F64, seen_a: F64, seen_b: F64, most: float) -> int:
-    """Which of the similarities (n, 4, 4) has the least sum of the errors of ``_squared``, each at
-    most so much.  A similarity is given up once its sum is no less than the least."""
+    """Return which of the similarities (n, 4, 4) has the smallest sum of truncated errors of
+    ``_squared``. A sum that exceeds the smallest one is abandoned.
+    """
     best, least = 0, np.inf
     for s in range(len(S)):
         A, t = S[s, :3, :3], S[s, :3, 3]
@@ -298,7 +303,7 @@ def _least_cost(S: F64, xyz_a: F64, xyz_b: F64, seen_a: F64, seen_b: F64, most: 
 
 @kernel
 def _error(x: float, y: float, z: float, seen: F64) -> float:
-    """Squared, of a point before a camera where it saw it; infinite behind."""
+    """Squared error of a point in a camera; infinite behind it."""
     if z <= 0.0:
         return np.inf
     z = max(z, _MIN_DEPTH)
@@ -306,11 +311,11 @@ def _error(x: float, y: float, z: float, seen: F64) -> float:
 
 
 def closed_form(source: F64, target: F64) -> F64:
-    """(S, 4, 4) similarities that take source (S, 3, 3) rows to target; those of triples without
-    extent, among them triples that have a point twice, are left out.
+    """(S, 4, 4) similarities that take source (S, 3, 3) rows to target; degenerate triples, among
+    them those with a repeated point, are left out.
 
-    Umeyama's of three points: both triples lie in planes, so one plane is turned into the other and
-    then in itself (Horn, "Closed-form solution of absolute orientation using unit quaternions",
+    Umeyama's for three points: both triples lie in planes, so one plane is rotated into the other
+    and then in itself (Horn, "Closed-form solution of absolute orientation using unit quaternions",
     JOSA A 1987, section 5), which takes a twentieth of the time of singular values.
     """
     S, good = np.zeros((len(source), 4, 4)), np.zeros(len(source), np.bool_)
@@ -366,7 +371,8 @@ def _centre(X: F64, centred: F64, mean: F64) -> None:
 @kernel
 def _axes_of(X: F64, axes: F64) -> bool:
     """Rows (3, 3): along the first of three centred points, at right angles to it in their plane,
-    and out of it; False where they span none."""
+    and out of it; False for collinear points.
+    """
     a, b = X[0], X[1]
     for c in range(3):
         i, j = (c + 1) % 3, (c + 2) % 3

@@ -1,17 +1,17 @@
-"""What a segment gives up where it has more observations than there is room for.
+"""Sparsification: what a segment drops when it has more observations than there is memory for.
 
-All of the map is adjusted at any length, and each adjustment takes time and memory by the
-observation.  What is given up has been published and stays in the results: it only does not tell
-the adjustment any more how the map lies, and hangs on a keyframe that moves it.
+Maps of any length are adjusted as a whole, and each adjustment takes time and memory per
+observation. Dropped content has been published and stays in the results: it no longer takes part in
+adjustments, and moves with a keyframe.
 
-First go points.  A keyframe sees thousands, and a fraction of them holds it as well; those seen by
-the most keyframes hold the most and stay.  Of each keyframe an equal share is left.  Where that
-becomes less than a place needs, or keyframes have too many neighbours, keyframes go: the one of
-which the least is lost.  Of what a point seen by n keyframes tells, one of these is a share of
-1 / (n - 1), and all of it where n = 1; the mean over the points that it sees is what is lost with a
-keyframe.  Where a place was visited many times, that is one visit of many; on a path, every other
-keyframe of where the camera was slow.  Points that one keyframe alone is left to see go with them:
-the adjustment would take them for wrong.
+Landmarks are dropped first.  A keyframe sees thousands, and a fraction of them determines its pose
+as well; those with the most observations stay.  Each keyframe keeps an equal share.  If that
+becomes less than a place needs, or keyframes have too many neighbours, keyframes are dropped, the
+one with the smallest loss of information first.  Of a landmark observed by n keyframes, one of them
+carries a share of 1 / (n - 1), and all of it if n = 1; the loss of a keyframe is the mean over its
+landmarks.  In a place that was visited many times, that is one of many visits; on a path, every
+other keyframe where the camera was slow.  Landmarks with one remaining keyframe are dropped with
+them: the adjustment would take them for outliers.
 """
 
 import heapq
@@ -26,24 +26,27 @@ from pliant.algorithms.mapping.segment import DroppedKeyframes, Segment
 from pliant.compiler.kernel import kernel
 
 _SPARE = 0.1
-"""Share of the room that is made free beyond what is needed: to find what can go takes time."""
+"""Share of the memory that is freed beyond what is necessary: selecting takes time."""
 
 _LESS = 0.8
-"""Of one try to the next, what keyframes are to keep: many see points that others need."""
+"""Factor from one attempt to the next on what keyframes keep: many see landmarks that
+others need.
+"""
 
 _PAIRS = 25
-"""Pairs of keyframes that there may be for each observation that there is room for: adjustments
-have a table of 6 bytes for each pair, and some 150 for each observation."""
+"""Maximum pairs of keyframes per observation: adjustments have a table of 6 bytes for each pair,
+and some 150 for each observation.
+"""
 
 _NEAR = 0.5
-"""Share of what others see of what a keyframe saw that makes its neighbours in time near."""
+"""Share of a keyframe's view that others must share for its neighbours in time to be near."""
 
 _SPREAD = 2654435761
-"""Knuth's multiplicative hash: which of the points that are seen as often go first, all over."""
+"""Knuth's multiplicative hash: spreads equally observed landmarks that are dropped first."""
 
 
 def observations_of(segments: list[Segment]) -> int:
-    """What the keyframes of segments see, of points and candidates."""
+    """Number of observations of segments, of landmarks and candidates."""
     return sum(len(keyframe.rows) for segment in segments for keyframe in segment.keyframes)
 
 
@@ -56,12 +59,12 @@ def sparsify(
     whole: int,
     settled: bool = True,
 ) -> None:
-    """Let a segment have no more observations than there is room for, as far as that can be.
+    """Reduce a segment to the allowed number of observations, as far as possible.
 
-    linked: row of each living track, negative where it has none.   whole: newest keyframes that
-    stay as they are, with the points that they see: nobody may have been told of them yet.
-    settled: the others have just been adjusted together, so that those may go, too, that have more
-    neighbours than ``limits`` allow.
+    linked: row of each living track, negative where it has none.   whole: newest keyframes that are
+    unchanged with their landmarks, because they may not be published yet. settled: the others have
+    just been adjusted together, so keyframes with more neighbours than ``limits`` allow may be
+    dropped as well.
     """
     most = int(np.sqrt(_PAIRS * room))
     if settled and len(segment.keyframes) > limits.kept_neighbours:
@@ -94,7 +97,7 @@ def _give_up_points(segment: Segment, room: int, floor: int, linked: I32, whole:
 
 
 def _may_go(segment: Segment, linked: I32, whole: int) -> BoolArray:
-    """Which rows have points that no track and none of the newest keyframes need."""
+    """Which rows have landmarks that no track and none of the newest keyframes need."""
     may = segment.points.state == MAPPED
     may[linked[linked >= 0]] = False
     for keyframe in segment.keyframes[max(len(segment.keyframes) - whole, 0) :]:
@@ -103,7 +106,7 @@ def _may_go(segment: Segment, linked: I32, whole: int) -> BoolArray:
 
 
 def _let_go(segment: Segment, gone: BoolArray) -> None:
-    """Points have been published, and tell the adjustment no more."""
+    """Drop published landmarks from adjustments."""
     for keyframe in segment.keyframes:
         keyframe.keep(~gone[keyframe.rows])
     segment.points.cull(np.flatnonzero(gone).astype(np.int32))
@@ -111,8 +114,7 @@ def _let_go(segment: Segment, gone: BoolArray) -> None:
 
 
 def _give_up_keyframes(segment: Segment, surplus: int, count: int, linked: I32, whole: int) -> None:
-    """All but the first and the newest may go, until so many observations and so many keyframes
-    have."""
+    """Drop this many observations and keyframes; the first and the newest stay."""
     start, slots = _seen_by(segment)
     counts = np.diff(start)
     known = list(segment.keyframes)
@@ -123,7 +125,7 @@ def _give_up_keyframes(segment: Segment, surplus: int, count: int, linked: I32, 
     while queue and (surplus > 0 or count > 0):
         _, slot = heapq.heappop(queue)
         rows = known[slot].rows
-        loss = _loss(counts[rows])  # it only grows as others go
+        loss = _loss(counts[rows])  # it only grows as others are dropped
         if queue and (loss, slot) > queue[0]:
             heapq.heappush(queue, (loss, slot))
             continue
@@ -152,8 +154,9 @@ def _give_up_keyframes(segment: Segment, surplus: int, count: int, linked: I32, 
 
 
 def _most_keyframes(segment: Segment, neighbours: int) -> int:
-    """How many keyframes a segment may have so that each shares points with so many, as the root of
-    the mean square: to factor the equations of an adjustment takes time by that mean."""
+    """Maximum keyframes of a segment so that the root mean square number of covisible keyframes is
+    as given: the time to factor the equations of an adjustment grows with that mean.
+    """
     count = len(segment.keyframes)
     start, slots = _seen_by(segment)
     met = np.zeros((count, count), np.bool_)
@@ -164,7 +167,7 @@ def _most_keyframes(segment: Segment, neighbours: int) -> int:
 
 @kernel
 def _meet(start: I64, slots: I32, met: BoolArray) -> None:
-    """Mark keyframes (K, K) that share a point, of those that see many as many as tell of one."""
+    """Mark keyframes (K, K) that share a landmark; of landmarks with many keyframes, only some."""
     for row in range(start.size - 1):
         seen = slots[start[row] : start[row + 1]]
         step = max(1, seen.size // MOST_SEEN)
@@ -174,7 +177,9 @@ def _meet(start: I64, slots: I32, met: BoolArray) -> None:
 
 
 def _loss(counts: I64) -> float:
-    """Share of what its points tell that goes with a keyframe.  counts: (n,) who sees each."""
+    """Share of its landmarks' information that a keyframe carries.  counts: (n,) keyframes
+    of each.
+    """
     return float((1.0 / np.maximum(counts - 1, 1)).mean()) if len(counts) else 0.0
 
 
@@ -201,7 +206,8 @@ def _sort(rows: I32, slot: I32, at: I64, slots: I32) -> None:
 def _choose(
     order: I64, start: I64, slots: I32, least: int, surplus: int, left: I64, gone: BoolArray
 ) -> int:
-    """Mark points as gone, in order, until the surplus is; returns what of it there still is.
+    """Mark landmarks as dropped, in order, until the surplus is gone; returns the remaining
+    surplus.
 
     left: (K,) observations of each keyframe, counted down, but not below ``least``.
     """
@@ -222,7 +228,7 @@ def _choose(
 
 @kernel
 def _shared(rows: I32, start: I64, slots: I32, keyframes: int) -> I64:
-    """(K,) of how many of the rows each keyframe sees."""
+    """(K,) how many of the rows each keyframe observes."""
     shared = np.zeros(keyframes, np.int64)
     for row in rows:
         for i in range(start[row], start[row + 1]):

@@ -1,11 +1,10 @@
-"""How a map starts: the frames seen so far become a small reconstruction, or a reason why not.
+"""How a map starts: the frames so far become a small reconstruction, or a reason why not.
 
 Every new frame is compared with the best earlier one: many shared tracks, and flow that no rotation
-explains.  Two views allow several motions, above all where most of what they share lies in a plane.
-Each gives a first structure, frames in between join it by their tracks, and all are adjusted
-together.  The start that the tracks fit best is accepted, if many points in several frames support
-it and no other motion explains them nearly as well, so that slow, rotating, still or ambiguous
-beginnings merely wait.
+explains.  Two views allow several motions, especially of a plane.  Each gives a first structure,
+intermediate frames join it by their tracks, and all are adjusted together.  The start that fits the
+tracks best is accepted if many landmarks in several frames support it and no other motion fits
+nearly as well.  So slow, rotating, still or ambiguous beginnings merely wait.
 """
 
 from dataclasses import dataclass
@@ -38,23 +37,22 @@ _ROTATION_SAMPLE = 400
 """Tracks that decide whether a rotation explains the flow; of fewer some count twice."""
 
 _GLANCE = 400
-"""Tracks that tell at every frame that waits whether to look closer, which takes ten times as
-long."""
+"""Tracks for a quick parallax test of every waiting frame; a full test takes ten times as long."""
 
 _CLEARLY_LESS = 0.7
-"""Share of the parallax wanted: with less of it by a glance, a closer look finds too little."""
+"""Share of the required parallax below which the quick test is conclusive."""
 
 _TELLING = 500
-"""Tracks, evenly of all, that tell which of several motions it was; the start has all of them."""
+"""Tracks, evenly of all, that decide between several motions; the start uses all."""
 
 _NOISE_PX = 1.0
-"""Error of a track that is no parallax."""
+"""Error of a track without parallax."""
 
 _MIN_FRAMES = 3
-"""Frames that a start needs: a point of two frames always agrees with some depth."""
+"""Minimum frames of a start: a point of two frames always agrees with some depth."""
 
 _AS_GOOD = 1.3
-"""Times the least misfit: a motion with less has not been ruled out."""
+"""Multiple of the smallest misfit below which a motion has not been ruled out."""
 
 _ONE_WAY = float(np.cos(0.1))
 """Cosine of the angle between translations that count as the same."""
@@ -72,7 +70,7 @@ class _Pair:
 
 
 class _Parallax(NamedTuple):
-    """What a start wants: so much, at this percentile of the tracks that agree."""
+    """The required parallax of a start, at this percentile of the agreeing tracks."""
 
     least_deg: float
     percentile: float
@@ -85,9 +83,10 @@ def find_start(
     *,
     motions: int | None = None,
 ) -> Start | str:
-    """The map that starts with the newest of the waiting frames, or the reason why it cannot.
+    """Return the map that starts with the newest of the waiting frames, or the reason why it
+    cannot.
 
-    motions: how many of those that two views allow are compared, None: all.
+    motions: how many of the possible motions of two views are compared; None: all.
     """
     start = parameters.start
     if len(waiting) < _MIN_FRAMES:
@@ -96,7 +95,7 @@ def find_start(
     reason = _why_not(pairs, waiting, start)
     if reason:
         return reason
-    # The more parallax the better; shared tracks count less, for there are many.
+    # More parallax is better; shared tracks count less, because there are many.
     pairs.sort(key=lambda pair: -pair.residual_px * len(pair.indices_newest) ** 0.5)
     wanted = _wanted_parallax(waiting, start)
     for pair in pairs[:2]:
@@ -108,7 +107,7 @@ def find_start(
 
 
 def with_minimum_parallax(parameters: MappingParameters) -> MappingParameters:
-    """With these a map starts as soon as it can."""
+    """Parameters with which a map starts as soon as it can."""
     start = parameters.start.model_copy(update={"patient_s": 0.0, "long_s": 0.0})
     return parameters.model_copy(update={"start": start})
 
@@ -121,8 +120,9 @@ def waits_long(waiting: list[BufferedFrame], start: StartParameters) -> bool:
 def why_no_start(
     waiting: list[BufferedFrame], camera: PinholeCamera, parameters: MappingParameters
 ) -> str:
-    """Why a camera of which little is known sees too few tracks or too little parallax for a start
-    whatever its lens is; "" where it does not."""
+    """Why an uncertain camera has too few tracks or too little parallax for a start, whatever its
+    lens; "" otherwise.
+    """
     if len(waiting) < _MIN_FRAMES:
         return f"too few frames: {len(waiting)} of {_MIN_FRAMES}"
     pairs = _pairs(waiting, camera, parameters.start, parameters.calibration)
@@ -144,11 +144,11 @@ def _pairs(
     parameters: StartParameters,
     unknown: CalibrationUncertainty | None = None,
 ) -> list[_Pair]:
-    """unknown: of the camera; None: a turn explains what it does with the camera as it is."""
+    """unknown: uncertainty of the camera; None: a rotation is tested with the given camera."""
     newest = waiting[-1]
     earlier = len(waiting) - 1
     tried = np.linspace(0, earlier - 1, min(earlier, _TRIED_REFERENCES)).astype(int)
-    tried[-1] = len(waiting) - _MIN_FRAMES  # what lives shorter starts nothing, and seems to turn
+    tried[-1] = len(waiting) - _MIN_FRAMES  # shorter tracks start nothing, and look like a rotation
     tried = np.unique(tried)
     shared: list[tuple[int, I64, I64]] = []
     for index in tried.tolist():
@@ -196,7 +196,7 @@ def _no_parallax(pairs: list[_Pair]) -> str:
 
 
 def _too_little(parallax: float, least: float, unit: str) -> str:
-    shown = np.floor(100.0 * parallax) / 100.0  # what falls short of it is not told as equal
+    shown = np.floor(100.0 * parallax) / 100.0  # never report an insufficient value as equal
     return f"too little parallax: {shown:.2f} of {least:.2f} {unit}"
 
 
@@ -223,10 +223,10 @@ def _start_from(
         return "no essential matrix fits the tracks"
     reason = _why_not_with(tried[0], start, wanted)
     if reason:
-        return reason  # parallax that a worse motion sees is its mistake
+        return reason  # the parallax of a worse motion is an error
     shared = waiting[-1].ids[pair.indices_newest]
     compared = tried[:motions]
-    # One motion is compared with none, and fewer tracks than these are all needed.
+    # A single motion needs no comparison, and few tracks are all needed.
     most = _TELLING if len(compared) > 1 and len(shared) >= 2 * _TELLING else len(shared)
     telling = shared[:: max(1, len(shared) // most)]
     least = wanted._replace(least_deg=start.min_parallax_deg)
@@ -252,15 +252,18 @@ def _start_from(
 
 
 def _agree(a: Start, b: Start) -> bool:
-    """Whether the camera of both starts has moved in one direction."""
+    """Whether both starts have the same direction of motion."""
     ways = [each.T_world_camera[-1, :3, 3] for each in (a, b)]
     return bool(ways[0] @ ways[1] > _ONE_WAY * np.prod(np.linalg.norm(ways, axis=1)))
 
 
 def _wanted_parallax(waiting: list[BufferedFrame], start: StartParameters) -> _Parallax:
-    """Under little parallax a start takes noise, and the readout of a rolling shutter, for shape;
-    but where tracks end soon there is never more.  Straight ahead what is near leaves the image
-    first, so that most of what two views share is always far."""
+    """The required parallax.
+
+    Under little parallax a start takes noise, and the readout of a rolling shutter, for shape; but
+    where tracks end soon there is never more.  Straight ahead, near points leave the image first,
+    so most of what two views share is always far.
+    """
     if _waited_s(waiting) < start.patient_s:
         return _Parallax(start.parallax_deg, 50.0)
     percentile = 75.0 if waits_long(waiting, start) else 50.0
@@ -292,8 +295,9 @@ def _misfit(
     camera: PinholeCamera,
     parameters: MappingParameters,
 ) -> float:
-    """Mean of Geman-McClure's kernel over tracks under the poses of a start, whether it has them as
-    points or not: a wrong motion leaves out what tells against it."""
+    """Mean of Geman-McClure's kernel over all tracks under the poses of a start, with or without
+    points: a wrong motion would leave out the tracks that contradict it.
+    """
     chosen = [frame for frame in waiting if frame.frame in start.frames]
     u, v, seen = table_of(chosen, ids)
     every = np.arange(len(ids))

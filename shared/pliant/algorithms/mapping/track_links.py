@@ -1,4 +1,4 @@
-"""Which landmark each track of the latest frame leads to."""
+"""Which landmark each track of the latest frame belongs to."""
 
 import numpy as np
 
@@ -7,15 +7,16 @@ from pliant.algorithms.mapping.landmarks import CANDIDATE, MAPPED, MAPPED_SHARE,
 from pliant.compiler.kernel import kernel
 
 UNLINKED = -1
-"""Row of a track that belongs to no point."""
+"""Row of a track without a landmark or candidate."""
 
 _KEPT_GONE = 20_000
-"""Tracks that have gone, whose rows are remembered: bounds memory and time."""
+"""Maximum lost tracks whose rows are stored: bounds memory and time."""
 
 _LOST_AT_ONCE = 0.5
-"""Share of the tracks that a frame loses at least where candidates are remembered, too, unless the
-one before has: elsewhere hardly a track comes back.  Nor are they where map points alone
-carry the pose: in quick motion they made it a little worse."""
+"""Minimum share of tracks lost in one frame for which candidates are stored, too, unless the frame
+before did: otherwise hardly a track returns.  Nor are they stored where landmarks alone determine
+the pose: in quick motion they made it a little worse.
+"""
 
 
 class TrackLinks:
@@ -34,10 +35,10 @@ class TrackLinks:
         self._lost_at_once = False
 
     def follow(self, ids: I64, points: Landmarks) -> None:
-        """Go on to the tracks of the next frame: living tracks keep their rows, and those that come
-        back have theirs again, where these are still in the map and without a track.
+        """Continue with the tracks of the next frame: living tracks keep their rows; returning
+        tracks get theirs back if these are still in the map and without a track.
 
-        See ``_LOST_AT_ONCE`` for whose are kept.
+        See ``_LOST_AT_ONCE`` for which rows are stored.
         """
         before, rows = self.ids, np.full(len(ids), UNLINKED, np.int32)
         _carry_over(before, self.rows, ids, rows)
@@ -58,7 +59,7 @@ class TrackLinks:
         self.ids, self.rows = ids, rows
 
     def _take_back(self, ids: I64, rows: I32, back: I64, points: Landmarks) -> None:
-        """Link tracks, by their indices, that were missing."""
+        """Link returning tracks, by their indices."""
         if not len(back) or not len(self._gone):
             return
         newest = len(self._gone) - 1
@@ -75,7 +76,7 @@ class TrackLinks:
         rows[back[first]] = row[first]
 
     def awaited(self) -> I32:
-        """Rows of the candidates whose tracks may come back."""
+        """Rows of the candidates whose tracks may return."""
         return self._gone[self._gone[:, 2] < 0, 1].astype(np.int32)
 
     def in_state(self, state: U8, wanted: int) -> I64:
@@ -84,8 +85,9 @@ class TrackLinks:
 
 
 def _identity(points: Landmarks, rows: I32) -> I64:
-    """What tells (n,) rows from what has them later: the id of a point; of a candidate, which has
-    none, -1 and less by the keyframe that saw it first."""
+    """Identity of (n,) rows that distinguishes them from later uses: the id of a landmark; for a
+    candidate a negative number by its first keyframe.
+    """
     return np.where(points.ids[rows] >= 0, points.ids[rows], -1 - points.first_keyframe[rows])
 
 

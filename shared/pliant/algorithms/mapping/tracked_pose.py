@@ -1,6 +1,6 @@
-"""The pose of a frame by its tracks alone: what there is time for where mapping is behind.
+"""The pose of a frame by its tracks alone, for when mapping is behind.
 
-Nothing is looked for in the image, and the map stays as it is; it costs a tenth of mapping a frame.
+It searches nothing in the image and does not change the map; it costs a tenth of mapping a frame.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ def pose_by_tracks(
     frame: Frame,
     generator: np.random.Generator,
 ) -> PlacedFrame | None:
-    """Localise a frame where its tracks lead; None where too few do, as after a cut.
+    """Localise a frame by its tracks; None if too few lead to landmarks, as after a cut.
 
     motion: before it.   ``active.links`` follow its tracks.
     """

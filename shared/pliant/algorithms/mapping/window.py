@@ -1,4 +1,4 @@
-"""The keyframes under adjustment, and the current frame, as dense camera x point arrays."""
+"""The keyframes under adjustment, and the current frame, as dense camera x landmark arrays."""
 
 import numpy as np
 
@@ -29,10 +29,10 @@ from pliant.algorithms.triangulation import spread_of_rays, triangulate
 OUTSIDE = -1
 
 _CLEAR_SHARE = 0.7
-"""Share of the least parallax under which noise does not make rays differ enough."""
+"""Share of the minimum parallax below which noise does not separate rays enough."""
 
 _SETTLED = 0.01
-"""Share of the cost that the last iteration may still take off."""
+"""Relative decrease of the cost at which iterations end."""
 
 
 class Window:
@@ -65,7 +65,7 @@ class Window:
         for keyframe in keyframes:
             self.columns[keyframe.rows] = 0
         rows = np.flatnonzero(self.columns >= 0).astype(np.int32)
-        # Points born together stand together, so that solvers skip the blocks a camera never saw.
+        # Points created together are adjacent, so that solvers skip blocks that a camera never saw.
         self.rows: I32 = rows[np.argsort(points.first_keyframe[rows], kind="stable")]
         self.columns[self.rows] = np.arange(len(self.rows), dtype=np.int32)
         size = (len(keyframes) + 1, len(self.rows))
@@ -98,16 +98,16 @@ class Window:
         self._observe(len(self.keyframes), rows, points_px)
 
     def move(self, S: F64) -> None:
-        """The world has moved: each keyframe where it now is, the frame by a similarity (4, 4)."""
+        """Move with the world: each keyframe to its pose, the frame by a similarity (4, 4)."""
         frame = move_by_similarity(S, self.T_world_camera[-1])
         # Not in place: keyframes and others may have rows of it.
         self.T_world_camera = np.array([*(k.T_world_camera for k in self.keyframes), frame])
 
     def sweep_current(self, parameters: MappingParameters) -> F64:
-        """A few subspace Gauss-Newton sweeps (Eq. 11-12) with the current frame.
+        """Run a few subspace Gauss-Newton sweeps (Eq. 11-12) with the current frame.
 
-        The frame and the points that it sees move; the paper lets the keyframes move as well.
-        Returns the pose of the frame.
+        The frame and its landmarks are free; in the paper the keyframes are free as well.  Returns
+        the pose of the frame.
         """
         columns = seen_in_state(
             self.rows, self.points.state, MAPPED, self.seen, len(self.keyframes), 1
@@ -119,11 +119,11 @@ class Window:
         return self.T_world_camera[-1].copy()
 
     def adjust(self, parameters: MappingParameters) -> None:
-        """Schur LM over the keyframes and all points that two of them see, until it settles or
-        for a few iterations: the next keyframe goes on from there.
+        """Run Schur LM over the keyframes and all landmarks of two of them, until it converges or
+        for a few iterations: the next keyframe continues.
 
-        The points seen longest alone are quicker, but they are those that the camera's motion moves
-        least in the image: with them scale drifts ten times as far on the way along a corridor.
+        Using only the longest observed landmarks is faster, but the camera's motion moves these
+        least in the image: the scale then drifts ten times as far along a corridor.
         """
         columns = self.mapped_columns()
         columns = columns[count_cameras(columns, self.seen, 0, len(self.seen)) >= 2]
@@ -138,9 +138,9 @@ class Window:
         self._take(columns, solve_schur(problem, bundle))
 
     def place_candidates(self, inverse_distance: float) -> float:
-        """Give the candidates their provisional places, about as far as the map is.
+        """Give the candidates provisional positions, about as far as the map.
 
-        inverse_distance: median of the map as the last keyframe found it.  Returns it of this one.
+        inverse_distance: median of the map at the last keyframe.  Returns that of this one.
         """
         mapped = self.rows[self.mapped_columns()]
         if len(mapped):
@@ -156,10 +156,10 @@ class Window:
         return inverse_distance
 
     def flow_since_keyframe(self, least: int) -> tuple[int, int, float]:
-        """How many of the newest keyframe's points are still seen, of how many, and their median
+        """How many of the newest keyframe's points are still visible, of how many, and their median
         flow, px.
 
-        least: state of the points.   The flow is what the turn of the camera leaves of it.
+        least: state of the points.   The flow is without the rotation of the camera.
         """
         fx, fy, cx, cy = self.lens.astype(np.float64)
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -169,7 +169,7 @@ class Window:
         return len(moved), before, float(np.median(moved)) if len(moved) else 0.0
 
     def in_view_since_keyframe(self) -> int:
-        """How many of the newest keyframe's mapped points the current frame has in its image."""
+        """How many of the newest keyframe's landmarks project into the current frame."""
         rows = self.rows[self.seen[-2] & (self.points.state[self.rows] == MAPPED)]
         T_camera_world = inverse(self.T_world_camera[-1])
         camera = self._camera
@@ -178,14 +178,14 @@ class Window:
         )
 
     def triangulate(self, limits: PointParameters) -> None:
-        """Make points of the candidates whose rays now meet under enough parallax."""
+        """Turn candidates whose rays have enough parallax into landmarks."""
         points = self.points
         if self.seen[-1].any():
             candidates = seen_in_state(
                 self.rows, points.state, CANDIDATE, self.seen, len(self.keyframes),
                 limits.min_observations,
             )  # fmt: skip
-            # Rays that hardly differ need no triangulation to be turned down.
+            # Nearly parallel rays are rejected without triangulation.
             columns = has_parallax(
                 candidates, len(self.keyframes), self.T_world_camera[:, :3, :3], self.u, self.v,
                 self.seen, self.lens,
@@ -232,9 +232,9 @@ class Window:
             keyframe.T_world_camera = self.T_world_camera[slot]
 
     def remove_outliers(self, outlier_px: float) -> None:
-        """Forget observations that miss their point, and points with too few observations.
+        """Remove outlying observations, and landmarks with too few observations.
 
-        A point that has gone to infinity is a candidate again, too.
+        A landmark at infinity becomes a candidate again, too.
         """
         columns = self.mapped_columns()
         rows = self.rows[columns]
@@ -250,7 +250,7 @@ class Window:
         self.points.remove(rows[(remaining < 2) | far])
 
     def update_statistics(self) -> None:
-        """Keyframes, parallax and uncertainty of the points of the window."""
+        """Update observations, parallax and uncertainty of the window's landmarks."""
         points = self.points
         mapped = self.mapped_columns()
         columns, rows = mapped.astype(np.int64), self.rows[mapped]
