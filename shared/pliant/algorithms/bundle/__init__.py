@@ -1,4 +1,4 @@
-"""Bundle adjustment (VITAMIN-E section 3): problems and parameters; the solvers beside them.
+"""Bundle adjustment (VITAMIN-E section 3): problems, parameters and solvers.
 
-``schur`` adjusts cameras, points and a calibration together, ``subspace`` by halves.
+``schur`` adjusts cameras, points and a calibration together, ``subspace`` alternates between them.
 """

@@ -2,7 +2,7 @@
 
 The projection is ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx`` with r^2 = x^2 + y^2 on the
 plane z = 1, likewise for v with b, and the unknowns are q = (s, k1, k2, readout, a, b), where
-(a, b) is how far off the principal point is.  At (a, b) = 0 the derivative by one of the first
+(a, b) is the error of the principal point.  At (a, b) = 0 the derivative by one of the first
 three is ``K (x, y)^T h_q`` with K = diag(fx e^s, fy e^s) and
 
     h = (1 + k1 r^2 + k2 r^4,  r^2,  r^4)       for  s, k1, k2.
@@ -16,8 +16,8 @@ So a calibration unknown moves the point on the plane z = 1 as if by
 The fourth unknown is the readout of a rolling shutter, as a share of the frame interval: it moves
 an observation by the readout times its flow, so that ``A = F^-1 flow``.  The last two move all
 of them alike: ``A = D^-1 (1, 0)^T`` and ``D^-1 (0, 1)^T``; and where they are not 0, s moves by
-``D^-1 (a, b)^T`` besides.  An unknown enters the
-Hessian of Eq. 7 like a column of B (see ``projection``): with M and e of that module its blocks are
+``D^-1 (a, b)^T`` as well.  An unknown enters the Hessian of Eq. 7 like a column of B (see
+``projection``): with M and e of that module its blocks are
 
     H_qq = sum A^T M A     H_qc = sum A^T M B     H_qp = sum A^T M P     - g_q = sum A^T e.
 
@@ -27,7 +27,7 @@ So the calibration is one more camera, which sees every point, and Eq. 9 becomes
     (S_qc  S_qq  ) (dx_q) = (b_q)     S = H + damping diag(H) - U U^T,  U_q = H_qp L^-T,
 
 as sparse as before, with one row and one column of blocks that are full.  A prior at the given
-calibration adds its precision to H_qq and pulls in b_q.
+calibration adds its precision to H_qq and its gradient to b_q.
 """
 
 from typing import Any, NamedTuple
@@ -53,10 +53,10 @@ from pliant.compiler.kernel import fast_kernel, kernel
 LOWER = np.tril_indices(SHARED)
 _NEWTON_STEPS = 8
 _SQUARES_TO_ROUNDING = 1e-8
-"""A step of Newton's method after which there is nothing left: its error is about its square."""
+"""A Newton step after which the error, about its square, is below rounding."""
 _LEAST_SLOPE = 0.1
 _FARTHEST = 4.0
-"""Times as far from the axis as it is seen: no lens within the model moves a point farther."""
+"""Maximum ratio of corrected to observed radius: no lens within the model exceeds it."""
 
 
 class SharedBlocks(NamedTuple):
@@ -73,15 +73,15 @@ class SharedBlocks(NamedTuple):
 
 
 def no_shared_blocks() -> SharedBlocks:
-    """Of a calibration that is right as it is."""
+    """Return the blocks of a fixed calibration."""
     return SharedBlocks(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 3 * SHARED)))
 
 
 class SharedCalibration:
-    """The calibration of one problem: where it starts, its prior, what it does to the layout.
+    """The calibration of one problem: its initial value, its prior, its effect on the layout.
 
-    given: (SHARED,) the middle of the prior.     start: (SHARED,) where the solver begins.
-    unknown: (SHARED,) which of the unknowns there are; the others keep their values.
+    given: (SHARED,) mean of the prior.     start: (SHARED,) initial value. unknown: (SHARED,) which
+    values are unknowns; the others are fixed.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class SharedCalibration:
     ):
         """lens: (M, 2) k1, k2 as given.  start: (SHARED,), None: at the given calibration.
 
-        Raises ValueError where cameras differ in their lenses.
+        Raises ValueError if cameras have different lenses.
         """
         if len(lens) == 0 or (lens != lens[0]).any():
             raise ValueError("an unknown calibration must be that of all cameras")
@@ -107,7 +107,7 @@ class SharedCalibration:
         self.precision[self.unknown] = (uncertainty.prior_px / sigmas[self.unknown]) ** 2
 
     def at(self, q: F64) -> tuple[Cameras, Slots]:
-        """The cameras and observations of a calibration."""
+        """Return the cameras and observations for a calibration."""
         layout = self.layout
         pinhole = layout.cameras.pinhole.copy()
         pinhole[:, :2] *= np.exp(q[0])
@@ -121,7 +121,7 @@ class SharedCalibration:
         return cameras, slots._replace(u=slots.u - moved[0], v=slots.v - moved[1])
 
     def prior_cost(self, q: F64) -> float:
-        """What departing from the given calibration costs, px^2."""
+        """Cost of the deviation from the given calibration, px^2."""
         return 0.5 * float(self.precision @ (q - self.given) ** 2)
 
     def linearise(self, cameras: Cameras, records: F64, q: F64) -> SharedBlocks:
@@ -275,11 +275,12 @@ def _add_points(
 
 
 def ideal_pixels(points_px: F32, camera: PinholeCamera, correction: F64) -> F32:
-    """Move pixels (N, 2) of the image to where ``camera``, were it right, would have seen them.
+    """Move pixels (N, 2) of the image to where ``camera`` would see them if its calibration were
+    correct.
 
-    correction: (6,) of ``solve_schur``; what the readout does is not undone here.  Newton's
-    method on the radius, to rounding for corrections under which the radius still grows with the
-    angle; elsewhere the nearest it gets.
+    correction: (6,) of ``solve_schur``; the readout is not removed here.  Newton's method on the
+    radius, to rounding for corrections under which the radius grows with the angle; otherwise the
+    nearest value that it reaches.
     """
     ideal = np.empty((len(points_px), 2), np.float32)
     K = camera.intrinsics
@@ -289,7 +290,7 @@ def ideal_pixels(points_px: F32, camera: PinholeCamera, correction: F64) -> F32:
 
 @kernel
 def _ideal_pixels(points_px: F32, K: F64, correction: F64, shrunk: float, ideal: F32) -> None:
-    """In blocks: a step is SIMD code.  Each of their points stops where it has settled."""
+    """In blocks: a step is SIMD code.  Each point stops once it has converged."""
     k1, k2, a, b = correction[1], correction[2], correction[4], correction[5]
     fx, fy, cx, cy = K
     x, y, wanted, r = np.empty((4, BLOCK))
@@ -313,7 +314,7 @@ def _ideal_pixels(points_px: F32, K: F64, correction: F64, shrunk: float, ideal:
 
 @kernel
 def _newton_step(wanted: F64, k1: float, k2: float, r: F64, settled: BoolArray) -> None:
-    """Move the radii r (BLOCK,) that have not settled yet."""
+    """Move the radii r (BLOCK,) that have not converged yet."""
     for i in range(BLOCK):
         before = r[i]
         r2 = before * before

@@ -1,7 +1,7 @@
-"""The dense, padded camera x point layout, on which the subspace method works.
+"""The dense, padded camera x point layout of the subspace method.
 
 Points are padded to blocks of ``BLOCK`` columns, so that inner loops have a constant length and
-become SIMD code, and a table says which camera sees anything of which block.
+become SIMD code.  A table states which camera observes any point of which block.
 """
 
 from dataclasses import dataclass
@@ -23,10 +23,9 @@ BLOCK = 128
 class Unknowns:
     """Cameras and points of one problem, ready for the kernels.  P is the number of columns.
 
-    column: (N,) where point n lies.
-    cameras: M of them.      free: (M,) 1 for a camera that moves.
-    origin: (3,) subtracted from the world, so that float32 has small numbers to deal with.
-    points: (3, P) in the shifted world.
+    column: (N,) of each point. cameras: M of them.      free: (M,) 1 for a free camera. origin:
+    (3,) subtracted from the world, so that float32 handles small numbers. points: (3, P) in the
+    shifted world.
     """
 
     column: I64
@@ -57,7 +56,7 @@ class Layout(Unknowns):
 
 
 def build_layout(problem: AnyProblem) -> Layout:
-    """Bring a problem into the dense layout.  Nothing in the problem is changed."""
+    """Convert a problem to the dense layout, without changing it."""
     M, N = len(problem.T_world_camera), len(problem.points_world)
     P = max(1, -(-N // BLOCK)) * BLOCK
     column, usable = columns_of(problem), finite_points(problem.points_world)
@@ -136,7 +135,7 @@ def residuals_of(layout: Layout, problem: BundleProblem, squared: F32) -> F32:
 
 
 def columns_of(problem: AnyProblem) -> I64:
-    """(N,) column of each point: points seen by the same cameras stand together."""
+    """(N,) column of each point: points with the same cameras are adjacent."""
     N = len(problem.points_world)
     if not isinstance(problem, BundleProblem):
         return np.arange(N)

@@ -1,4 +1,4 @@
-"""The focal length of one frame beside its pose, points fixed: where zoom or focus change it.
+"""The focal length and pose of one frame with fixed points, if zoom or focus change it.
 
 The image of a frame is that of the calibrated camera, magnified by e^d about a centre c:
 
@@ -11,7 +11,7 @@ With (x, y) = X'/Z' on the plane z = 1 and F = e^d diag(fx, fy) the Jacobian by 
 
 Gauss-Newton with Geman-McClure weights ``1 / (1 + r^2 / sigma^2)^2``, from a wide kernel to a
 narrow one, and a prior d ~ N(0, deviation^2) at residuals of 1 px: without parallax or depth that
-differs across the image a magnification looks like a step ahead.
+differs across the image a magnification looks like a forward motion.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ from pliant.compiler.kernel import kernel
 _SIGMAS_PX = (8.0, 8.0, 2.0, 2.0)
 _MIN_DEPTH = 1e-6
 _MOST = 250
-"""Points are taken out evenly down to twice as many at most: they tell it well enough."""
+"""Points are thinned evenly to at most twice as many, which is sufficient."""
 
 _MEDIAN_OF_TWO = 1.386
 """The median of chi-square with two degrees of freedom."""
@@ -41,8 +41,8 @@ def refine_focal(
     centre: tuple[float, float],
     deviation: float,
 ) -> tuple[float, float]:
-    """The log d of the magnification of a frame, and its standard deviation by the residuals, as if
-    all points had been looked at.
+    """Return the log magnification d of a frame, and its standard deviation by the residuals,
+    scaled to all points.
 
     T_world_camera: (4, 4) to start from.  points_world: (N, 3).  points_px: (N, 2).  deviation:
     standard deviation of d.

@@ -1,4 +1,4 @@
-"""Kernels of the Schur complement solver: observations linearised, points taken out, points moved.
+"""Kernels of the Schur complement solver: linearisation, elimination of points, substitution.
 
 An observation is linearised once for a state, into a record of eight numbers: x, y, 1/z, m00, m01,
 m11, e0, e1 of ``projection``.  Everything else follows from the record and the rotation of its
@@ -12,7 +12,7 @@ So another damping costs no projection.  With ``L L^T = H_pp + damping diag(H_pp
     (H_cc + damping diag(H_cc) - U U^T) dx_c = - g_c - U y        L^T dx_p = y - U^T dx_c.
 
 A calibration that all cameras share is one more camera c with the rows ``A^T M P`` of
-``calibration``; it sees every point, so that its H_cp is kept summed up, one block a point.
+``calibration``; it observes every point, so its H_cp is stored as a sum, one block per point.
 
 Linearisation goes camera by camera, in SIMD over blocks of observations; elimination goes point by
 point, over the records of each point in ascending order of their cameras.
@@ -53,7 +53,7 @@ _SINGULAR = 1e-14
 
 
 class Linearised(NamedTuple):
-    """The observations of one state: what no damping changes.
+    """The linearised observations of one state, independent of the damping.
 
     records: (O + 1, RECORD).     motion: (M, 12).     shared: (P, SHARED 3) H_cp of the shared
     calibration by rows, whose position is the last; (0, ...): there is none.
@@ -79,7 +79,7 @@ class CameraSystem(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Room for one point: what its cameras see, their U, their positions."""
+    """Memory for one point: its observations, their U, their positions."""
 
     seen: F64
     U: F64
@@ -87,7 +87,7 @@ class Scratch(NamedTuple):
 
 
 def scratch_for(cameras: int) -> Scratch:
-    """Room for points that at most so many cameras see, and a shared calibration."""
+    """Return memory for points with at most this many observations, and a shared calibration."""
     size = cameras + 1
     return Scratch(np.empty((size, 9)), np.empty((size, 18)), np.empty(size, np.int64))
 
@@ -263,10 +263,10 @@ def camera_block(local: F64, normal: F64) -> None:
 def eliminate_points(
     state: Linearised, damping: float, system: CameraSystem, scratch: Scratch, factors: F64
 ) -> None:
-    """Factor every point's block and take the points out of the system.
+    """Factor every point's block and eliminate the points from the system.
 
-    To S ``- U U^T`` is added, to b ``- U y``.
-    factors: (P, FACTOR) are written, 0 for a point without information.
+    To S ``- U U^T`` is added, to b ``- U y``. factors: (P, FACTOR) are written, 0 for a point
+    without information.
     """
     records, shared, places, motion = state.records, state.shared, state.places, state.motion
     free, block, S, b = system.position, system.block, system.S, system.b
@@ -372,7 +372,7 @@ def substitute(
             x, y, iz = records[o, 0], records[o, 1], records[o, 2]
             m00, m01, m11 = records[o, 3], records[o, 4], records[o, 5]
             d = steps[m]
-            # How the step moves the point on the plane z = 1: B dx_c.
+            # Motion of the point on the plane z = 1 by the step: B dx_c.
             mu = (d[0] - x * d[2]) * iz - x * y * d[3] + (1.0 + x * x) * d[4] - y * d[5]
             mv = (d[1] - y * d[2]) * iz - (1.0 + y * y) * d[3] + x * y * d[4] + x * d[5]
             a, c = apply_metric(m00, (m01,), m11, mu, mv)

@@ -1,4 +1,4 @@
-"""The packed layout, on which the Schur complement works: a list of observations.
+"""The packed layout of the Schur complement solver: a list of observations.
 
 Each observation has a slot and a place.  Slots go camera by camera, in blocks of ``BLOCK``
 observations of one camera, so that linearisation is SIMD code with the camera in registers.  Places
@@ -67,7 +67,7 @@ class PackedLayout(Unknowns):
 
 
 def build_packed_layout(problem: AnyProblem) -> PackedLayout:
-    """Bring a problem into the packed layout.  Nothing in the problem is changed."""
+    """Convert a problem to the packed layout, without changing it."""
     N, usable = len(problem.points_world), finite_points(problem.points_world)
     unknowns = unknowns_of(problem, columns_of(problem), usable, N)
     if not isinstance(problem, BundleProblem):
@@ -98,7 +98,7 @@ def build_packed_layout(problem: AnyProblem) -> PackedLayout:
 
 
 def _room(counts: I64, start: I64) -> tuple[Slots, Places, I64]:
-    """Room for so many observations of each camera (M,), and the first slot of each.
+    """Return the slots for this many observations of each camera (M,), and the first slot of each.
 
     start: (P,) first place of each point.
     """
@@ -199,7 +199,7 @@ def _pack(
     places: Places,
     place: I32,
 ) -> I32:
-    """Give every observation its place; returns its slot, both in the order given.
+    """Assign a place to every observation; returns its slot and place, in the given order.
 
     next_slot: (M,) the first slot of each camera, counted up.
     """
@@ -211,7 +211,7 @@ def _pack(
         m, n = camera_index[k], column[point_index[k]]
         at = stop[n]
         if at > start[n] and camera[at - 1] == m:
-            # A camera that observes a point again: the repetition replaces.
+            # A repeated observation replaces the earlier one.
             at -= 1
             slot = slot_at[at]
         else:

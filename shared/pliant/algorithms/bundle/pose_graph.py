@@ -1,12 +1,12 @@
-"""Where drift goes when a place is recognised: a graph of similarities between keyframes.
+"""The pose graph of loop closing: similarities between keyframes distribute the drift.
 
 Strasdat, Montiel and Davison, Scale Drift-Aware Large Scale Monocular SLAM (RSS 2010): poses with a
-scale of their own, ``S_i = [s R | t]`` from camera i to the world, and edges that say how two of
-them lie to each other, ``Z_ij ~ S_i^-1 S_j``.  What is left over of an edge,
+scale of their own, ``S_i = [s R | t]`` from camera i to the world, and edges that measure the
+relative similarity of two poses, ``Z_ij ~ S_i^-1 S_j``.  The residual of an edge,
 
     E = Z_ij^-1 S_i^-1 S_j = [s_E R_E | t_E],      r = (log R_E, t_E, log s_E),
 
-is zero where all agree.  A step d = (omega, upsilon, sigma) moves ``S <- S D``,
+is zero if all agree.  A step d = (omega, upsilon, sigma) moves ``S <- S D``,
 ``D = [e^sigma exp(omega) | upsilon]``.  With ``A = S_i^-1 S_j = Z_ij E`` and J the inverse of the
 right Jacobian of SO(3) at log R_E, to first order
 
@@ -14,10 +14,10 @@ right Jacobian of SO(3) at log R_E, to first order
     step of i:  Z^-1 D^-1 A      ->  (-J R_A^T omega,  (R_Z^T / s_Z) (t_A x omega - upsilon
                                                                       - sigma t_A),   -sigma).
 
-Edges that may be false, as two rooms can look alike, count by Geman and McClure's weight
-``(c^2 / (c^2 + chi^2))^2``.  That has many minima, so c begins so wide that every edge counts, and
-shrinks (graduated non-convexity: Yang, Antonante, Tzoumas and Carlone, RA-L 2020, Eq. 9-12): an
-edge goes only where the others, having had their say, still contradict it.
+Edges that may be false, because two rooms can look alike, have Geman and McClure's weight
+``(c^2 / (c^2 + chi^2))^2``.  That cost has many minima, so c begins so wide that every edge counts,
+and shrinks (graduated non-convexity: Yang, Antonante, Tzoumas and Carlone, RA-L 2020, Eq. 9-12).
+An edge is rejected only if the others still contradict it in the end.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,9 @@ from pliant.compiler.kernel import fast_kernel
 _N = 7
 
 _CHI2 = 24.3
-"""c^2 of edges that may be false: 99.9 % of a chi-square of seven degrees lie below."""
+"""c^2 of edges that may be false: 99.9 % of a chi-square distribution with seven degrees of
+freedom.
+"""
 
 _NARROWING = 1.4
 _MOST_STEPS = 100
@@ -43,11 +45,11 @@ _MAX_DAMPING = 1e8
 
 @dataclass(frozen=True, kw_only=True)
 class Edges:
-    """What is known between pairs of poses.
+    """Measurements between pairs of poses.
 
-    i, j: (E,) of the poses.    Z: (E, 4, 4) similarity from j to i.
-    sigmas: (E, 7) standard deviations of rotation, translation (in units of j) and log scale.
-    doubtful: (E,) those that may be false.
+    i, j: (E,) of the poses.    Z: (E, 4, 4) similarity from j to i. sigmas: (E, 7) standard
+    deviations of rotation, translation (in units of j) and log scale. doubtful: (E,) those that may
+    be false.
     """
 
     i: I32
@@ -58,10 +60,10 @@ class Edges:
 
 
 def optimise_pose_graph(S: F64, edges: Edges, fixed: BoolArray) -> tuple[F64, F64]:
-    """Similarities (M, 4, 4) that agree best with the edges, by Levenberg-Marquardt.
+    """Return the similarities (M, 4, 4) that fit the edges best, by Levenberg-Marquardt.
 
-    S: (M, 4, 4) to begin from.    fixed: (M,) those that stay; at least one.
-    Returns them, and the weights (E,) of the edges: 1, but for doubtful ones that are contradicted.
+    S: (M, 4, 4) initial values.    fixed: (M,) fixed poses; at least one. Also returns the weights
+    (E,) of the edges: 1, except for doubtful ones that are contradicted.
     """
     free = np.cumsum(~fixed, dtype=np.int32) - 1
     free[fixed] = -1
@@ -88,7 +90,7 @@ def optimise_pose_graph(S: F64, edges: Edges, fixed: BoolArray) -> tuple[F64, F6
             damping, growth = max(0.1 * damping, _DAMPING), 2.0
         else:
             damping, growth = damping * growth, 2.0 * growth
-        # Only what has settled is judged more strictly.
+        # The kernel shrinks only after convergence.
         if 0.0 <= fall <= 0.01 * cost and widening > 1.0:
             widening = max(1.0, widening / _NARROWING)
             fall = np.inf
@@ -99,7 +101,7 @@ def optimise_pose_graph(S: F64, edges: Edges, fixed: BoolArray) -> tuple[F64, F6
 
 
 def residuals(S: F64, edges: Edges) -> F64:
-    """(E, 7) what is left over of each edge."""
+    """(E, 7) residual of each edge."""
     E = _inverse(edges.Z) @ _inverse(S[edges.i]) @ S[edges.j]
     R, scale = _parts(E)
     return np.column_stack([so3_log(R), E[:, :3, 3], np.log(scale)])

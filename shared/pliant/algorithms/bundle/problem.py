@@ -1,4 +1,4 @@
-"""What bundle adjustment is asked and what it answers: cameras, points and observations.
+"""Input and output of bundle adjustment: cameras, points and observations.
 
 Two forms of the same problem are accepted everywhere: ``BundleProblem`` lists its observations,
 ``BundleWindow`` holds them as dense camera x point arrays, which is how the solvers work inside.
@@ -56,7 +56,7 @@ class BundleParameters(Parameters):
 
 
 class CalibrationUncertainty(Parameters):
-    """How far the given calibration may be wrong: standard deviations of a prior at 0."""
+    """Uncertainty of the given calibration: standard deviations of a prior at 0."""
 
     focal: float = Field(
         default=0.01,
@@ -152,7 +152,7 @@ class BundleWindow:
 
     u, v: pixels where camera m observes point n; any finite number elsewhere.
     weights: factor of the cost term of each observation, 0 where there is none.
-    Points born together should stand together: blocks of points that a camera does not see are
+    Points created together should be adjacent: blocks of points that a camera does not observe are
     skipped.  The other fields are those of ``BundleProblem``.
     """
 

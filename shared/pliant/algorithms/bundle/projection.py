@@ -1,4 +1,4 @@
-"""One observation of one point, one step of one camera: what the kernels have in common.
+"""One observation of one point, one step of one camera: common code of the kernels.
 
 The residual is ``r = u - phi(T_camera_world p)``.  With x, y on the plane z = 1 and F the (2, 2)
 Jacobian of the lens (focal lengths, radial distortion), the Jacobians of phi are ``F P`` for the
@@ -31,11 +31,11 @@ _Camera: TypeAlias = Any
 _Point: TypeAlias = tuple[Any, Any, Any]
 
 _BEHIND_PX2 = 1e8
-"""Squared residual charged behind a camera without a kernel; above all real ones, and constant."""
+"""Squared residual behind a camera without a kernel; above all real ones, and constant."""
 
 _SINGULAR = 1e-12
 _LEAST_DISTANCE = 1e-6
-"""Map units.  Where a point may lie behind, it must still not lie in the plane of the camera."""
+"""Map units.  A point that may lie behind a camera must still not lie in the camera's plane."""
 
 
 class Cameras(NamedTuple):
@@ -55,7 +55,7 @@ class Cameras(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Where a camera sees a point, px, and how much that counts; or arrays of these."""
+    """Pixel and weight of an observation; or arrays of these."""
 
     u: Any
     v: Any
@@ -91,7 +91,7 @@ class Limits(NamedTuple):
 
 
 def limits_of(parameters: BundleParameters, dtype: DTypeLike = np.float64) -> Limits:
-    """What the kernels need of the parameters."""
+    """Limits that the kernels need, from the parameters."""
     number: Any = np.dtype(dtype).type
     sigma2 = parameters.kernel_sigma_px**2
     return Limits(
@@ -104,7 +104,7 @@ def limits_of(parameters: BundleParameters, dtype: DTypeLike = np.float64) -> Li
 
 @fast_kernel
 def motion_of(cameras: Cameras, m: int) -> Any:
-    """The 12 numbers of camera m, to stand in registers during a loop."""
+    """The 12 numbers of camera m, held in registers during a loop."""
     return row_of(cameras.motion[m])
 
 
@@ -139,7 +139,7 @@ def _lens_of(lens: Any, m: int) -> Any:
 def residual(
     one: _Number, T: _Camera, K: _Camera, lens: Any, point: _Point, u: Any, v: Any, limits: Limits
 ) -> Any:
-    """(x, y, 1/z, in front, residual u, residual v); behind the camera: finite nonsense."""
+    """(x, y, 1/z, in front, residual u, residual v); finite but meaningless behind the camera."""
     X, Y, Z = point
     z = T[6] * X + T[7] * Y + T[8] * Z + T[11]
     front = (z > limits.min_depth) & (abs(z) > limits.min_distance)

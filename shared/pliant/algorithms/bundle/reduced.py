@@ -1,19 +1,20 @@
-"""The reduced system of the cameras (Eq. 9): which of its blocks there are, and its solution.
+"""The reduced system of the cameras (Eq. 9): its sparsity pattern and its solution.
 
-Two cameras meet in the system where they see a common point, so that of a long path few blocks are
-there.  A calibration that all cameras share is one more camera, which meets all of them: it borders
-the matrix, and is eliminated last.  ``S = L L^T`` by blocks, for the columns j in their order:
+Two cameras have a block in the system if they observe a common point, so a long path has few
+blocks.  A calibration that all cameras share is one more camera with a block for each of them: it
+borders the matrix, and is eliminated last.  ``S = L L^T`` by blocks, for the columns j in their
+order:
 
     L_jj L_jj^T = S_jj      L_ij = S_ij L_jj^-T      S_ik -= L_ij L_kj^T   for all i >= k below j.
 
-The last step makes every pair of cameras meet that met camera j.  How many blocks that fills in is
-up to the order: next is always the camera that meets the fewest others (minimum degree, Tinney and
-Walker 1967; George and Liu 1989).  Everything is done by our own kernels, in one thread.
+The last step fills in the blocks of all pairs of cameras that have one with camera j.  The order
+determines the fill-in: next is always the camera with the fewest blocks (minimum degree, Tinney and
+Walker 1967; George and Liu 1989).  All kernels are our own and run in one thread.
 
-``S -= A C^T`` is the whole price of the Schur complement: with 6 x 3 matrices that of eliminating
-points, with 6 x 6 matrices that of factoring what is left.  numba vectorises loops, which here are
-too short, and leaves straight code scalar; so this one update is written in LLVM's own vectors,
-which any processor has or can imitate.
+``S -= A C^T`` is nearly all of the cost of the Schur complement: with 6 x 3 matrices of eliminating
+points, with 6 x 6 matrices of factoring the rest.  numba vectorises loops, which are too short
+here, and leaves straight code scalar.  So this update is written in LLVM's own vectors, which any
+processor supports or emulates.
 """
 
 from collections.abc import Callable
@@ -99,11 +100,11 @@ subtract_product6: Any = intrinsic(_subtraction(6))
 
 
 class Pattern(NamedTuple):
-    """The blocks of L, which has room for those of S.
+    """The blocks of L, which include those of S.
 
-    position: (F,) of each movable camera in the order of elimination.
-    block: (N, N) where the block of two positions lies, row >= column; -1 where there is none.
-    start: (N + 1,) blocks of each column, the one on the diagonal first.     row: of each block.
+    position: (F,) of each movable camera in the order of elimination. block: (N, N) index of the
+    block of two positions, row >= column; -1 without one. start: (N + 1,) blocks of each column,
+    the one on the diagonal first.     row: of each block.
     """
 
     position: I32
@@ -113,9 +114,9 @@ class Pattern(NamedTuple):
 
 
 def find_pattern(meetings: BoolArray, *, bordered: bool) -> Pattern:
-    """Order the F cameras.  meetings: (F, F) symmetric, whether two of them see a common point.
+    """Order the F cameras.  meetings: (F, F) symmetric, whether two of them observe a common point.
 
-    bordered: one more position, the last, meets all of them.
+    bordered: one more position, the last, has a block with all of them.
     """
     F = len(meetings)
     N = F + int(bordered)
@@ -128,7 +129,7 @@ def find_pattern(meetings: BoolArray, *, bordered: bool) -> Pattern:
 
 @kernel
 def _order(filled: BoolArray, F: int) -> I32:
-    """(N,) position of each camera; those that come to meet are marked in ``filled`` (N, N)."""
+    """(N,) position of each camera; blocks that fill in are marked in ``filled`` (N, N)."""
     N = filled.shape[0]
     degree = np.zeros(N, np.int64)
     for m in range(N):
@@ -181,11 +182,11 @@ def _lay_out(filled: BoolArray, position: I32) -> tuple[I32, I64, I32]:
 
 
 def solve_reduced(pattern: Pattern, S: F64, b: F64, damping: F64) -> F64 | None:
-    """Solve ``(S + diag(damping)) x = b``: (N, 6), None where that is not positive definite.
+    """Solve ``(S + diag(damping)) x = b``: (N, 6), None if that is not positive definite.
 
     S: (K, 36) blocks of the pattern by rows, those on the diagonal in their lower triangles; it is
-    overwritten.     b, damping: (N, 6).
-    An unknown without observations has an empty row: the identity keeps it where it is.
+    overwritten.     b, damping: (N, 6). An unknown without observations has an empty row: the
+    identity keeps it unchanged.
     """
     return substitute_reduced(pattern, S, b) if factor_reduced(pattern, S, damping) else None
 

@@ -53,14 +53,14 @@ from pliant.compiler.kernel import kernel
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e8
 
 _GAUGE_DAMPING = 1e-9
-"""Keeps the scale of a map, which nothing holds, from making its system singular."""
+"""Keeps the system regular although the scale of a map is undetermined."""
 
 _NONE: F64 = np.zeros(0)
 _HELD = 1e9
-"""Damping of unknowns that are not to move."""
+"""Damping of fixed unknowns."""
 
 OnIteration: TypeAlias = Callable[[float], None]
-"""Called with the cost after each iteration, so that a benchmark can note the time."""
+"""Called with the cost after each iteration, for benchmarks."""
 
 
 def solve_schur(
@@ -76,21 +76,20 @@ def solve_schur(
 ) -> BundleResult:
     """Minimise Eq. 6 over all movable cameras and points by damped Gauss-Newton steps.
 
-    Each step eliminates the points exactly.  float64 throughout.  A step is taken only if it
-    does not raise the cost.
+    Each step eliminates the points exactly.  float64 throughout.  A step is accepted only if it
+    does not increase the cost.
 
     uncertainty: of the calibration, which is then a further unknown that all cameras share; None:
-    it is right.  Of the result, ``correction`` (s, k1, k2, readout, a, b) says that the
-    observations follow ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx + readout flow``, likewise
-    for v with b, and the costs include the prior, at k1 and k2 of the problem's intrinsics;
-    with_covariance: the result tells how far to believe it.
-    start: (6,) the correction to begin from, None: the middle of the prior.  Several views tell the
-    focal length from rotation, and from parallax that differs across the image.  Where they cannot
-    (no rotation, one plane, forward motion) the prior holds it, as ``covariance`` then says.
-    doubled: twice each step is tried as well, which takes some 0.6 of the iterations to a cost that
-    has all but settled.
-    walk: prior of the focal length of each camera relative to the shared one; None: they are equal.
-    Raises ValueError where cameras differ in their lenses.
+    it is fixed.  The result's ``correction`` (s, k1, k2, readout, a, b) means that the observations
+    follow ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx + readout flow``, likewise for v with b.
+    The costs include the prior, at k1 and k2 of the problem's intrinsics. with_covariance: the
+    result contains the covariance of the correction. start: (6,) initial correction, None: the mean
+    of the prior.  Several views determine the focal length by rotation, and by parallax that
+    differs across the image.  Otherwise (no rotation, one plane, forward motion) the prior
+    determines it, as ``covariance`` then shows. doubled: twice each step is tried as well, which
+    takes some 0.6 of the iterations to convergence. walk: prior of the focal length of each camera
+    relative to the shared one; None: they are equal. Raises ValueError if cameras have different
+    lenses.
     """
     layout = build_packed_layout(problem)
     calibration, focal = None, None
@@ -123,7 +122,8 @@ def system_at(
     uncertainty: CalibrationUncertainty,
     walk: FocalWalk | None = None,
 ) -> "SchurSystem":
-    """The system whose ``start`` is where an adjustment ended, to ask what further unknowns gain.
+    """Return the system that starts where an adjustment ended, to compute the gain of further
+    unknowns.
 
     uncertainty: with these unknowns.   walk: as of ``solve_schur``.
     """
@@ -162,7 +162,7 @@ def _iterate(
     on_iteration: OnIteration | None,
     doubled: bool,
 ) -> tuple[State, list[float], bool]:
-    """Iterate until the cost settles: (state, cost curve, converged)."""
+    """Iterate until the cost converges: (state, cost curve, converged)."""
     state = system.start()
     costs = [state.cost]
     damping, growth = parameters.initial_damping, 2.0
@@ -245,7 +245,7 @@ class SchurSystem:
         return State(cameras, slots, points, q, cost, z)
 
     def linearise(self, state: State) -> None:
-        """Bring all that no damping changes to a state."""
+        """Linearise at a state, independent of the damping."""
         if state is self.at:
             return
         cameras = state.cameras
@@ -260,13 +260,14 @@ class SchurSystem:
         self.at = state
 
     def step(self, state: State, damping: float, doubled: bool = False) -> State | None:
-        """The state after one damped Gauss-Newton step; None where it has no solution.
+        """Return the state after one damped Gauss-Newton step, or None without a solution.
 
-        doubled: or after twice that step, where the cost is lower there.  The weights of the robust
-        kernel make a parabola of it that touches the cost and lies above it elsewhere, as rho is
-        concave in r^2: so steps are too short.  Where one is doubled the parabola is back at where
-        it began, and the cost, below it, no higher than it was.  Of an error of which steps leave
-        the share r they leave 2 r - 1 then (Hunter and Lange 2004, A tutorial on MM algorithms).
+        doubled: or after twice that step, if the cost is lower there.  The weights of the robust
+        kernel replace the cost by a parabola that touches it and lies above it elsewhere, because
+        rho is concave in r^2: so steps are too short.  At the doubled step the parabola has its
+        initial value again, and the cost, below it, is no higher than before.  If steps leave the
+        share r of an error, doubled ones leave 2 r - 1 (Hunter and Lange 2004, A tutorial on MM
+        algorithms).
         """
         self.linearise(state)
         S, b, diagonal = self._reduced_system(state, damping)
@@ -297,9 +298,9 @@ class SchurSystem:
         return far if far.cost < near.cost else near
 
     def calibration_covariance(self, state: State) -> F64:
-        """(SHARED, SHARED) of the calibration with all else unknown, at residuals of 1 px.
+        """(SHARED, SHARED) of the calibration with everything else unknown, at residuals of 1 px.
 
-        Its block of the inverse of S: the calibration is eliminated last.  0 where it is held.
+        Its block of the inverse of S: the calibration is eliminated last.  0 where it is fixed.
         """
         covariance = np.zeros((SHARED, SHARED))
         if self.calibration is None:
@@ -315,8 +316,9 @@ class SchurSystem:
         return covariance
 
     def gain_of_focal(self) -> tuple[float, F64]:
-        """How much less a linear step from the start would cost, px^2, for the focal lengths of the
-        cameras; and these (M,).  Zeros where the step has no solution."""
+        """Decrease of the cost, px^2, by a linear step from the start with a focal length per
+        camera; and these (M,).  Zeros if the step has no solution.
+        """
         assert self.focal is not None
         unknowns = np.zeros((len(self.pattern.start) - 1, 6), np.bool_)
         unknowns[self.focal.position] = True
@@ -330,8 +332,9 @@ class SchurSystem:
         return self._gain_of(unknowns)[0]
 
     def _gain_of(self, unknowns: BoolArray) -> tuple[float, F64]:
-        """With b the right side of Eq. 9 and S its matrix: ``b^T S^-1 b`` less the same with some
-        unknowns (N, 6) held, and ``S^-1 b``."""
+        """With b the right side of Eq. 9 and S its matrix: ``b^T S^-1 b`` minus the same with some
+        unknowns (N, 6) fixed, and ``S^-1 b``.
+        """
         state = self.start()
         self.linearise(state)
         S, b, diagonal = self._reduced_system(state, _GAUGE_DAMPING)
@@ -373,7 +376,7 @@ class SchurSystem:
         return S, b, diagonal
 
     def _linearised(self, state: State) -> Linearised:
-        """What ``linearise`` has found of a state."""
+        """Return the linearised observations of a state."""
         return Linearised(self._records, self.shared.points, self.layout.places, state.motion)
 
     def squared_residuals(self, state: State) -> F32:
@@ -387,8 +390,9 @@ class SchurSystem:
 
 
 def _records_for(observations: int) -> F64:
-    """Room for the records of so many observations and a dump, each in a cache line of its own:
-    they are written in the order of cameras and read in that of points."""
+    """Return memory for this many records and a dump, each in its own cache line: they are written
+    in the order of cameras and read in that of points.
+    """
     room = np.empty((observations + 2) * RECORD)
     skipped = -(room.ctypes.data // room.itemsize) % RECORD
     return room[skipped : skipped + (observations + 1) * RECORD].reshape(-1, RECORD)
@@ -396,7 +400,7 @@ def _records_for(observations: int) -> F64:
 
 @kernel
 def _meetings(places: Places, free: I32, cameras: int) -> BoolArray:
-    """(F, F) whether two of the movable cameras see a common point."""
+    """(F, F) whether two of the movable cameras observe a common point."""
     met = np.zeros((cameras, cameras), np.bool_)
     for m in range(cameras):
         met[m, m] = True

@@ -1,9 +1,9 @@
-"""Bundle adjustment by halves: points for fixed cameras, cameras for fixed points.
+"""Bundle adjustment by alternation: points for fixed cameras, cameras for fixed points.
 
 The subspace Gauss-Newton method (VITAMIN-E section 3.2, Eq. 11-12) does both in turn.  A sweep
 solves every point for fixed cameras and then every camera for fixed points: blocks of 3 x 3 and
-6 x 6 only.  Points do not meet in the Hessian, nor do cameras, so that a sweep is one exact block
-Gauss-Seidel pass, linearised afresh for each of its halves.
+6 x 6 only.  The Hessian has no blocks between points, nor between cameras, so a sweep is one exact
+block Gauss-Seidel pass, linearised again for each of its halves.
 """
 
 from collections.abc import Callable
@@ -48,10 +48,10 @@ def solve_subspace(
     parameters: BundleParameters,
     on_iteration: Callable[[float], None] | None = None,
 ) -> BundleResult:
-    """Sweep until ``max_sweeps`` or until a sweep lowers the cost by too little.
+    """Sweep until ``max_sweeps``, or until a sweep reduces the cost by too little.
 
-    The work is done in float32 around the mean of the cameras; steps add up in float64.  Meant
-    for a window that is nearly converged: from a bad start use ``solve_schur``.
+    Works in float32 around the mean of the cameras; steps accumulate in float64.  Meant for a
+    window near convergence: from a poor initial state use ``solve_schur``.
     """
     layout = build_layout(problem)
     motion, points = layout.cameras.motion.copy(), layout.points.copy()
@@ -181,7 +181,7 @@ def make_result(
     converged: bool,
     parameters: BundleParameters,
 ) -> BundleResult:
-    """The answer in the terms of the problem."""
+    """Convert the result to the form of the problem."""
     squared = np.zeros(0, np.float32)
     if isinstance(problem, BundleProblem):
         table = squared_residuals(layout, motion, points, parameters)

@@ -1,4 +1,4 @@
-"""A focal length that changes from camera to camera: one more unknown of each, beside its pose.
+"""A focal length that changes between cameras: one more unknown for each of them.
 
 Zoom, focus breathing and cropped stabilisation change it during a clip.  Camera m projects with
 ``fx e^(s + z_m)``, where s is that of the shared calibration and z_m its own.  Two priors hold z: a
@@ -7,9 +7,9 @@ random walk in time and a spread about 0,
     z_(m+1) - z_m ~ N(0, rate^2 dt)      z_m ~ N(0, spread^2).
 
 The Jacobian by z_m is that by s (``calibration``), for the observations of camera m alone.  Six of
-these unknowns share one block of the reduced system, as if they were one more camera; it meets each
-camera that one of the six meets.  Kernels of their own add them to what ``normal_equations`` has
-found without them, so that a system with one focal length stays as it is.
+these unknowns share one block of the reduced system, like one more camera, with the blocks of all
+six cameras.  Separate kernels add them to the system of ``normal_equations``, so that a system with
+one focal length is unchanged.
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ _LEAST_GAP_S = 1e-3
 class FocalWalk:
     """Prior of the log focal lengths z of the cameras, relative to the shared one.
 
-    gaps_s: (M - 1,) between the cameras, inf where nobody knows.   rate: standard deviation of the
+    gaps_s: (M - 1,) between the cameras, inf where unknown.   rate: standard deviation of the
     change of z in one second, growing with the square root of time.   spread: standard deviation of
     each z.   start: (M,) z to begin from.
     """
@@ -72,7 +72,8 @@ class FocalBlocks(NamedTuple):
 
 
 class VaryingFocal:
-    """The focal lengths of one problem: where they start, their prior, their part of the system.
+    """The focal lengths of one problem: their initial values, their prior, their part of the
+    system.
 
     position: (G,) of each block of six in the order of elimination.
     """
@@ -111,11 +112,13 @@ class VaryingFocal:
         return cameras._replace(pinhole=pinhole)
 
     def prior_cost(self, z: F64) -> float:
-        """px^2."""
+        """Cost of the priors, px^2."""
         return 0.5 * float(self.spread @ z**2 + self.walk @ np.diff(z) ** 2)
 
     def linearise(self, cameras: Cameras, records: F64, unknown: BoolArray, principal: F64) -> None:
-        """Bring the blocks to the state of the records.   unknown: (SHARED,) of the calibration."""
+        """Linearise the blocks at the state of the records.   unknown: (SHARED,) of the
+        calibration.
+        """
         layout, M = self.layout, len(self.start)
         blocks = FocalBlocks(
             np.zeros((M, SHARED)), np.zeros(M), np.zeros((M, 6)), np.zeros((len(records), 3))
@@ -127,7 +130,7 @@ class VaryingFocal:
         self, system: CameraSystem, linearised: Linearised, scratch: Scratch, factors: F64,
         diagonal: F64, z: F64,
     ) -> None:  # fmt: skip
-        """Add the focal lengths to a system from which the points have been taken out.
+        """Add the focal lengths to a system from which the points have been eliminated.
 
         diagonal: (N, 6) of H without damping.   z: (M,) of the state.
         """
@@ -144,7 +147,7 @@ class VaryingFocal:
         return solution[self.position].reshape(-1)[: len(self.start)]
 
     def substitute(self, linearised: Linearised, steps: F64, factors: F64, moved: F64) -> None:
-        """Move the points (3, P) by what the focal lengths do."""
+        """Move the points (3, P) by the steps of the focal lengths."""
         assert self._blocks is not None
         substitute_focal(linearised, self._blocks.points, steps, factors, moved)
 
@@ -213,8 +216,8 @@ def eliminate_focal(
     scratch: Scratch,
     factors: F64,
 ) -> None:
-    """Take the points out of the rows of the focal lengths: to S ``- U U^T`` is added, to b
-    ``- U y``, for all pairs of which one is a block of focal lengths.
+    """Eliminate the points from the rows of the focal lengths: to S ``- U U^T`` is added, to b ``-
+    U y``, for all pairs with a block of focal lengths.
 
     of_focal: (O + 1, 3) H_zp of each place.   position: (G,) of the blocks.   factors: of the
     points, see ``eliminate_points``.
@@ -229,7 +232,7 @@ def eliminate_focal(
         if i00 == 0.0:
             continue
         count = 0
-        for o in range(places.start[n], places.stop[n]):  # the blocks of focal lengths first
+        for o in range(places.start[n], places.stop[n]):  # blocks of focal lengths first
             m = places.camera[o]
             row = position[m // PER_BLOCK]
             if count == 0 or rows[count - 1] != row:
@@ -289,7 +292,7 @@ def _assemble(
     system: CameraSystem,
     diagonal: F64,
 ) -> None:
-    """Add what the focal lengths have by themselves: their blocks of H, and their prior."""
+    """Add the focal lengths' own blocks of H, and their prior."""
     free, block, S, b = system.position, system.block, system.S, system.b
     last = b.shape[0] - 1
     for m in range(pull.size):
@@ -322,7 +325,7 @@ def _assemble(
 def substitute_focal(
     state: Linearised, of_focal: F64, steps: F64, factors: F64, moved: F64
 ) -> None:
-    """Move the points (3, P) that have been moved by all else already.   steps: (M,) of z."""
+    """Move the points (3, P) further by the steps of the focal lengths.   steps: (M,) of z."""
     places = state.places
     for n in range(places.start.size):
         t0 = t1 = t2 = 0.0
