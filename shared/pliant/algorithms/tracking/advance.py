@@ -1,7 +1,7 @@
 """One step of every track to the next frame: predict, climb, refine (section 2.3).
 
 A template belongs to an octave: 0 is the full-size image, 1 half the size, where the same patch
-sees twice as far.
+has twice the extent.
 """
 
 from typing import NamedTuple
@@ -32,7 +32,7 @@ from pliant.algorithms.tracks import COASTING, EXTREMUM
 from pliant.compiler.kernel import fast_kernel
 
 AHEAD = 3
-"""Tracks by which memory is asked for before it is read."""
+"""Number of tracks by which memory is prefetched."""
 
 _COAST_ZNCC = np.float32(0.3)
 """A patch with a small residual but less correlation than this has no contrast left."""
@@ -42,7 +42,7 @@ _LEAST_GATE, _WIDEST_GATE = np.float32(0.25), np.float32(1.0)
 
 
 class FrameImages(NamedTuple):
-    """What patches are seen in: smoothed grey levels, at half size too."""
+    """The images that patches are taken from: smoothed grey levels, also at half size."""
 
     full: Pixels
     half: Pixels
@@ -71,7 +71,7 @@ class StepLimits(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Where a template is found: the point (u, v), and whether that is to be believed."""
+    """Position (u, v) of a template, and whether it is reliable."""
 
     u: np.float32
     v: np.float32
@@ -149,7 +149,7 @@ def _prefetch_track(
     track: Track,
     templates: F32,
 ) -> None:
-    """Ask for all that a track is about to read: waiting for it takes longer than the work."""
+    """Prefetch all that a track will read: waiting for it takes longer than the work."""
     prefetch_template(templates, track.slot * TEMPLATE_FLOATS)
     left = int(to_octave(track.u + du, track.octave) + track.left)
     top = int(to_octave(track.v + dv, track.octave) + track.top)
@@ -241,7 +241,7 @@ def _find_extremum(
     sign = np.float32(1.0) if track.kappa >= np.float32(0.0) else np.float32(-1.0)
     weight = limits.prediction_weight * abs(track.kappa)
     sigma = limits.prediction_sigma
-    # An extremum moves with the surface: from where it was, not from where the patch has put it.
+    # An extremum moves with the surface: from its own last position, not from the patch's.
     from_u, from_v = track.u, track.v
     if track.pixel >= 0:
         from_u, from_v = track.extremum_u, track.extremum_v
@@ -314,7 +314,7 @@ def _align_track(
     track: Track,
     templates: F32,
 ) -> _Place:
-    """Align the template of a track from a place of the full-size image, and judge it."""
+    """Align the template of a track from a position in the full-size image, and test it."""
     octave = track.octave
     scale = np.float32(1.0) if octave == 0 else np.float32(0.5)
     found = align_patch(
@@ -341,7 +341,7 @@ def _leads_back(
     track: Track,
     scratch: F32,
 ) -> bool:
-    """Whether the patch seen now at (u, v) is found again where the track was."""
+    """Whether the patch at (u, v), tracked backwards, returns to the track's position."""
     octave = track.octave
     at_u, at_v = to_octave(u, octave), to_octave(v, octave)
     left, top = patch_origin(at_u, at_v)
@@ -354,7 +354,7 @@ def _leads_back(
     make_template(image, left, top, tensor, GAUSSIAN, scratch, 0)
     from_u = to_octave(track.u, octave) + (np.float32(left) - at_u)
     from_v = to_octave(track.v, octave) + (np.float32(top) - at_v)
-    # As the noise of a patch: what is sharp has to come back exactly.
+    # Scales with the noise of a patch: a sharp one must return exactly.
     gate = limits.backward_gate / np.sqrt(strength)
     gate = min(max(gate, _LEAST_GATE), _WIDEST_GATE)
     if octave != 0:

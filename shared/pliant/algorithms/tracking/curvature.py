@@ -1,8 +1,8 @@
 """Image curvature (VITAMIN-E, section 2.1, Eq. 1), and climbing its hills (section 2.3, Eq. 5).
 
-Curvature is taken on a float Gaussian, in one pass over the image.  An 8-bit Gaussian makes four
-times as many maxima, most of them rounding; hence floats throughout.  A climb goes to the extremum
-that is near, with a pull to where the track was predicted.
+Curvature is computed on a float Gaussian, in one pass over the image.  An 8-bit Gaussian makes four
+times as many maxima, most of them by rounding; hence floats throughout.  A climb goes to a nearby
+extremum, with a pull towards the prediction of the track.
 """
 
 import math
@@ -36,7 +36,7 @@ _I64 = ir.IntType(64)
 _FLAGS = ("nnan", "reassoc", "contract", "nsz", "arcp")
 
 MAX_STEPS = 24
-"""Steps after which a climb gives up; it ends by itself, as the value rises at every step."""
+"""Maximum steps of a climb; it ends by itself, because the value rises at every step."""
 
 
 def gaussian_taps(sigma_px: float) -> GaussianTaps:
@@ -65,7 +65,7 @@ def curvature(
 
 
 def row_scratch(width: int) -> F32:
-    """Room for what ``curve_row`` keeps of a row."""
+    """Return the memory in which ``curve_row`` stores a row."""
     return np.empty((4, width + 2 * BLUR_RADIUS), np.float32)
 
 
@@ -84,7 +84,7 @@ def _curvature(
 
 @fast_kernel
 def clear_border(kappa: F32) -> None:
-    """There is no curvature in the first and the last rows."""
+    """Set the first and the last rows to 0."""
     height = kappa.shape[0]
     kappa[: min(CURVATURE_BORDER, height)] = 0.0
     kappa[max(height - CURVATURE_BORDER, 0) :] = 0.0

@@ -1,8 +1,8 @@
-"""How patches deform: templates turn and grow with the surface that they show.
+"""Deformation of patches: templates rotate and scale with their surface.
 
-A patch of the birth frame stops resembling its point once the view has rotated or come nearer, and
-slides along the contours that it shows.  The tracks' own motion gives the deformation: its slope
-over neighbouring cells is exact to about 0.1 % a frame, far better than one patch could tell.
+A patch of the birth frame stops resembling its point once the view has rotated or approached, and
+slides along its contours.  The tracks' own motion gives the deformation: its slope over
+neighbouring cells is exact to about 0.1 % a frame, far better than one patch could determine.
 """
 
 import numpy as np
@@ -26,15 +26,15 @@ from pliant.compiler.kernel import fast_kernel
 WINDOW_SIDE = PATCH_SIZE + 2
 """Of the samples of a patch with the margin of its gradients."""
 AHEAD = 2
-"""Tracks by which memory is asked for before it is read."""
+"""Number of tracks by which memory is prefetched."""
 MIN_CELL_TRACKS = 3
-"""Tracks of a cell whose mean motion counts."""
+"""Minimum tracks of a cell with a mean motion."""
 AGREEMENT_PX = np.float32(1.0)
 """Pixels by which a cell may differ from its neighbours and still show the same surface."""
 MAX_SLOPE = np.float32(0.12)
-"""Pixels per pixel and frame: what exceeds this is a step in depth."""
+"""Pixels per pixel and frame: more is a depth discontinuity."""
 MIN_TURN = np.float32(0.06)
-"""Change of a deformation, per pixel, that a template is made anew for: 0.2 px at its rim."""
+"""Change of a deformation, per pixel, at which a template is renewed: 0.2 px at its rim."""
 MAX_GROWTH, MIN_GROWTH = np.float32(4.0), np.float32(0.4)
 """Of the area, beyond which what was kept from the birth says too little."""
 
@@ -83,7 +83,7 @@ def _mean_motion(tracks: Tracks, affine: F32, motion: F32, points: F32, found: B
 def turn_templates(
     tracks: Tracks, slopes: F32, affine: F32, patches: Patches, window: Pixels, lagging: I32
 ) -> None:
-    """Carry every track's deformation on by one frame, and make anew the templates that lag.
+    """Update every track's deformation by one frame, and renew outdated templates.
 
     slopes: from ``slopes_of_motion``.  window, lagging: scratch for WINDOW_SIDE x WINDOW_SIDE
     samples, and for as many rows as there are tracks.
@@ -91,7 +91,7 @@ def turn_templates(
     births, templates = patches.births, patches.templates
     turned = _deform(tracks, slopes, affine, patches.deformations, lagging)
     for rank in range(turned):
-        # What was kept of births is too much for the cache: ask for it before it is needed.
+        # Birth patches exceed the cache: prefetch them.
         ahead = tracks[lagging[min(rank + AHEAD, turned - 1)]].slot * BIRTH_FLOATS
         for start in range(0, BIRTH_FLOATS, CACHE_LINE_FLOATS):
             prefetch(births, ahead + start)
@@ -108,7 +108,7 @@ def turn_templates(
 
 @fast_kernel
 def _deform(tracks: Tracks, slopes: F32, affine: F32, deformations: F32, lagging: I32) -> int:
-    """Carry the deformations on.  Writes the rows whose template lags; returns their number."""
+    """Update the deformations.  Writes the rows with an outdated template; returns their number."""
     rows, columns = slopes.shape[0], slopes.shape[1]
     lags = 0
     for i in range(len(tracks)):
@@ -135,10 +135,10 @@ def _deform(tracks: Tracks, slopes: F32, affine: F32, deformations: F32, lagging
 
 @fast_kernel
 def sample_birth(births: F32, offset: int, track: Track, m: F32, window: F32) -> None:
-    """Sample what was kept of a birth as a deformation m = [m00 m01 m10 m11] shows it now.
+    """Sample the stored birth patch under the deformation m = [m00 m01 m10 m11].
 
-    window: WINDOW_SIDE^2, the patch with a margin of one pixel.  Beyond what was kept its
-    edge goes on.
+    window: WINDOW_SIDE^2, the patch with a margin of one pixel.  Beyond the stored area its edge is
+    repeated.
     """
     scale = np.float32(1.0) / (m[0] * m[3] - m[1] * m[2])
     i00, i01, i10, i11 = m[3] * scale, -m[1] * scale, -m[2] * scale, m[0] * scale
@@ -184,7 +184,7 @@ def _blend(births: F32, start: np.uint64, u: np.float32, v: np.float32) -> np.fl
 
 @fast_kernel
 def keep_birth(image: Pixels, left: int, top: int, births: F32, offset: int) -> None:
-    """Keep the surroundings of a new patch; beyond the image its edge goes on."""
+    """Store the surroundings of a new patch; beyond the image its edge is repeated."""
     for row in range(BIRTH_SIZE):
         y = min(max(top + row - BIRTH_MARGIN, 0), image.height - 1)
         for column in range(BIRTH_SIZE):

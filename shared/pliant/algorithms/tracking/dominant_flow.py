@@ -1,7 +1,7 @@
 """The dominant flow between two frames (VITAMIN-E, section 2.2).
 
 BRIEF pairs (Calonder et al. 2010, without steering) on the image at a sixth of its size, or larger
-where that leaves too few rows for them, and an affine model y = A x + b fitted to them with the
+if that leaves too few rows for them, and an affine model y = A x + b fitted to them with the
 Geman-McClure kernel (Eq. 2-3).
 """
 
@@ -24,9 +24,9 @@ BRIEF_RADIUS = 7
 BRIEF_WORDS = 4
 """64-bit words of a descriptor: 256 comparisons."""
 _LEAST_SIDE = 2 * (2 * BRIEF_RADIUS + 1)
-"""Pixels of a small image of which half the rows and columns can be described."""
+"""Minimum side of the small image, so that half of its rows and columns can be described."""
 _CLEAR = 2
-"""Nearer than so many small pixels to what a mask covers, its edge is in their curvature."""
+"""Small pixels from a masked area within which its edge affects the curvature."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +177,7 @@ def _gauss_newton(x: F64, y: F64, model: F64, sigma_px: float, squares: F64) -> 
             sx, sy, n = sx + wx, sy + wy, n + weight
             ux, uy, u = ux + wu * px, uy + wu * py, u + wu
             vx, vy, v = vx + wv * px, vy + wv * py, v + wv
-        # Damped just enough that points on a line do no harm.
+        # Damped just enough for collinear points.
         xx, yy, n = xx + 1e-9, yy + 1e-9, n + 1e-9
         # Cofactors of the normal matrix [[xx, xy, sx], [xy, yy, sy], [sx, sy, n]].
         a, b, c = yy * n - sy * sy, sx * sy - xy * n, xy * sy - sx * yy
@@ -235,7 +235,7 @@ def _match(
             bits = np.uint64(0)
             for word in range(BRIEF_WORDS):
                 bits += count_bits(descriptors_a[i, word] ^ descriptors_b[j, word])
-            # Hardly any pair is nearer than the best so far: only that branch foretells well.
+            # Hardly any pair is nearer than the best so far: this branch is predictable.
             far = du * du + dv * dv > max_shift_squared
             distance = np.int64(bits) + (np.int64(64 * BRIEF_WORDS + 1) if far else np.int64(0))
             if distance < best:

@@ -1,8 +1,8 @@
 """A coarse-to-fine grid of local flow, as a correction of the dominant flow.
 
-An affine model cannot follow parallax.  One patch a cell is aligned at an eighth, a quarter and
-half of the size; after each level a plane through each cell and its neighbours carries the flow
-from the patch to the centre of the cell, and mends cells that failed or stand alone.
+An affine model cannot follow parallax.  One patch per cell is aligned at an eighth, a quarter and
+half of the size.  After each level a plane through each cell and its neighbours moves the flow from
+the patch to the centre of the cell, and repairs cells that failed or are isolated.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ COARSEST = 3
 MIN_ZNCC = np.float32(0.7)
 """Correlation below which the patch of a cell counts as lost."""
 MIN_STRENGTH = np.float32(0.5)
-"""Smaller eigenvalue of a cell's patch, DN^2 per pixel, below which it cannot be placed."""
+"""Minimum smaller eigenvalue of a cell's patch, DN^2 per pixel."""
 AGREEMENT_PX = np.float32(1.5)
 """Pixels of the level by which a cell may differ from the median around it."""
 
@@ -39,7 +39,7 @@ def grid_shape(width: int, height: int) -> tuple[int, int]:
 
 
 class Flow(NamedTuple):
-    """The dominant flow and what remains of the local flow without it.
+    """The dominant flow and the local flow relative to it.
 
     grid: (rows, columns, 2) full-size pixels, at cell centres.  affine: six numbers of [A | b].
     """
@@ -61,12 +61,11 @@ class _Cells(NamedTuple):
 def local_flow(
     previous: list[F32], current: list[F32], maxima: F32, affine: F32, hint: F32
 ) -> Flow:
-    """Estimate the flow that remains when the dominant flow is taken away.
+    """Estimate the local flow relative to the dominant flow.
 
-    previous, current: images at 1/2, 1/4 and 1/8 of the size.  maxima: (M, 3) rows
-    (u, v, kappa) of the previous frame: the strongest of each cell is followed.
-    affine: six numbers of the dominant flow.  hint: (rows, columns, 2) a second place to begin at
-    (the flow of the frame before).
+    previous, current: images at 1/2, 1/4 and 1/8 of the size.  maxima: (M, 3) rows (u, v, kappa) of
+    the previous frame: the strongest of each cell is followed. affine: six numbers of the dominant
+    flow.  hint: (rows, columns, 2) a second initial value (the flow of the frame before).
     """
     rows, columns = hint.shape[:2]
     points = np.zeros((rows, columns, 3), np.float32)
@@ -150,7 +149,7 @@ def _align_cells(
             best = MIN_ZNCC
             best_u, best_v = np.float32(0.0), np.float32(0.0)
             for attempt in range(4):
-                # What is known of this cell, then its neighbours, then the second hint.
+                # Start from this cell's flow, then its neighbours', then the second hint.
                 if attempt == 0:
                     guess_u, guess_v = flow_at(cells.coarser, u, v)
                     guess_u -= base_u
@@ -253,7 +252,7 @@ def _fit_planes(
                     syu += weight * y * du
                     sxv += weight * x * dv
                     syv += weight * y * dv
-            # Damped slopes: where the neighbours lie in a line, the mean has to do.
+            # Damped slopes: collinear neighbours give their mean.
             damping = np.float32(0.02) * sw
             a, b, c2 = (
                 sxx - sx * sx / sw + damping,
@@ -273,7 +272,7 @@ def _fit_planes(
 
 @fast_kernel
 def _insert_sorted(values: F32, count: int, value: np.float32) -> None:
-    # Each place keeps the smaller and passes the larger on: no branch to foretell wrongly.
+    # Each step keeps the smaller value and passes the larger on: without branches.
     for i in range(count):
         smaller, value = min(values[i], value), max(values[i], value)
         values[i] = smaller

@@ -25,10 +25,10 @@ from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.compiler.kernel import fast_kernel
 
 REACH_PX = PATCH_SIZE // 2 + EDGE_PX
-"""Nearer than this to what a mask covers, a patch of the full size has some of it."""
+"""Distance to a masked area within which a full-size patch overlaps it."""
 
 RUN = 32
-"""Pixels that one word speaks of."""
+"""Pixels per word of bits."""
 
 _LANES = 8
 """Pixels at a time: with more the eight neighbours do not fit into registers."""
@@ -41,7 +41,7 @@ _LEAST_WIDTH = RUN + 2 * CURVATURE_BORDER
 """Of an image in which a run that begins inside ends inside of the array, if not of its row."""
 
 _AT_ONCE = 4
-"""Extrema of a run that are written without looking whether there are as many."""
+"""Extrema of a run that are written without a test of their number."""
 
 
 def curvature_and_maxima(
@@ -85,8 +85,9 @@ def maxima_of(image: U8, parameters: TrackingParameters, clearance: F32 | None =
 
 
 def uncovered(pixels: I32, maxima: F32, clearance: F32 | None) -> tuple[I32, F32]:
-    """Those maxima of a frame, as of ``find_maxima``, at which a patch has nothing of what its mask
-    covers."""
+    """Return the maxima of a frame, as of ``find_maxima``, whose patches do not overlap its
+    mask.
+    """
     if clearance is None:
         return pixels, maxima
     kept = np.flatnonzero(clearance.reshape(-1)[pixels] > REACH_PX)
@@ -125,7 +126,7 @@ def _limits(min_curvature: float, *, both_signs: bool) -> tuple[np.float32, np.f
 def subpixel_offset(before: np.float32, centre: np.float32, after: np.float32) -> np.float32:
     """Vertex of the parabola through three samples at -1, 0, 1, clamped to +-0.5 px."""
     curve = before - np.float32(2.0) * centre + after
-    # Branch-free, so that it vectorises: a straight line has its vertex nowhere, and stays.
+    # Branch-free, so that it vectorises: a straight line has no vertex, and is unchanged.
     rise = np.float32(0.5) * (before - after) if curve != np.float32(0.0) else np.float32(0.0)
     offset = rise / (curve if curve != np.float32(0.0) else np.float32(1.0))
     return min(max(offset, np.float32(-0.5)), np.float32(0.5))
@@ -194,7 +195,7 @@ def _extrema_of_row(
             bits &= (one << np.uint64(inside)) - one
         first = np.int32(y * width + x)
         end = n + count_bits(bits)
-        # A few at a time, wanted or not: a branch for each would be foretold wrongly.
+        # A few at a time, needed or not: a branch for each would be mispredicted.
         while True:
             for k in range(_AT_ONCE):
                 pixels[n + np.uint64(k)] = first + np.int32(first_bit(bits))
@@ -302,7 +303,7 @@ def write_extremum(
         twice = builder.fmul(constant(-2.0), splat(builder, centre, 4), flags=_FLAGS)
         curve = builder.fadd(twice, builder.fadd(before, after, flags=_FLAGS), flags=_FLAGS)
         rise = builder.fmul(constant(0.5), builder.fsub(before, after, flags=_FLAGS), flags=_FLAGS)
-        # A straight line has its vertex nowhere, and stays.
+        # A straight line has no vertex, and is unchanged.
         straight = builder.fcmp_ordered("==", curve, constant(0.0))
         curve = builder.select(straight, constant(1.0), curve)
         offset = builder.fdiv(builder.select(straight, constant(0.0), rise), curve)

@@ -6,7 +6,7 @@ from pliant.algorithms.parameters import Parameters
 
 
 class TrackingParameters(Parameters):
-    """What a user may change about tracking.  Lengths are pixels of the full-size image."""
+    """Parameters of tracking.  Lengths are pixels of the full-size image."""
 
     blur_sigma_px: float = Field(
         default=1.0, ge=0.5, le=1.3, description="Gaussian before the derivatives of Eq. 1, px."

@@ -39,7 +39,7 @@ TRACK = np.dtype(
         ("octave", np.int32),
     ]
 )
-"""A track.  All that a step needs of one lies together in memory."""
+"""A track.  All that a step needs is contiguous in memory."""
 
 Track: TypeAlias = Any
 """A record of type TRACK."""
@@ -48,11 +48,11 @@ Tracks: TypeAlias = Any
 
 
 class Patches(NamedTuple):
-    """What tracks look like, by the slot of a track.
+    """Appearance of tracks, by the slot of a track.
 
     templates: flat, TEMPLATE_FLOATS each.  births: flat, BIRTH_FLOATS grey levels around the patch
-    in the frame of birth.  deformations: (capacity, 8), the 2x2 map from then to now, and the one
-    that the template was made with.
+    in the frame of birth.  deformations: (capacity, 8), the 2x2 map from birth to now, and that of
+    the template.
     """
 
     templates: F32
@@ -75,7 +75,7 @@ class TrackTable:
 
     @staticmethod
     def with_capacity(capacity: int) -> "TrackTable":
-        """No tracks, and room for so many, and for half as many patches of others."""
+        """Return an empty table for this many tracks, and for half as many patches of lost ones."""
         patches = capacity + capacity // 2
         return TrackTable(
             count=0,

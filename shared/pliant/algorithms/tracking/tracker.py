@@ -35,7 +35,7 @@ MAX_BRIEF_DISTANCE_BITS = 64
 """Of 256: beyond this a pair is as likely chance as not."""
 
 _KAPPA_BITS = 8
-"""Significant ones that are told: of a cube of the contrast the sign and the size count."""
+"""Significant bits of a published kappa: of a cube of the contrast, sign and size matter."""
 
 
 class ExtremaTracker:
@@ -47,7 +47,7 @@ class ExtremaTracker:
     def __init__(
         self, width: int, height: int, parameters: TrackingParameters, seed: int = 0
     ) -> None:
-        """Prepare for frames of one size.  seed: of the comparisons that BRIEF makes."""
+        """Prepare for frames of one size.  seed: of the BRIEF comparisons."""
         self._parameters = parameters
         self._shape = (height, width)
         self._brief = BriefExtractor(np.random.default_rng(seed), parameters.flow_points)
@@ -58,10 +58,10 @@ class ExtremaTracker:
         self._scratch = np.zeros(TEMPLATE_FLOATS, np.float32)
         self._rows = np.zeros(parameters.max_tracks, np.int32)
         self._window = np.zeros((WINDOW_SIDE, WINDOW_SIDE), np.float32)
-        # Of the frame before; none of them means anything until has_previous.
+        # Of the frame before; undefined until has_previous.
         self._has_previous = False
         self._lost_at_once = False
-        self._kept: LastSharp | None = None  # from before most tracks were lost at once
+        self._kept: LastSharp | None = None  # the frame before most tracks were lost
         self._stamp_ns = 0
         self._smooth = np.zeros(self._shape, np.float32)
         self._spare_smooth = np.zeros(self._shape, np.float32)
@@ -77,12 +77,12 @@ class ExtremaTracker:
         timer: StageTimer = no_stages,
         clearance: F32 | None = None,
     ) -> FrameExtrema:
-        """Follow all tracks into the next frame and start new ones.
+        """Track all points into the next frame and start new tracks.
 
-        grey: (H, W) uint8, of the size given at the start.  stamp_ns: when it was taken,
-        increasing.  timer: told of each stage.  clearance: (H, W) of its mask, see
-        ``image.masks``; None: all of it is used.  No maximum and no patch of a track touches what
-        is not.  Raises ValueError for an image of another size or type.
+        grey: (H, W) uint8, of the size given at the start.  stamp_ns: capture time, increasing.
+        timer: called at each stage.  clearance: (H, W) of its mask, see ``image.masks``; None: the
+        whole image.  No maximum and no patch of a track overlaps the mask.  Raises ValueError for
+        an image of another size or type.
         """
         if grey.shape != self._shape or grey.dtype != np.uint8:
             raise ValueError(
@@ -187,7 +187,7 @@ class ExtremaTracker:
             table.free_count,
         )
         self._next_id += table.count - before
-        if clearance is not None:  # patches of half the size reach farther than their maxima keep
+        if clearance is not None:  # half-size patches are larger than the distance of maxima
             _end_covered(table.tracks, clearance)
             self._compact()
 
@@ -213,7 +213,7 @@ class ExtremaTracker:
         stamp_ns: int,
         clearance: F32 | None,
     ) -> None:
-        """Find tracks again that were lost with others, by the frame before that."""
+        """Recover tracks that were lost together, by the frame before the loss."""
         table, p = self._table, self._parameters
         lost = kept.lost(table)
         if not is_over(kept, lost, stamp_ns, p.coast_s):
@@ -266,7 +266,7 @@ class ExtremaTracker:
 
 
 def _end_covered(tracks: Tracks, clearance: F32 | None) -> None:
-    """Tracks end whose patch has come to touch what a mask covers."""
+    """End tracks whose patch overlaps the mask."""
     if clearance is None:
         return
     living = np.flatnonzero(tracks["alive"])

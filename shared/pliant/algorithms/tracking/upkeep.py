@@ -1,4 +1,4 @@
-"""Keeps the set of tracks in order: the dead go, new extrema take their places."""
+"""Upkeep of the track set: removes dead tracks and starts new ones at extrema."""
 
 from typing import NamedTuple
 
@@ -75,11 +75,11 @@ def start_tracks(
     free_slots: I32,
     free_count: int,
 ) -> tuple[int, int]:
-    """Start tracks at extrema that no track is near to, the strongest of each cell first.
+    """Start tracks at extrema that are far from all tracks, the strongest of each cell first.
 
-    pixels, maxima: from ``find_maxima``.  Every cell may hold its share of the table's capacity;
-    what weak cells leave goes to the strongest of the rest.  Returns (count, free_count); ids
-    count on from next_id.
+    pixels, maxima: from ``find_maxima``.  Every cell may use its share of the table's capacity; the
+    unused rest goes to the strongest remaining extrema.  Returns (count, free_count); ids continue
+    from next_id.
     """
     height, width = now.full.height, now.full.width
     cell, spacing = limits.cell, limits.spacing
@@ -142,7 +142,7 @@ def _take_patch(
     slot: int,
     patches: Patches,
 ) -> _Birth:
-    """Keep the patch around a point, at half size where there is little to see so near."""
+    """Store the patch around a point, at half size if it has little texture."""
     nothing = _Birth(0, 0, 0, np.float32(-1.0))
     octave = 0
     image = now.full
@@ -193,7 +193,7 @@ def _strongest_first(maxima: F32) -> I32:
 
 @fast_kernel
 def no_bits(height: int, width: int) -> NDArray[np.uint64]:
-    """Bits of an image, by flat pixel in words of 64, and one word more; none is set."""
+    """Return the cleared bits of an image, by flat pixel in words of 64, and one word more."""
     return np.zeros(height * width // 64 + 2, np.uint64)
 
 
