@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+from pliant.datasets.source_spec import SourceSpec
+
 sys.path.insert(0, str(Path(__file__).parent / "system"))
 
 import pytest
@@ -24,7 +26,9 @@ CUTS_S = (5.0, 30.0, 60.0)
 STOP_S = 60.0
 FAULT_FRAME = 10
 HOSTILE = 100_000  # on each key
-LONG = RunRequest(source="built-in:room")  # a few frames go on every ten seconds of the attack
+LONG = RunRequest(
+    source=SourceSpec(location="built-in:room")
+)  # a few frames go on every ten seconds of the attack
 IMAGES = 1000
 Row = tuple[str, bool, str]
 

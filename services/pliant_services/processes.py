@@ -9,6 +9,7 @@ from pliant.messages.topics import Topic
 
 if TYPE_CHECKING:
     from pliant.config import Config
+    from pliant.datasets.source_spec import SourceSpec
 
 
 @dataclass(frozen=True)
@@ -104,11 +105,12 @@ BY_NAME = {process.name: process for process in PROCESSES}
 COMPILED = tuple(process.name for process in PROCESSES if process.kernels)
 
 
-def reads_depth(fleet: Sequence[str], config: "Config") -> bool:
-    """Whether a service of the fleet works with the source's depth maps."""
-    return config.surfels.depth_from == "sensor" and any(
+def with_depth(source: "SourceSpec", fleet: Sequence[str], config: "Config") -> "SourceSpec":
+    """A source with the depth maps that a service of the fleet reads."""
+    reads = config.surfels.depth_from == "sensor" and any(
         topics.DEPTH in BY_NAME[name].inputs for name in fleet
     )
+    return source.model_copy(update={"depth": config.ingest.depth if reads else "none"})
 
 
 def deformable_fleet(config: "Config") -> str:

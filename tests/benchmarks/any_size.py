@@ -13,6 +13,7 @@ import cv2
 
 from benchmarks.in_process import run
 from benchmarks.table import markdown
+from pliant.config import IngestParameters
 from pliant.datasets import open_source
 from pliant.datasets.base import Dataset, SourceFrame, is_builtin
 from pliant.datasets.rectifier import decode
@@ -62,9 +63,11 @@ def measure(
         for size in sizes:
             width, height = (int(side) for side in size.split("x"))
             if is_builtin(name):
-                source = open_source(f"{name}?frames={frames}&width={width}", longest_side_px=width)
+                source = open_source(
+                    f"{name}?frames={frames}&width={width}", IngestParameters(longest_side_px=width)
+                )
             else:
-                source = open_source(name, longest_side_px=4096)
+                source = open_source(name, IngestParameters(longest_side_px=4096))
             source = at_working_size(_Sized(source, width, height))
             found.append((size, source.calibration, run(source, overrides, frames=frames)))
         best = min(mapped.ate_m for _, _, mapped in found)

@@ -19,6 +19,7 @@ from pliant.config import load_config
 from pliant.datasets import open_source
 from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.rectifier import decode
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.video_decoder import quiet_opencv
 from pliant.messages import topics
 from pliant.messages.types import SourceImage
@@ -62,7 +63,7 @@ def clip_of(source: str, file: Path, frames: int | None = None, width: int | Non
 
 def _row(file: Path, path: Path, clip: str) -> list[str]:
     config, bus = load_config(overrides=[f"recorder.clip={clip}"]), ReplayBus({})
-    dataset = open_source(str(file), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
     ingest.run(bus, config, SilentMonitor(), dataset, stopping=lambda: False)
     logged = {topic: messages for topic, messages in bus.outputs.items() if topic.logged}
     recorder.run(ReplayBus(logged), config, path, {})

@@ -17,6 +17,7 @@ from benchmarks.table import markdown_header, markdown_row
 from pliant.datasets import open_source
 from pliant.datasets.base import Dataset
 from pliant.datasets.calibration import calibration_from_fov
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError, PliantError
 from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.exit_codes import DONE, INCOMPLETE
@@ -62,7 +63,7 @@ def _focal(source: Dataset, seed: int, frames: int | None) -> tuple[float, float
 def _scale(name: str, source: Dataset, seed: int) -> tuple[float, float] | None:
     """Error and standard deviation, as shares; None where the source has no depth maps."""
     try:
-        open_source(name, depth="first")
+        open_source(SourceSpec(location=name, depth="first"))
     except DatasetError:
         return None
     with tempfile.TemporaryDirectory(prefix="pliant-coverage-") as made:

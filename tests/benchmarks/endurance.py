@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks.table import markdown
 from pliant.config import config_yaml, load_config
 from pliant.datasets.builtin import builtin_folder
+from pliant.datasets.source_spec import SourceSpec
 from pliant.messages.types import Status
 from pliant.results.folder import prepare
 from pliant_services.profiles import PROFILES
@@ -42,7 +43,10 @@ def measure(source: str, frames: int, minutes: float) -> Iterator[str]:
 
     with tempfile.TemporaryDirectory(prefix="pliant-endurance-") as folder:
         endless = forth_and_back(builtin_folder(source), Path(folder) / "source", frames, _FPS)
-        request, output = RunRequest(source=str(endless)), Path(folder) / "output"
+        request, output = (
+            RunRequest(source=SourceSpec(location=str(endless))),
+            Path(folder) / "output",
+        )
         prepare(output, config_yaml(config))
         fleet = Fleet(SERVICES, log_folder=output / "logs", on_status=on_status)
         try:

@@ -19,7 +19,7 @@ from pliant.algorithms.geometry import matrix_to_pose, so3_exp
 from pliant.config import load_config
 from pliant.datasets import open_source
 from pliant.datasets.base import SourceFrame
-from pliant.datasets.static_mask import StaticallyMasked
+from pliant.datasets.source_spec import SourceSpec
 from pliant.map_history import MapHistory
 from pliant.offline import Pipeline, Timers
 from pliant.rendering.scenes import SCENES
@@ -81,9 +81,8 @@ def _shown(value: float) -> str:
 
 def _row(source: Source, count: int, overrides: list[str]) -> list[float]:
     config = load_config(None, overrides)
-    dataset = StaticallyMasked(
-        open_source(source.name or hard_clip(), calibration=source.calibration, part=config.ingest)
-    )
+    spec = SourceSpec(location=source.name or hard_clip(), calibration=source.calibration)
+    dataset = open_source(spec, config.ingest)
     watch, at_end = (Stopwatch(time.process_time) for _ in range(2))
     history = MapHistory()
     pipeline = Pipeline(dataset.calibration, config, history, Timers(watch, watch))

@@ -102,7 +102,7 @@ def measure(
     off_centre: added to the principal point, across, as a share of the focal length."""
     yield markdown_header(_HEADER)
     for source in sources:
-        dataset = open_source(source, part=load_config(None, overrides).ingest)
+        dataset = open_source(source, load_config(None, overrides).ingest)
         given = dataset.calibration
         cx = given.cx + off_centre * given.fx
         lens = replace(given, fx=focal * given.fx, fy=focal * given.fy, cx=cx)

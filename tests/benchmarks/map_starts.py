@@ -29,7 +29,7 @@ def measure(
     yield markdown_header(_HEADER)
     config = load_config(None, overrides)
     for source in sources:
-        dataset = open_source(source, part=config.ingest)
+        dataset = open_source(source, config.ingest)
         truth = true_poses(dataset)
         frames = list(dataset)
         firsts = np.linspace(0, len(frames), starts, endpoint=False).astype(int).tolist()

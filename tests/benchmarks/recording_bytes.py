@@ -14,6 +14,7 @@ from pliant.algorithms.arrays import array_fields
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, config_yaml, load_config
 from pliant.datasets import open_source
+from pliant.datasets.source_spec import SourceSpec
 from pliant.messages import topics
 from pliant.recording.layout import CHUNK_BYTES, compress
 from pliant.recording.reader import Recording
@@ -45,7 +46,7 @@ def measure(
 def _record(video: Path, config: Config, path: Path) -> None:
     """What ``pliant run`` records, in one process."""
     bus = ReplayBus({})
-    dataset = open_source(str(video), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(video), fov_deg=60.0))
     ingest.run(bus, config, SilentMonitor(), dataset, stopping=lambda: False)
     logged = {topic: messages for topic, messages in bus.outputs.items() if topic.logged}
     images, metadata = path.with_name("images.mcap"), {"config": {"yaml": config_yaml(config)}}

@@ -19,6 +19,7 @@ from pliant.backwards import lost_stretches, reach_back
 from pliant.config import Config
 from pliant.datasets import Calibration, open_source
 from pliant.datasets.base import Dataset, SourceFrame
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.map_history import MapHistory
@@ -101,7 +102,7 @@ def measure(
     """Two rows for each source.   frames: the first ones; None: all."""
     yield markdown_header(_HEADER)
     for name in sources:
-        opened = open_source(name, part=config.ingest, calibration=calibration)
+        opened = open_source(SourceSpec(location=name, calibration=calibration), config.ingest)
         held = Frames(opened.calibration, list(opened)[:frames])
         try:
             truth = true_poses(opened)

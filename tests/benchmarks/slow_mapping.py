@@ -15,6 +15,7 @@ from benchmarks.table import markdown
 from pliant.algorithms.map_delta import WAITING
 from pliant.config import config_yaml, load_config
 from pliant.datasets.builtin import builtin_folder
+from pliant.datasets.source_spec import SourceSpec
 from pliant.messages.types import Status
 from pliant.results.folder import prepare
 from pliant_services.profiles import PROFILES
@@ -110,7 +111,10 @@ def measure(
     quarter = frames // 4
     with tempfile.TemporaryDirectory(prefix="pliant-slow-") as folder:
         endless = forth_and_back(builtin_folder(source), Path(folder) / "source", frames, fps)
-        request, output = RunRequest(source=str(endless)), Path(folder) / "output"
+        request, output = (
+            RunRequest(source=SourceSpec(location=str(endless))),
+            Path(folder) / "output",
+        )
         prepare(output, config_yaml(config))
         fleet = Fleet(SERVICES, log_folder=output / "logs", on_status=watch.on_status)
         try:

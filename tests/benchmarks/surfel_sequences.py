@@ -16,6 +16,7 @@ from pliant.datasets.base import BrokenFrame, is_builtin
 from pliant.datasets.builtin import builtin_folder, is_deforming
 from pliant.datasets.depth import DepthRectifier
 from pliant.datasets.rectifier import Rectifier
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 from pliant.evaluation.surface_truth import SurfaceTruth
 
@@ -50,7 +51,7 @@ def load(source: str, frames: int, *, all_depths: bool = False) -> Sequence:
     Raises DatasetError.
     """
     folder = str(builtin_folder(source)) if is_builtin(source) else source
-    dataset = open_source(folder, depth="all")
+    dataset = open_source(SourceSpec(location=folder, depth="all"))
     rectifier, depths = Rectifier(dataset.calibration), DepthRectifier(dataset.calibration)
     exact = is_deforming(source)
     images: list[U8] = []

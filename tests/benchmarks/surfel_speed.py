@@ -20,6 +20,7 @@ from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 from pliant.datasets import open_source
 from pliant.datasets.depth import DepthRectifier
 from pliant.datasets.rectifier import Rectifier
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 from pliant.rendering.film import CameraOptions
 from pliant.rendering.paths import SampledPath
@@ -115,7 +116,7 @@ def _board(count: int) -> tuple[list[U8], F64, PinholeCamera]:
 
 
 def _film(source: str, count: int) -> tuple[list[U8], F64, PinholeCamera]:
-    dataset = open_source(source, depth="first")
+    dataset = open_source(SourceSpec(location=source, depth="first"))
     rectifier, depths = Rectifier(dataset.calibration), DepthRectifier(dataset.calibration)
     images: list[U8] = []
     depth: F64 | None = None

@@ -55,7 +55,7 @@ def measure(
     config = load_config(None, overrides)
     found: list[tuple[float, float]] = []
     for source in sources:
-        dataset = open_source(source, part=config.ingest)
+        dataset = open_source(source, config.ingest)
         truth = true_poses(dataset)
         given = list(dataset)
         last = max(0, len(given) - frames)

@@ -15,6 +15,7 @@ from statistics import median
 
 from benchmarks.table import markdown, markdown_header, markdown_row
 from pliant.config import config_yaml, load_config
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import PliantError
 from pliant.exit_codes import DONE, INCOMPLETE
 from pliant.messages import topics
@@ -128,7 +129,7 @@ def run_once(
     kill: at which share of the run, and whom.     beside: entered before the services start.
     """
     warm_up.compile_kernels(print)
-    request = RunRequest(source=source)
+    request = RunRequest(source=SourceSpec(location=source))
     prepare(output, config_yaml(load_config()))
     times: list[float] = []
     when = _Killer(kill)

@@ -13,6 +13,7 @@ from pliant.config import Config, IngestParameters, load_config
 from pliant.datasets import open_source
 from pliant.datasets.base import Dataset
 from pliant.datasets.recorded_images import RecordedImages
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.video_decoder import quiet_opencv
 from pliant.messages import topics
 from pliant.messages.topics import Topic
@@ -75,7 +76,7 @@ def published_on(bus: ReplayBus) -> list[SourceImage]:
 
 
 def opened(clip: Path, **part: float) -> Dataset:
-    return open_source(str(clip), fov_deg=60.0, part=IngestParameters(**part))  # type: ignore[arg-type]
+    return open_source(SourceSpec(location=str(clip), fov_deg=60.0), IngestParameters(**part))  # type: ignore[arg-type]
 
 
 def references(path: Path) -> list[SourceImage]:

@@ -10,6 +10,7 @@ import pytest
 from result_room import contents
 
 from pliant.config import config_yaml, load_config
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import RecordingError, ResultError
 from pliant.files import make_folder
 from pliant.recording.parts import PART
@@ -204,7 +205,11 @@ def test_a_run_that_ends_before_its_first_frame_leaves_a_result_as_it_was(
         (others / "logs" / "diary.txt").write_text("somebody's")
         for output in (room, tmp_path / "new", others):
             with pytest.raises((KeyboardInterrupt, ResultError, ServiceDiedError)) as raised:
-                run_pipeline(RunRequest(source="built-in:tiny", output=output, force=True))
+                run_pipeline(
+                    RunRequest(
+                        source=SourceSpec(location="built-in:tiny"), output=output, force=True
+                    )
+                )
             assert raised.type is type(error)
         assert {**contents(room), "metadata.json": before["metadata.json"]} == before
         assert (tmp_path / "new").exists() == (getattr(error, "crashed", False))

@@ -9,6 +9,7 @@ import pytest
 from result_room import evaluation, refused
 
 from pliant.config import load_config
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import PliantError, ResultError, SourceLostError
 from pliant.export.export import export_result
 from pliant.results.folder import (
@@ -40,9 +41,9 @@ def test_one_process_writes_a_result_folder_and_a_dead_one_holds_nobody_up(room:
         holder.stdout.readline()
         waits = f"is being written by process {holder.pid}: wait until it ends$"
         says = f"{waits[:-1]}, or choose another --output$"
-        run = RunRequest(source="built-in:tiny", output=room, force=True)
+        run = RunRequest(source=SourceSpec(location="built-in:tiny"), output=room, force=True)
         refused(lambda: run_pipeline(run), room, says)
-        resumed = RunRequest(source="built-in:tiny", output=room, resume=True)
+        resumed = RunRequest(source=SourceSpec(location="built-in:tiny"), output=room, resume=True)
         refused(lambda: run_pipeline(resumed), room, says)
         other = room.with_name("other.mcap")
         os.link(room / "recording.mcap", other)
@@ -62,7 +63,7 @@ def test_one_process_writes_a_result_folder_and_a_dead_one_holds_nobody_up(room:
 
 def test_recorders_of_several_sessions_hold_one_folder_against_a_run(room: Path) -> None:
     says = f"is being written by process {os.getpid()}"
-    run = RunRequest(source="built-in:tiny", output=room, force=True)
+    run = RunRequest(source=SourceSpec(location="built-in:tiny"), output=room, force=True)
     with recorded_into(room):
         with recorded_into(room):
             refused(lambda: run_pipeline(run), room, says)
@@ -95,7 +96,9 @@ def test_every_recorder_holds_its_folder(
 def test_a_folder_that_nothing_came_of_goes(tmp_path: Path) -> None:
     output = tmp_path / "results" / "none"
     with pytest.raises(PliantError, match="no such"):
-        run_pipeline(RunRequest(source=str(tmp_path / "none.mp4"), output=output))
+        run_pipeline(
+            RunRequest(source=SourceSpec(location=str(tmp_path / "none.mp4")), output=output)
+        )
     assert not output.parent.exists()
     with (
         written(output, force=False),

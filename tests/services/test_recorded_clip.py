@@ -30,6 +30,7 @@ from pliant.config import Config, IngestParameters
 from pliant.datasets import open_source
 from pliant.datasets.clip import clip_of
 from pliant.datasets.recorded_images import RecordedImages
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import RecordingError, SourceLostError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
@@ -93,9 +94,9 @@ def test_the_recording_of_a_video_is_as_large_as_the_video(clip: Path, tmp_path:
 def test_a_part_of_a_video_and_a_smaller_size(
     clip: Path, tmp_path: Path, part: dict[str, float]
 ) -> None:
-    side = int(part.pop("longest_side_px", 0))
+    side = part.get("longest_side_px")
     chosen = IngestParameters(**part)  # type: ignore[arg-type]
-    dataset = open_source(str(clip), fov_deg=60.0, longest_side_px=side, part=chosen)
+    dataset = open_source(SourceSpec(location=str(clip), fov_deg=60.0), chosen)
     published = record(dataset, tmp_path / "recording.mcap")
     assert {(m.width, m.height) for m in published} == {(96, 72) if side else (WIDTH, HEIGHT)}
     assert not any(m.data for m in references(tmp_path / "recording.mcap"))
@@ -109,8 +110,8 @@ def test_a_masked_video_is_recorded_as_the_video_and_its_masks(clip: Path, tmp_p
         mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
         mask[:, : number + 1] = 0
         cv2.imwrite(str(masks / f"{number}.png"), mask)
-    part = IngestParameters(start_s=0.95, every=5)
-    dataset = open_source(str(clip), fov_deg=60.0, longest_side_px=96, part=part, mask=masks)
+    part = IngestParameters(start_s=0.95, every=5, longest_side_px=96)
+    dataset = open_source(SourceSpec(location=str(clip), fov_deg=60.0, mask=masks), part)
     path = tmp_path / "recording.mcap"
     published = record(dataset, path)
     assert not any(m.data for m in references(path))

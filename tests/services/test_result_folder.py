@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from result_room import evaluation, refused
 
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import ResultError
 from pliant.export.export import export_result
 from pliant.results.folder import (
@@ -45,17 +46,26 @@ def test_a_run_does_not_destroy_what_it_reads(
         ("other/video.mp4", "other"),
         ("room", "."),
     ):
-        request = RunRequest(source=source, output=Path(output) if output else None, force=True)
+        request = RunRequest(
+            source=SourceSpec(location=source), output=Path(output) if output else None, force=True
+        )
         refused(lambda request=request: run_pipeline(request), room)
     monkeypatch.chdir(room)
-    refused(lambda: run_pipeline(RunRequest(source=".", output=Path("."), force=True)), room)
+    refused(
+        lambda: run_pipeline(
+            RunRequest(source=SourceSpec(location="."), output=Path("."), force=True)
+        ),
+        room,
+    )
 
 
 def test_a_run_does_not_destroy_the_calibration_that_it_is_given(room: Path) -> None:
     """What a run has found is for the next one: not into the same folder."""
     found = room / "calibration.yaml"
     found.write_text("found by an earlier run")
-    run = RunRequest(source="built-in:tiny", output=room, calibration=found, force=True)
+    run = RunRequest(
+        source=SourceSpec(location="built-in:tiny", calibration=found), output=room, force=True
+    )
     refused(lambda: run_pipeline(run), room, f"{READ}: choose another --output")
 
 
@@ -63,13 +73,15 @@ def test_parts_are_read_wherever_they_are(room: Path, tmp_path: Path) -> None:
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     (folder / "part_00000.mcap").symlink_to(room / "recording.mcap")
-    request = RunRequest(source=str(folder), output=room, force=True)
+    request = RunRequest(source=SourceSpec(location=str(folder)), output=room, force=True)
     refused(lambda: run_pipeline(request), room)
 
 
 @pytest.mark.parametrize("save", ["recording.mcap", "report.json", "../room/config.yaml"])
 def test_a_view_is_not_saved_over_the_run_that_it_shows(room: Path, save: str) -> None:
-    request = RunRequest(source="built-in:tiny", output=room, save=room / save, force=True)
+    request = RunRequest(
+        source=SourceSpec(location="built-in:tiny"), output=room, save=room / save, force=True
+    )
     refused(lambda: run_pipeline(request), room, f"{READ}: choose another --save")
 
 

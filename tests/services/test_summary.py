@@ -15,6 +15,7 @@ from pliant.algorithms.map_delta import LOST, TRACKING, MapDelta
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameTracks
+from pliant.datasets.source_spec import SourceSpec
 from pliant.exit_codes import DONE, INCOMPLETE
 from pliant.map_history import Keyframe
 from pliant.messages import codec, topics
@@ -213,7 +214,11 @@ def test_a_run_that_was_interrupted_before_it_recorded_has_nothing_to_mesh(
     monkeypatch.setattr(pipeline, "Fleet", lambda *_, **options: None)
     source = "built-in:tiny?frames=8"
     with pytest.raises(KeyboardInterrupt):
-        run_pipeline(RunRequest(source=source, output=tmp_path / "run", on_crash="restart"))
+        run_pipeline(
+            RunRequest(
+                source=SourceSpec(location=source), output=tmp_path / "run", on_crash="restart"
+            )
+        )
 
 
 def test_frames_that_waited_for_the_map_count_no_inliers(tmp_path: Path) -> None:

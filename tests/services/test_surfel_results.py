@@ -7,6 +7,7 @@ import pytest
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import config_yaml, load_config
 from pliant.datasets import open_source
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import ResultError
 from pliant.export.export import export_result
 from pliant.export.kinds import OF_STILL_SCENES
@@ -30,7 +31,7 @@ def test_depth_that_was_made_up_is_doubtful_and_not_in_metres(
     config = load_config(None, [*settings, f"surfels.depth_from={depth_from}"])
     source = ReplayBus({})
     depth = "all" if depth_from == "sensor" else "none"
-    dataset = open_source(f"built-in:tiny?frames={FRAMES}", depth=depth)
+    dataset = open_source(SourceSpec(location=f"built-in:tiny?frames={FRAMES}", depth=depth))
     ingest.run(source, config, SilentMonitor(), dataset, stopping=lambda: False)
     inputs = (topics.STREAM, topics.IMAGE, topics.DEPTH)
     followed = ReplayBus({topic: source.outputs[topic] for topic in inputs})

@@ -10,6 +10,7 @@ from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, load_config
 from pliant.datasets import open_source
+from pliant.datasets.source_spec import SourceSpec
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import WAITING_FOR_DEPTH, Depth, Header, Image, Surfels
@@ -29,7 +30,7 @@ def config() -> Config:
 @pytest.fixture(scope="module")
 def ingested(config: Config) -> Messages:
     bus = ReplayBus({})
-    dataset = open_source(f"built-in:tiny?frames={FRAMES}", depth="all")
+    dataset = open_source(SourceSpec(location=f"built-in:tiny?frames={FRAMES}", depth="all"))
     ingest.run(bus, config, SilentMonitor(), dataset, stopping=lambda: False)
     return bus.outputs
 

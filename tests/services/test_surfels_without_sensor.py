@@ -17,6 +17,7 @@ from pliant.config import Config, load_config
 from pliant.datasets import open_source
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.depth import DepthRectifier
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import ConfigError
 from pliant.map_history import CurrentMap
 from pliant.messages import codec, topics
@@ -53,7 +54,7 @@ def everything() -> Messages:
     """What all services of a fleet make of a rigid scene that comes into view."""
     config, monitor = load_config(), SilentMonitor()
     source = ReplayBus({})
-    dataset = open_source(f"{SOURCE}&frames={FRAMES}", depth="all")
+    dataset = open_source(SourceSpec(location=f"{SOURCE}&frames={FRAMES}", depth="all"))
     ingest.run(source, config, monitor, dataset, stopping=lambda: False)
     made = dict(source.outputs)
     for name, service in (("tracking", tracking), ("bundle_adjustment", bundle_adjustment)):

@@ -18,6 +18,7 @@ from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config
 from pliant.datasets import open_source
 from pliant.datasets.depth import DepthRectifier
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import ResultError
 from pliant.export import overview
 from pliant.export.export import export_result
@@ -227,7 +228,7 @@ def test_depth_is_that_of_the_map_in_the_unit_that_is_said(
     pycolmap: Any = import_module("pycolmap")
     read = pycolmap.Reconstruction(str(model / "sparse" / "0"))
     folder = export_result(result, "depth", tmp_path / "depth")
-    source = open_source(str(folder), depth="all")
+    source = open_source(SourceSpec(location=str(folder), depth="all"))
     rectifier, lens = DepthRectifier(source.calibration), source.calibration.lens
     assert source.frame_count is not None
     assert source.frame_count >= read.num_images() - 1

@@ -23,6 +23,7 @@ from pliant.datasets import open_source
 from pliant.datasets.calibration import calibration_yaml
 from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.rectifier import decode
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.video_decoder import quiet_opencv
 from pliant.messages import topics
 from pliant.messages.types import ClipPiece, MapUpdate, SourceImage, Status
@@ -44,7 +45,7 @@ FRAMES = 40
 SERVICES = PROFILES["points"]
 _HELD_S, _LET_GO_S = 10.0, 0.01
 _ATTEMPTS = 5
-REQUEST = RunRequest(source=TINY)
+REQUEST = RunRequest(source=SourceSpec(location=TINY))
 
 
 def run(
@@ -189,7 +190,7 @@ def replayed(recorded: Path, output: Path, frames: int = FRAMES) -> dict[str, st
 
 def in_map(known: Path) -> RunRequest:
     """A run that goes on in a map."""
-    return RunRequest(source=TINY, known=known)
+    return RunRequest(source=SourceSpec(location=TINY), known=known)
 
 
 @pytest.mark.slow
@@ -215,7 +216,10 @@ def test_a_run_is_taken_up_in_its_own_map(tmp_path: Path, tiny_run: Path) -> Non
     assert_one_line(refused, "which has none")
     note = tmp_path / "cut" / STATE_FOLDER / "known_map"
     note.write_text(str(tiny_run / "map.pliant"))
-    assert resumed_map(tmp_path / "cut", RunRequest(source=TINY)) == tiny_run / "map.pliant"
+    assert (
+        resumed_map(tmp_path / "cut", RunRequest(source=SourceSpec(location=TINY)))
+        == tiny_run / "map.pliant"
+    )
     assert resumed_map(tmp_path / "cut", in_map(tiny_run)) == tiny_run / "map.pliant"
     note.write_text(str(tmp_path / "gone" / "map.pliant"))
     refused = in_this_process("run", TINY, "--resume", "--output", tmp_path / "cut")
@@ -236,7 +240,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> RunRequest:
     writer.release()
     calibration = file.with_suffix(".yaml")
     calibration.write_text(calibration_yaml(open_source(TINY).calibration))
-    return RunRequest(source=str(file))
+    return RunRequest(source=SourceSpec(location=str(file)))
 
 
 def test_the_recording_of_a_video_has_all_images_whoever_is_killed(
@@ -254,7 +258,7 @@ def test_the_recording_of_a_video_has_all_images_whoever_is_killed(
     made = [image.data for image in RecordedImages(recording)]
     assert made == [frame.data for frame in open_source(clip.source)]
     pieces = [m for m in recording.decoded(topics.CLIP) if isinstance(m, ClipPiece)]
-    assert b"".join(piece.data for piece in pieces) == Path(clip.source).read_bytes()
+    assert b"".join(piece.data for piece in pieces) == Path(clip.source.location).read_bytes()
 
 
 @pytest.fixture(scope="module")
@@ -272,7 +276,7 @@ def torn(tmp_path_factory: pytest.TempPathFactory) -> RunRequest:
     for number, image in enumerate(shown):
         cv2.imwrite(str(folder / f"{number:03}.png"), image)
     (folder / "calib.yaml").write_text(calibration_yaml(source.calibration))
-    return RunRequest(source=str(folder))
+    return RunRequest(source=SourceSpec(location=str(folder)))
 
 
 def test_bundle_adjustment_is_killed_after_a_loss_and_while_maps_become_one(

@@ -11,6 +11,7 @@ from running import TINY, pliant
 
 from pliant.config import config_yaml, load_config
 from pliant.datasets.builtin import builtin_folder
+from pliant.datasets.source_spec import SourceSpec
 from pliant.messages import topics
 from pliant.messages.types import PASSED_OVER, Extrema, MapUpdate, SourceImage, Status
 from pliant.recording.reader import Recording
@@ -36,7 +37,7 @@ def test_tracking_goes_on_and_the_run_can_be_replayed(tmp_path: Path) -> None:
     output = tmp_path / "run"
     config = load_config(overrides=["ingest.mode=live", f"bus.window={WINDOW}"])
     source = forth_and_back(builtin_folder(TINY), tmp_path / "source", FRAMES, FPS)
-    request = RunRequest(source=str(source))
+    request = RunRequest(source=SourceSpec(location=str(source)))
     prepare(output, config_yaml(config))
     stood_still: list[bool] = []
 

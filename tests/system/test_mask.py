@@ -18,6 +18,7 @@ import pliant as pliant_api
 from pliant.algorithms.image.masks import clearance_of, unpacked
 from pliant.datasets import open_source
 from pliant.datasets.builtin import builtin_folder
+from pliant.datasets.source_spec import SourceSpec
 from pliant.export.export import export_result
 from pliant.export.models import draw
 from pliant.messages import topics
@@ -131,7 +132,7 @@ def test_its_recording_is_a_source_with_the_mask(result: Path, bonnet: Path) -> 
     assert unpacked(first.mask).shape == (120, 160)
     anew = bonnet / "other.png"
     cv2.imwrite(str(anew), np.eye(240, 320, dtype=np.uint8))
-    masked = next(iter(open_source(str(result), mask=anew)))
+    masked = next(iter(open_source(SourceSpec(location=str(result), mask=anew))))
     assert unpacked(masked.mask).shape == (240, 320)
 
 

@@ -10,6 +10,7 @@ import pytest
 from running import TINY, assert_one_line, digests, in_this_process, pliant
 
 from pliant.datasets.builtin import builtin_folder
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import PliantError
 from pliant.formats.tum import read_tum
 from pliant.recording.map_file import MapFile
@@ -42,7 +43,9 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 @pytest.fixture
 def first(late: tuple[Path, Path], tmp_path: Path) -> tuple[RunRequest, Path]:
     output = Path(shutil.copytree(late[1], tmp_path / "result"))
-    return RunRequest(source=str(late[0]), output=output, quality="high"), output
+    return RunRequest(
+        source=SourceSpec(location=str(late[0])), output=output, quality="high"
+    ), output
 
 
 def contents(folder: Path) -> dict[str, bytes]:

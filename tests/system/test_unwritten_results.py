@@ -17,6 +17,7 @@ from running import (
     services_of,
 )
 
+from pliant.datasets.source_spec import SourceSpec
 from pliant.recording.recover import recover
 from pliant.results.folder import STATE_FOLDER
 from pliant_services.run.command import run_pipeline
@@ -83,7 +84,10 @@ def test_what_resumes_a_run_stays_until_its_results_stand(
         raise KilledError
 
     request = RunRequest(
-        source=TINY, output=tmp_path / "tiny", on_crash="restart", overrides=NO_MESH[1:]
+        source=SourceSpec(location=TINY),
+        output=tmp_path / "tiny",
+        on_crash="restart",
+        overrides=NO_MESH[1:],
     )
     with monkeypatch.context() as patch:
         patch.setattr("pliant.results.write.write_results", killed)

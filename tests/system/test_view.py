@@ -16,6 +16,7 @@ from benchmarks.viewer_cost import run_with
 from running import command, in_this_process, pliant
 
 from pliant.bus.session import free_endpoint
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import ResultError
 from pliant.viewers import rerun, rerun_data
 from pliant.viewers.rerun import RerunCanvas
@@ -105,7 +106,9 @@ def test_a_viewer_that_cannot_start_leaves_an_earlier_result(
         with pytest.raises(ResultError, match=says):
             check_viewer(output, web=False, save=save, force=True)
     with pytest.raises(ResultError, match="--force"):
-        run_pipeline(RunRequest(source="built-in:tiny", output=output, save=there))
+        run_pipeline(
+            RunRequest(source=SourceSpec(location="built-in:tiny"), output=output, save=there)
+        )
     assert there.read_text() == "mine"
     assert not output.exists()
 

@@ -11,6 +11,7 @@ import pliant
 from pliant import datasets
 from pliant.config import overrides_of
 from pliant.datasets import open_source, sources_in
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import ConfigError, DatasetError, ResultError
 from pliant.formats.tum import write_tum
 
@@ -26,11 +27,11 @@ class Shades:
     ground_truth_path = None
     notes = ["shades are flat"]
 
-    def __init__(self, source, options):
-        self.levels = [int(line) for line in Path(source).read_text().split()]
-        self.name = Path(source).stem
+    def __init__(self, spec):
+        self.levels = [int(line) for line in Path(spec.location).read_text().split()]
+        self.name = Path(spec.location).stem
         self.frame_count = len(self.levels)
-        self.calibration = calibration_from_fov(32, 24, options.fov_deg)
+        self.calibration = calibration_from_fov(32, 24, spec.fov_deg)
 
     def __iter__(self):
         for index, level in enumerate(self.levels):
@@ -64,7 +65,7 @@ def test_a_package_brings_a_format_along(plugin: Path, tmp_path: Path) -> None:
     clips = tmp_path / "clips"
     clips.mkdir()
     (clips / "a.shades").write_text("3 4 5")
-    source = open_source(str(clips / "a.shades"), fov_deg=70.0)
+    source = open_source(SourceSpec(location=str(clips / "a.shades"), fov_deg=70.0))
     assert [frame.data[0] for frame in source] == [3, 4, 5]
     assert datasets.notes_on(source) == ["shades are flat"]
     assert sources_in(clips, but=tmp_path / "results") == [clips / "a.shades"]

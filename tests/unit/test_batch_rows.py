@@ -9,6 +9,7 @@ import pytest
 
 from pliant.config import config_yaml, load_config
 from pliant.datasets import sources_in
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError, ResultError
 from pliant.results.folder import folder_name
 from pliant_services.batch.command import run_batch
@@ -57,9 +58,14 @@ def test_a_run_is_taken_up_with_the_options_that_it_was_begun_with(tmp_path: Pat
     (tmp_path / "state").mkdir()
     settings = ["tracking.max_tracks=5000"]
     (tmp_path / "config.yaml").write_text(config_yaml(load_config(overrides=settings, seed=3)))
-    same = RunRequest(source="a.mp4", overrides=settings, seed=3)
-    assert resumed_config(tmp_path, same) == resumed_config(tmp_path, RunRequest(source="a.mp4"))
-    for other in (RunRequest(source="a.mp4", overrides=settings), RunRequest(source="a", seed=4)):
+    same = RunRequest(source=SourceSpec(location="a.mp4"), overrides=settings, seed=3)
+    assert resumed_config(tmp_path, same) == resumed_config(
+        tmp_path, RunRequest(source=SourceSpec(location="a.mp4"))
+    )
+    for other in (
+        RunRequest(source=SourceSpec(location="a.mp4"), overrides=settings),
+        RunRequest(source=SourceSpec(location="a"), seed=4),
+    ):
         with pytest.raises(ResultError, match="and this one differs"):
             resumed_config(tmp_path, other)
 

@@ -10,6 +10,7 @@ from recorded_messages import HEIGHT, WIDTH, Ros
 
 from pliant.datasets import notes_on, open_source
 from pliant.datasets.rectifier import decode
+from pliant.datasets.source_spec import SourceSpec
 
 COUNT = 30
 
@@ -27,7 +28,7 @@ def test_the_bits_that_are_used_become_eight_in_all_images_alike(
 ) -> None:
     for row in range(COUNT):
         assert cv2.imwrite(str(tmp_path / f"{row}{suffix}"), grey(row, bits))
-    source = open_source(str(tmp_path), fov_deg=60.0)
+    source = open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0))
     for row, frame in enumerate(source):
         assert np.array_equal(decode(frame), grey(row, bits) >> (bits - 8))
     assert f"16-bit images use {bits} bits: these are scaled to 8 bits, in all images alike" in (
@@ -39,7 +40,7 @@ def test_colour_too(tmp_path: Path) -> None:
     bgr = np.dstack([grey(0, 12), grey(9, 12), grey(COUNT - 1, 12)])
     for row in range(3):
         cv2.imwrite(str(tmp_path / f"{row}.png"), bgr)
-    for frame in open_source(str(tmp_path), fov_deg=60.0):
+    for frame in open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0)):
         assert np.array_equal(decode(frame), bgr[:, :, ::-1] >> 4)
 
 
@@ -48,7 +49,7 @@ def test_what_uses_all_bits_or_has_eight_stays_as_it_is(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         for row in range(2):
             cv2.imwrite(str(tmp_path / name / f"{row}.png"), pixels)
-        source = open_source(str(tmp_path / name), fov_deg=60.0)
+        source = open_source(SourceSpec(location=str(tmp_path / name), fov_deg=60.0))
         assert [frame.encoding for frame in source] == ["png", "png"]
         assert len(notes_on(source)) == 1
         expected = pixels >> 8 if name == "deep" else pixels
@@ -66,7 +67,7 @@ def test_messages_of_twelve_bits(big: int, tmp_path: Path) -> None:
         for row in range(3)
     ]  # fmt: skip
     bags.write_ros2_bag(tmp_path / "bag", ros, {"/image": images})
-    for frame in open_source(str(tmp_path / "bag"), fov_deg=70.0):
+    for frame in open_source(SourceSpec(location=str(tmp_path / "bag"), fov_deg=70.0)):
         assert np.array_equal(decode(frame), grey(COUNT - 1, 12) >> 4)
 
 
@@ -96,7 +97,7 @@ def test_every_yuv_gives_its_colours(encoding: str, padding: int, tmp_path: Path
     image = ros.image(0, encoding=encoding)
     image.data, image.step = rows.reshape(-1), rows.shape[1]
     bags.write_ros2_bag(tmp_path / "bag", ros, {"/image": [image]})
-    (frame,) = open_source(str(tmp_path / "bag"), fov_deg=70.0)
+    (frame,) = open_source(SourceSpec(location=str(tmp_path / "bag"), fov_deg=70.0))
     assert np.abs(decode(frame).astype(int) - rgb).max() <= 6
 
 
@@ -108,7 +109,7 @@ def test_bayer_of_sixteen_bits(pattern: str, tmp_path: Path) -> None:
     ros = Ros(2)
     image = ros.image(0, encoding=f"bayer_{pattern}16", pixels=mosaic)
     bags.write_ros2_bag(tmp_path / "bag", ros, {"/image": [image]})
-    (frame,) = open_source(str(tmp_path / "bag"), fov_deg=70.0)
+    (frame,) = open_source(SourceSpec(location=str(tmp_path / "bag"), fov_deg=70.0))
     assert (decode(frame)[2:-2, 2:-2] == np.array([3000, 1500, 200]) >> 4).all()
 
 

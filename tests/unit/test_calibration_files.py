@@ -11,6 +11,7 @@ from recorded_messages import Ros
 
 from pliant.datasets import open_source
 from pliant.datasets.calibration_files import read_calibration
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError
 
 SIZE = (640, 480)
@@ -157,9 +158,13 @@ def test_of_a_chain_the_folder_or_the_topic_of_a_source_tells(tmp_path: Path) ->
     cv2.imwrite(str(camera / "data" / "1.png"), np.zeros((bags.HEIGHT, bags.WIDTH), np.uint8))
     (camera / "data.csv").write_text("1403636579763555584,1.png\n")
     for n in range(2):
-        opened = open_source(str(tmp_path / "bag"), topic=f"/cam{n}/image_raw", calibration=chain)
+        opened = open_source(
+            SourceSpec(
+                location=str(tmp_path / "bag"), topic=f"/cam{n}/image_raw", calibration=chain
+            )
+        )
         assert opened.calibration.fx == 40.0 + n
-    assert open_source(str(camera), calibration=chain).calibration.fx == 41.0
+    assert open_source(SourceSpec(location=str(camera), calibration=chain)).calibration.fx == 41.0
 
 
 @pytest.mark.parametrize(

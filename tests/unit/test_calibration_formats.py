@@ -11,6 +11,7 @@ import pytest
 from pliant.datasets import open_source
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_files import read_calibration
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError
 
 ORB_SLAM2 = """%YAML:1.0
@@ -203,5 +204,5 @@ def test_a_source_is_opened_with_the_file_of_another_program(tmp_path: Path) -> 
     (tmp_path / "images").mkdir()
     cv2.imwrite(str(tmp_path / "images" / "0.png"), np.zeros((480, 640), np.uint8))
     file = written(tmp_path, TRANSFORMS, "transforms.json")
-    source = open_source(str(tmp_path / "images"), calibration=file)
+    source = open_source(SourceSpec(location=str(tmp_path / "images"), calibration=file))
     assert intrinsics(source.calibration) == (500.0, 501.0, 320.0, 240.0)

@@ -17,6 +17,7 @@ from pliant.datasets import open_source
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import Calibration, DepthImages
 from pliant.datasets.depth import DepthRectifier
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError, DatasetError
 
 WIDTH, HEIGHT = 32, 24
@@ -47,7 +48,7 @@ def sequence(
 
 def found(folder: Path, depth: str) -> list[float]:
     """The depth of each frame in metres, 0 without."""
-    source = open_source(str(folder), depth=depth)  # type: ignore[arg-type]
+    source = open_source(SourceSpec(location=str(folder), depth=depth))  # type: ignore[arg-type]
     rectifier = DepthRectifier(source.calibration)
     return [
         float(rectifier.rectify(frame.index, frame.depth)[0, 0]) if frame.depth else 0.0
@@ -71,14 +72,19 @@ def test_a_source_without_depth_is_refused_in_one_line(tmp_path: Path) -> None:
     folder = sequence(tmp_path / "s", [(0.0, 1000)])
     (folder / "depth.txt").unlink()
     with pytest.raises(DatasetError, match=r"no depth\.txt"):
-        open_source(str(folder), depth="first")
+        open_source(SourceSpec(location=str(folder), depth="first"))
     assert len(list(open_source(str(folder)))) == 4
     with pytest.raises(DatasetError, match="has no depth: use"):
-        open_source(str(folder / "images"), fov_deg=60.0, depth="first")
+        open_source(SourceSpec(location=str(folder / "images"), fov_deg=60.0, depth="first"))
     with pytest.raises(CalibrationError, match="depth_scale"):
-        open_source(str(sequence(tmp_path / "t", [(0.0, 1000)], depth_scale=None)), depth="first")
+        open_source(
+            SourceSpec(
+                location=str(sequence(tmp_path / "t", [(0.0, 1000)], depth_scale=None)),
+                depth="first",
+            )
+        )
     with pytest.raises(DatasetError, match="within 20 ms"):
-        open_source(str(sequence(tmp_path / "u", [(5.0, 1000)])), depth="all")
+        open_source(SourceSpec(location=str(sequence(tmp_path / "u", [(5.0, 1000)])), depth="all"))
 
 
 def test_depth_goes_into_the_pixels_of_the_rectified_image() -> None:

@@ -13,6 +13,7 @@ from pliant.datasets.base import Dataset
 from pliant.datasets.calibration import UNSAID_SIGMA
 from pliant.datasets.images import image_files
 from pliant.datasets.rectifier import Rectifier, decode
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.times import nanoseconds, number_of
 from pliant.errors import CalibrationError, DatasetError, PliantError
 
@@ -99,7 +100,7 @@ def kitti(folder: Path, camera: int = 0) -> Path:
 
 def refused(source: Path | str, kind: type[PliantError] = DatasetError, **options: object) -> str:
     with pytest.raises(kind) as caught:
-        open_source(str(source), **options)  # type: ignore[arg-type]
+        open_source(SourceSpec(location=str(source), **options))  # type: ignore[arg-type]
     line = str(caught.value)
     assert "\n" not in line
     return line
@@ -229,7 +230,7 @@ def test_bare_folder(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("")
     names = [path.name for path in image_files(tmp_path)]
     assert names == ["frame1.png", "frame9.jpg", "frame10.png"]
-    dataset = open_source(str(tmp_path), fov_deg=90.0)
+    dataset = open_source(SourceSpec(location=str(tmp_path), fov_deg=90.0))
     assert stamps(dataset) == [0, 33333333, 66666667]
     assert dataset.calibration.fx == pytest.approx(32.0)
     assert 0.0 < dataset.calibration.focal_sigma < UNSAID_SIGMA
@@ -242,7 +243,7 @@ def test_the_users_calibration_wins(tmp_path: Path) -> None:
     folder = listed_folder(tmp_path / "a")
     other = tmp_path / "other.yaml"
     other.write_text(yaml.safe_dump({**CALIBRATION, "fx": 70.0}))
-    assert open_source(str(folder), calibration=other).calibration.fx == 70.0
+    assert open_source(SourceSpec(location=str(folder), calibration=other)).calibration.fx == 70.0
     both = refused(folder, CalibrationError, calibration=other, fov_deg=60.0)
     assert both == "--calibration and --fov exclude each other: pass only one"
     assert str(other) in refused(

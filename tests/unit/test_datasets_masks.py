@@ -16,6 +16,7 @@ from pliant.datasets import notes_on, open_source
 from pliant.datasets import rectifier as datasets_rectifier
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.rectifier import Rectifier, rectified
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 from pliant.messages.types import BROKEN, MASKED
 
@@ -54,7 +55,7 @@ def columns(count: int) -> U8:
 def told(source: str, mask: Path, **part: object) -> list[int]:
     """White columns of each frame's mask; all of them where it has none."""
     parameters = IngestParameters.model_validate(part)
-    frames = open_source(source, fov_deg=60.0, mask=mask, part=parameters)
+    frames = open_source(SourceSpec(location=source, fov_deg=60.0, mask=mask), parameters)
     return [int(unpacked(f.mask)[0].sum()) if f.mask else WIDTH for f in frames]
 
 
@@ -70,7 +71,9 @@ def told(source: str, mask: Path, **part: object) -> list[int]:
 )
 def test_one_image_is_for_all_frames(tmp_path: Path, name: str, pixels: U8) -> None:
     opened = open_source(
-        images(tmp_path / "images"), fov_deg=60.0, mask=write(tmp_path / name, pixels)
+        SourceSpec(
+            location=images(tmp_path / "images"), fov_deg=60.0, mask=write(tmp_path / name, pixels)
+        )
     )
     frames = list(opened)
     assert len({frame.mask for frame in frames}) == 1
@@ -82,7 +85,7 @@ def test_one_image_is_for_all_frames(tmp_path: Path, name: str, pixels: U8) -> N
 
 def test_a_white_mask_is_none(tmp_path: Path) -> None:
     white = write(tmp_path / "white.png", np.full_like(BLACK, 255))
-    opened = open_source(images(tmp_path / "images"), fov_deg=60.0, mask=white)
+    opened = open_source(SourceSpec(location=images(tmp_path / "images"), fov_deg=60.0, mask=white))
     assert [frame.mask for frame in opened] == [b""] * 3
 
 
@@ -93,7 +96,7 @@ def test_a_folder_has_them_by_the_names_of_images(tmp_path: Path) -> None:
     write(masks / "a.jpg.png", columns(1))  # as COLMAP has it
     write(masks / "other.png", columns(9))
     assert told(source, masks) == [1, 2, WIDTH]
-    said = notes_on(open_source(source, fov_deg=60.0, mask=masks))
+    said = notes_on(open_source(SourceSpec(location=source, fov_deg=60.0, mask=masks)))
     assert said[-1:] == ["masked: 2 of 3 frames have a mask, the others are used completely"]
 
 
@@ -119,7 +122,7 @@ def test_a_mask_that_breaks_later_breaks_its_frame_alone(tmp_path: Path) -> None
     write(masks / "a.png", columns(1))
     (masks / "b.png").write_bytes(b"no image")
     write(masks / "c.png", np.zeros((HEIGHT, 3 * WIDTH), np.uint8))
-    opened = open_source(source, fov_deg=60.0, mask=masks)
+    opened = open_source(SourceSpec(location=source, fov_deg=60.0, mask=masks))
     rectifier = Rectifier(opened.calibration)
     made = [rectified(frame, rectifier).missing for frame in opened]
     assert made[0] == ""
@@ -131,7 +134,9 @@ def test_a_mask_that_breaks_later_breaks_its_frame_alone(tmp_path: Path) -> None
 
 def test_a_frame_without_a_mask_is_whole_whatever_came_before_it(tmp_path: Path) -> None:
     write(tmp_path / "masks" / "b.png", columns(20))
-    opened = open_source(images(tmp_path / "images"), fov_deg=60.0, mask=tmp_path / "masks")
+    opened = open_source(
+        SourceSpec(location=images(tmp_path / "images"), fov_deg=60.0, mask=tmp_path / "masks")
+    )
     rectifier = Rectifier(opened.calibration)
     made = [rectified(frame, rectifier) for frame in opened]
     assert [image.missing for image in made] == ["", "", ""]
@@ -159,7 +164,9 @@ def test_what_is_no_mask_is_said_in_a_line(tmp_path: Path, mask: str, words: str
     for name in ("1.png", "m1.png"):
         write(tmp_path / "twice" / name, columns(3))
     with pytest.raises(DatasetError) as raised:
-        open_source(images(tmp_path / "images"), fov_deg=60.0, mask=tmp_path / mask)
+        open_source(
+            SourceSpec(location=images(tmp_path / "images"), fov_deg=60.0, mask=tmp_path / mask)
+        )
     assert words in str(raised.value)
     assert str(raised.value).startswith("--mask ")
     assert "\n" not in str(raised.value)

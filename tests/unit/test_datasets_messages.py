@@ -13,6 +13,7 @@ from recorded_messages import COUNT, HEIGHT, START_NS, STEP_NS, WIDTH, Ros
 from pliant.datasets import notes_on, open_source
 from pliant.datasets.calibration import UNSAID_SIGMA
 from pliant.datasets.rectifier import decode
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError, DatasetError
 
 Write = Callable[[Path], None]
@@ -76,7 +77,7 @@ def test_compressed_images_keep_their_bytes(tmp_path: Path) -> None:
     bags.write_ros2_bag(tmp_path / "a", ros, messages)
     bags.write_foxglove_mcap(tmp_path / "b.mcap", raw=False, encoding="protobuf")
     for path in (tmp_path / "a", tmp_path / "b.mcap"):
-        frames = list(open_source(str(path), fov_deg=70.0))
+        frames = list(open_source(SourceSpec(location=str(path), fov_deg=70.0)))
         assert [f.data for f in frames] == [bags.jpeg(i) for i in range(COUNT)]
         assert {f.encoding for f in frames} == {"jpeg"}
 
@@ -119,7 +120,7 @@ def test_every_encoding_gives_its_colours(encoding: str, padding: int, tmp_path:
         0, encoding=name, padding=padding, pixels=pixels, is_bigendian=int(name != encoding)
     )
     bags.write_ros2_bag(tmp_path / "bag", ros, {"/image": [image]})
-    (frame,) = open_source(str(tmp_path / "bag"), fov_deg=70.0)
+    (frame,) = open_source(SourceSpec(location=str(tmp_path / "bag"), fov_deg=70.0))
     decoded = decode(frame)
     expected = rgb[:, :, 0] if name.startswith("mono") else rgb
     assert decoded.shape == expected.shape
@@ -179,20 +180,22 @@ def test_the_calibration_nearest_by_name_is_taken_and_rectified_images_use_p(
     }
     bags.write_ros2_bag(tmp_path / "bag", ros, messages)
     bag = str(tmp_path / "bag")
-    assert open_source(bag, topic="/left/image_raw").calibration.fx == 40.0
-    assert open_source(bag, topic="right/image_raw").calibration.fx == 50.0
-    rectified = open_source(bag, topic="/right/image_rect").calibration
+    assert open_source(SourceSpec(location=bag, topic="/left/image_raw")).calibration.fx == 40.0
+    assert open_source(SourceSpec(location=bag, topic="right/image_raw")).calibration.fx == 50.0
+    rectified = open_source(SourceSpec(location=bag, topic="/right/image_rect")).calibration
     assert (rectified.model, rectified.fx, rectified.cx) == ("pinhole", 44.0, 22.0)
 
 
 def test_an_own_calibration_wins(tmp_path: Path) -> None:
     ros2(tmp_path / "bag")
-    assert open_source(str(tmp_path / "bag"), fov_deg=90.0).calibration.fx == pytest.approx(24.0)
+    assert open_source(
+        SourceSpec(location=str(tmp_path / "bag"), fov_deg=90.0)
+    ).calibration.fx == pytest.approx(24.0)
 
 
 def refused(source: Path, topic: str = "", **more: Any) -> str:
     with pytest.raises((DatasetError, CalibrationError)) as caught:
-        list(open_source(str(source), topic=topic, **more))
+        list(open_source(SourceSpec(location=str(source), topic=topic, **more)))
     text = str(caught.value)
     assert "\n" not in text
     assert source.name in text
@@ -210,7 +213,7 @@ def test_the_choice_of_a_topic(tmp_path: Path) -> None:
         tmp_path / "two", "/nowhere"
     )
     assert "/chatter carries std_msgs/String, no images" in refused(tmp_path / "two", "/chatter")
-    other = open_source(str(tmp_path / "two"), topic="/other").calibration
+    other = open_source(SourceSpec(location=str(tmp_path / "two"), topic="/other")).calibration
     assert other.focal_sigma == UNSAID_SIGMA
     bags.write_ros2_bag(tmp_path / "none", ros, {"/chatter": [ros.text()]})
     assert "no topic with images; its topics: std_msgs/String" in refused(tmp_path / "none")
@@ -267,7 +270,7 @@ def test_any_bytes_are_one_line(tmp_path: Path) -> None:
             path.write_bytes(data)
             said = ""
             try:
-                list(open_source(str(path), fov_deg=70.0))
+                list(open_source(SourceSpec(location=str(path), fov_deg=70.0)))
             except (DatasetError, CalibrationError) as error:
                 said = str(error)
             assert "\n" not in said
@@ -282,11 +285,13 @@ def test_of_colour_and_depth_the_colour_is_used_and_a_line_says_so(tmp_path: Pat
         "/camera/depth/image_rect_raw": [ros.image(0, encoding="16UC1", pixels=deep)],
     }
     bags.write_ros2_bag(tmp_path / "bag", ros, messages)
-    source = open_source(str(tmp_path / "bag"), fov_deg=70.0)
+    source = open_source(SourceSpec(location=str(tmp_path / "bag"), fov_deg=70.0))
     assert np.array_equal(decode(next(iter(source))), bags.picture(0))
     assert notes_on(source) == [
         "using /camera/color/image_raw, not /camera/color/image_raw/compressed, "
         "/camera/depth/image_rect_raw (choose with --topic)"
     ]
-    asked = open_source(str(tmp_path / "bag"), topic="/camera/color/image_raw", fov_deg=70.0)
+    asked = open_source(
+        SourceSpec(location=str(tmp_path / "bag"), topic="/camera/color/image_raw", fov_deg=70.0)
+    )
     assert notes_on(asked) == []

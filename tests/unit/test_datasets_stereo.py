@@ -10,6 +10,7 @@ from running import write_sequence
 
 from pliant.datasets import open_source
 from pliant.datasets.depth import DepthRectifier
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.stereo import consistent_disparities
 from pliant.errors import CalibrationError
 
@@ -58,7 +59,9 @@ def folder_of(folder: Path, left: np.ndarray, right: np.ndarray, **calibration: 
 
 def test_surfels_are_given_metres(tmp_path: Path) -> None:
     made = {"fx": FOCAL, "fy": FOCAL, "cx": 79.5, "cy": 59.5, "stereo_baseline": BASELINE}
-    source = open_source(str(folder_of(tmp_path, *pair(), **made)), depth="first")
+    source = open_source(
+        SourceSpec(location=str(folder_of(tmp_path, *pair(), **made)), depth="first")
+    )
     frames = list(source)
     assert [bool(frame.depth) for frame in frames] == [True, False]
     metres = DepthRectifier(source.calibration).rectify(0, frames[0].depth)
@@ -78,13 +81,17 @@ def test_what_is_missing_is_named(
     tmp_path: Path, calibration: dict[str, object], says: str
 ) -> None:
     with pytest.raises(CalibrationError, match=says):
-        open_source(str(folder_of(tmp_path, *pair(), **calibration)), depth="first")
+        open_source(
+            SourceSpec(location=str(folder_of(tmp_path, *pair(), **calibration)), depth="first")
+        )
 
 
 def test_a_right_image_that_is_none_gives_no_depth(tmp_path: Path) -> None:
     folder = folder_of(tmp_path, *pair(), stereo_baseline=BASELINE)
     (folder / "right.png").write_bytes(b"no image")
-    assert [frame.depth for frame in open_source(str(folder), depth="first")] == [b"", b""]
+    assert [
+        frame.depth for frame in open_source(SourceSpec(location=str(folder), depth="first"))
+    ] == [b"", b""]
 
 
 def test_real_tissue_is_where_ct_saw_it() -> None:

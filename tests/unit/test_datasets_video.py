@@ -16,8 +16,8 @@ from pliant.datasets import open_source
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import UNSAID_SIGMA, calibration_from_yaml, calibration_yaml
 from pliant.datasets.camera_device import CameraDevice, camera_index
-from pliant.datasets.images import SourceOptions
 from pliant.datasets.rectifier import Rectifier, decode
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.video_decoder import quiet_opencv
 from pliant.errors import CalibrationError, DatasetError
 
@@ -39,7 +39,7 @@ def video(folder: Path, frames: int = 6, name: str = "clip.avi") -> Path:
 
 def test_video(tmp_path: Path) -> None:
     file = video(tmp_path)
-    dataset = open_source(str(file), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
     assert (dataset.name, dataset.frame_count, dataset.is_live) == ("clip", 6, False)
     for _ in range(2):  # again from the start
         frames = list(dataset)
@@ -71,7 +71,7 @@ def test_a_telephone_that_was_held_upright_and_frames_at_unequal_times(tmp_path:
     for times, file in (("equal", content), ("unequal", unequal)):
         for quarters, degrees in enumerate((0, 90, 180, 270)):
             lying.write_bytes(turned(file, degrees) if degrees else file)
-            dataset = open_source(str(lying), fov_deg=60.0)
+            dataset = open_source(SourceSpec(location=str(lying), fov_deg=60.0))
             size = (HEIGHT, WIDTH) if quarters % 2 else (WIDTH, HEIGHT)
             assert (dataset.calibration.width, dataset.calibration.height) == size
             frames = list(dataset)
@@ -91,7 +91,7 @@ def test_a_damaged_frame_is_named_and_ends_nothing(tmp_path: Path) -> None:
         damaged = bytearray(content)
         damaged[starts[first] : end] = bytes(end - starts[first])
         file.write_bytes(damaged)
-        dataset = open_source(str(file), fov_deg=60.0)
+        dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
         frames = list(dataset)
         count = 12 if last < 12 else first  # behind the last whole one there is nothing
         assert [frame.index for frame in frames] == list(range(count))
@@ -114,21 +114,21 @@ def test_calibration_of_a_video(tmp_path: Path) -> None:
     other = tmp_path / "other.yaml"
     other.write_text(yaml.safe_dump({**CALIBRATION, "width": 128}))
     with pytest.raises(CalibrationError, match="128x48"):
-        open_source(str(file), calibration=other)
+        open_source(SourceSpec(location=str(file), calibration=other))
 
 
 def test_files_that_are_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "junk.mp4").write_bytes(b"not a video" * 100)
     with pytest.raises(DatasetError, match=r"junk.mp4: not a video that OpenCV can read"):
-        open_source(str(tmp_path / "junk.mp4"), fov_deg=60.0)
+        open_source(SourceSpec(location=str(tmp_path / "junk.mp4"), fov_deg=60.0))
     (tmp_path / "empty.mp4").touch()
     with pytest.raises(DatasetError, match=r"empty.mp4: is empty \(0 bytes\)"):
-        open_source(str(tmp_path / "empty.mp4"), fov_deg=60.0)
+        open_source(SourceSpec(location=str(tmp_path / "empty.mp4"), fov_deg=60.0))
     with pytest.raises(DatasetError, match=r"contains several: .* `pliant batch"):
         open_source(str(tmp_path))
     (tmp_path / "image.png").write_bytes(b"")
     with pytest.raises(DatasetError, match="pass its folder"):
-        open_source(str(tmp_path / "image.png"), fov_deg=60.0)
+        open_source(SourceSpec(location=str(tmp_path / "image.png"), fov_deg=60.0))
     assert capfd.readouterr().err == ""  # one line is enough, and that is ours
 
 
@@ -168,7 +168,10 @@ def test_camera() -> None:
 
     clock = iter([100, 100, 90, 300, 400])
     camera = CameraDevice(
-        3, SourceOptions(fov_deg=90.0), open_device=open_device, clock_ns=lambda: next(clock)
+        3,
+        SourceSpec(location="camera:0", fov_deg=90.0),
+        open_device=open_device,
+        clock_ns=lambda: next(clock),
     )
     assert (camera.name, camera.is_live, camera.frame_count) == ("camera:3", True, None)
     assert captures[0].released  # so that the process that streams can open it
@@ -190,7 +193,7 @@ def test_camera_is_released_when_nobody_reads_any_more() -> None:
         captures.append(SimulatedCapture())
         return captures[-1]
 
-    camera = CameraDevice(0, SourceOptions(fov_deg=90.0), open_device=open_device)
+    camera = CameraDevice(0, SourceSpec(location="camera:0", fov_deg=90.0), open_device=open_device)
     stream = iter(camera)
     next(stream)
     stream.close()  # type: ignore[attr-defined]
@@ -202,20 +205,24 @@ def test_camera_is_asked_for_the_size_of_its_calibration(tmp_path: Path) -> None
     file = tmp_path / "calib.yaml"
     file.write_text(yaml.safe_dump({**CALIBRATION, "width": 128, "height": 96}))
     with pytest.raises(CalibrationError, match="128x96 px, but they have 64x48"):
-        CameraDevice(0, SourceOptions(calibration=file), open_device=lambda _: capture)
+        CameraDevice(
+            0, SourceSpec(location="camera:0", calibration=file), open_device=lambda _: capture
+        )
     assert capture.asked == {cv2.CAP_PROP_FRAME_WIDTH: 128, cv2.CAP_PROP_FRAME_HEIGHT: 96}
 
 
 def test_camera_that_is_not_there(capfd: pytest.CaptureFixture[str]) -> None:
     missing = SimulatedCapture(plugged_in=False)
     with pytest.raises(DatasetError, match="camera:5: no such camera"):
-        CameraDevice(5, SourceOptions(fov_deg=60.0), open_device=lambda _: missing)
+        CameraDevice(
+            5, SourceSpec(location="camera:0", fov_deg=60.0), open_device=lambda _: missing
+        )
     silent = SimulatedCapture(frames=0)
     with pytest.raises(DatasetError, match="no more images"):
-        CameraDevice(5, SourceOptions(fov_deg=60.0), open_device=lambda _: silent)
+        CameraDevice(5, SourceSpec(location="camera:0", fov_deg=60.0), open_device=lambda _: silent)
     assert silent.released
     with pytest.raises(DatasetError, match="camera:99: no such camera"):
-        open_source("camera:99", fov_deg=60.0)
+        open_source(SourceSpec(location="camera:99", fov_deg=60.0))
     assert capfd.readouterr().err == ""
 
 
@@ -234,7 +241,7 @@ def test_a_video_that_is_replaced_after_it_was_opened_is_not_read_as_what_it_was
     tmp_path: Path,
 ) -> None:
     file, other = video(tmp_path), video(tmp_path, 9, "other.avi")
-    dataset = open_source(str(file), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
     other.replace(file)
     with pytest.raises(DatasetError, match=r"clip.avi: was replaced after it was opened"):
         next(iter(dataset))
@@ -245,13 +252,13 @@ def test_a_video_that_is_written_to_while_it_is_read_is_told_and_one_without_a_n
 ) -> None:
     file = video(tmp_path)
     content = file.read_bytes()
-    frames = iter(open_source(str(file), fov_deg=60.0))
+    frames = iter(open_source(SourceSpec(location=str(file), fov_deg=60.0)))
     next(frames)
     file.write_bytes(content[: len(content) // 2])
     with pytest.raises(DatasetError, match=r"clip.avi: was modified during the run"):
         list(frames)
     file.write_bytes(content)
-    frames = iter(open_source(str(file), fov_deg=60.0))
+    frames = iter(open_source(SourceSpec(location=str(file), fov_deg=60.0)))
     next(frames)
     file.unlink()
     assert len(list(frames)) == 5
@@ -262,7 +269,7 @@ def test_a_video_that_is_written_to_while_a_part_of_it_is_read_is_told(tmp_path:
     content = file.read_bytes()
     for time, mask in enumerate((None, _white(tmp_path / "mask.png"))):
         part = IngestParameters(end_s=0.1)
-        frames = iter(open_source(str(file), fov_deg=60.0, part=part, mask=mask))
+        frames = iter(open_source(SourceSpec(location=str(file), fov_deg=60.0, mask=mask), part))
         next(frames)
         file.write_bytes(content)
         os.utime(file, (time, time))

@@ -14,6 +14,7 @@ from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration, calibration_from_fov
 from pliant.datasets.excerpt import Excerpt
 from pliant.datasets.rectifier import Rectifier, rectified
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.video_decoder import quiet_opencv
 from pliant.errors import DatasetError
 
@@ -102,9 +103,11 @@ def test_where_a_source_ends_is_known_without_reading_it_all(tmp_path: Path) -> 
     for number in range(50):
         writer.write(np.full((48, 64, 3), number, np.uint8))
     writer.release()
-    open_source(str(file), fov_deg=60.0, part=IngestParameters(start_s=1.9))
+    open_source(SourceSpec(location=str(file), fov_deg=60.0), IngestParameters(start_s=1.9))
     for start_s, ends in ((1.9, False), (1.99, True), (2.5, True), (1e6, True)):
-        video = open_source(str(file), fov_deg=60.0, part=IngestParameters(start_s=start_s))
+        video = open_source(
+            SourceSpec(location=str(file), fov_deg=60.0), IngestParameters(start_s=start_s)
+        )
         if not ends:
             check_start(video)
             continue
@@ -125,9 +128,9 @@ def test_a_broken_frame_is_called_as_the_source_counts_it() -> None:
 def test_a_source_is_opened_in_part() -> None:
     whole = list(open_source("built-in:tiny"))
     part = IngestParameters(every=4)
-    some = list(open_source("built-in:tiny", part=part))
+    some = list(open_source("built-in:tiny", part))
     assert [f.number for f in some] == list(range(0, len(whole), 4))
     assert [replace(f, index=0, number=-1) for f in some] == [
         replace(f, index=0) for f in whole[::4]
     ]
-    assert open_source("built-in:tiny", part=IngestParameters()).frame_count == len(whole)
+    assert open_source("built-in:tiny", IngestParameters()).frame_count == len(whole)

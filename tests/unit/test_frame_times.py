@@ -16,6 +16,7 @@ from pliant.datasets import notes_on, open_source
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.frame_times import in_order, increasing
 from pliant.datasets.rectifier import decode
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError, DatasetError
 from pliant.results.judgement import BAD, DOUBTFUL, GOOD, judge
 
@@ -105,7 +106,7 @@ def test_a_wrong_time_in_a_bag_costs_one_frame(name: str, stamp_of_20: int, tmp_
     if stamp_of_20 == 21:  # swapped
         images[21].header = ros.header(20)
     WRITERS[name](tmp_path / name, ros, {"/image": images})
-    came = list(open_source(str(tmp_path / name), fov_deg=70.0))
+    came = list(open_source(SourceSpec(location=str(tmp_path / name), fov_deg=70.0)))
     assert len(came) == COUNT
     assert sum(not f.data for f in came) == 1
     stamps = np.array([f.stamp_ns for f in came])
@@ -118,7 +119,7 @@ def test_an_encoding_that_is_not_understood_costs_one_frame(tmp_path: Path) -> N
     images = [ros.image(i) for i in range(COUNT)]
     images[7].encoding = "nothing"
     bags.write_ros_mcap(tmp_path / "a.mcap", ros, {"/image": images})
-    came = list(open_source(str(tmp_path / "a.mcap"), fov_deg=70.0))
+    came = list(open_source(SourceSpec(location=str(tmp_path / "a.mcap"), fov_deg=70.0)))
     assert [f.index for f in came if not f.data] == [7]
     with pytest.raises(BrokenFrame, match="frame 7: images with encoding 'nothing'"):
         decode(came[7])
@@ -138,7 +139,7 @@ def test_a_message_that_cannot_be_read_costs_one_frame(
     monkeypatch.setattr(ros.store, "serialize_cdr", serialise)
     for name, write in WRITERS.items():
         write(tmp_path / name, ros, {"/image": short})
-        came = list(open_source(str(tmp_path / name), fov_deg=70.0))
+        came = list(open_source(SourceSpec(location=str(tmp_path / name), fov_deg=70.0)))
         assert [f.index for f in came if not f.data] == [9]
         with pytest.raises(BrokenFrame, match="frame 9: its message is damaged"):
             decode(came[9])
@@ -179,7 +180,7 @@ def test_a_wrong_time_in_a_list_costs_one_frame(wrong: str, tmp_path: Path) -> N
     times[20] = wrong
     if wrong == "2.1":
         times[21] = "2.0"
-    source = open_source(str(listed(tmp_path / "a", times)), fov_deg=70.0)
+    source = open_source(SourceSpec(location=str(listed(tmp_path / "a", times)), fov_deg=70.0))
     came = list(source)
     broken = [f.index for f in came if not f.data]
     assert len(broken) == 1
@@ -192,7 +193,7 @@ def test_a_wrong_time_in_a_list_costs_one_frame(wrong: str, tmp_path: Path) -> N
 def test_a_list_with_many_wrong_times_is_refused(tmp_path: Path) -> None:
     times = [f"{0.1 * (i if i < 20 else i - 20):.2f}" for i in range(COUNT)]
     with pytest.raises(DatasetError, match=r"line 21: the time .* runs back"):
-        open_source(str(listed(tmp_path / "a", times)), fov_deg=70.0)
+        open_source(SourceSpec(location=str(listed(tmp_path / "a", times)), fov_deg=70.0))
 
 
 def test_a_verdict_speaks_of_all_frames_of_the_source() -> None:
@@ -245,7 +246,7 @@ def test_json_with_odd_fields_costs_one_frame(changed: dict[str, Any], tmp_path:
         messages.append({**content, "timestamp": stamp, "data": data})
     messages[4] = {k: v for k, v in {**messages[4], **changed}.items() if v is not None}
     write_json(tmp_path / "a.mcap", messages, {})
-    came = list(open_source(str(tmp_path / "a.mcap"), fov_deg=70.0))
+    came = list(open_source(SourceSpec(location=str(tmp_path / "a.mcap"), fov_deg=70.0)))
     assert [f.index for f in came] == list(range(COUNT))
     broken: dict[int, str] = {}
     for each in came:

@@ -9,6 +9,7 @@ import pytest
 from pliant.datasets import notes_on, open_source, sources_in
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.rectifier import Rectifier
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 
 COUNT = 5
@@ -24,7 +25,7 @@ def write(folder: Path, pattern: str, pixels: np.ndarray, count: int = COUNT) ->
 
 
 def names(folder: Path) -> tuple[list[str], list[str]]:
-    source = open_source(str(folder), fov_deg=60.0)
+    source = open_source(SourceSpec(location=str(folder), fov_deg=60.0))
     said = [note for note in notes_on(source) if not note.startswith("times: ")]
     return [frame.name for frame in source], said
 
@@ -65,7 +66,7 @@ def test_kinds_of_other_frames_stay_together(tmp_path: Path) -> None:
 def test_a_thumbnail_first_costs_itself(tmp_path: Path) -> None:
     write(tmp_path, "{}.png", COLOUR)
     cv2.imwrite(str(tmp_path / "0.png"), COLOUR[::2, ::2])
-    source = open_source(str(tmp_path), fov_deg=60.0)
+    source = open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0))
     assert (source.calibration.width, source.calibration.height) == (32, 24)
     rectifier, broken = Rectifier(source.calibration), list[int]()
     for frame in source:
@@ -82,7 +83,7 @@ def test_images_that_are_turned_by_what_they_say_of_themselves(tmp_path: Path) -
         data = path.read_bytes()
         exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
         path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2) + exif + data[2:])
-    calibration = open_source(str(tmp_path), fov_deg=60.0).calibration
+    calibration = open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0)).calibration
     assert (calibration.width, calibration.height) == (24, 32)
 
 
@@ -137,7 +138,7 @@ def test_images_that_a_list_leaves_out_are_named(tmp_path: Path) -> None:
     write(tmp_path / "rgb", "{}.png", COLOUR, count=30)
     lines = [f"{0.1 * row:.1f} rgb/{row}.png" for row in range(20)]
     (tmp_path / "rgb.txt").write_text("\n".join(lines))
-    source = open_source(str(tmp_path), fov_deg=60.0)
+    source = open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0))
     assert notes_on(source) == ["rgb.txt: lists 20 images; 10 more in rgb/ are skipped"]
 
 
@@ -146,7 +147,7 @@ def test_a_listed_file_that_is_missing_costs_itself(tmp_path: Path) -> None:
     lines = [f"{0.1 * row:.1f} rgb/{row}.png" for row in range(20)]
     (tmp_path / "rgb.txt").write_text("\n".join(lines))
     (tmp_path / "rgb" / "7.png").unlink()
-    source = open_source(str(tmp_path), fov_deg=60.0)
+    source = open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0))
     assert [frame.index for frame in source if not frame.data] == [7]
     assert notes_on(source) == [
         "rgb.txt: 1 file of 20 (the first in line 8) are missing and count as broken"
@@ -154,7 +155,7 @@ def test_a_listed_file_that_is_missing_costs_itself(tmp_path: Path) -> None:
     for row in range(3):
         (tmp_path / "rgb" / f"{row}.png").unlink()
     with pytest.raises(DatasetError, match="4 of 20 listed images are missing"):
-        open_source(str(tmp_path), fov_deg=60.0)
+        open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0))
 
 
 def test_a_raw_drive_of_kitti(tmp_path: Path) -> None:

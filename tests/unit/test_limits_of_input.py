@@ -13,6 +13,7 @@ from pliant.config import load_config
 from pliant.datasets import open_source
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.calibration_files import read_calibration
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError, ConfigError, DatasetError
 from pliant.wording import shortened, shown
 from pliant.yaml_text import YamlError, load_yaml
@@ -107,7 +108,7 @@ def test_a_line_of_a_list_is_quoted_in_part(tmp_path: Path) -> None:
     for line in (f"{'9' * 10**5} a.png", f"1 {'b' * 10**5}.png", "c" * 10**5, f"{'n' * 10**5} a"):
         (tmp_path / "rgb.txt").write_text(line)
         with pytest.raises(DatasetError) as caught:
-            open_source(str(tmp_path), fov_deg=60.0)
+            open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0))
         assert len(str(caught.value)) < 400 + len(str(tmp_path))
 
 
@@ -136,6 +137,6 @@ def test_an_image_that_says_it_is_huge_is_one_line(tmp_path: Path) -> None:
     mask = tmp_path / "mask.png"
     mask.write_bytes(huge_png(60000))
     with pytest.raises(DatasetError, match="OpenCV cannot read this image, or it exceeds"):
-        open_source(str(folder), fov_deg=60.0, mask=mask)
+        open_source(SourceSpec(location=str(folder), fov_deg=60.0, mask=mask))
     (folder / "0.png").write_bytes(huge_png(60000))
-    assert open_source(str(folder), fov_deg=60.0).calibration.width == 20
+    assert open_source(SourceSpec(location=str(folder), fov_deg=60.0)).calibration.width == 20

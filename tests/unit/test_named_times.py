@@ -9,6 +9,7 @@ import pytest
 
 from pliant.datasets import notes_on, open_source
 from pliant.datasets.named_times import times_in_names
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.times import likely_unit
 
 S, MS = 10**9, 10**6
@@ -115,7 +116,7 @@ def write(folder: Path, names: list[str]) -> None:
 
 def test_a_folder_is_in_the_order_of_its_times_and_says_which_they_are(tmp_path: Path) -> None:
     write(tmp_path / "a", ["0.1.png", "0.2.png", "0.13.png"])
-    source = open_source(str(tmp_path / "a"), fov_deg=60.0)
+    source = open_source(SourceSpec(location=str(tmp_path / "a"), fov_deg=60.0))
     frames = list(source)
     assert [f.name for f in frames] == ["0.1.png", "0.13.png", "0.2.png"]
     assert [f.stamp_ns for f in frames] == [100000000, 130000000, 200000000]
@@ -126,14 +127,14 @@ def test_times_without_a_leading_zero_are_no_hidden_files(tmp_path: Path) -> Non
     write(tmp_path, [".9.png", "1.0.png", ".95.png"])
     (tmp_path / "._1.0.png").write_bytes(b"what macOS leaves")
     (tmp_path / ".thumb.png").write_bytes(b"hidden")
-    frames = list(open_source(str(tmp_path), fov_deg=60.0))
+    frames = list(open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0)))
     assert [f.name for f in frames] == [".9.png", ".95.png", "1.0.png"]
     assert [f.stamp_ns for f in frames] == [900000000, 950000000, 1000000000]
 
 
 def test_a_folder_whose_names_tell_no_times_says_what_is_assumed(tmp_path: Path) -> None:
     write(tmp_path / "a", ["2.png", "10.png", "1.png"])
-    source = open_source(str(tmp_path / "a"), fov_deg=60.0)
+    source = open_source(SourceSpec(location=str(tmp_path / "a"), fov_deg=60.0))
     assert [f.name for f in source] == ["1.png", "2.png", "10.png"]
     (note,) = notes_on(source)
     assert note.startswith("times: none in the file names, assuming 30 images/s")
@@ -151,7 +152,7 @@ def test_a_list_may_have_other_units(times: list[str], note: list[str], tmp_path
     write(tmp_path, ["0.png", "1.png", "2.png"])
     lines = [f"{time} {row}.png" for row, time in enumerate(times)]
     (tmp_path / "rgb.txt").write_text("\n".join(lines))
-    source = open_source(str(tmp_path), fov_deg=60.0)
+    source = open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0))
     assert [round(f.stamp_ns / 1e6) for f in source] == [0, 33, 67]
     assert notes_on(source) == [f"rgb.txt: times are taken as {each}" for each in note]
 
@@ -162,7 +163,7 @@ def test_euroc_in_seconds(header: str, tmp_path: Path) -> None:
     write(camera / "data", ["a.png", "b.png"])
     rows = [header, "1403636579.763555584,a.png", "1403636579.813555456,b.png"]
     (camera / "data.csv").write_text("\n".join(rows))
-    source = open_source(str(tmp_path), fov_deg=60.0)
+    source = open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0))
     assert [f.stamp_ns for f in source] == [1403636579763555584, 1403636579813555456]
     assert notes_on(source) == [
         "data.csv: times are taken as seconds, not nanoseconds: 20 images/s"
@@ -185,7 +186,7 @@ def test_associations_have_four_columns(name: str, swapped: bool, tmp_path: Path
     (tmp_path / "calib.yaml").write_text(
         "width: 32\nheight: 24\nfx: 30\nfy: 30\ncx: 16\ncy: 12\ndepth_scale: 0.001\n"
     )
-    frames = list(open_source(str(tmp_path), depth="all"))
+    frames = list(open_source(SourceSpec(location=str(tmp_path), depth="all")))
     assert [f.stamp_ns for f in frames] == [5000000000, 5033300000]
     assert [f.name for f in frames] == ["0.png", "1.png"]
     assert all(f.depth == (tmp_path / "depth" / f.name).read_bytes() for f in frames)

@@ -24,11 +24,13 @@ from odd_videos import (
 )
 
 from pliant.algorithms.image.fields import is_combed
+from pliant.config import IngestParameters
 from pliant.datasets import notes_on, open_source
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.mp4_boxes import video_streams
 from pliant.datasets.packet_decoder import decodes, parameter_sets
 from pliant.datasets.rectifier import Rectifier, decode
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.video import shown_frames
 from pliant.datasets.video_decoder import opened
 from pliant.datasets.video_streams import Patch, PatchedFile, VideoStream, choose, streams_of
@@ -53,7 +55,7 @@ def preview(tmp_path: Path) -> bytes:
 
 
 def read(file: Path) -> list[SourceFrame]:
-    return list(open_source(str(file), fov_deg=60.0))
+    return list(open_source(SourceSpec(location=str(file), fov_deg=60.0)))
 
 
 def assert_film(frames: list[SourceFrame], images: list[np.ndarray]) -> None:
@@ -70,7 +72,7 @@ def test_a_preview_before_the_film_is_passed_over(
     """The film is the larger one; where one is enabled and the other is not, it is that."""
     file = tmp_path / "two.mp4"
     file.write_bytes(with_track_before(film, preview, enabled=enabled))
-    dataset = open_source(str(file), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
     assert notes_on(dataset) == ["2 video streams (160x120, 320x240): reading stream 2"]
     assert (dataset.calibration.width, dataset.calibration.height) == (WIDTH, HEIGHT)
     assert_film(list(dataset), images)
@@ -81,7 +83,7 @@ def test_the_default_stream_wins_over_a_larger_one(
 ) -> None:
     file = tmp_path / "two.mp4"
     file.write_bytes(with_track_before(preview, film, enabled=False))
-    dataset = open_source(str(file), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
     assert (dataset.calibration.width, dataset.calibration.height) == (160, 120)
     assert len(list(dataset)) == FRAMES
 
@@ -91,7 +93,7 @@ def test_a_cover_picture_before_the_film_is_passed_over(
 ) -> None:
     file, jpeg = tmp_path / "cover.mp4", cv2.imencode(".jpg", scene(160, 160, seed=2))[1].tobytes()
     file.write_bytes(with_cover(film, jpeg))
-    dataset = open_source(str(file), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
     assert (dataset.calibration.width, dataset.frame_count) == (WIDTH, FRAMES)
     assert_film(list(dataset), images)
 
@@ -104,7 +106,7 @@ def test_a_preview_in_matroska_is_passed_over(tmp_path: Path) -> None:
         tracks.append(("V_VP8", size, size, default, packets_of(tmp_path / "part.webm")))
     file = tmp_path / "three.mkv"
     file.write_bytes(matroska(tracks))
-    dataset = open_source(str(file), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
     note = "3 video streams (160x160, 320x320, 640x640): reading stream 2"
     assert notes_on(dataset) == [note]
     assert_film(list(dataset), moving(FRAMES, 320, 320))
@@ -129,7 +131,7 @@ def test_an_edit_list_says_which_frames_come(
 ) -> None:
     file = tmp_path / "trim.mp4"
     file.write_bytes(with_edits(film, edits))
-    dataset = open_source(str(file), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
     frames = list(dataset)
     assert dataset.frame_count == len(frames) == len(shown)
     assert_film(frames, [images[i] for i in shown])
@@ -146,7 +148,10 @@ def test_interlaced_video_is_read_by_one_field(tmp_path: Path) -> None:
     for comb, later in zip(combed, shown[1:], strict=False):
         comb[1::2] = later[1::2]
     write_video(tmp_path / "tape.avi", combed[:-1], "dvsd")
-    dataset = open_source(str(tmp_path / "tape.avi"), fov_deg=60.0, longest_side_px=720)
+    dataset = open_source(
+        SourceSpec(location=str(tmp_path / "tape.avi"), fov_deg=60.0),
+        IngestParameters(longest_side_px=720),
+    )
     assert notes_on(dataset)[0].startswith("interlaced: one field of each frame")
     assert_film(list(dataset), shown[:-1])
 
@@ -166,7 +171,7 @@ def test_frames_of_matroska_are_counted(tmp_path: Path, live: bool) -> None:
             )
     file = tmp_path / "screen.webm"
     file.write_bytes(content)
-    dataset = open_source(str(file), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
     assert dataset.frame_count == 6
     assert [frame.stamp_ns for frame in dataset] == [ms * 1_000_000 for ms in times]
 
@@ -197,7 +202,7 @@ def test_two_fields_in_a_file_that_says_nothing_of_it(tmp_path: Path) -> None:
     for comb, later in zip(combed, shown[1:], strict=False):
         comb[1::2] = later[1::2]
     write_video(tmp_path / "tape.avi", combed[:-1], "FFV1")
-    dataset = open_source(str(tmp_path / "tape.avi"), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(tmp_path / "tape.avi"), fov_deg=60.0))
     assert notes_on(dataset)[0].startswith("interlaced: one field of each frame")
     for frame, image in zip(dataset, shown, strict=False):
         assert np.abs(decode(frame)[:, :, ::-1].astype(int) - image).mean() < 1.0
@@ -234,7 +239,7 @@ def test_a_size_that_changes_on_the_way(tmp_path: Path) -> None:
         packets += packets_of(tmp_path / "part.webm", 160 * part)
     file = tmp_path / "call.webm"
     file.write_bytes(matroska([("V_VP8", 320, 240, True, packets)]))
-    dataset = open_source(str(file), fov_deg=60.0)
+    dataset = open_source(SourceSpec(location=str(file), fov_deg=60.0))
     rectifier, frames = Rectifier(dataset.calibration), list(dataset)
     assert len(frames) == 12
     for frame in frames[:8]:

@@ -15,6 +15,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.bus.session import open_session
 from pliant.datasets import decode, open_source
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError, DatasetError
 from pliant.viewers.canvas import Moment
 from pliant.viewers.point_blocks import PointBlocks
@@ -268,7 +269,11 @@ def test_a_camera_of_ros_is_a_source(ros: tuple[str, Node]) -> None:
 def test_it_ends_when_nobody_publishes_any_more(endpoint: str) -> None:
     with open_session([endpoint]) as session:
         driver = Driver(endpoint, Node(session, "/driver"))
-        source = iter(open_source("ros:" + endpoint.removeprefix("tcp/"), topic="cam/image_raw"))
+        source = iter(
+            open_source(
+                SourceSpec(location="ros:" + endpoint.removeprefix("tcp/"), topic="cam/image_raw")
+            )
+        )
         assert next(source).index == 0
         driver.stop()
     assert all(frame.index > 0 for frame in source)
@@ -284,8 +289,8 @@ def test_what_cannot_be_had_is_one_line(
     driver = Driver(endpoint, node, info=False)
     try:
         with pytest.raises(DatasetError, match=r"no topic /other; images are in /cam/image_raw"):
-            open_source(f"ros:{host}", topic="/other")
-        source = open_source(f"ros:{host}", fov_deg=70.0)
+            open_source(SourceSpec(location=f"ros:{host}", topic="/other"))
+        source = open_source(SourceSpec(location=f"ros:{host}", fov_deg=70.0))
         assert next(iter(source)).width == bags.WIDTH
     finally:
         driver.stop()
@@ -293,7 +298,7 @@ def test_what_cannot_be_had_is_one_line(
     wait_until_published(endpoint, "/wrong/image")
     monkeypatch.setattr("pliant.datasets.ros_camera._FIRST_S", 0.0)
     with pytest.raises(DatasetError, match="no message arrived"):
-        open_source(f"ros:{host}", topic="/wrong/image")
+        open_source(SourceSpec(location=f"ros:{host}", topic="/wrong/image"))
     stopping = threading.Event()
 
     def babble() -> None:
@@ -305,7 +310,7 @@ def test_what_cannot_be_had_is_one_line(
     thread.start()
     try:
         with pytest.raises(DatasetError, match="its message is damaged"):
-            open_source(f"ros:{host}", topic="/wrong/image")
+            open_source(SourceSpec(location=f"ros:{host}", topic="/wrong/image"))
     finally:
         stopping.set()
         thread.join()

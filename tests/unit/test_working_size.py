@@ -11,10 +11,11 @@ import pytest
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.image.sharpness import resized, sharpness, working_side
 from pliant.algorithms.map_delta import TRACKING
-from pliant.config import load_config
+from pliant.config import IngestParameters, load_config
 from pliant.datasets import Dataset, SourceFrame, decode, open_source
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.rectifier import Rectifier, rectified
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.working_size import SmallerImages, at_working_size
 from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
@@ -155,11 +156,13 @@ def test_a_source_is_opened_at_its_working_size(tmp_path: Path) -> None:
     image = enlarged(picture(320, 180), 1280)
     for i in range(2):
         cv2.imwrite(str(tmp_path / f"{i}.png"), image)
-    opened = open_source(str(tmp_path), fov_deg=60.0)
+    opened = open_source(SourceSpec(location=str(tmp_path), fov_deg=60.0))
     assert (opened.calibration.width, opened.calibration.height) == (640, 360)
     assert opened.frame_count == 2
     np.testing.assert_array_equal(decode(next(iter(opened))), resized(image, 640))
-    whole = open_source(str(tmp_path), fov_deg=60.0, longest_side_px=1280)
+    whole = open_source(
+        SourceSpec(location=str(tmp_path), fov_deg=60.0), IngestParameters(longest_side_px=1280)
+    )
     assert whole.calibration.width == 1280
 
 

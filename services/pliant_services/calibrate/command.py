@@ -27,11 +27,13 @@ from pliant.algorithms.board_calibration import (
 from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.image.sharpness import LONGEST_SIDE_PX, resized, sharpness
+from pliant.config import IngestParameters
 from pliant.datasets import BrokenFrame, Dataset, decode, open_source
 from pliant.datasets.calibration import UNSAID_FOV_DEG, Calibration, calibration_yaml
 from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.excerpt import Excerpt
 from pliant.datasets.rectifier import Rectifier
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError, DatasetError, ResultError
 from pliant.exit_codes import INTERRUPTED
 from pliant.export.posed_images import INLIER_PX, IdealCamera
@@ -120,7 +122,8 @@ def calibrate_with_board(
     Returns what to tell.  Raises PliantError: no board, another one, too few views, no lens.
     """
     dataset = open_source(
-        source, fov_deg=UNSAID_FOV_DEG, topic=topic, longest_side_px=_WHOLE_PX, mask=mask
+        SourceSpec(location=source, fov_deg=UNSAID_FOV_DEG, topic=topic, mask=mask),
+        IngestParameters(longest_side_px=_WHOLE_PX, mask_static=False),
     )
     width, height = dataset.calibration.width, dataset.calibration.height
     found, others, looked = _look_for(dataset, printed, source)
@@ -254,7 +257,8 @@ def calibrate_without_board(
 
     It is a run, without its mesh and images, whose other results are thrown away.
     """
-    dataset = open_source(source, fov_deg=fov_deg, topic=topic, mask=mask)
+    spec = SourceSpec(location=source, fov_deg=fov_deg, topic=topic, mask=mask)
+    dataset = open_source(spec)
     if dataset.is_live:
         raise DatasetError(f"{source}: is live: film, and pass the video")
     if dataset.calibration.focal_sigma == 0.0:
@@ -264,12 +268,9 @@ def calibrate_without_board(
         )
     with tempfile.TemporaryDirectory(prefix="pliant-calibrate-") as folder:
         request = RunRequest(
-            source=source,
+            source=spec,
             output=Path(folder) / "run",
             overrides=["meshing.enabled=false", "recorder.images=false"],
-            fov_deg=fov_deg,
-            topic=topic,
-            mask=mask,
         )
         with contextlib.redirect_stdout(io.StringIO()):  # of results that nobody will find
             code = run_pipeline(request)

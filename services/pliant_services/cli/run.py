@@ -187,6 +187,7 @@ def run(
 
     pliant run path/to/tissue --profile deformable --camera moving --depth map
     """
+    from pliant.datasets.source_spec import SourceSpec
     from pliant_services.run.command import RunRequest, run_pipeline
 
     sets = [_LIGHT] if light else []
@@ -216,19 +217,16 @@ def run(
     localising = ["bundle_adjustment.only_localise=true", "meshing.enabled=false"]
     sets += localising if localise else []
     sets += [] if images else ["recorder.images=false"]
+    spec = SourceSpec(location=source, calibration=calibration, fov_deg=fov, topic=topic, mask=mask)
     request = RunRequest(
-        source=source,
+        source=spec,
         profile=profile,
         output=output,
         force=force,
         config_file=config_file,
         overrides=sets,
         seed=seed,
-        calibration=calibration,
-        fov_deg=fov,
-        mask=mask,
         known=known,
-        topic=topic,
         view=view,
         save=save,
         poses=poses,

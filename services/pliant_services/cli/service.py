@@ -26,7 +26,9 @@ def service(
         list[str] | None,
         typer.Option("--set", help="KEY=VALUE overrides the file; may be repeated."),
     ] = None,
-    source: Annotated[str, typer.Option(help="ingest: source of the frames.")] = "",
+    source: Annotated[
+        str, typer.Option(help="ingest: source of the frames, or its SourceSpec as JSON.")
+    ] = "",
     calibration: Annotated[
         Path | None, typer.Option(help="ingest: calibration of a video or camera.")
     ] = None,
@@ -74,7 +76,7 @@ def service(
     pliant service tracking --connect tcp/host:7447
     """
     from pliant.config import load_config
-    from pliant_services.processes import reads_depth
+    from pliant_services.processes import with_depth
     from pliant_services.runtime.host import ServiceOptions, end_with_launcher, run_service
     from pliant_services.runtime.session_end import run_alone
 
@@ -93,22 +95,24 @@ def service(
     arguments: dict[str, Any] = {}
     if name == "ingest":
         from pliant.datasets import open_source
+        from pliant.datasets.source_spec import SourceSpec
         from pliant.recording.map_file import MapFile
 
         if not source:
             raise PliantError(
                 "ingest needs --source, such as a folder, a video, camera:0 or built-in:room"
             )
+        described = source.startswith("{")
+        spec = (
+            SourceSpec.parse(source)
+            if described
+            else SourceSpec(
+                location=source, calibration=calibration, fov_deg=fov, topic=topic, mask=mask
+            )
+        )
         arguments["dataset"] = open_source(
-            source,
-            calibration=calibration,
-            fov_deg=fov,
-            topic=topic,
-            depth=config.ingest.depth if reads_depth(names, config) else "none",
-            longest_side_px=config.ingest.longest_side_px,
-            part=config.ingest,
-            mask=mask,
-            mask_static=config.ingest.mask_static,
+            with_depth(spec, names, config),
+            config.ingest,
         )
         arguments["known"] = None if known is None else MapFile(known)
     elif name == "recorder":

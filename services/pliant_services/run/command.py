@@ -39,7 +39,7 @@ from pliant.results.folder import (
 )
 from pliant.results.locking import Held
 from pliant_services.nodes.ingest import plays_live
-from pliant_services.processes import BY_NAME, deformable_fleet, reads_depth
+from pliant_services.processes import BY_NAME, deformable_fleet, with_depth
 from pliant_services.profiles import PROFILES
 from pliant_services.run.progress import Progress
 from pliant_services.run.request import RunRequest
@@ -67,9 +67,10 @@ def run_pipeline(request: RunRequest) -> int:
     Everything is checked before an earlier result is touched.
     """
     check_limits()
-    output = request.output or Path("results") / folder_name(request.source)
-    source = Path(request.source)
-    read = [source, *parts.parts_of(source)] if os.path.exists(request.source) else []
+    source = request.source
+    output = request.output or Path("results") / folder_name(source.location)
+    place = Path(source.location)
+    read = [place, *parts.parts_of(place)] if os.path.exists(source.location) else []
     if request.resume:
         settle_killed(output)
         request = replace(request, known=resumed_map(output, request))
@@ -77,8 +78,8 @@ def run_pipeline(request: RunRequest) -> int:
     if known is not None:
         read.append(known.path)
     # What the configuration says is taken over before anything goes: it may be of this folder.
-    read += [request.mask] if request.mask is not None else []
-    read += [file_and_camera(request.calibration)[0]] if request.calibration is not None else []
+    read += [source.mask] if source.mask is not None else []
+    read += [file_and_camera(source.calibration)[0]] if source.calibration is not None else []
     keep_apart(output, read)
     if request.save is not None:
         keep_apart(request.save, [*read, *files_read(output)], option="--save")
@@ -112,24 +113,16 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
         profile = _DEFORMABLE if (output / STATE_FOLDER / "surfels").is_dir() else profile
     if request.view or request.save:
         check_viewer(output, web=request.view == "web", save=request.save, force=request.force)
-    if is_builtin(request.source):
+    spec = with_depth(request.source, PROFILES[profile], config)
+    if is_builtin(spec.location):
         from pliant.datasets.builtin import builtin_folder  # other sources need none
 
-        builtin_folder(request.source, progress=_say_rendering)
-    dataset = open_source(
-        request.source,
-        calibration=request.calibration,
-        fov_deg=request.fov_deg,
-        topic=request.topic,
-        depth=config.ingest.depth if reads_depth(PROFILES[profile], config) else "none",
-        longest_side_px=config.ingest.longest_side_px,
-        part=config.ingest,
-        mask=request.mask,
-    )
+        builtin_folder(spec.location, progress=_say_rendering)
+    dataset = open_source(spec, config.ingest.model_copy(update={"mask_static": False}))
     check_start(dataset)
     if request.quality == "high" and plays_live(dataset, config):
         raise DatasetError(
-            f"{request.source}: --quality high reads a source twice, which a live source does not "
+            f"{spec.location}: --quality high reads a source twice, which a live source does not "
             "allow: leave it out, and use it on the recording"
         )
     if request.force and not dataset.is_live:
@@ -137,7 +130,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
     progress = Progress(dataset.frame_count)
     for note in notes_on(dataset):
         progress.say(note)
-    if request.calibration is None and request.fov_deg is None:
+    if spec.calibration is None and spec.fov_deg is None:
         _say_guess(dataset.calibration, profile, progress)
     if profile == _DEFORMABLE:
         profile = deformable_fleet(config)
@@ -278,11 +271,7 @@ def service_arguments(name: str, request: RunRequest, output: Path) -> list[str]
     """What a service is told on its command line beside how to reach the others."""
     extra = ["--config", str(output / CONFIG_NAME)]
     if name == "ingest":
-        extra += ["--source", request.source]
-        extra += ["--calibration", str(request.calibration)] if request.calibration else []
-        extra += ["--fov", str(request.fov_deg)] if request.fov_deg is not None else []
-        extra += ["--mask", str(request.mask)] if request.mask is not None else []
-        extra += ["--topic", request.topic] if request.topic else []
+        extra += ["--source", request.source.to_json()]
         extra += ["--map", str(request.known)] if request.known is not None else []
     if name == "recorder":
         extra += ["--output", str(output / RECORDING_NAME)]

@@ -5,23 +5,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from pliant.datasets.source_spec import SourceSpec
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunRequest:
     """What the user asked for."""
 
-    source: str
+    source: SourceSpec
     profile: str = "rigid"
     output: Path | None = None
     force: bool = False
     config_file: Path | None = None
     overrides: Sequence[str] = ()
     seed: int | None = None
-    calibration: Path | None = None
-    fov_deg: float | None = None
-    mask: Path | None = None
     known: Path | None = None
-    topic: str = ""
     port: int | None = None
     view: Literal["window", "web"] | None = None
     save: Path | None = None

@@ -135,11 +135,7 @@ def _messages(
     output: Path, request: RunRequest, config: Config, run: Run, stretches: list[Stretch]
 ) -> dict[Topic, list[Header]]:
     """The last messages of the map, of both passes."""
-    dataset = open_source(
-        request.source, calibration=request.calibration, fov_deg=request.fov_deg,
-        topic=request.topic, longest_side_px=config.ingest.longest_side_px, part=config.ingest,
-        mask=request.mask, mask_static=config.ingest.mask_static,
-    )  # fmt: skip
+    dataset = open_source(request.source, config.ingest)
     known: list[KeptKeyframe] = list(MapFile(output).keyframes())
     reached = reach_back(dataset, config, known, stretches, run.history)
     recording = Recording(output / RECORDING_NAME)

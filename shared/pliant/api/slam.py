@@ -13,6 +13,7 @@ from pliant.config import Settings, load_config, overrides_of
 from pliant.datasets import open_source
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration, calibration_from_fov
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError, DatasetError
 from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
@@ -168,15 +169,13 @@ def follow(
     Raises DatasetError, CalibrationError, ConfigError.
     """
     config = load_config(None, overrides_of(settings), seed=seed)
-    dataset = open_source(
-        str(source),
+    spec = SourceSpec(
+        location=str(source),
         calibration=None if calibration is None else Path(calibration),
         fov_deg=fov,
-        longest_side_px=config.ingest.longest_side_px,
-        part=config.ingest,
         mask=None if mask is None else Path(mask),
-        mask_static=config.ingest.mask_static,
     )
+    dataset = open_source(spec, config.ingest)
     slam = Slam(dataset.calibration, settings=settings, seed=seed)
     for frame in dataset:
         yield slam._step(frame)  # pyright: ignore[reportPrivateUsage]

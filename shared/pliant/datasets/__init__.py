@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Literal
 
 from pliant.datasets.base import (
     VIDEO_SUFFIXES,
@@ -22,7 +21,7 @@ from pliant.datasets.calibration import Calibration, calibration_from_yaml, cali
 from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.camera_device import CameraDevice, camera_index
 from pliant.datasets.euroc import is_euroc, open_euroc
-from pliant.datasets.excerpt import Excerpt, Part, is_all
+from pliant.datasets.excerpt import Excerpt, Frames, is_all
 from pliant.datasets.folder import (
     is_bare_folder,
     is_listed_folder,
@@ -30,13 +29,14 @@ from pliant.datasets.folder import (
     open_listed_folder,
 )
 from pliant.datasets.image_kinds import foreign_files
-from pliant.datasets.images import SUFFIXES, SourceOptions
+from pliant.datasets.images import SUFFIXES
 from pliant.datasets.kitti import is_kitti, open_kitti
 from pliant.datasets.masks import Masked
 from pliant.datasets.mcap_file import is_mcap, open_mcap
 from pliant.datasets.own_recording import is_own_recording, open_own_recording
 from pliant.datasets.rectifier import Rectifier, decode
 from pliant.datasets.ros_bag import is_ros_bag, open_ros_bag
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.static_mask import StaticallyMasked
 from pliant.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
 from pliant.datasets.video import VideoFile
@@ -50,11 +50,11 @@ __all__ = [
     "Calibration",
     "CameraDevice",
     "Dataset",
-    "Part",
+    "Frames",
     "Rectifier",
     "SourceFormat",
     "SourceFrame",
-    "SourceOptions",
+    "SourceSpec",
     "VideoFile",
     "calibration_from_yaml",
     "calibration_yaml",
@@ -78,41 +78,41 @@ class SourceFormat:
     """
 
     recognises: Callable[[str], bool]
-    open: Callable[[str, SourceOptions], Dataset]
+    open: Callable[[SourceSpec], Dataset]
     has_topics: bool = False
     has_depth: bool = False
     sized: bool = False
 
 
-def _open_builtin(source: str, options: SourceOptions) -> Dataset:
+def _open_builtin(spec: SourceSpec) -> Dataset:
     from pliant.datasets.builtin import builtin_folder
 
-    return open_listed_folder(str(builtin_folder(source)), options, name=source)
+    return open_listed_folder(spec.at(builtin_folder(spec.location)), name=spec.location)
 
 
 def _is_camera(source: str) -> bool:
     return camera_index(source) is not None and not Path(source).exists()
 
 
-def _open_camera(source: str, options: SourceOptions) -> Dataset:
-    return CameraDevice(camera_index(source) or 0, options)
+def _open_camera(spec: SourceSpec) -> Dataset:
+    return CameraDevice(camera_index(spec.location) or 0, spec)
 
 
 def _is_ros(source: str) -> bool:
     return source.startswith("ros:") and not Path(source).exists()
 
 
-def _open_ros(source: str, options: SourceOptions) -> Dataset:
+def _open_ros(spec: SourceSpec) -> Dataset:
     from pliant.datasets.ros_camera import open_ros  # Zenoh, which other sources do without
 
-    return open_ros(source, options)
+    return open_ros(spec)
 
 
-def _open_video(source: str, options: SourceOptions) -> Dataset:
-    path = Path(source)
+def _open_video(spec: SourceSpec) -> Dataset:
+    path = Path(spec.location)
     if path.suffix.lower() in (*SUFFIXES, ".txt", ".csv", ".yaml"):
-        raise DatasetError(f"{source}: a single file of this kind is not a source; pass its folder")
-    return VideoFile(path, options)
+        raise DatasetError(f"{path}: a single file of this kind is not a source; pass its folder")
+    return VideoFile(path, spec)
 
 
 FORMATS: dict[str, SourceFormat] = {
@@ -160,53 +160,38 @@ def formats() -> dict[str, SourceFormat]:
     return {**found, **FORMATS}
 
 
-def open_source(
-    source: str,
-    *,
-    calibration: Path | None = None,
-    fov_deg: float | None = None,
-    topic: str = "",
-    depth: Literal["none", "first", "all"] = "none",
-    longest_side_px: int = 0,
-    part: Part | None = None,
-    mask: Path | None = None,
-    mask_static: bool = False,
-) -> Dataset:
+def open_source(spec: SourceSpec | str, frames: Frames | None = None) -> Dataset:
     """Open a source of frames of any of the ``FORMATS``, and check it as far as can be seen.
 
-    calibration: a file that wins over what comes with the source.
-    fov_deg: horizontal field of view, for a guess without any calibration.
-    topic: which images of a file that holds several; "" where there is one.
-    depth: which depth maps the frames bring along; a source without any is refused then.
-    longest_side_px: to which larger images are made smaller; 0: as large as their details need.
-    part: which frames are taken; None: all.
-    mask: an image, or a folder of them, that says which part of frames is used: see ``masks``.
-    mask_static: whether borders and overlays are found and masked, where no mask is given: see
-    ``static_mask``.
+    spec: its description, or its location alone.
+    frames: which of its frames are used, and how; None: all, at their working size.
 
     Raises DatasetError or CalibrationError: one line with what is wrong, where, and what to do.
     """
+    spec = SourceSpec(location=spec) if isinstance(spec, str) else spec
+    source = spec.location
     if not source or "\0" in source:
         raise DatasetError(f"source {shown(source)}: is empty; {HELP}")
-    first_depth = depth == "first"
-    depth = "all" if first_depth and not is_all(part) else depth  # that of its first is elsewhere
-    options = SourceOptions(calibration=calibration, fov_deg=fov_deg, topic=topic, depth=depth)
+    first_depth = spec.depth == "first"
+    if first_depth and not is_all(frames):  # the depth of the first frame that is used
+        spec = spec.model_copy(update={"depth": "all"})
     path = Path(source)
     try:
         for kind in formats().values():
             if kind.recognises(source):
-                if topic and not kind.has_topics:
+                if spec.topic and not kind.has_topics:
                     raise DatasetError(f"{source}: has no topics: leave out --topic")
-                if depth != "none" and not kind.has_depth:
+                if spec.depth != "none" and not kind.has_depth:
                     raise DatasetError(
                         f"{source}: has no depth: use a folder with rgb.txt and depth.txt"
                     )
-                opened = kind.open(source, options)
-                opened = opened if mask is None else Masked(opened, mask)
-                if part is not None and not is_all(part):
-                    opened = Excerpt(opened, part, first_depth_only=first_depth)
-                if mask_static and mask is None:
+                opened = kind.open(spec)
+                opened = opened if spec.mask is None else Masked(opened, spec.mask)
+                if frames is not None and not is_all(frames):
+                    opened = Excerpt(opened, frames, first_depth_only=first_depth)
+                if frames is not None and frames.mask_static and spec.mask is None:
                     opened = StaticallyMasked(opened)
+                longest_side_px = 0 if frames is None else frames.longest_side_px
                 if kind.sized and not longest_side_px:
                     return opened
                 return at_working_size(opened, longest_side_px)

@@ -16,7 +16,8 @@ from pliant.algorithms.arrays import U8
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_files import read_calibration
-from pliant.datasets.images import SourceOptions, choose_calibration
+from pliant.datasets.images import choose_calibration
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.video import raw_frame
 from pliant.datasets.video_decoder import quiet_opencv
 from pliant.errors import DatasetError
@@ -51,7 +52,7 @@ class CameraDevice:
     def __init__(
         self,
         index: int,
-        options: SourceOptions,
+        spec: SourceSpec,
         *,
         open_device: Callable[[int], Capture] = _open_device,
         clock_ns: Callable[[], int] = time.time_ns,
@@ -66,8 +67,8 @@ class CameraDevice:
         self._clock_ns = clock_ns
         # The camera is asked for the size that it is calibrated for.
         self._size: tuple[int, int] | None = None
-        if options.calibration is not None:
-            wanted = read_calibration(options.calibration)
+        if spec.calibration is not None:
+            wanted = read_calibration(spec.calibration)
             self._size = (wanted.width, wanted.height)
         capture = self._start()
         try:
@@ -75,7 +76,7 @@ class CameraDevice:
         finally:
             capture.release()
         self.calibration: Calibration = choose_calibration(
-            options, (width, height), found=None, where=self.name
+            spec, (width, height), found=None, where=self.name
         )
 
     def __iter__(self) -> Iterator[SourceFrame]:

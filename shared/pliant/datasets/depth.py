@@ -25,7 +25,8 @@ from pliant.datasets import stereo
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import Calibration, DepthImages
 from pliant.datasets.image_lists import ImageList, read_list
-from pliant.datasets.images import ListedImage, SourceOptions
+from pliant.datasets.images import ListedImage
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.stereo import StereoPair
 from pliant.errors import CalibrationError, DatasetError
 from pliant.trajectory import associate
@@ -35,7 +36,7 @@ _MAX_DIFFERENCE_NS = 20_000_000
 
 
 def with_depth(
-    listed: ImageList, folder: Path, calibration: Calibration, options: SourceOptions
+    listed: ImageList, folder: Path, calibration: Calibration, spec: SourceSpec
 ) -> Sequence[ListedImage]:
     """The images with the depth maps that are wanted of them.
 
@@ -43,11 +44,11 @@ def with_depth(
     CalibrationError where the unit of the depth maps is not known.
     """
     images = listed.images
-    if options.depth == "none":
+    if spec.depth == "none":
         return images
     if listed.others:
         _check_scale(folder, calibration)
-        taken = listed.others[: 1 if options.depth == "first" else None]
+        taken = listed.others[: 1 if spec.depth == "first" else None]
         depths = [*taken, *[None] * (len(images) - len(taken))]
         return [replace(image, depth=path) for image, path in zip(images, depths, strict=True)]
     file = folder / LIST_NAME
@@ -66,7 +67,7 @@ def with_depth(
     rows, of_maps = associate(_stamps(images), _stamps(maps), max_difference_ns=_MAX_DIFFERENCE_NS)
     if not len(rows):
         raise DatasetError(f"{file}: no depth map is within 20 ms of an image; correct the times")
-    wanted = slice(1 if options.depth == "first" else None)
+    wanted = slice(1 if spec.depth == "first" else None)
     pairs = zip(rows[wanted].tolist(), of_maps[wanted].tolist(), strict=True)
     found: dict[int, Path | StereoPair] = {row: maps[of_map].path for row, of_map in pairs}
     if is_stereo:

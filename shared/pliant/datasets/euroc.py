@@ -14,11 +14,11 @@ from pliant.datasets.base import Dataset
 from pliant.datasets.image_lists import read_list
 from pliant.datasets.images import (
     ImageFiles,
-    SourceOptions,
     choose_calibration,
     existing,
     image_size,
 )
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 
 
@@ -27,11 +27,11 @@ def is_euroc(source: str) -> bool:
     return _camera_folder(Path(source)) is not None
 
 
-def open_euroc(source: str, options: SourceOptions) -> Dataset:
+def open_euroc(spec: SourceSpec) -> Dataset:
     """A sequence in ASL format.  Raises DatasetError and CalibrationError."""
-    camera = _camera_folder(Path(source))
+    camera = _camera_folder(Path(spec.location))
     if camera is None:
-        raise DatasetError(f"{source}: no mav0/cam0 with data.csv and data/")
+        raise DatasetError(f"{spec.location}: no mav0/cam0 with data.csv and data/")
     listed = read_list(camera / "data.csv", camera / "data", unit="nanoseconds")
     resolved = camera.resolve()
     sequence = resolved.parent.parent if resolved.parent.name == "mav0" else resolved.parent
@@ -40,7 +40,7 @@ def open_euroc(source: str, options: SourceOptions) -> Dataset:
         images=listed.images,
         notes=listed.notes,
         calibration=choose_calibration(
-            options, image_size(listed.images), found=camera / "sensor.yaml", where=str(camera)
+            spec, image_size(listed.images), found=camera / "sensor.yaml", where=str(camera)
         ),
         ground_truth_path=existing(
             camera.parent / "state_groundtruth_estimate0" / "data.csv",

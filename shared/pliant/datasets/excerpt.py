@@ -34,6 +34,20 @@ class Part(Protocol):
     def sharpest(self) -> bool: ...
 
 
+class Frames(Part, Protocol):
+    """Which frames of a source are used and how: ``ingest`` of the configuration.
+
+    longest_side_px: the limit of a larger image; 0: as many pixels as its details need.
+    mask_static: whether borders and overlays are found and masked, without a mask: see
+    ``static_mask``.
+    """
+
+    @property
+    def longest_side_px(self) -> int: ...
+    @property
+    def mask_static(self) -> bool: ...
+
+
 class Excerpt:
     """Those frames of a source, counted from 0.  Times stay those of the source."""
 

@@ -25,12 +25,12 @@ from pliant.datasets.image_lists import read_list
 from pliant.datasets.images import (
     ImageFiles,
     ListedImage,
-    SourceOptions,
     choose_calibration,
     existing,
     image_size,
 )
 from pliant.datasets.named_times import times_in_names
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.times import rate
 
 LIST_NAME = "rgb.txt"
@@ -55,19 +55,19 @@ def is_listed_folder(source: str) -> bool:
     return list_of(Path(source)) is not None
 
 
-def open_listed_folder(source: str, options: SourceOptions, *, name: str = "") -> Dataset:
+def open_listed_folder(spec: SourceSpec, *, name: str = "") -> Dataset:
     """A folder with rgb.txt, under another name if one is given.
 
     Raises DatasetError and CalibrationError.
     """
-    folder = Path(source)
+    folder = Path(spec.location)
     listed = read_list(list_of(folder) or folder / LIST_NAME, folder)
     calibration = choose_calibration(
-        options, image_size(listed.images), found=calibration_in(folder), where=source
+        spec, image_size(listed.images), found=calibration_in(folder), where=spec.location
     )
     return ImageFiles(
         name=name or folder.resolve().name,
-        images=with_depth(listed, folder, calibration, options),
+        images=with_depth(listed, folder, calibration, spec),
         calibration=calibration,
         ground_truth_path=existing(folder / GROUND_TRUTH_NAME),
         notes=listed.notes,
@@ -79,16 +79,16 @@ def is_bare_folder(source: str) -> bool:
     return folder_of_images(Path(source)) is not None
 
 
-def open_bare_folder(source: str, options: SourceOptions) -> Dataset:
+def open_bare_folder(spec: SourceSpec) -> Dataset:
     """A folder of images without a list.  Raises DatasetError and CalibrationError."""
-    folder = Path(source)
+    folder = Path(spec.location)
     inner = folder_of_images(folder) or folder
     paths, notes = images_of_one_kind(inner)
     if inner != folder:
         notes.append(f"the images are those in {inner.name}/")
     untimed = [ListedImage(stamp_ns=0, path=path) for path in paths]
     calibration = choose_calibration(
-        options, image_size(untimed), found=calibration_in(folder, inner), where=source
+        spec, image_size(untimed), found=calibration_in(folder, inner), where=spec.location
     )
     images, told = _timed(paths, calibration.fps)
     return ImageFiles(

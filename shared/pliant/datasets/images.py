@@ -4,15 +4,15 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from pliant.datasets.base import BrokenFrame, SourceFrame, encoding_of
 from pliant.datasets.bit_depth import bits_used, eight_bits, note_on
 from pliant.datasets.calibration import Calibration, calibration_from_fov
 from pliant.datasets.calibration_files import check_size, read_calibration
 from pliant.datasets.image_sizes import LOOKED_AT, most_frequent, size_of
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.stereo import StereoPair
-from pliant.errors import CalibrationError, DatasetError
+from pliant.errors import DatasetError
 
 SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"),
@@ -21,24 +21,6 @@ SUFFIXES = (
 _TRIED_FOR_SIZE = 20
 _HIDDEN = re.compile(r"\.(?![0-9]+\.[A-Za-z]+$)")
 """Names of hidden files; .25.png is a time."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SourceOptions:
-    """What the user says about the camera.  Either wins over what comes with the source.
-
-    topic: which images of a file with several are meant; "" where there is but one.
-    depth: which depth maps are wanted: none, the first one, or those of all frames.
-    """
-
-    calibration: Path | None = None
-    fov_deg: float | None = None
-    topic: str = ""
-    depth: Literal["none", "first", "all"] = "none"
-
-    def __post_init__(self) -> None:
-        if self.calibration is not None and self.fov_deg is not None:
-            raise CalibrationError("--calibration and --fov exclude each other: pass only one")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +135,7 @@ def _spread(count: int) -> list[int]:
 
 
 def choose_calibration(
-    options: SourceOptions,
+    spec: SourceSpec,
     size: tuple[int, int],
     *,
     found: Path | Calibration | None,
@@ -166,11 +148,11 @@ def choose_calibration(
     Where there is none, a guess.  pixel_aspect: width over height of a pixel.
     Raises CalibrationError where it is broken, or for other images.
     """
-    if options.fov_deg is not None:
-        return calibration_from_fov(*size, options.fov_deg, pixel_aspect=pixel_aspect)
+    if spec.fov_deg is not None:
+        return calibration_from_fov(*size, spec.fov_deg, pixel_aspect=pixel_aspect)
     source = where.rpartition(": ")[2] if ": /" in where else Path(where).name
-    if options.calibration is not None:
-        return read_calibration(options.calibration, size, kitti_camera=kitti_camera, source=source)
+    if spec.calibration is not None:
+        return read_calibration(spec.calibration, size, kitti_camera=kitti_camera, source=source)
     if isinstance(found, Calibration):
         check_size(found, size, f"{where}: its built-in calibration")
         return found

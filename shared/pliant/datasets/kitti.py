@@ -23,12 +23,12 @@ from pliant.datasets.image_lists import data_lines, mended, stamps_of
 from pliant.datasets.images import (
     ImageFiles,
     ListedImage,
-    SourceOptions,
     choose_calibration,
     existing,
     image_files,
     image_size,
 )
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 from pliant.wording import shown
 
@@ -51,12 +51,12 @@ def is_kitti(source: str) -> bool:
     return _layout(Path(source)) is not None
 
 
-def open_kitti(source: str, options: SourceOptions) -> Dataset:
+def open_kitti(spec: SourceSpec) -> Dataset:
     """A sequence of the benchmark.  Raises DatasetError and CalibrationError."""
-    folder = Path(source)
+    folder = Path(spec.location)
     layout = _layout(folder)
     if layout is None:
-        raise DatasetError(f"{source}: no folder image_0 or image_2")
+        raise DatasetError(f"{spec.location}: no folder image_0 or image_2")
     paths = image_files(layout.images)
     if not paths:
         raise DatasetError(f"{layout.images}: no images in it")
@@ -80,10 +80,10 @@ def open_kitti(source: str, options: SourceOptions) -> Dataset:
         images=images,
         notes=[*notes, *told],
         calibration=choose_calibration(
-            options,
+            spec,
             image_size(images),
             found=layout.calibration,
-            where=source,
+            where=spec.location,
             kitti_camera=layout.camera,
         ),
         ground_truth_path=existing(

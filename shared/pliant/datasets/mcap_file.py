@@ -22,7 +22,6 @@ from pliant.datasets.image_messages import (
     RecordedImage,
     plain_type,
 )
-from pliant.datasets.images import SourceOptions
 from pliant.datasets.message_files import (
     MessageImages,
     MessageTopic,
@@ -30,6 +29,7 @@ from pliant.datasets.message_files import (
     missing_library,
     recorded_image,
 )
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError, PliantError
 from pliant.wording import shortened, shown
 
@@ -47,9 +47,9 @@ def is_mcap(source: str) -> bool:
         return file.read(len(MAGIC)) == MAGIC or path.suffix == ".mcap"
 
 
-def open_mcap(source: str, options: SourceOptions) -> Dataset:
+def open_mcap(spec: SourceSpec) -> Dataset:
     """The images of an MCAP file.  Raises DatasetError and CalibrationError."""
-    return MessageImages(_Mcap(Path(source)), options)
+    return MessageImages(_Mcap(Path(spec.location)), spec)
 
 
 class _Mcap:

@@ -14,8 +14,9 @@ from pliant.datasets.calibration import Calibration
 from pliant.datasets.frame_times import in_order
 from pliant.datasets.image_messages import CALIBRATION_TYPES, IMAGE_TYPES, RecordedImage
 from pliant.datasets.image_sizes import LOOKED_AT, most_frequent
-from pliant.datasets.images import SourceOptions, choose_calibration
+from pliant.datasets.images import choose_calibration
 from pliant.datasets.rectifier import decode
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import CalibrationError, DatasetError
 from pliant.wording import shortened
 
@@ -57,21 +58,21 @@ class MessageImages:
     is_live = False
     ground_truth_path: Path | None = None
 
-    def __init__(self, file: MessageFile, options: SourceOptions) -> None:
+    def __init__(self, file: MessageFile, spec: SourceSpec) -> None:
         """Raises DatasetError, which lists the topics where the choice is not clear."""
         self.name = file.path.resolve().stem
         self.notes: list[str] = []
         self._bits = 16
         self._file = file
         with file.open() as opened:
-            self._topic = _choose(opened.topics, options.topic, file.path)
-            self.notes += _other_topics(opened.topics, self._topic, options.topic)
+            self._topic = _choose(opened.topics, spec.topic, file.path)
+            self.notes += _other_topics(opened.topics, self._topic, spec.topic)
             self._where = f"{file.path}: {self._topic.name}"
             size = self._look(opened)
             found = None
-            if options.calibration is None and options.fov_deg is None:
+            if spec.calibration is None and spec.fov_deg is None:
                 found = _calibration(opened, self._topic, self._where)
-            self.calibration = choose_calibration(options, size, found=found, where=self._where)
+            self.calibration = choose_calibration(spec, size, found=found, where=self._where)
         self.frame_count = self._topic.count if self._topic.count >= 0 else None
 
     def __iter__(self) -> Iterator[SourceFrame]:

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.calibration import calibration_from_yaml
-from pliant.datasets.images import SourceOptions, choose_calibration
+from pliant.datasets.images import choose_calibration
 from pliant.datasets.mcap_file import is_mcap
 from pliant.datasets.recorded_images import RecordedImages
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Depth, SourceImage
@@ -33,9 +34,9 @@ def is_own_recording(source: str) -> bool:
         return file.read(_PROFILE_AT + len(_PROFILE))[_PROFILE_AT:] == _PROFILE
 
 
-def open_own_recording(source: str, options: SourceOptions) -> Dataset:
+def open_own_recording(spec: SourceSpec) -> Dataset:
     """The frames of a recording.  Raises DatasetError, CalibrationError and RecordingError."""
-    return RecordedFrames(Path(source), options)
+    return RecordedFrames(Path(spec.location), spec)
 
 
 class RecordedFrames:
@@ -44,10 +45,10 @@ class RecordedFrames:
     is_live = False
     ground_truth_path: Path | None = None
 
-    def __init__(self, path: Path, options: SourceOptions) -> None:
+    def __init__(self, path: Path, spec: SourceSpec) -> None:
         """Raises DatasetError where it holds no images."""
         self._recording = Recording(path)
-        self._depth = options.depth
+        self._depth = spec.depth
         streams = self._recording.decoded(topics.STREAM)
         stream = next((m for m in streams if isinstance(m, CameraStream)), None)
         first = next(self._recording.messages(topics.SOURCE), None)
@@ -60,7 +61,7 @@ class RecordedFrames:
         self.name = stream.source
         self.frame_count = stream.frames if stream.frames >= 0 else None
         self.calibration = choose_calibration(
-            options, (calibration.width, calibration.height), found=calibration, where=str(path)
+            spec, (calibration.width, calibration.height), found=calibration, where=str(path)
         )
 
     def __iter__(self) -> Iterator[SourceFrame]:

@@ -13,7 +13,6 @@ from typing import Any
 
 from pliant.datasets.base import Dataset
 from pliant.datasets.image_messages import RecordedImage, plain_type
-from pliant.datasets.images import SourceOptions
 from pliant.datasets.message_files import (
     MessageImages,
     MessageTopic,
@@ -21,6 +20,7 @@ from pliant.datasets.message_files import (
     missing_library,
     recorded_image,
 )
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import PliantError
 
 _HINT = "`rosbag reindex` (ROS 1) or `ros2 bag reindex` (ROS 2)"
@@ -32,9 +32,9 @@ def is_ros_bag(source: str) -> bool:
     return (path.suffix == ".bag" and path.is_file()) or (path / "metadata.yaml").is_file()
 
 
-def open_ros_bag(source: str, options: SourceOptions) -> Dataset:
+def open_ros_bag(spec: SourceSpec) -> Dataset:
     """The images of a bag.  Raises DatasetError and CalibrationError."""
-    return MessageImages(_Bag(Path(source)), options)
+    return MessageImages(_Bag(Path(spec.location)), spec)
 
 
 class _Bag:

@@ -14,8 +14,8 @@ from pathlib import Path
 from pliant.bus.session import open_session
 from pliant.datasets.base import Dataset
 from pliant.datasets.image_messages import RecordedImage, capture_time, plain_type
-from pliant.datasets.images import SourceOptions
 from pliant.datasets.message_files import MessageImages, MessageTopic, recorded_image
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import BusError, DatasetError
 from pliant.ros.definitions import RosError, definitions
 from pliant.ros.graph import Node
@@ -27,9 +27,9 @@ _FIRST_S = 10.0  # for the first message of a topic
 _ASK_S = 0.5
 
 
-def open_ros(source: str, options: SourceOptions) -> Dataset:
+def open_ros(spec: SourceSpec) -> Dataset:
     """The images of a topic.  Raises DatasetError and CalibrationError."""
-    return RosCamera(source, options)
+    return RosCamera(spec)
 
 
 class RosCamera(MessageImages):
@@ -37,10 +37,10 @@ class RosCamera(MessageImages):
 
     is_live = True
 
-    def __init__(self, source: str, options: SourceOptions) -> None:
+    def __init__(self, spec: SourceSpec) -> None:
         """Raises DatasetError and CalibrationError."""
-        super().__init__(_Graph(source), options)
-        self.name = source
+        super().__init__(_Graph(spec.location), spec)
+        self.name = spec.location
 
 
 class _Graph:

@@ -20,11 +20,11 @@ from pliant.datasets.folder import CALIBRATION_NAME, GROUND_TRUTH_NAME, LIST_NAM
 from pliant.datasets.image_lists import read_list
 from pliant.datasets.images import (
     ImageFiles,
-    SourceOptions,
     choose_calibration,
     existing,
     image_size,
 )
+from pliant.datasets.source_spec import SourceSpec
 
 _WIDTH, _HEIGHT = 640, 480
 # The benchmark's calibration of the colour cameras (page "Intrinsic camera calibration of the
@@ -50,19 +50,19 @@ def is_tum_rgbd(source: str) -> bool:
     return listed and _camera_number(folder) is not None
 
 
-def open_tum_rgbd(source: str, options: SourceOptions) -> Dataset:
+def open_tum_rgbd(spec: SourceSpec) -> Dataset:
     """A sequence of the benchmark.  Raises DatasetError and CalibrationError."""
-    folder = Path(source)
+    folder = Path(spec.location)
     listed = read_list(folder / LIST_NAME, folder)
     calibration = choose_calibration(
-        options,
+        spec,
         image_size(listed.images),
         found=tum_calibration(_camera_number(folder) or "1"),
-        where=source,
+        where=spec.location,
     )
     return ImageFiles(
         name=folder.resolve().name,
-        images=with_depth(listed, folder, calibration, options),
+        images=with_depth(listed, folder, calibration, spec),
         notes=listed.notes,
         calibration=calibration,
         ground_truth_path=existing(folder / GROUND_TRUTH_NAME),

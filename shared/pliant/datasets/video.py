@@ -14,7 +14,8 @@ from pathlib import Path
 from pliant.algorithms.arrays import U8
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration
-from pliant.datasets.images import SourceOptions, choose_calibration
+from pliant.datasets.images import choose_calibration
+from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.video_decoder import FIELDS, VideoDecoder, file_version, opened
 from pliant.datasets.video_streams import VideoStream
 from pliant.errors import DatasetError
@@ -36,7 +37,7 @@ class VideoFile:
     is_live = False
     ground_truth_path: Path | None = None
 
-    def __init__(self, file: Path, options: SourceOptions) -> None:
+    def __init__(self, file: Path, spec: SourceSpec) -> None:
         """Raises DatasetError where it holds no video, CalibrationError for its calibration."""
         self.name = file.stem
         self.file = file
@@ -59,7 +60,7 @@ class VideoFile:
             self.frame_count = shown_frames(decoder.stream, decoder.count, first_ns)
         height, width = first.shape[:2]
         self.calibration: Calibration = choose_calibration(
-            options,
+            spec,
             (width, height),
             found=file.with_suffix(".yaml"),
             where=str(file),

@@ -16,6 +16,7 @@ from pliant.datasets.builtin import builtin_folder
 from pliant.datasets.builtin_deforming import SURFACES_NAME
 from pliant.datasets.depth import DepthRectifier
 from pliant.datasets.rectifier import Rectifier
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import ResultError
 from pliant.evaluation.exact_surfels import ExactSurfels, format_exact
 from pliant.evaluation.later_surfels import LaterSurfels, format_later, scaled, true_scale
@@ -35,7 +36,7 @@ def surfels_against_truth(result: Path, source: str, figures: dict[str, Any]) ->
     if (folder / SURFACES_NAME).is_file():
         yield _against_surfaces(result, folder, figures)
         return
-    dataset = open_source(source, depth="all")
+    dataset = open_source(SourceSpec(location=source, depth="all"))
     rectifier, depths = Rectifier(dataset.calibration), DepthRectifier(dataset.calibration)
     truth = SurfelTruth(rectifier.camera)
     for surfels, frame in zip(

@@ -11,6 +11,7 @@ from pliant.algorithms.rectification import rectified_camera
 from pliant.datasets import open_source
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.depth import DepthRectifier
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import ResultError
 from pliant.export.images import camera_of
 from pliant.recording.reader import Recording
@@ -67,7 +68,7 @@ def from_depth(recording: Recording, run: Run, source: str) -> Scale:
     that it sees; the scale is the median of these, its sigma their spread, as all share the errors
     of a sensor.  Raises PliantError.
     """
-    dataset = open_source(source, depth="all")
+    dataset = open_source(SourceSpec(location=source, depth="all"))
     depths, camera = DepthRectifier(dataset.calibration), rectified_camera(dataset.calibration.lens)
     stream = camera_of(recording)
     history, longest = run.history, run.history.longest_segment()
