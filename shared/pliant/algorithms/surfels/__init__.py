@@ -1,1 +1,1 @@
-"""Surfels that move on their own, followed through the images of one camera (DSDT)."""
+"""Independently moving surfels, tracked through the images of one camera (DSDT)."""

@@ -1,6 +1,6 @@
 """New surfels from an image and its depth (DSDT, section III).
 
-They stand on points with texture in two directions (Shi and Tomasi), spread by non-maximum
+They are created at points with texture in two directions (Shi and Tomasi), spread by non-maximum
 suppression.
 """
 
@@ -44,15 +44,15 @@ _TANGENT_RADIUS_PX = 11
 _DEPTH_JUMP = 0.08
 """A larger relative step of depth is another surface."""
 _DEPTH_NOISE = 5e-4
-"""No depth is expected to be more exact than this share of itself."""
+"""Minimum relative noise of a depth."""
 _MIN_DEPTH_SHARE = 0.5
-"""Least share of the window of a tangent that has the surface of its middle."""
+"""Minimum share of a tangent's window on the surface of its centre."""
 _MAX_SLOPE = 4.0
 """Steepest surface: relative change of depth per unit of normalised coordinate."""
 _MAX_OFF_PLANE = 0.03
-"""What is off a surfel's plane by more than this share of its depth is no part of its texture."""
+"""Pixels off a surfel's plane by more than this share of its depth are not part of its texture."""
 _MIN_TEMPLATE = 0.6
-"""Least share of a patch inside of the image and on the surfel's plane."""
+"""Minimum share of a patch inside the image and on the surfel's plane."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +71,10 @@ def find_births(
     occupied: F64,
     count: int,
 ) -> Births:
-    """At most ``count`` surfels where there is texture, depth and room.
+    """Return at most ``count`` new surfels at pixels with texture, depth and enough distance.
 
     pyramid: of the image.  depth: (H, W) metres, 0 or NaN for holes.  occupied: (M, 2) pixels near
-    which nothing may be born.
+    which no surfel may be created.
     """
     p, level = parameters, pyramid[0]
     image = level.pixels
@@ -136,8 +136,8 @@ def make_templates(
 ) -> Templates:  # fmt: skip
     """Textures on the surfels' own grids at one level, and their derivatives along the grid.
 
-    depth: (H, W) metres of the full-size image.  What is not of the surfel's own plane takes no
-    part: a background that stays where it is would hold the patch, or tear it along the ray.
+    depth: (H, W) metres of the full-size image.  Pixels off the surfel's own plane are left out: a
+    static background would hold the patch, or pull it along the ray.
     """
     n, side = len(poses), level.side
     templates = Templates(
@@ -155,9 +155,9 @@ def make_templates(
 
 @fast_kernel
 def _leave_out_other_surfaces(h: F64, level: Level, wide: Grid, depth: F64, bound: float) -> None:
-    """Make invalid what has no depth, or one off the plane by more than a share of ``bound``.
+    """Invalidate samples without depth, or off the plane by more than a share of ``bound``.
 
-    A pixel of a coarse level covers several of the depth map: its middle and corners are looked at.
+    A pixel of a coarse level covers several of the depth map: its centre and corners are tested.
     """
     height, width = depth.shape
     scale = width // level.width
@@ -196,7 +196,7 @@ def _fill(
                 continue
             vu = np.float32(0.5) * (wide.values[k + 1] - wide.values[k - 1])
             vv = np.float32(0.5) * (wide.values[k + wide.side] - wide.values[k - wide.side])
-            # What has no derivatives is no part of the texture.
+            # Samples without derivatives are not part of the texture.
             if abs(vu) < _FAR * 0.5 and abs(vv) < _FAR * 0.5:
                 images[1, n], images[2, n] = vu, vv
             count, total, squares = count + 1, total + v, squares + v * v

@@ -1,9 +1,9 @@
-"""The camera before surfels (DSDT, section V).
+"""The pose of a camera relative to surfels (DSDT, section V).
 
-Everything is in the camera's frame.  What an image sees of a surfel is its motion relative to the
-camera alone (the floating map ambiguity, Eq. 16-19), so that Eq. 20 alone ties the camera to the
-surfels.  Camera and surfels take turns: surfels by Eq. 21 before a camera that is held, then the
-camera that fits them, which needs no image.
+Everything is in the camera's frame.  An image shows only a surfel's motion relative to the camera
+(the floating map ambiguity, Eq. 16-19), so Eq. 20 alone relates the camera to the surfels.  Camera
+and surfels are solved alternately: surfels by Eq. 21 with a fixed camera, then the camera that fits
+them, which needs no image.
 """
 
 import numpy as np
@@ -21,12 +21,13 @@ from pliant.algorithms.surfels.surfel_alignment import (
 )
 
 _RIGID_SURFELS = 150
-"""So many surfels say where the camera is before each of them is looked for."""
+"""Number of surfels that determine the camera before each surfel is aligned."""
 _RIDGE = 1e-9
 _FIT_STEPS = 3
 _FITTED = 1e-6
-"""A step that turns the camera, and moves it relative to the depth, by less than this is the last:
-a thousandth of a pixel."""
+"""The last step rotates and moves the camera, relative to the depth, by less than this: a
+thousandth of a pixel.
+"""
 
 
 def se3_exp(zeta: F64) -> F64:
@@ -44,7 +45,7 @@ def se3_exp(zeta: F64) -> F64:
 
 
 def spread(rows: U8) -> U8:
-    """Of the rows that are 1 every so many, ``_RIGID_SURFELS`` or up to twice as many."""
+    """Select ``_RIGID_SURFELS`` or up to twice as many rows, evenly, of those that are 1."""
     chosen = np.flatnonzero(rows)
     out = np.zeros_like(rows)
     out[chosen[:: max(1, len(chosen) // _RIGID_SURFELS)]] = 1
@@ -52,10 +53,10 @@ def spread(rows: U8) -> U8:
 
 
 def align_rigid(poses: F64, active: U8, T_camera_world: F64, matcher: Matcher) -> F64:
-    """Move the camera alone: all surfels stand still in the world.
+    """Move the camera alone: all surfels are static in the world.
 
-    The matrices are the textures' own, which shape the steps and not where they end.
-    poses: (N, POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
+    The matrices are those of the textures, which affect the steps and not the result. poses: (N,
+    POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
     """
     level, templates, limits, work = matcher
     now = evaluate_all(poses, active, matcher)
@@ -96,7 +97,7 @@ def rigid_system(
 ) -> tuple[F64, F64, F64]:
     """M (6, 6) and v (6,) of a rigid scene, M zeta = v, and (N, 2, 7) gain and bias from (1, zeta).
 
-    A surfel that stands still in the world steps by its own adjoint times zeta.
+    A surfel that is static in the world steps by its own adjoint times zeta.
     """
     own = eliminate_all(poses, active, level, ISOMETRIC, work, sums, matrices)
     adjoints = np.tile(np.eye(6), (len(poses), 1, 1))
@@ -114,15 +115,15 @@ def _shift(before: F64, after: F64) -> F64:
 
 
 def fit_camera(poses: F64, active: U8, T_camera_world: F64, equilibria: F64, weights: F64) -> F64:
-    """Minimise Eq. 21 over the camera alone, which only Eq. 20 knows of; no image is needed.
+    """Minimise Eq. 21 over the camera alone, which depends only on Eq. 20; no image is needed.
 
-    poses: (N, POSE_FLOATS) in the camera's frame: the images have found them, and they stay.
-    equilibria: (N, 3) metres, world.  weights: (N,) DN^2 / m^2.  Returns T_camera_world.
+    poses: (N, POSE_FLOATS) in the camera's frame, fixed at their aligned values. equilibria: (N, 3)
+    metres, world.  weights: (N,) DN^2 / m^2.  Returns T_camera_world.
     """
     w, x = weights * active, poses[:, X : X + 3]
     for _ in range(_FIT_STEPS):
         points = transform(T_camera_world, equilibria)
-        # A step turns Sigma's axes, too: it is about where a surfel is, not where it rests.
+        # A step rotates Sigma's axes, too: about the surfel's position, not its equilibrium.
         G = np.concatenate([np.tile(np.eye(3), (len(x), 1, 1)), -hat(x)], axis=2)
         M = np.einsum("n,nki,nkj->ij", w, G, G)
         zeta = _solve(M, np.einsum("n,nki,nk->i", w, G, x - points), 0.0)
@@ -134,7 +135,7 @@ def fit_camera(poses: F64, active: U8, T_camera_world: F64, equilibria: F64, wei
 
 
 def _solve(M: F64, v: F64, damping: float) -> F64:
-    """Damped step, scaled by the diagonal (Eq. 14-15); zero where nothing is known."""
+    """Return the damped step, scaled by the diagonal (Eq. 14-15); zero where undetermined."""
     diagonal: F64 = np.diag(M) * (1.0 + damping)
     finite = np.isfinite(M).all() and np.isfinite(v).all()
     if not finite or not bool(np.min(diagonal) > 0.0):

@@ -1,6 +1,6 @@
-"""Surfels that were born side by side on one surface: the edges of a deformation graph.
+"""The deformation graph: edges between surfels that were created side by side on one surface.
 
-Not in the paper, whose surfels know nothing of each other; ``graph_alignment`` says what for.
+Not in the paper, whose surfels are independent; see ``graph_alignment`` for their use.
 """
 
 from typing import NamedTuple
@@ -12,16 +12,16 @@ from pliant.algorithms.surfels.patch_sampling import A, B, F, X
 from pliant.compiler.kernel import fast_kernel
 
 _OFF_PLANE = 0.3
-"""Neighbours are off each other's plane by at most this share of their distance."""
+"""Maximum distance of neighbours from each other's plane, as a share of their distance."""
 
 _TEAR = 0.3
-"""Strain at which neighbours hold on by a quarter only: what tears or slides."""
+"""Strain at which an edge has a quarter of its weight: for tears and slides."""
 _FEW = 3
 _HELD_SHARE = 0.25
 
 
 class Edges(NamedTuple):
-    """E pairs of neighbours, d metres apart when the younger was born."""
+    """E pairs of neighbours, d metres apart when the younger was created."""
 
     ends: I64  # (E, 2) rows of the two surfels
     first: F64  # (E, 3) d in A, B, A x B of the first
@@ -96,9 +96,9 @@ def _nearest(
 
 
 def find_edges(poses: F64, known: I64, first_new: int, count: int) -> Edges:
-    """The ``count`` nearest neighbours of each surfel that lie on the same surface.
+    """Return the ``count`` nearest neighbours of each surfel on the same surface.
 
-    poses: (N, POSE_FLOATS).  known: (N,) 1 where the pose is trusted.  first_new: pairs of earlier
+    poses: (N, POSE_FLOATS).  known: (N,) 1 where the pose is reliable.  first_new: pairs of earlier
     rows are left out.
     """
     n = len(poses)
@@ -169,10 +169,10 @@ def _edge_rows(
 
 
 def torn_off(edges: Edges, weights: F64, count: int) -> BoolArray:
-    """(count,) which surfels are held by no more than a few of their neighbours.
+    """(count,) which surfels keep only a few of their neighbours.
 
-    weights: (E,) of ``edge_rows``.  Where two surfaces slide along each other, each surfel still
-    has neighbours of its own; one that has left them all has run away along its ray.
+    weights: (E,) of ``edge_rows``.  If two surfaces slide along each other, each surfel still has
+    neighbours; one that has left them all has drifted along its ray.
     """
     ends = edges.ends.ravel()
     degree = np.bincount(ends, minlength=count)
@@ -181,7 +181,7 @@ def torn_off(edges: Edges, weights: F64, count: int) -> BoolArray:
 
 
 def pull_of_edges(edges: Edges, count: int, weight: float, strain: float) -> F64:
-    """(count,) DN^2 / m^2 by which its pairs hold each surfel where it is.
+    """(count,) DN^2 / m^2 with which its edges hold each surfel in place.
 
     weight: of a pair that is strained by ``strain``, DN^2.
     """

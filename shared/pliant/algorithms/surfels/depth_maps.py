@@ -1,10 +1,11 @@
-"""What a depth map tells surfels: their tangents at birth, and how far it agrees with them.
+"""Depth maps for surfels: their tangents at creation, and the consistency of the map with them.
 
-A plane has an inverse depth that is affine in the image.  That affine is fitted robustly to the
-pixels around a point, so that noise is averaged, holes are left out, and what lies beyond an edge
-in depth does not bend the tangent (DSDT, Eq. 3 and 4).
+A plane has an inverse depth that is affine in the image.  It is fitted robustly to the pixels
+around a point, so that noise is averaged, holes are left out, and surfaces beyond a depth
+discontinuity do not bend the tangent (DSDT, Eq. 3 and 4).
 
-A map of something rigid is wrong where the scene deforms: surfels say where, and what its scale is.
+A map of a rigid scene is wrong where the scene deforms: surfels show where, and determine its
+scale.
 """
 
 import math
@@ -21,21 +22,21 @@ _REWEIGHTINGS = 4
 _TUKEY = 4.685  # 95 % efficiency for Gaussian noise
 _MAD = 1.4826
 _CELL_PX = 16
-"""The agreement is asked for once in a square of this side."""
+"""Side of the squares in which the agreement is tested once."""
 _MIN_SURFELS = 30
-"""So many surfels that agree, and half of those that the map shows, are needed."""
+"""Minimum agreeing surfels, besides half of those in the map."""
 _MAX_DISAGREEMENT = 0.02
-"""A surfel disagrees whose depth is off the map's by more than this share, after the median."""
+"""Maximum relative difference between a surfel's depth and the map's, after the median."""
 _REACH = 2.0
-"""Surfels within so many sides of a patch say whether a depth is right."""
+"""Surfels within this many patch sides decide whether a depth is right."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """What surfels say of a depth map.
+    """Comparison of a depth map with surfels.
 
-    ratio: units of the surfels by one of the map.    depth: (H, W) in units of the surfels, 0 where
-    it is unknown or where they disagree; None where they cannot tell, for the ``problem``.
+    ratio: units of the surfels per unit of the map.    depth: (H, W) in units of the surfels, 0
+    where unknown or contradicted; None if undecided, because of the ``problem``.
     """
 
     ratio: float
@@ -44,9 +45,9 @@ class Agreement:
 
 
 def agree(depth: F64, surfels: SurfelFrame, patch_px: int) -> Agreement:
-    """Compare a depth map with the surfels that are tracked in its frame.
+    """Compare a depth map with the surfels tracked in its frame.
 
-    depth: (H, W) along the optical axis in any unit, 0 where nothing is known.
+    depth: (H, W) along the optical axis in any unit, 0 where unknown.
     """
     pixels, ratios = _ratios(depth, surfels)
     if len(ratios) < _MIN_SURFELS:
@@ -74,8 +75,7 @@ def _ratios(depth: F64, surfels: SurfelFrame) -> tuple[I64, F64]:
 
 
 def _doubted(depth: F64, pixels: I64, agrees: np.ndarray, reach_px: float) -> np.ndarray:
-    """(H, W) whether fewer than half of the surfels about a pixel agree; where there are none,
-    nobody doubts."""
+    """(H, W) whether fewer than half of the surfels around a pixel agree; false without surfels."""
     height, width = depth.shape
     rows, columns = np.arange(0, height, _CELL_PX), np.arange(0, width, _CELL_PX)
     middle = 0.5 * (_CELL_PX - 1)

@@ -1,4 +1,4 @@
-"""All surfels of a deformation graph step as one (beyond the paper).
+"""Joint steps of all surfels of a deformation graph (not in the paper).
 
 A surfel's depth comes from its size in the image alone, so a patch that stretches by one per cent
 is wrong by one per cent of its depth.  Over a surface such strains average out.  So two surfels
@@ -6,10 +6,10 @@ that were born as neighbours, d apart, cost omega_E w times
 
     |X_j - X_i - (R_i + R_j) d / 2|^2 / (strain |d|)^2 + |(R_j - R_i) d|^2 / (bend |d|)^2
 
-beside Eq. 11: as rigid as possible, at the middle of the pair, where curvature cancels.  w lets go
-of what is torn apart.  Each surfel keeps its own six parameters and its own image; F, gain and bias
+in addition to Eq. 11: as rigid as possible, at the middle of the pair, where curvature cancels.  w
+releases torn pairs.  Each surfel keeps its own six parameters and its own image; F, gain and bias
 are eliminated from its block (Schur complement), and preconditioned conjugate gradients move all.
-A surfel that is not seen is carried along.
+An invisible surfel follows its neighbours.
 """
 
 from typing import NamedTuple
@@ -42,7 +42,7 @@ from pliant.compiler.kernel import fast_kernel
 STEPS, COARSE_STEPS = 3, 2
 """Steps of all surfels, at full size and at half the size."""
 _GRAPH_LAMBDA_UP = 10.0
-"""A surfel whose image does not follow the others is left behind sooner than one on its own."""
+"""A surfel whose image does not follow the others is left behind sooner than an independent one."""
 _CG_ITERATIONS = 60
 _CG_TOLERANCE = 1e-4
 _DIAGONAL = np.arange(RIGID)
@@ -371,15 +371,14 @@ def _step_all(poses: F64, x: F64, own: Eliminated, model: int, step: F64, candid
 
 
 def relocate(poses: F64, wanted: U8, edges: Edges, matcher: Matcher, strain: float) -> None:
-    """Align surfels alone at full size that the image did not show where they were expected.
+    """Align surfels alone at full size if the image did not show them at the expected position.
 
-    ``align_graph`` looks at the image only where it already fits.  A surfel that the coarse scales
-    left a pixel or two away, as fine texture does, would be carried by its neighbours from frame to
-    frame and never meet its image again.  So it is aligned alone once more, from where they have
-    carried it, and tied to that place as firmly as they hold it: Eq. 21 with that place as the
-    equilibrium.
+    ``align_graph`` uses the image only where it already fits.  A surfel that the coarse scales left
+    a pixel or two off, as with fine texture, would follow its neighbours from frame to frame
+    without its image.  So it is aligned alone, from the position of its neighbours, and tied to it
+    as firmly as they hold it: Eq. 21 with that position as the equilibrium.
 
-    poses: (N, POSE_FLOATS) in the camera's frame, those that are wanted are overwritten.  wanted:
+    poses: (N, POSE_FLOATS) in the camera's frame; those that are wanted are overwritten.  wanted:
     (N,) 1 or 0.  strain: of the pairs, relative.
     """
     pulls = pull_of_edges(edges, len(poses), OMEGA_E, strain)

@@ -1,7 +1,7 @@
 """Parameters of the deforming surfels.
 
-DSDT leaves the saturation threshold, the schedule of lambda, omega_E and Sigma open.  What nobody
-should have to change is a constant beside its use; ``docs/surfels.md`` says how all were chosen.
+DSDT leaves the saturation threshold, the schedule of lambda, omega_E and Sigma open.  Values that
+users should not need to change are constants in the code; ``docs/surfels.md`` explains all of them.
 """
 
 from typing import Literal
@@ -12,7 +12,7 @@ from pliant.algorithms.parameters import Parameters
 
 
 class SurfelParameters(Parameters):
-    """What a user may change about surfels.  Lengths are pixels of the full-size image."""
+    """Parameters of surfels.  Lengths are pixels of the full-size image."""
 
     camera: Literal["static", "moving"] = Field(
         default="static",

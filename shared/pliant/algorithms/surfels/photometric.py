@@ -1,7 +1,7 @@
 """Sums over a patch from which every normal equation follows (DSDT, Eq. 5).
 
-A surfel is flat, so whatever it does, its grid moves by a homography: each row of the Jacobian
-is a mixture of eight functions of the grid, and of two for gain and bias,
+A surfel is flat, so its grid always moves by a homography: each row of the Jacobian combines eight
+functions of the grid, and two for gain and bias,
 
     Vu, Vv, i Vu, j Vu, i Vv, j Vv, i D, j D, V, 1      with  D = i Vu + j Vv,
 
@@ -9,13 +9,13 @@ Vu and Vv being derivatives of the patch along its own grid.  One 10 x 10 matrix
 therefore serves every deformation model and both cameras; ``deformation_models`` has the mixing.
 
 The derivatives are those of the frame's patch (forward, as the paper), of the texture, or their
-mean.  The matrix shapes the steps, and not where they end: that is settled by the sums of features
-times residual.  So these are made at every step, and the matrix, which costs twice as much, only
+mean.  The matrix affects the steps, and not the result, which depends on the sums of features times
+residual.  So these are computed at every step, and the matrix, which costs twice as much, only
 after a surfel has moved.
 
 A patch is sampled one pixel wider on every side, for its derivatives.  Its textures keep the rows
-of that grid, with two samples between rows that the texture lacks, so that a sample and
-its neighbours stand at fixed distances and one loop serves all: sample k is at ``first_inner``
+of that grid, with two unused samples between rows, so that a sample and its neighbours have
+fixed distances and one loop serves all: sample k is at ``first_inner``
 + k of it.
 """
 
@@ -80,7 +80,7 @@ def photometric_sums(
     images: (TEMPLATE_IMAGES, n) of the texture.  out: (FEATURES,).  Returns (cost DN^2, samples not
     saturated).
     """
-    # Where none of it is asked for, the texture's derivatives need not come out of memory.
+    # With a blend of 1 the texture's derivatives are not read from memory.
     u, v = (images[1], images[2]) if comparison.blend < 1.0 else (images[0], images[0])
     texture = (images[0], u, v)
     return _sums(grid.i, grid.j, grid.values, grid.side, texture, _single(comparison), out)

@@ -1,4 +1,4 @@
-"""Starting surfels where something else saw them go (not in the paper)."""
+"""Initial positions of surfels from other motion estimates (not in the paper)."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from pliant.compiler.kernel import fast_kernel
 _NEAREST = 9
 _FEWEST = 3
 _RADIUS_PX = 30.0
-"""About a patch and its margin: what is farther away may move otherwise."""
+"""Radius around a patch and its margin; farther tracks may move differently."""
 
 
 def start_at(poses: F64, active: U8, targets_px: F64, matcher: Matcher) -> None:
@@ -38,11 +38,11 @@ def targets(points_px: F64, displacements_px: F64, scale: float) -> F64:
 
 
 def predict(points_px: F32, before: FrameTracks, now: FrameTracks) -> F64:
-    """(N, 2) displacements in pixels from the last frame to this one.
+    """(N, 2) predicted displacements in pixels from the last frame to this one.
 
-    points_px: (N, 2) surfels in the last frame.    before, now: tracks of the two frames.
-    A surfel goes with the median of the nearest tracks that live on, and where fewer than three are
-    near, with the dominant flow (VITAMIN-E, Eq. 4).
+    points_px: (N, 2) surfels in the last frame.    before, now: tracks of the two frames. A surfel
+    follows the median of the nearest surviving tracks; if fewer than three are near, the dominant
+    flow (VITAMIN-E, Eq. 4).
     """
     _, old, new = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
     order = np.argsort(before.points_px[old, 1], kind="stable")
@@ -56,7 +56,7 @@ def predict(points_px: F32, before: FrameTracks, now: FrameTracks) -> F64:
 
 @fast_kernel
 def _follow_nearest(points_px: F32, start_px: F32, moves_px: F32, first: I64, found: F64) -> None:
-    """Replace a displacement by the median of the nearest moves where enough are near.
+    """Replace a displacement by the median of the nearest moves, if enough are near.
 
     start_px: (M, 2) in ascending order of v.    moves_px: (M, 2).    first: (N,) where in
     ``start_px`` to begin.  found: (N, 2), in and out.

@@ -1,11 +1,11 @@
-"""Surfels found back after a loss: a view that was seen before tells where they have gone.
+"""Recovery of surfels after a loss, by earlier views.
 
-What was covered, in the dark or carried off lies farther from where it was than the image draws a
-patch.  So views are remembered: their corners (``places``), each by its place on a surfel.  A frame
-that looks like one shows some of these corners again; where the surfels were last, P3P and RANSAC
-over them give the motion that most agree on, then that of the rest, as long as enough agree: of the
-camera where that moves, and of things that went by themselves.  It is a proposal: whether surfels
-are there, their own images tell, as always.
+Surfels that were covered, in the dark or relocated are farther away than the image attracts a
+patch.  So views are stored: their corners (``places``), each by its position on a surfel.  A
+similar frame shows some of these corners again.  P3P and RANSAC over the last positions of their
+surfels give the motion on which most agree, then that of the rest, as long as enough agree: the
+motion of a moving camera, or of independent objects.  It is a proposal: the surfels' own images
+verify it.
 """
 
 from dataclasses import dataclass, field
@@ -25,17 +25,19 @@ from pliant.algorithms.surfels.surfel_table import SurfelTable
 from pliant.algorithms.surfels.validation import U, V
 
 _MOST = 50
-"""Views that are remembered, some 45 kB each; the oldest are forgotten."""
+"""Maximum stored views, some 45 kB each; the oldest are dropped."""
 _PLACES = 5
-"""Views most like a frame that are looked at more closely."""
+"""Number of most similar views that are tested."""
 _MOVED_SHARE = 0.1
-"""Of the image's width: surfels that have moved by so much, in the median, are another view."""
+"""Share of the image's width: a larger median motion of the surfels makes another view."""
 _SHARED = 0.5
-"""And so are those of which fewer than this share were seen in the last one."""
+"""And so does a smaller share of surfels in common with the last view."""
 _AGREEING = 15
-"""Fewest corners that agree on a motion, as for cameras that are lost (``RecoveryParameters``)."""
+"""Minimum corners that agree on a motion, as for lost cameras (``RecoveryParameters``)."""
 _GATE_SHARE = 0.01
-"""Of the image's width: error of a corner that agrees.  What deforms is off any rigid motion."""
+"""Share of the image's width: error of an agreeing corner.  Deforming scenes deviate from any rigid
+motion.
+"""
 _SAMPLES = 500
 _REPEATED, _SAME_SHIFT = 0.5, 0.1
 """With this share of the corners seen again a step aside, which is at least so long as a share of
@@ -44,8 +46,9 @@ the depth, nothing is recognised."""
 
 @dataclass(frozen=True, kw_only=True)
 class _View:
-    """segment: of the surfels.   ids: (n,) of those on which the corners lie.   at: (n, 2) where on
-    their plane, along both tangents."""
+    """segment: of the surfels.   ids: (n,) surfel of each corner.   at: (n, 2) positions on their
+    planes, along both tangents.
+    """
 
     segment: int
     ids: I64
@@ -54,9 +57,9 @@ class _View:
 
 @dataclass(frozen=True, kw_only=True)
 class FoundBack:
-    """Where surfels of a segment may be: T_world_camera, and poses (N, POSE_FLOATS) in the world.
+    """Proposed surfels of a segment: T_world_camera, and poses (N, POSE_FLOATS) in the world.
 
-    rows: (m,) of the surfels on which corners agree.
+    rows: (m,) of the surfels with agreeing corners.
     """
 
     segment: int
@@ -76,7 +79,7 @@ class RememberedViews:
     seen_px: F64 = field(default_factory=lambda: np.zeros((0, 2)))
 
     def is_another(self, table: SurfelTable, camera: PinholeCamera) -> bool:
-        """Whether what is tracked looks otherwise than in the newest view."""
+        """Whether the tracked surfels differ from the newest view."""
         ids, points_px = table.ids[table.tracked], table.validations[table.tracked, U : V + 1]
         _, new, old = np.intersect1d(ids, self.seen_ids, assume_unique=True, return_indices=True)
         if len(new) < _SHARED * len(ids):
@@ -88,7 +91,7 @@ class RememberedViews:
         self, seen: Features, table: SurfelTable, segment: int, T_world_camera: F64,
         camera: PinholeCamera, patch_px: int,
     ) -> None:  # fmt: skip
-        """Remember the corners of a frame that lie on tracked surfels."""
+        """Store the corners of a frame that lie on tracked surfels."""
         rows = np.flatnonzero(table.tracked)
         self.seen_ids, self.seen_px = table.ids[rows], table.validations[rows, U : V + 1].copy()
         corners, on = _nearest(seen.points_px, self.seen_px, 0.5 * patch_px)
@@ -102,16 +105,16 @@ class RememberedViews:
         self._forget([number for number in self.views if number < self.added - _MOST])
 
     def forget_segment(self, segment: int) -> None:
-        """Nobody follows these surfels any more."""
+        """Drop the views of a segment."""
         self._forget([n for n, view in self.views.items() if view.segment == segment])
 
     def recognise(
         self, seen: Features, tables: dict[int, SurfelTable], T_world_camera: F64 | None,
         camera: PinholeCamera,
     ) -> FoundBack | None:  # fmt: skip
-        """Where the surfels of the view are on which most corners of a frame agree.
+        """Return the surfels of the view on which most corners of a frame agree.
 
-        tables: of the segments that are asked for.   T_world_camera: of a camera that stands still.
+        tables: of the segments to search.   T_world_camera: of a static camera.
         """
         best: FoundBack | None = None
         agreeing = 0
@@ -164,15 +167,16 @@ def _on_plane(poses: F64, seen_at: F64) -> tuple[F64, BoolArray]:
 
 
 def _points(poses: F64, at: F64) -> F64:
-    """(n, 3) the same places on the planes as they lie now."""
+    """(n, 3) the same positions on the planes in their current poses."""
     return poses[:, X : X + 3] + np.einsum("nij,nj->ni", _tangents(poses), at)
 
 
 def _motions(
     seen: Features, corners: I64, points: F64, camera: PinholeCamera
 ) -> list[tuple[F64, I64]]:
-    """T_camera_world of the points (n, 3) seen as corners (n,), of which each has some, those that
-    agree; the most first.  None where an image that repeats itself shows them."""
+    """T_camera_world of points (n, 3), each seen as some of the corners (n,), and the agreeing
+    ones; the most first.  None if the image repeats itself.
+    """
     generator, out = np.random.default_rng(0), list[tuple[F64, I64]]()
     seen_at = camera.normalise(seen.points_px[corners].astype(np.float64))
     gate_px, left = _GATE_SHARE * camera.width, np.arange(len(corners))
@@ -205,7 +209,7 @@ def _moved(
     table: SurfelTable, segment: int, rows: I64, motions: list[tuple[F64, I64]],
     T_world_camera: F64 | None,
 ) -> FoundBack:  # fmt: skip
-    """Each surfel goes with the nearest corner that agrees.  rows: (n,) surfels of the corners."""
+    """Move each surfel with the nearest agreeing corner.  rows: (n,) surfels of the corners."""
     T = inverse(motions[0][0]) if T_world_camera is None else T_world_camera
     agree = np.concatenate([rows[corners] for _, corners in motions])
     of = np.repeat(np.arange(len(motions)), [len(corners) for _, corners in motions])

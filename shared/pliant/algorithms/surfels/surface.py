@@ -9,8 +9,9 @@ from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 _MAX_LENGTHS = 3.0
 """A longer edge, in medians of all edges, spans a hole."""
 _MAX_STEEPNESS = 2.0
-"""An edge whose ends differ more in depth than this times their distance across the view joins two
-surfaces, or one that is seen from the side."""
+"""An edge whose ends differ more in depth than this times their lateral distance joins two
+surfaces, or a surface in profile.
+"""
 
 
 def surface_of(surfels: SurfelFrame) -> tuple[I64, F32, I32]:

@@ -1,6 +1,6 @@
-"""Levenberg-Marquardt of surfels in one level of the pyramid, each on its own (DSDT, section IV).
+"""Levenberg-Marquardt of independent surfels in one level of the pyramid (DSDT, section IV).
 
-Before a moving camera this is Eq. 21 for a camera that is held, with the regulariser of Eq. 20,
+With a moving camera this is Eq. 21 for a fixed camera, with the regulariser of Eq. 20,
 
     omega_E (X - X^0)' Sigma^-1 (X - X^0),
 
@@ -109,7 +109,7 @@ def make_workspace(side: int) -> Workspace:
 
 
 class Matcher(NamedTuple):
-    """What finds surfels in one level of an image."""
+    """Aligns surfels in one level of an image."""
 
     level: Level
     templates: Templates
@@ -118,19 +118,19 @@ class Matcher(NamedTuple):
 
 
 class Equilibrium(NamedTuple):
-    """Where N surfels rest, as a camera sees them (Eq. 20)."""
+    """Equilibria of N surfels in a camera's frame (Eq. 20)."""
 
     points: F64  # (N, 3) metres, camera's frame
     weights: F64  # (N,) omega_E / sigma^2, DN^2 / m^2
 
 
 def no_equilibrium(count: int) -> Equilibrium:
-    """Of a static camera: nothing holds a surfel."""
+    """Return no equilibria, for a static camera."""
     return Equilibrium(np.zeros((count, 3)), np.zeros(count))
 
 
 class Evaluation(NamedTuple):
-    """What the image says of N surfels at their poses.  The last two may be of no surfels."""
+    """The photometric state of N surfels at their poses.  The last two may be empty."""
 
     costs: F64  # (N,) DN^2, photometric; negative where a surfel is not in front, or not asked for
     seen: F64  # (N,) samples that are not saturated
@@ -171,7 +171,7 @@ def factorise(H: F64, n: int, damped: int, damping: float, L: F64, inverse: F64)
             L[column, row] = v
             L[row, column] = v * inverse[column]
             total -= v * L[row, column]
-        # A parameter that nothing depends on keeps its value: its gradient is zero.
+        # An undetermined parameter is unchanged: its gradient is zero.
         inverse[row] = 1.0 / max(total, _RIDGE * s) if s > 1e-30 else 0.0
     return True
 
@@ -265,7 +265,7 @@ def _evaluate_all(poses: F64, active: U8, matcher: Matcher, out: Evaluation) -> 
 def evaluate_all(
     poses: F64, active: U8, matcher: Matcher, *, zncc: bool = False, matrices: bool = False
 ) -> Evaluation:
-    """Look at the image at the poses of active surfels that have a template of this level."""
+    """Evaluate active surfels with a template of this level at their poses."""
     n = len(poses)
     k, m = n if zncc else 0, n if matrices else 0
     out = Evaluation(
@@ -355,7 +355,7 @@ def align_all(poses: F64, active: U8, equilibrium: Equilibrium, matcher: Matcher
             else:
                 fresh = False
                 damping = bound * limits.lambda_up
-            # While steps are held short by policy, a short step does not mean that the end is near.
+            # While damping limits steps, a short step does not mean convergence.
             if moved * (1.0 + bound) < limits.min_step_px or moved < 0.1 * limits.min_step_px:
                 break
 

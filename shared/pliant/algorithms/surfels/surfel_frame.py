@@ -1,4 +1,4 @@
-"""What is said of the surfels in one frame."""
+"""The published state of the surfels in one frame."""
 
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -10,13 +10,13 @@ from pliant.algorithms.arrays import F32, F64, I32, I64, U8, Shape, check_arrays
 
 
 class SurfelState(IntEnum):
-    """How a surfel fares in a frame.  All but TRACKED keep the last estimate that was good."""
+    """State of a surfel in a frame.  All but TRACKED keep the last good estimate."""
 
     TRACKED = 0  # found, ZNCC above the threshold
     OUTLIER = 1  # ZNCC below the threshold
     OCCLUDED = 2  # too much of its patch is saturated, covered or on a highlight
     OUTSIDE = 3  # left the image, or went behind the camera
-    LOST = 4  # none of the above was mended for long; is still looked for
+    LOST = 4  # not tracked for long; still searched
 
 
 def _none_tried() -> F64:
@@ -28,7 +28,7 @@ class SurfelFrame:
     """N surfels in one frame, ordered by id.  No entry is ever NaN or infinite."""
 
     frame: int  # 0 at the start, of this tracker
-    segment: int  # one more at each start, or an earlier one again; each has ids of its own
+    segment: int  # one more at each start, or a resumed one; each has its own ids
     lost: bool  # too few surfels are tracked; waits for depth
     T_world_camera: Annotated[F64, Shape(4, 4)]
     ids: Annotated[I64, Shape("N")]
@@ -53,7 +53,7 @@ class SurfelFrame:
 
     @staticmethod
     def empty() -> "SurfelFrame":
-        """No surfels: what a frame without pixels gets, or one before the start."""
+        """Return no surfels: for a frame without pixels, or before the start."""
         floats = np.zeros(0, np.float32)
         return SurfelFrame(
             frame=0,

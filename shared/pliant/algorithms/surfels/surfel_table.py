@@ -1,4 +1,4 @@
-"""The surfels that are being tracked, as columns."""
+"""The current surfels, as columns."""
 
 from dataclasses import dataclass, field, replace
 
@@ -56,7 +56,7 @@ class SurfelTable:
     def add(
         self, births: Births, T_world_camera: F64, first_id: int, frame: int, sigmas: F64
     ) -> None:
-        """Append new surfels; theirs are the ids from ``first_id`` on."""
+        """Append new surfels, with ids from ``first_id`` on."""
         n = len(births.poses)
         poses = move_poses(births.poses, T_world_camera)
         validations = new_validations(n)
@@ -78,7 +78,7 @@ class SurfelTable:
         self.validations = np.concatenate([self.validations, validations])
 
     def copy(self) -> "SurfelTable":
-        """One that may be followed into another frame and leaves this one as it is."""
+        """Return a copy that can be tracked into another frame."""
         return replace(self, poses=self.poses.copy(), validations=self.validations.copy())
 
     def keep(self, rows: I64) -> None:
@@ -100,21 +100,21 @@ class SurfelTable:
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[rows]))
 
     def connect(self, first_new: int, count: int) -> None:
-        """Give the rows from ``first_new`` on their neighbours."""
+        """Connect the rows from ``first_new`` on with their neighbours."""
         known = self.tracked.astype(np.int64)
         new = find_edges(self.guesses, known, first_new, count)
         self.edges = join_edges(self.edges, new)
 
     @property
     def tracked(self) -> BoolArray:
-        """(N,) whether a surfel was found in the last frame."""
+        """(N,) whether a surfel was tracked in the last frame."""
         return self.state == SurfelState.TRACKED
 
 
 def frame_of(
     table: SurfelTable, *, frame: int, segment: int, lost: bool, T_world_camera: F64
 ) -> SurfelFrame:
-    """What is published of the surfels in a frame."""
+    """Return the published state of the surfels in a frame."""
     poses, validations = table.poses, table.validations
     f11, f12, f22 = (poses[:, F + k, None] for k in range(3))
     a, b = poses[:, A : A + 3], poses[:, B : B + 3]

@@ -30,16 +30,18 @@ from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surfel_table import SurfelTable, frame_of
 
 _RELOCATED_ZNCC = 0.9
-"""A surfel that was missing must fit better than one that was followed: chance has had tries."""
+"""Minimum ZNCC of a recovered surfel, higher than that of a tracked one: repeated attempts may
+match by chance.
+"""
 _TOGETHER_LEVELS = {False: 2, True: 1}
 """Levels, the finest, at which surfels with neighbours move as one: before a static camera, and
 before a moving one, where more takes twice as long and the camera is hardly better."""
 _KEPT = 0.7
-"""With a smaller share of the surfels tracked than in the frame before, something has happened."""
+"""Minimum share of the previous frame's tracked surfels; below it, views are searched."""
 _FOUND_BACK = 0.5
-"""Least share of the surfels whose corners tell where they have gone that must be there."""
+"""Minimum share of the surfels with agreeing corners that are then tracked."""
 _EARLIER = 2
-"""Segments that are kept, beside the present one, to go on in: some 15 MB each."""
+"""Number of stored earlier segments that may resume: some 15 MB each."""
 _BLEND, _COARSE_STATIC_BLEND = 1.0, 0.5
 """Share of the frame in the derivatives of a patch; the rest is the texture's.  At the coarse
 scales of a static camera their mean converges most often (second order, as in ESM); before a moving
@@ -49,9 +51,9 @@ _STEP_PX, _COARSE_STEP_PX = 0.01, 0.05
 
 
 class SurfelTracker:
-    """Follows surfels that move on their own, each by itself, from a depth map on.
+    """Tracks independently moving surfels, from a depth map on.
 
-    Deterministic: what comes out depends on images, depths and parameters alone.
+    Deterministic: the output depends only on images, depths and parameters.
     """
 
     def __init__(self, parameters: SurfelParameters) -> None:
@@ -68,7 +70,7 @@ class SurfelTracker:
     def start(
         self, image: U8, depth: F64, camera: PinholeCamera, T_world_camera: F64 | None = None
     ) -> SurfelFrame:
-        """Give birth to surfels (section III).
+        """Create surfels (section III).
 
         image: (H, W) uint8.  depth: (H, W) metres, 0 or NaN for holes.  T_world_camera: (4, 4), by
         default the camera's frame is the world.  Raises ValueError for arrays of another size.
@@ -91,13 +93,12 @@ class SurfelTracker:
         depth: F64 | None = None,
         timer: StageTimer = no_stages,
     ) -> SurfelFrame:
-        """Follow all surfels into the next frame.
+        """Track all surfels into the next frame.
 
         image: (H, W) uint8.  interval_s: since the last frame, seconds.  prediction: (N, 2)
         displacements in pixels from the last frame, in the order of the last result, NaN where
-        there is none.  depth: (H, W) metres of this frame, for new surfels where there is room.
-        timer: told of each stage.  Raises ValueError before ``start``, and for arrays of another
-        size.
+        there is none.  depth: (H, W) metres of this frame, for new surfels in free areas.  timer:
+        called at each stage.  Raises ValueError before ``start``, and for arrays of another size.
         """
         if self._camera is None:
             raise ValueError("track() before start(): surfels need a depth map to begin with")
@@ -116,10 +117,10 @@ class SurfelTracker:
         return self._result()
 
     def add(self, image: U8, depth: F64, T_world_camera: F64 | None = None) -> SurfelFrame:
-        """Give birth to more surfels in the frame that was tracked last, where there is room.
+        """Create more surfels in free areas of the last tracked frame.
 
         image: (H, W) uint8 of that frame.  depth: (H, W) in units of the surfels.  T_world_camera:
-        (4, 4), where the camera is when tracking is lost: surfels start anew from there.  Raises
+        (4, 4), the camera's pose if tracking is lost: surfels start again from there.  Raises
         ValueError before ``start``, and for arrays of another size.
         """
         if self._camera is None:
@@ -158,10 +159,10 @@ class SurfelTracker:
     def _look_back(
         self, image: U8, pyramid: list[Level], before: SurfelTable, *, was_lost: bool
     ) -> Features | None:
-        """Go on where a view is recognised.  Returns the corners of the image where it was asked.
+        """Resume at a recognised view.  Returns the corners of the image if it was searched.
 
-        before: the surfels as they were in the last frame.  Where many of them were lost they are
-        looked for by the index, too; those of older segments whenever the view is another.
+        before: the surfels in the last frame.  If many of them were lost, they are searched by the
+        index as well; those of older segments whenever the view is another.
         """
         camera, followed = self._camera, int(self._table.tracked.sum())
         assert camera is not None
@@ -178,7 +179,7 @@ class SurfelTracker:
         return seen
 
     def _remember(self, image: U8, seen: Features | None = None) -> None:
-        """This view, where it is another one.  seen: its corners, where they are known."""
+        """Store this view if it is another one.  seen: its corners, if known."""
         camera, patch_px = self._camera, self._parameters.patch_px
         assert camera is not None
         if not self._lost and self._views.is_another(self._table, camera):
@@ -190,8 +191,8 @@ class SurfelTracker:
     def _go_on(
         self, found: FoundBack, tables: dict[int, SurfelTable], pyramid: list[Level]
     ) -> None:
-        """Follow surfels from where they may be.  All stays as it is where they are not there, no
-        more of them than were found without, or few beside those of this segment.
+        """Track surfels from their proposed positions.  Nothing changes unless they are found
+        there, more of them than without the proposal, and not too few compared with this segment.
         """
         now = self._table, self._T_world_camera, self._segment, self._lost
         self._table, self._segment = tables[found.segment].copy(), found.segment
@@ -210,7 +211,7 @@ class SurfelTracker:
             self._leave(now[0], now[2])
 
     def _leave(self, table: SurfelTable, segment: int) -> None:
-        """Keep the surfels of a segment that is left, for as long as there is room."""
+        """Store the surfels of a segment that is left, as long as there is memory."""
         self._earlier[segment] = table
         for old in list(self._earlier)[:-_EARLIER]:
             del self._earlier[old]
@@ -225,16 +226,16 @@ class SurfelTracker:
     def _align(
         self, pyramid: list[Level], poses: F64, goals: F64 | None, timer: StageTimer
     ) -> BoolArray:
-        """Coarse to fine: the solution of a scale is the guess of the next (section VI-A2).
+        """Coarse to fine: the solution of a scale initialises the next (section VI-A2).
 
-        A camera that moves is found first as if the scene were rigid.  Then camera and surfels take
-        turns: surfels before a camera that is held, then the camera that fits them.  The image
-        decides far more of a surfel's place than its equilibrium does, so one turn a level comes
-        close.  Returns which surfels have left their neighbours.
+        A moving camera is first estimated as if the scene were rigid.  Then camera and surfels
+        alternate: surfels with a fixed camera, then the camera that fits them.  The image
+        determines a surfel's position far more than its equilibrium, so one alternation per level
+        is sufficient.  Returns which surfels have left their neighbours.
         """
         table, moving, n = self._table, self._parameters.camera == "moving", len(poses)
         everyone, torn, coarsest = np.ones(n, np.uint8), np.zeros(n, np.bool_), len(pyramid) - 1
-        # What was missing is looked for, too, but says nothing of the camera.
+        # Missing surfels are searched too, but do not determine the camera.
         guides = table.tracked.astype(np.uint8)
         if not moving or int(guides.sum()) < self._parameters.min_alive:
             guides = everyone
@@ -251,7 +252,7 @@ class SurfelTracker:
             if moving:
                 equilibrium = Equilibrium(transform(T_camera_world, table.rest), weights)
                 start = move_poses(table.guesses, T_camera_world)
-            # Alone each finds its place in the image; close to it depth would go astray.
+            # Alone each surfel finds its pixel; close to it its depth would drift.
             if number == coarsest or number >= together:
                 self._align_alone(number, level, poses, everyone, equilibrium, timer)
             if number < together:
@@ -304,7 +305,7 @@ class SurfelTracker:
             )  # fmt: skip
 
     def _validate(self, level: Level, poses: F64, torn: BoolArray) -> None:
-        """Keep what was found; what was not stays where it was last good."""
+        """Keep the tracked surfels; the others keep their last good estimate."""
         table, p = self._table, self._parameters
         found, matcher = table.validations, self._matcher(0, level)
         validation.validate_all(poses, np.ones(len(poses), np.uint8), matcher, found)
@@ -327,13 +328,13 @@ class SurfelTracker:
         state[~good & (table.missing > p.lost_after_s)] = SurfelState.LOST
         table.state = state
         self._lost = int(good.sum()) < p.min_alive
-        if self._lost:  # nobody is given up in the dark
+        if self._lost:  # surfels are never dropped in the dark
             table.missing = np.minimum(table.missing, p.lost_after_s)
         world = move_poses(poses, self._T_world_camera)
         finite = np.isfinite(world).all(axis=1, keepdims=True)
         table.tried = np.where(finite, world[:, X : X + 3], table.poses[:, X : X + 3])
         table.poses[good] = world[good]
-        # With neighbours, what is not seen is looked for where they have carried it.
+        # With neighbours, invisible surfels are searched at their position.
         table.guesses = table.poses.copy()
         if p.neighbours and not self._lost:
             carried = ~good & np.isfinite(world).all(axis=1)
@@ -350,7 +351,7 @@ class SurfelTracker:
         births = find_births(pyramid, depth, camera, p, occupied, p.max_surfels - len(alive))
         n = len(births.poses)
         if anew and n < p.min_alive:
-            return  # in the dark nothing can start: what was followed is still looked for
+            return  # in the dark nothing can start: the tracked surfels are still searched
         if anew:
             self._leave(table, self._segment)
             self._table = table = SurfelTable()

@@ -1,4 +1,4 @@
-"""Which surfels were found: ZNCC, visibility and uncertainty (DSDT, sections IV and VI-A)."""
+"""Validation of surfels: ZNCC, visibility and uncertainty (DSDT, sections IV and VI-A)."""
 
 import math
 
@@ -62,7 +62,7 @@ def validate_all(poses: F64, active: U8, matcher: Matcher, out: F64) -> None:
         if seen < parameters:
             continue
         models.mixing(pose, level, limits.model, work.mix)
-        # What is covered tells nothing: the information shrinks with the share that is seen.
+        # Information shrinks with the visible share of the patch.
         models.hessian(
             templates.matrices[s], row[VISIBLE], work.mix, parameters, work.product, work.H
         )
