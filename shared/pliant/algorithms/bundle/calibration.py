@@ -80,8 +80,8 @@ def no_shared_blocks() -> SharedBlocks:
 class SharedCalibration:
     """The calibration of one problem: its initial value, its prior, its effect on the layout.
 
-    given: (SHARED,) mean of the prior.     start: (SHARED,) initial value. unknown: (SHARED,) which
-    values are unknowns; the others are fixed.
+    given: (SHARED,) mean of the prior.     start: (SHARED,) initial value.
+    unknown: (SHARED,) which values are unknowns; the others are fixed.
     """
 
     def __init__(

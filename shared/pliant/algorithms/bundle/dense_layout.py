@@ -23,9 +23,10 @@ BLOCK = 128
 class Unknowns:
     """Cameras and points of one problem, ready for the kernels.  P is the number of columns.
 
-    column: (N,) of each point. cameras: M of them.      free: (M,) 1 for a free camera. origin:
-    (3,) subtracted from the world, so that float32 handles small numbers. points: (3, P) in the
-    shifted world.
+    column: (N,) of each point.
+    cameras: M of them.      free: (M,) 1 for a free camera.
+    origin: (3,) subtracted from the world, so that float32 handles small numbers.
+    points: (3, P) in the shifted world.
     """
 
     column: I64

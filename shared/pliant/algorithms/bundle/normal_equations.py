@@ -265,8 +265,8 @@ def eliminate_points(
 ) -> None:
     """Factor every point's block and eliminate the points from the system.
 
-    To S ``- U U^T`` is added, to b ``- U y``. factors: (P, FACTOR) are written, 0 for a point
-    without information.
+    To S ``- U U^T`` is added, to b ``- U y``.
+    factors: (P, FACTOR) are written, 0 for a point without information.
     """
     records, shared, places, motion = state.records, state.shared, state.places, state.motion
     free, block, S, b = system.position, system.block, system.S, system.b

@@ -47,9 +47,9 @@ _MAX_DAMPING = 1e8
 class Edges:
     """Measurements between pairs of poses.
 
-    i, j: (E,) of the poses.    Z: (E, 4, 4) similarity from j to i. sigmas: (E, 7) standard
-    deviations of rotation, translation (in units of j) and log scale. doubtful: (E,) those that may
-    be false.
+    i, j: (E,) of the poses.    Z: (E, 4, 4) similarity from j to i.
+    sigmas: (E, 7) standard deviations of rotation, translation (in units of j) and log scale.
+    doubtful: (E,) those that may be false.
     """
 
     i: I32

@@ -102,9 +102,9 @@ subtract_product6: Any = intrinsic(_subtraction(6))
 class Pattern(NamedTuple):
     """The blocks of L, which include those of S.
 
-    position: (F,) of each movable camera in the order of elimination. block: (N, N) index of the
-    block of two positions, row >= column; -1 without one. start: (N + 1,) blocks of each column,
-    the one on the diagonal first.     row: of each block.
+    position: (F,) of each movable camera in the order of elimination.
+    block: (N, N) index of the block of two positions, row >= column; -1 without one.
+    start: (N + 1,) blocks of each column, the one on the diagonal first.     row: of each block.
     """
 
     position: I32

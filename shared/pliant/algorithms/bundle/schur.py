@@ -82,14 +82,15 @@ def solve_schur(
     uncertainty: of the calibration, which is then a further unknown that all cameras share; None:
     it is fixed.  The result's ``correction`` (s, k1, k2, readout, a, b) means that the observations
     follow ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx + readout flow``, likewise for v with b.
-    The costs include the prior, at k1 and k2 of the problem's intrinsics. with_covariance: the
-    result contains the covariance of the correction. start: (6,) initial correction, None: the mean
-    of the prior.  Several views determine the focal length by rotation, and by parallax that
-    differs across the image.  Otherwise (no rotation, one plane, forward motion) the prior
-    determines it, as ``covariance`` then shows. doubled: twice each step is tried as well, which
-    takes some 0.6 of the iterations to convergence. walk: prior of the focal length of each camera
-    relative to the shared one; None: they are equal. Raises ValueError if cameras have different
-    lenses.
+    The costs include the prior, at k1 and k2 of the problem's intrinsics.
+    with_covariance: the result contains the covariance of the correction.
+    start: (6,) initial correction, None: the mean of the prior.  Several views determine the focal
+    length by rotation, and by parallax that differs across the image.  Otherwise (no rotation, one
+    plane, forward motion) the prior determines it, as ``covariance`` then shows.
+    doubled: twice each step is tried as well, which takes some 0.6 of the iterations to
+    convergence.
+    walk: prior of the focal length of each camera relative to the shared one; None: they are equal.
+    Raises ValueError if cameras have different lenses.
     """
     layout = build_packed_layout(problem)
     calibration, focal = None, None

@@ -50,9 +50,9 @@ _MAX_STRIKES = 3
 class ActiveMap:
     """A segment while the camera is tracked in it.
 
-    points: rows shared by all segments.   next_keyframe_id: of the keyframe to come. links: rows of
-    the living tracks.   window: the keyframes under adjustment. room: maximum number of
-    observations.   seen_by: the calibration whose pixels it has.
+    points: rows shared by all segments.   next_keyframe_id: of the keyframe to come.
+    links: rows of the living tracks.   window: the keyframes under adjustment.
+    room: maximum number of observations.   seen_by: the calibration whose pixels it has.
     """
 
     def __init__(

@@ -44,8 +44,8 @@ class _Taken(NamedTuple):
 class BootstrapMapper:
     """A mapper that waits for its calibration, with the interface of ``Mapper``.
 
-    mapper: the trial, or the final one.    taken: during the trial, the newest frames. first: the
-    first of them that the trial gave a pose.
+    mapper: the trial, or the final one.    taken: during the trial, the newest frames.
+    first: the first of them that the trial gave a pose.
     """
 
     def __init__(

@@ -75,8 +75,8 @@ def focal_range(log_focals: F64, gaps: F64) -> tuple[float, float]:
 
 
 class Evidence(NamedTuple):
-    """gain: of separate focal lengths, in units of what noise would gain. log_focals: (M,) by one
-    step.   gaps_s: (M - 1,).
+    """gain: of separate focal lengths, in units of what noise would gain.
+    log_focals: (M,) by one step.   gaps_s: (M - 1,).
     """
 
     gain: float

@@ -46,9 +46,9 @@ _MIN_DEPTH = 1e-6
 class ObservationList:
     """The observations of all keyframes, keyframe by keyframe, and the state of both.
 
-    rows: (N,) of the landmarks.     xyz: (N, 3).     T_world_camera: (M, 4, 4). camera, point: (O,)
-    of each observation.    px: (O, 2).   weights: (O,).   flow: (O, 2) px. log_focal: (M,) and
-    gaps_s: (M - 1,) of the keyframes, see ``changing_focal``.
+    rows: (N,) of the landmarks.     xyz: (N, 3).     T_world_camera: (M, 4, 4).
+    camera, point: (O,) of each observation.    px: (O, 2).   weights: (O,).   flow: (O, 2) px.
+    log_focal: (M,) and gaps_s: (M - 1,) of the keyframes, see ``changing_focal``.
     """
 
     rows: I32
@@ -179,10 +179,10 @@ def adjust_keyframes(
     """Adjust all but the first keyframe, their landmarks and the calibration by Schur LM.
 
     Outlying observations are removed, and the landmarks' statistics updated.  The keyframes' pixels
-    become those of the estimated camera, except for the readout. known: of the camera, whose pixels
-    the keyframes have.    motions: (M, 6) of the keyframes, see ``FramePoses``.    Returns the new
-    calibration, the rows of landmarks that are at infinity or seen by too few keyframes, and how
-    the map around each keyframe moves.
+    become those of the estimated camera, except for the readout.
+    known: of the camera, whose pixels the keyframes have.    motions: (M, 6) of the keyframes, see
+    ``FramePoses``.    Returns the new calibration, the rows of landmarks that are at infinity or
+    seen by too few keyframes, and how the map around each keyframe moves.
     """
     given, before = known, known.view
     seen = list_observations(keyframes, points, known, parameters)
@@ -274,7 +274,8 @@ def list_observations(
     parameters: MappingParameters,
 ) -> ObservationList:
     """px: as the rolling shutter recorded them.   known: of the camera, whose pixels the keyframes
-    have. parameters: of the adjustment that follows.
+    have.
+    parameters: of the adjustment that follows.
     """
     mapped = [points.state[keyframe.rows] == MAPPED for keyframe in keyframes]
     pairs = list(zip(keyframes, mapped, strict=True))

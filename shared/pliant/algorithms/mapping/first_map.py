@@ -46,11 +46,11 @@ class BufferedFrame:
 class Start:
     """A first map.  The world is the camera of the first keyframe; the median depth in it is 1.
 
-    frames: (K,) frame numbers of the keyframes, ascending.   T_world_camera: (K, 4, 4). ids: (N,)
-    track of each landmark, ascending.   points_world: (N, 3). keyframe_index, point_index,
-    points_px: (O,) observations that support the landmarks. kappas, newest_px: (N,) and (N, 2): the
-    landmark's curvature where it was last detected, and its position in the image of the last
-    keyframe, or near where it left the image.
+    frames: (K,) frame numbers of the keyframes, ascending.   T_world_camera: (K, 4, 4).
+    ids: (N,) track of each landmark, ascending.   points_world: (N, 3).
+    keyframe_index, point_index, points_px: (O,) observations that support the landmarks.
+    kappas, newest_px: (N,) and (N, 2): the landmark's curvature where it was last detected, and its
+    position in the image of the last keyframe, or near where it left the image.
     """
 
     frames: I64

@@ -37,9 +37,9 @@ class Frame:
 class IdealFrame:
     """A frame as an ideal pinhole camera sees it, at first with its rolling shutter.
 
-    calibration: by which it is corrected.   tracks: in pixels of the ideal camera. rolled: the
-    readout that ``to_global_shutter`` has removed, or None. rolled_px: (N, 2) rolling-shutter
-    offset of the tracks that was removed.
+    calibration: by which it is corrected.   tracks: in pixels of the ideal camera.
+    rolled: the readout that ``to_global_shutter`` has removed, or None.
+    rolled_px: (N, 2) rolling-shutter offset of the tracks that was removed.
     """
 
     given: Frame

@@ -57,8 +57,8 @@ class AdjustmentJob:
     """A copy of the map after a frame, to be adjusted.
 
     keyframe_ids: (M,).   seen: their observations.   known: of the camera; ``seen`` has pixels of
-    the rectified image.   loops: to be closed; without loops everything is adjusted. closed:
-    whether loops have just been closed.   sigmas: (N,) of the landmarks.
+    the rectified image.   loops: to be closed; without loops everything is adjusted.
+    closed: whether loops have just been closed.   sigmas: (N,) of the landmarks.
     """
 
     frame: int
@@ -100,7 +100,8 @@ class GlobalAdjustment:
 
     due: number of keyframes at which the next one is requested.    job: requested, not applied yet.
     result: of the job, once a worker has finished it.    loops: to be closed by the next job,
-    alone. closed: whether loops were closed since the last adjustment.
+    alone.
+    closed: whether loops were closed since the last adjustment.
     """
 
     due: float = 0.0

@@ -194,7 +194,8 @@ def corrected_as(kept: KeptKeyframe, calibration: SelfCalibration) -> KeptKeyfra
 
     Observations keep their position in the image.  A keyframe of another camera, or with the same
     calibration, is unchanged.  Two sessions differ by a thousandth in the focal length, and rays by
-    as much: as rays the same image would be seen from two places.
+    as
+    much: as rays the same image would be seen from two places.
     """
     same = np.array_equal(kept.correction, calibration.correction)
     if same or kept.given_camera != calibration.given:

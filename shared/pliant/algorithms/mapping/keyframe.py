@@ -13,14 +13,15 @@ from pliant.compiler.kernel import kernel
 class Keyframe:
     """A keyframe and its observations.
 
-    rows: (n,) rows of landmarks or candidates, each at most once.    points_px: (n, 2). rolled_px:
-    (n, 2) rolling-shutter offset that was removed, see ``rolling_shutter``. published_pose:
-    T_world_camera when last published. is_pure_rotation: it has the position of the last one: a
-    pure rotation determines no depths, and its pose depends on all its observations when it was
-    made. stamp_ns: capture time; -1: unknown.   log_focal: its focal length relative to the
-    calibration, with which its pixels are those of an ideal camera: see ``changing_focal``. focus:
-    (3,) the point on its axis at the median depth of its landmarks.  Set when it leaves the window;
-    NaN without landmarks.
+    rows: (n,) rows of landmarks or candidates, each at most once.    points_px: (n, 2).
+    rolled_px: (n, 2) rolling-shutter offset that was removed, see ``rolling_shutter``.
+    published_pose: T_world_camera when last published.
+    is_pure_rotation: it has the position of the last one: a pure rotation determines no depths, and
+    its pose depends on all its observations when it was made.
+    stamp_ns: capture time; -1: unknown.   log_focal: its focal length relative to the calibration,
+    with which its pixels are those of an ideal camera: see ``changing_focal``.
+    focus: (3,) the point on its axis at the median depth of its landmarks.  Set when it leaves the
+    window; NaN without landmarks.
     """
 
     id: int

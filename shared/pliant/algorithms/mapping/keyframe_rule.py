@@ -22,8 +22,9 @@ class Overlap(NamedTuple):
     """What a frame shares with the last keyframe.
 
     share: of the keyframe's landmarks that are tracked.   in_view: share that is in the image.
-    flow: median motion of the landmarks without the rotation, px at 640x480. age_s: since the
-    keyframe.   interval_s: since the last frame; the next one is expected after the same time.
+    flow: median motion of the landmarks without the rotation, px at 640x480.
+    age_s: since the keyframe.   interval_s: since the last frame; the next one is expected after
+    the same time.
     """
 
     share: float

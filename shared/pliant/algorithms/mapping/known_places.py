@@ -208,7 +208,8 @@ class SegmentMerges:
         """Compare a new keyframe with places of earlier segments, the most similar first.
 
         elsewhere: other places of a segment, which must not contradict.   comparisons: counted
-        there. contradicts: whether the keyframe's image contradicts a match.
+        there.
+        contradicts: whether the keyframe's image contradicts a match.
         """
         by_segment: dict[int, list[Place]] = {}
         for place in places:

@@ -26,16 +26,19 @@ class Landmarks:
 
     Only the methods of this class write positions.
 
-    state: FREE, CANDIDATE, MAPPED or MERGED.    ids: of landmarks, never reused; else -1. alias:
-    the row that a MERGED one stands for; itself otherwise. xyz: world position of landmarks, and
-    the provisional one of candidates. spread: (3,) depth sigma along the ray, see
-    ``inverse_depth``; 0 for landmarks, NaN for candidates without a position.    published_xyz: as
-    last published, NaN before. published_sigmas: ``sigmas`` when last published.    segment: of the
-    map. first_keyframe: keyframe id of the first observation. keyframes, parallax_rad, sigmas: as
-    MapDelta defines them. base_keyframes, base_parallax_rad: the part of these from keyframes
-    outside the window. kappas: curvature at the last detection.    strikes: consecutive frames in
-    which its track missed. misses: consecutive frames in which a search for it failed. patches:
-    grey levels around it in its last keyframe.   patch_keyframe: id of that.
+    state: FREE, CANDIDATE, MAPPED or MERGED.    ids: of landmarks, never reused; else -1.
+    alias: the row that a MERGED one stands for; itself otherwise.
+    xyz: world position of landmarks, and the provisional one of candidates.
+    spread: (3,) depth sigma along the ray, see ``inverse_depth``; 0 for landmarks, NaN for
+    candidates without a position.    published_xyz: as last published, NaN before.
+    published_sigmas: ``sigmas`` when last published.    segment: of the map.
+    first_keyframe: keyframe id of the first observation.
+    keyframes, parallax_rad, sigmas: as MapDelta defines them.
+    base_keyframes, base_parallax_rad: the part of these from keyframes outside the window.
+    kappas: curvature at the last detection.    strikes: consecutive frames in which its track
+    missed.
+    misses: consecutive frames in which a search for it failed.
+    patches: grey levels around it in its last keyframe.   patch_keyframe: id of that.
     """
 
     def __init__(self) -> None:

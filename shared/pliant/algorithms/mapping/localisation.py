@@ -140,8 +140,8 @@ class Motion:
     """The last motion of the camera: T_world_camera (4, 4) of two frames, the newer one last.
 
     tracked: tracked landmarks and helping candidates that support the newer one, as far as known.
-    to_points: tracks that lead from it to landmarks alone. unmapped_s: from the last mapped frame
-    to the newer one.
+    to_points: tracks that lead from it to landmarks alone.
+    unmapped_s: from the last mapped frame to the newer one.
     """
 
     frames: tuple[int, int]

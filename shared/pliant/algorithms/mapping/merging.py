@@ -35,7 +35,8 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 class Merged:
     """joined: (segment of the second map, segment of the first map in whose world it is now).
     apart: (unmatched segment of the second map, its new number).   proofs: matched pairs of
-    keyframes. keyframes: of the merged map, oldest first.
+    keyframes.
+    keyframes: of the merged map, oldest first.
     """
 
     joined: list[tuple[int, int]]

@@ -202,8 +202,8 @@ def smoothed_poses(
     (``smooth_trajectory``).
 
     The map is unchanged: a keyframe's frame may differ from its keyframe within the uncertainty of
-    the observations.   path: final poses of all other frames. stamps_ns: of the frames.   seen_by:
-    whose pixels the keyframes have.
+    the observations.   path: final poses of all other frames.
+    stamps_ns: of the frames.   seen_by: whose pixels the keyframes have.
     """
     for keyframe in keyframes:
         if not path.has(keyframe.frame, keyframe):

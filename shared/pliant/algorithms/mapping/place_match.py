@@ -25,8 +25,9 @@ class PlaceMatch:
     """What two keyframes have in common.
 
     S_old_new: (4, 4) similarity, ``X_old = S_old_new X_new``, between the worlds of their segments;
-    in one segment: the drift of the newer one. rows: (n, 2) rows of landmarks that are the same,
-    old and new; a row at most once in each column.
+    in one segment: the drift of the newer one.
+    rows: (n, 2) rows of landmarks that are the same, old and new; a row at most once in each
+    column.
     """
 
     S_old_new: F64
@@ -106,7 +107,8 @@ def _guided(
     min_zncc: float,
 ) -> tuple[I32, Pairs, F32]:
     """Match similar landmarks of the old and the new keyframe that each sees where the other one
-    has its own: two dense maps of the same surfaces have many neighbours by position alone.
+    has its
+    own: two dense maps of the same surfaces have many neighbours by position alone.
 
     Returns their rows (n, 2), themselves, and where the old keyframe saw them.
     """

@@ -109,7 +109,8 @@ class Reacquired:
     """Reacquired landmarks, each at most once.
 
     rows: (R,) of the landmarks.   points_px: (R, 2) their positions.   maxima: (R,) index of
-    theirs. visible: (V,) rows that should have been in the image.
+    theirs.
+    visible: (V,) rows that should have been in the image.
     """
 
     rows: I32
@@ -121,9 +122,9 @@ class Reacquired:
 class _Wanted(NamedTuple):
     """Landmarks to search.
 
-    projected: (W, 2) predicted position, px.     rows: (W,) of the landmarks. kappas: curvature of
-    every row, of which the sign counts. patches: (..., PATCH_SIDE, PATCH_SIDE) grey levels around
-    every row.
+    projected: (W, 2) predicted position, px.     rows: (W,) of the landmarks.
+    kappas: curvature of every row, of which the sign counts.
+    patches: (..., PATCH_SIDE, PATCH_SIDE) grey levels around every row.
     """
 
     projected: F32
@@ -186,8 +187,9 @@ def match_widely(
 ) -> tuple[I32, F32]:
     """Match landmarks to the maxima of a frame with an uncertain pose, by their patches.
 
-    rows, grey: as for ``reacquire``.   radius_px: around the projection by T_world_camera. count:
-    maximum number of landmarks.   Returns rows (F,) and pixels (F, 2); some of them are wrong.
+    rows, grey: as for ``reacquire``.   radius_px: around the projection by T_world_camera.
+    count: maximum number of landmarks.   Returns rows (F,) and pixels (F, 2); some of them are
+    wrong.
     """
     projected, inside = _projected(T_world_camera, rows, points, camera)
     visible = np.flatnonzero(inside)

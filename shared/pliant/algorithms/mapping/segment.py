@@ -127,9 +127,9 @@ class DroppedKeyframes:
 class Moved(NamedTuple):
     """A motion of the end of a segment, by a similarity S (4, 4).
 
-    moves: of all published content; None if its publication includes them anyway. gone: the segment
-    that was merged into this one.   same_places: pairs of keyframes, the older one first, that are
-    the reason.
+    moves: of all published content; None if its publication includes them anyway.
+    gone: the segment that was merged into this one.   same_places: pairs of keyframes, the older
+    one first, that are the reason.
     """
 
     S: F64
@@ -141,12 +141,12 @@ class Moved(NamedTuple):
 @dataclass(kw_only=True)
 class Segment:
     """points: rows shared by all segments.    keyframes: oldest first.   path: of its frames.
-    ordinary: those of them that are no keyframes. since: index of the first keyframe after the last
-    recognition: older ones do not move with the window.   adjusted: id of the newest keyframe in a
-    global adjustment applied since the last keyframe, or -1.   sparsified: whether keyframes or
-    landmarks were dropped (``sparsification``). dropped: those keyframes.   inverse_distance:
-    median of its landmarks from the newest keyframe. strayed: similarity (4, 4) by which its
-    beginning has moved.
+    ordinary: those of them that are no keyframes.
+    since: index of the first keyframe after the last recognition: older ones do not move with the
+    window.   adjusted: id of the newest keyframe in a global adjustment applied since the last
+    keyframe, or -1.   sparsified: whether keyframes or landmarks were dropped (``sparsification``).
+    dropped: those keyframes.   inverse_distance: median of its landmarks from the newest keyframe.
+    strayed: similarity (4, 4) by which its beginning has moved.
     """
 
     id: int

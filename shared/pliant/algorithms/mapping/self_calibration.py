@@ -49,10 +49,11 @@ GROWTH = 1.4
 class SelfCalibration:
     """The current estimate of a camera's calibration.
 
-    given: the given camera of the rectified images. correction: (6,) of it, see ``solve_schur``.
-    covariance: (6, 6) of that. next_keyframes: the number of keyframes at which the calibration is
-    estimated again. changes: whether the focal length changes during the clip.   log_focal: of the
-    newest frame relative to the correction's: see ``changing_focal``.
+    given: the given camera of the rectified images.
+    correction: (6,) of it, see ``solve_schur``.   covariance: (6, 6) of that.
+    next_keyframes: the number of keyframes at which the calibration is estimated again.
+    changes: whether the focal length changes during the clip.   log_focal: of the newest frame
+    relative to the correction's: see ``changing_focal``.
     """
 
     given: PinholeCamera

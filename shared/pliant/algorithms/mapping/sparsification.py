@@ -62,9 +62,9 @@ def sparsify(
     """Reduce a segment to the allowed number of observations, as far as possible.
 
     linked: row of each living track, negative where it has none.   whole: newest keyframes that are
-    unchanged with their landmarks, because they may not be published yet. settled: the others have
-    just been adjusted together, so keyframes with more neighbours than ``limits`` allow may be
-    dropped as well.
+    unchanged with their landmarks, because they may not be published yet.
+    settled: the others have just been adjusted together, so keyframes with more neighbours than
+    ``limits`` allow may be dropped as well.
     """
     most = int(np.sqrt(_PAIRS * room))
     if settled and len(segment.keyframes) > limits.kept_neighbours:
@@ -155,7 +155,8 @@ def _give_up_keyframes(segment: Segment, surplus: int, count: int, linked: I32, 
 
 def _most_keyframes(segment: Segment, neighbours: int) -> int:
     """Maximum keyframes of a segment so that the root mean square number of covisible keyframes is
-    as given: the time to factor the equations of an adjustment grows with that mean.
+    as
+    given: the time to factor the equations of an adjustment grows with that mean.
     """
     count = len(segment.keyframes)
     start, slots = _seen_by(segment)

@@ -14,8 +14,9 @@ _KEPT_GONE = 20_000
 
 _LOST_AT_ONCE = 0.5
 """Minimum share of tracks lost in one frame for which candidates are stored, too, unless the frame
-before did: otherwise hardly a track returns.  Nor are they stored where landmarks alone determine
-the pose: in quick motion they made it a little worse.
+before
+did: otherwise hardly a track returns.  Nor are they stored where landmarks alone determine the
+pose: in quick motion they made it a little worse.
 """
 
 

@@ -120,7 +120,8 @@ class Window:
 
     def adjust(self, parameters: MappingParameters) -> None:
         """Run Schur LM over the keyframes and all landmarks of two of them, until it converges or
-        for a few iterations: the next keyframe continues.
+        for a few
+        iterations: the next keyframe continues.
 
         Using only the longest observed landmarks is faster, but the camera's motion moves these
         least in the image: the scale then drifts ten times as far along a corridor.

@@ -55,8 +55,8 @@ def spread(rows: U8) -> U8:
 def align_rigid(poses: F64, active: U8, T_camera_world: F64, matcher: Matcher) -> F64:
     """Move the camera alone: all surfels are static in the world.
 
-    The matrices are those of the textures, which affect the steps and not the result. poses: (N,
-    POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
+    The matrices are those of the textures, which affect the steps and not the result.
+    poses: (N, POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
     """
     level, templates, limits, work = matcher
     now = evaluate_all(poses, active, matcher)
@@ -117,8 +117,8 @@ def _shift(before: F64, after: F64) -> F64:
 def fit_camera(poses: F64, active: U8, T_camera_world: F64, equilibria: F64, weights: F64) -> F64:
     """Minimise Eq. 21 over the camera alone, which depends only on Eq. 20; no image is needed.
 
-    poses: (N, POSE_FLOATS) in the camera's frame, fixed at their aligned values. equilibria: (N, 3)
-    metres, world.  weights: (N,) DN^2 / m^2.  Returns T_camera_world.
+    poses: (N, POSE_FLOATS) in the camera's frame, fixed at their aligned values.
+    equilibria: (N, 3) metres, world.  weights: (N,) DN^2 / m^2.  Returns T_camera_world.
     """
     w, x = weights * active, poses[:, X : X + 3]
     for _ in range(_FIT_STEPS):

@@ -64,8 +64,9 @@ def local_flow(
     """Estimate the local flow relative to the dominant flow.
 
     previous, current: images at 1/2, 1/4 and 1/8 of the size.  maxima: (M, 3) rows (u, v, kappa) of
-    the previous frame: the strongest of each cell is followed. affine: six numbers of the dominant
-    flow.  hint: (rows, columns, 2) a second initial value (the flow of the frame before).
+    the previous frame: the strongest of each cell is followed.
+    affine: six numbers of the dominant flow.  hint: (rows, columns, 2) a second initial value (the
+    flow of the frame before).
     """
     rows, columns = hint.shape[:2]
     points = np.zeros((rows, columns, 3), np.float32)
