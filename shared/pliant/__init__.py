@@ -43,7 +43,7 @@ _WHERE = {
     "read_trajectory": "pliant.api.evaluation",
     "run": "pliant.api.run",
 }
-"""Loaded when they are asked for: a service that needs none of it starts sooner."""
+"""Loaded on demand: a service that needs none of it starts faster."""
 
 
 def __getattr__(name: str) -> Any:

@@ -96,10 +96,10 @@ class MadeKeyframe:
 
 @dataclass(kw_only=True)
 class Reached:
-    """What reading backwards came to, beside what the history tells.
+    """The result of reading backwards, besides the history.
 
-    kept: the whole map.   keyframes: that were made, by id.   joined: segments that have become
-    one.   last: the last update, which says what is known of the camera.
+    kept: the whole map.   keyframes: new ones, by id.   joined: merged segments.
+    last: the last update, with the calibration.
     """
 
     kept: list[KeptKeyframe] = field(default_factory=list[KeptKeyframe])
@@ -153,7 +153,7 @@ def reach_back(
 
 
 class _Told:
-    """Folds what a mapper tells of frames that are numbered as they were read."""
+    """Collects the output of a mapper for frames that are numbered in reading order."""
 
     def __init__(self, history: MapHistory, numbers: Sequence[int], found: Reached) -> None:
         self._history, self._numbers, self._found = history, np.array(numbers, np.int64), found
@@ -194,8 +194,7 @@ class _Told:
         image: Image | None = None,
         waiting: Sequence[int] = (),
     ) -> None:
-        """Take in what is told of keyframes after a frame.   waiting: frames from which a map may
-        yet start."""
+        """Take the keyframe changes after a frame.   waiting: frames for a later start."""
         if image is not None:
             self._images[number] = _as_jpeg(image)
         made = {frame: keyframe for keyframe, frame in self._made.items()}
@@ -211,9 +210,9 @@ class _Told:
 
 
 def final_update(before: MapHistory, after: MapHistory, last: MapDelta) -> MapDelta:
-    """What makes one history of another: all that the one has, and what it has no more.
+    """Return the update that turns one history into another: its content, and its removals.
 
-    last: says what is known of the camera, and which segments have become one.
+    last: has the calibration and the merged segments.
     """
     frames, keyframes, points = after.frames, after.keyframes, after.points()
     poses = [pose.pose_keyframe_camera for pose in frames.values()]

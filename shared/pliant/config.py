@@ -160,7 +160,7 @@ class RecorderParameters(Parameters):
 
 
 class Config(Parameters):
-    """Everything that a run can be told."""
+    """All parameters of a run."""
 
     seed: int = Field(default=0, ge=0, description="Seed of all random choices.")
     ingest: IngestParameters = IngestParameters()

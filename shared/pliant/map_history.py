@@ -130,7 +130,7 @@ class Points:
 
 
 class CurrentMap:
-    """Keyframes and points as last published: they grow with what is seen, not with time."""
+    """Keyframes and points as last published: they grow with the scene, not with time."""
 
     def __init__(self) -> None:
         self.keyframes: dict[int, Keyframe] = {}
@@ -212,8 +212,8 @@ class MapHistory(CurrentMap):
         super().__init__()
         self.stamps_ns: dict[int, int] = {}
         self.causal: dict[int, tuple[int, F64]] = {}
-        """Segment and T_world_camera of each frame as known when the frame was done: what became of
-        that segment later is not told."""
+        """Segment and T_world_camera of each frame as estimated at frame time, without later changes of
+        the segment."""
         self.frames: dict[int, FramePose] = {}
         self.states: dict[int, tuple[int, str]] = {}
         self.same_places: list[tuple[int, int]] = []

@@ -1,4 +1,4 @@
-"""The state of a service as bytes and back, exactly: what a restarted service goes on from.
+"""The state of a service as bytes and back, exactly, from which a restarted service continues.
 
 A tree of our own objects, containers, numpy arrays and random generators.  A file from elsewhere
 can run no code of its own: of the rooms that touch neither files nor sockets, records are made
@@ -6,7 +6,7 @@ again and the classes listed here, without a call of theirs, and none gets an at
 of a method.  What is shared stays shared; arrays keep their layout, which decides how a kernel is
 compiled.
 
-A state is for the release that made it: what its objects mean is not told.
+A state is valid only for the release that made it, because it does not describe its objects.
 """
 
 import hashlib

@@ -1,6 +1,10 @@
-"""Pages and ``--help`` use the words of the field, in lines of a readable length."""
+"""Pages, ``--help``, docstrings and comments use the words of the field, in readable lengths."""
 
+import ast
+import inspect
+import io
 import re
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +23,12 @@ PAGES = [
     if page.name not in LATER
 ]
 LONGEST_LINE = 150  # characters, outside of tables and code
+LONGEST_SENTENCE = 40  # words of two letters and more, in docstrings and comments
+CODE = sorted(
+    file
+    for package in ("shared/pliant", "services/pliant_services")
+    for file in (ROOT / package).rglob("*.py")
+)
 
 # Idioms, each with the word to use.
 BANNED = {
@@ -61,6 +71,38 @@ def faults(text: str) -> list[str]:
     ]
 
 
+def descriptions(source: str) -> Iterator[str]:
+    """Docstrings, those of constants among them, and blocks of comments."""
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.Expr(value=ast.Constant(value=str(text))):
+                yield inspect.cleandoc(text)
+    block: list[str] = []
+    last = 0
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            if token.start[0] != last + 1 or token.line.lstrip()[0] != "#":
+                yield "\n".join(block)
+                block = []
+            block.append(token.string.lstrip("# "))
+            last = token.start[0]
+    yield "\n".join(block)
+
+
+def words_of(description: str) -> str:
+    """A docstring or comment without formulas, examples, quotations and the names of fields."""
+    lines = [line for line in description.splitlines() if not line.startswith("    ")]
+    text = re.sub(r"``.*?``|`[^`]*`|\"[^\"]*\"", "`", "\n".join(lines), flags=re.DOTALL)
+    return re.sub(r"(?:^| {2,})[\w.]+(?:, [\w.]+)*: ", ". ", text, flags=re.MULTILINE)
+
+
+def long_sentences(text: str) -> list[str]:
+    """Sentences of more words than are read at once."""
+    text = re.sub(r"\n\s*(?:\n|[-*] )", ". ", text)
+    sentences = re.split(r"[.:;!?](?:\s|$)", " ".join(text.split()))
+    return [each for each in sentences if len(re.findall(r"[A-Za-z]{2,}", each)) > LONGEST_SENTENCE]
+
+
 def help_texts(command: Any, name: str) -> Iterator[tuple[str, str]]:
     """The help of a command, of its parameters, and of the commands below it."""
     yield name, command.help or ""
@@ -85,6 +127,23 @@ def test_help_is_in_plain_english() -> None:
     texts = dict(help_texts(typer.main.get_command(app), "pliant"))
     found = {name: faults(text) for name, text in texts.items()}
     assert {name: said for name, said in found.items() if said} == {}
+
+
+@pytest.mark.parametrize("file", CODE, ids=lambda file: f"{file.parent.name}/{file.name}")
+def test_docstrings_and_comments_are_in_plain_english(file: Path) -> None:
+    texts = [words_of(text) for text in descriptions(file.read_text(encoding="utf-8"))]
+    assert not [said for text in texts for said in faults(text)]
+    assert not [said for text in texts for said in long_sentences(text)]
+
+
+def test_descriptions_are_read_without_their_code() -> None:
+    doc = 'def f():\n    """A.\n\n    told: of a pose.  Kind "causal".\n    """\n'
+    source = doc + "    # told\n    # so\n"
+    texts = [*descriptions(source)]
+    assert "told\nso" in texts
+    assert [words_of(text) for text in texts if faults(words_of(text))] == ["told\nso"]
+    assert long_sentences("word " * 41)
+    assert not long_sentences("word " * 40 + ". " + "word " * 40)
 
 
 def test_idioms_are_found_as_whole_words() -> None:

@@ -1,4 +1,4 @@
-"""Every clip of a folder, a few at a time; what was done is kept, what was begun goes on."""
+"""Runs every clip of a folder, a few at a time; finished ones are kept, interrupted ones resume."""
 
 import json
 import sys

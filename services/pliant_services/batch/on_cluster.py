@@ -63,7 +63,7 @@ class Cluster:
         begun: Callable[[str, str], None],
         over: Callable[[str, Outcome], None],
     ) -> None:
-        """Run all of them.  begun, over: are told which, where, and what came of it.
+        """Run all of them.  begun, over: called with the clip, the worker, and the outcome.
 
         Ctrl-C cuts off those that run; raises KeyboardInterrupt then.  Raises BusError where the
         scheduler goes away.

@@ -1,4 +1,4 @@
-"""One clip of a batch: ``pliant run`` in a process of its own, that can be cut off and goes on.
+"""One clip of a batch: ``pliant run`` in its own process, which can be interrupted and resumed.
 
 It runs where the batch is, or on another machine that sees the same folders (``on_cluster.py``).
 """
@@ -45,7 +45,7 @@ class Errand:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came of it.  exit_code: None where it was cut off.  told: what the table says of it."""
+    """The outcome.  exit_code: None if it was interrupted.  told: its entry in the table."""
 
     exit_code: int | None
     seconds: float = 0.0
@@ -53,7 +53,7 @@ class Outcome:
 
 
 def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
-    """Run it, or go on with it, until its end or until it is to stop."""
+    """Run it, or continue with it, until its end or until it is to stop."""
     here = Path(errand.folder)
     result, log = here / errand.result, here / errand.log
     if errand.version != __version__:
@@ -154,9 +154,9 @@ class OneRun:
         return next((line for line in reversed(lines) if line.strip()), "").removeprefix("pliant: ")
 
     def _cut_off(self) -> None:
-        """End it and its services as a power cut does: ``--resume`` goes on exactly there.
+        """Kill it and its services, as a power cut does: ``--resume`` continues exactly there.
 
-        Ctrl-C would end the stream instead: what was recorded then has an end, and is no beginning.
+        Ctrl-C would end the stream instead: such a recording is complete and cannot be resumed.
         """
         services = self._children()
         self._process.kill()

@@ -299,7 +299,7 @@ def calibrate_without_board(
     of = f"median residuals of {count:,} observations of points, over the image"
     words = [f"{source}: {lines[0]}", verdict, of]
     assert run.stream is not None
-    # What was seen are pixels of the size that the run was worked on at.
+    # Observations are in pixels of the working size.
     size = run.stream.camera.width, run.stream.camera.height
     write_image(picture, draw_calibration([left], *size, words))
     return [*lines, f"written: {output}, {picture}"]

@@ -28,7 +28,7 @@ _FREE_BYTES = 2 << 30
 
 @dataclass(frozen=True)
 class Finding:
-    """One check.  detail: what was found, and what to do where it is not ok."""
+    """One check.  detail: the result, and the remedy if it is not ok."""
 
     grade: Literal["ok", "warning", "error"]
     what: str

@@ -1,4 +1,4 @@
-"""``pliant eval``: a result against the truth."""
+"""``pliant eval``: a result against ground truth."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""``pliant scale``: a result in metres, by what is known of the scene."""
+"""``pliant scale``: a result in metres, by a known length in the scene."""
 
 from pathlib import Path
 from typing import Annotated

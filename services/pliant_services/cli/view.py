@@ -1,4 +1,4 @@
-"""``pliant view``: look at a run, while it goes on or afterwards."""
+"""``pliant view``: look at a run, during or after it."""
 
 import signal
 import sys

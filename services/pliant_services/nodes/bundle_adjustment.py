@@ -1,7 +1,7 @@
 """Bundle adjustment: where the camera is and what it sees, from tracks alone.
 
 in   camera/stream    once
-     map/known        before the first frame: a map of earlier sessions, to go on in
+     map/known        before the first frame: a map of earlier sessions, to continue in
      camera/image     every frame: colours, and for re-acquisition patches and maxima of curvature;
                       in live mode, whether to map the frame, or only to localise it by its tracks
      tracks/extrema   every frame

@@ -29,7 +29,7 @@ def run(
 ) -> None:
     """Record until every topic has ended, putting all on the disk at least every second.
 
-    restartable: go on behind what an earlier recorder of this run has put there, in a new part.
+    restartable: continue behind what an earlier recorder of this run has put there, in a new part.
     """
     limits = config.recorder
     if restartable:

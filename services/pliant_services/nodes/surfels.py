@@ -65,7 +65,7 @@ class _Heard:
 
 @dataclass
 class _State:
-    """map_depth: where surfels are born on our own map.    stamp_ns, tracks, points_px: of the
+    """map_depth: if surfels are created on our own map.    stamp_ns, tracks, points_px: of the
     last frame with pixels.    ratio, segment: units of the surfels by one of the map, and the
     segment of the map, when surfels were last born on it."""
 
@@ -167,7 +167,7 @@ def _prediction(state: _State, heard: _Heard, config: Config) -> F64 | None:
 
 
 def _look_at_map(state: _State, heard: _Heard, config: Config) -> MapView | None:
-    """What our own map shows in this frame.  Every frame tells of the map, pixels or not."""
+    """The state of Pliant's own map in this frame, with or without pixels."""
     if state.map_depth is None or heard.update is None or heard.keyframe is None:
         return None
     p = config.surfels

@@ -1,4 +1,4 @@
-"""Work on another core: what a replay reads, before it is asked for, and what it writes, after."""
+"""Work on another core: reads inputs of a replay ahead, and writes its outputs behind."""
 
 import sys
 from collections import deque

@@ -41,7 +41,7 @@ Metadata: TypeAlias = Mapping[str, Mapping[str, str]]
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayRequest:
-    """What the user asked for."""
+    """The request of a user."""
 
     recording: Path
     services: Sequence[str]  # without any, all that were recorded

@@ -27,7 +27,7 @@ _KEYS_S = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class PlayRequest:
-    """What the user asked for.  rate: times the pace of capture, 0 for as fast as it goes."""
+    """The request of a user.  rate: multiple of the capture speed, 0 for as fast as possible."""
 
     recording: Path
     rate: float = 1.0
@@ -149,7 +149,7 @@ class Pace:
             return False
 
     def toggle(self) -> bool:
-        """Pause or go on; whether it is paused now."""
+        """Pause or continue; whether it is paused now."""
         with self._changed:
             now = time.monotonic()
             if self._paused:

@@ -77,12 +77,13 @@ def play(
     again: Callable[[int], bool] | None = None,
     identity: Callable[[str], Identity | None] = lambda name: None,
 ) -> int:
-    """Publish the recording, and where it ends; returns the number of messages.
+    """Publish the recording, and its ends; returns the number of messages.
 
-    wait_until: is given each message's capture time in nanoseconds from the start, returns when it
-    is due, and False where playing shall end.     again: is given how many messages were published
-    after each time, and says whether to publish all once more, in the same session; without it
-    once.     identity: the certificate of a service that is impersonated, for tls/ endpoints.
+    wait_until: called with each message's capture time in nanoseconds from the start; returns when
+    it is due, and False to stop.
+    again: called with the number of published messages after each pass; returns whether to publish
+    all once more in the same session.  None: once.
+    identity: the certificate of an impersonated service, for tls/ endpoints.
 
     Raises RecordingError and BusError.
     """

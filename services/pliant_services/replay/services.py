@@ -85,7 +85,7 @@ def _recorded_as(topic: Topic) -> Topic:
 
 
 def gaps(summary: Summary, services: Sequence[Process]) -> list[str]:
-    """What is known to be missing of what the services read, for people."""
+    """Describe the missing inputs of the services."""
     read = {t for p in services for t in (*p.inputs, *p.optional)}.difference(_made_by(services))
     missing = {(key := _recorded_as(t).key): summary.missing_of(key) for t in read}
     return [
@@ -204,9 +204,9 @@ def record(
     writer: RecordingWriter,
     beside: Callable[[Event], None] | None = None,
 ) -> None:
-    """Run a service on messages; what it makes is recorded, numbered and closed as on the bus.
+    """Run a service on messages; its output is recorded, numbered and closed as on the bus.
 
-    beside: done by the thread that writes, before it writes; told when the service has failed.
+    beside: run by the writing thread before it writes, and notified if the service has failed.
     """
     failed = Event()
     with quick_turns(), behind() as do:

@@ -186,7 +186,7 @@ def _where_now(output: Path, held: Held, failure: PliantError | None, progress: 
 
 
 class _Followed:
-    """Shows how a run goes on, and lets an earlier result go once a frame is on the disk."""
+    """Shows the progress of a run, and releases an earlier result once a frame is on the disk."""
 
     def __init__(self, output: Path, progress: Progress) -> None:
         self._output, self._progress, self._size = output, progress, -1
@@ -268,7 +268,7 @@ def _wait(fleet: Fleet, progress: Progress, up: str) -> bool:
 
 
 def service_arguments(name: str, request: RunRequest, output: Path) -> list[str]:
-    """What a service is told on its command line beside how to reach the others."""
+    """Command-line arguments of a service, besides those for the connection."""
     extra = ["--config", str(output / CONFIG_NAME)]
     if name == "ingest":
         extra += ["--source", request.source.to_json()]

@@ -3,8 +3,8 @@
     pose FRAME SECONDS tx ty tz qx qy qz qw        T_world_camera
     pose FRAME SECONDS                             it has none, or none yet
 
-It is what trajectory_causal.txt has in the end.  Nobody waits for whoever reads them, but for the
-end of the run, which comes when all have been told.
+The file trajectory_causal.txt has the same poses in the end.  A slow reader delays nothing but the
+end of the run, which waits until all are printed.
 """
 
 import threading
@@ -29,7 +29,7 @@ _LAST_S = 5.0
 
 @contextmanager
 def told_poses(fleet: Fleet, known: MapFile | None, *, deformable: bool) -> Generator[None]:
-    """Print them until the run is over.  known: the map in which it goes on."""
+    """Print them until the run is over.  known: the loaded map."""
     topic = topics.SURFELS if deformable else topics.MAP_UPDATE
     heard: SimpleQueue[Received | None] = SimpleQueue()
     history = MapHistory()

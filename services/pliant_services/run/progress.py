@@ -1,4 +1,4 @@
-"""What a user sees while a run goes on: a bar on a terminal, a few lines elsewhere."""
+"""The progress of a run: a bar on a terminal, a few lines elsewhere."""
 
 import sys
 import threading
@@ -17,7 +17,7 @@ _STATES = {WAITING: "starting", TRACKING: "tracking", LOST: "lost"}
 
 
 class _Console(Console):
-    """A console that falls silent where nobody listens any more: the run goes on."""
+    """A console that falls silent if its output is closed: the run continues."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True

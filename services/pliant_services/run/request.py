@@ -1,4 +1,4 @@
-"""What ``pliant run`` was asked for."""
+"""The request of ``pliant run``."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from pliant.datasets.source_spec import SourceSpec
 
 @dataclass(frozen=True, kw_only=True)
 class RunRequest:
-    """What the user asked for."""
+    """The request of a user."""
 
     source: SourceSpec
     profile: str = "rigid"

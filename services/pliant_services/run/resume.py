@@ -15,7 +15,7 @@ from pliant_services.profiles import PROFILES
 from pliant_services.run.request import RunRequest
 
 KNOWN_MAP = "known_map"
-"""In the folder of checkpoints: where the map is in which a run goes on."""
+"""In the folder of checkpoints: the path of the map that the run extends."""
 _NONE = "there is no run to resume: leave out --resume"
 _OVER = "its run is complete, and there is nothing to resume: use --force to start again"
 _CUT_OFF = (
@@ -40,7 +40,7 @@ def resumed_config(output: Path, request: RunRequest) -> Config:
 
 
 def resumed_map(output: Path, request: RunRequest) -> Path | None:
-    """The map in which the run goes on that is taken up again.  Raises ResultError for another."""
+    """The map that the resumed run extends.  Raises ResultError for another one."""
     if not (output / STATE_FOLDER).is_dir():  # at most results are left to write
         return request.known
     note = output / STATE_FOLDER / KNOWN_MAP

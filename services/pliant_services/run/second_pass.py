@@ -2,8 +2,8 @@
 
 The first result is whole before that begins, and stays unless the second pass comes to a better
 one: more frames that have a pose, or more of them in one segment, under a verdict that is no worse.
-Then the recording of the first takes its place with what was found: its last messages of the map
-are of both passes, and the mesh is made anew.
+Then the recording of the first pass gets the result: its last messages of the map are of both
+passes, and the mesh is made again.
 """
 
 import json
@@ -114,8 +114,9 @@ def what_is_lost(run: Run) -> tuple[list[Stretch], str]:
 
 
 def is_better(second: dict[str, Any], first: dict[str, Any]) -> bool:
-    """Whether a report tells of more frames that have a pose, or more in one segment, and of
-    nothing that is worse."""
+    """Whether a report has more frames with a pose, or more in one segment, and nothing that is
+    worse.
+    """
     more = [_counts(second)[n] - _counts(first)[n] for n in range(2)]
     worse = _VERDICTS.index(second["verdict"]) > _VERDICTS.index(first["verdict"])
     return not worse and min(more) >= 0 and max(more) > 0

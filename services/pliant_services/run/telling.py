@@ -1,4 +1,4 @@
-"""What a run says at its end: where its results are, and what they come to."""
+"""The summary of a run: where its results are, and its verdict."""
 
 from contextlib import suppress
 from pathlib import Path

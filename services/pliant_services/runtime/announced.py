@@ -1,4 +1,4 @@
-"""Where a run is reached while it goes on: ``session.json`` in its result folder.
+"""The address of an active run: ``session.json`` in its result folder.
 
 It is believed only while a process holds the folder, and only of an endpoint on this machine: a run
 that was killed leaves its file behind, and a folder may come from anybody.
@@ -20,7 +20,7 @@ _MORE = frozenset("#?;")
 
 @contextmanager
 def announced(output: Path, endpoint: str, session: str) -> Generator[None]:
-    """Leave ``session.json`` in the result folder while the run goes on."""
+    """Leave ``session.json`` in the result folder during the run."""
     file, content = output / SESSION_NAME, json.dumps({"endpoint": endpoint, "session": session})
     with suppress(OSError):  # a full disk has a line of its own
         write_whole(file, content, synced=False)

@@ -37,15 +37,14 @@ _TOLD_MESSAGES = 128  # two seconds at 60 frames/s, and a few
 
 @dataclass(frozen=True, kw_only=True)
 class ServiceOptions:
-    """What a service is told besides its configuration.
+    """Options of a service besides its configuration.
 
     endpoints: where the router listens.      session: keeps runs on one network apart.
-    fleet: the services of this session.      arguments: what this service's ``run`` takes beside
-    bus, config and monitor.     delays_ms: largest random delay of each message, for tests.
-    patience_s: how long peers may be away; the configuration's if None.
-    state: folder of the session's checkpoints, where services are started again; else None.
-    identity: the service's certificate, for endpoints such as tls/host:7447.
-    alive: file that is touched once a second as long as the service is well.
+    fleet: the services of this session.      arguments: further arguments of this service's
+    ``run``.     delays_ms: largest random delay of each message, for tests. patience_s: how long
+    peers may be away; the configuration's if None. state: folder of the session's checkpoints,
+    where services are started again; else None. identity: the service's certificate, for endpoints
+    such as tls/host:7447. alive: file that is touched once a second as long as the service is well.
     """
 
     endpoints: Sequence[str]
@@ -158,12 +157,12 @@ def lags(config: Config, fleet: Sequence[str]) -> dict[str, Window]:
 
 
 def checkpoint_windows(config: Config, fleet: Sequence[str]) -> dict[str, Window]:
-    """The windows of those services that may ask for all since their last usable checkpoint.
+    """The windows of those services that may request all since their last usable checkpoint.
 
-    What is on the way, also to one further down that lags, two intervals for each stage down to the
-    disk (one checkpoint may be passed over while another is written), and what comes while each
-    stage tells the one before it: the rate of 60 frames/s for two of its ticks of a second.  With
-    less the others would wait for checkpoints that need more frames.
+    They cover the messages on the way, also to one further down that lags; two intervals for each
+    stage down to the disk (one checkpoint may be skipped while another is written); and the
+    messages until each stage has reported to the one before it: 60 frames/s for two of its ticks of
+    a second.  With less, the others would wait for checkpoints that need more frames.
     """
 
     def stages(name: str) -> int:

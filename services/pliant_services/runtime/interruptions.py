@@ -14,7 +14,7 @@ def deliver_swallowed_interruptions() -> None:
 
     Python runs the handler of a signal between any two instructions of the main thread.  In a
     destructor or in the callback of a weak reference, what the handler raises goes nowhere: Python
-    prints it and goes on, and a command that was told to end would run for ever.
+    prints it and continues, and a command that should end would run for ever.
     """
     if threading.current_thread() is not threading.main_thread():
         return

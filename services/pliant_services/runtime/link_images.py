@@ -45,7 +45,7 @@ class Sender:
         try:
             pixels = decode(frame)
         except BrokenFrame:
-            return frame  # told when it is rectified
+            return frame  # reported when it is rectified
         bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
         data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])[1].tobytes()
         made_from = f"{frame.made_from or frame.encoding}, quality {self._quality}"

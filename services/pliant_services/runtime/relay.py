@@ -3,7 +3,7 @@
 Services send reliably: whoever reads slowly holds them up.  So viewers do not read from them.  The
 launcher, which hosts the router, takes the newest messages out of rings that drop the oldest, and
 sends them on under ``view/`` in a way that drops what a viewer does not take.  It does so only
-while a viewer is there; the camera, which is told once, is kept for those who come late.
+while a viewer is there; the camera, which is published once, is kept for late viewers.
 """
 
 import threading
@@ -61,7 +61,7 @@ class Relay:
         return self._alone.wait(timeout_s)
 
     def know_camera(self, camera: tuple[bytes, bytes]) -> None:
-        """What the session has told of its camera, as it came."""
+        """The camera message of the session."""
         self._camera = camera
         self._arrived.set()
 
@@ -218,7 +218,7 @@ class Relays:
                 return
             for name in new:
                 relay = Relay(self._router, name)
-                with self._changed:  # the camera may have been told in the meantime
+                with self._changed:  # the camera may have been published in the meantime
                     self._relays[name] = relay
                     if name in self._cameras:
                         relay.know_camera(self._cameras[name])

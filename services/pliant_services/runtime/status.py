@@ -43,10 +43,11 @@ class Seen:
 def listen(
     endpoints: Sequence[str], session: str, seconds: float, identity: Identity | None = None
 ) -> tuple[list[Seen], list[tuple[str, str, str]]]:
-    """Every service that told its health in so many seconds, by session and name; and the session
-    and name of those that are announced and told nothing that we read, and why that is.
+    """Return the health of every service that reported it within these seconds, by session and
+    name; and the session and name of those that are announced without a readable report, with the
+    reason.
 
-    Raises BusError where no router answers.
+    Raises BusError if no router answers.
     """
     seen: dict[tuple[str, str], Seen] = {}
     announced: dict[str, tuple[str, str]] = {}
@@ -95,7 +96,7 @@ def listen(
 
 
 def table(services: Sequence[Seen], silent: Sequence[tuple[str, str, str]] = ()) -> Iterator[str]:
-    """The services as lines of text.  silent: session, name, and why nothing is told of it."""
+    """The services as lines of text.  silent: session, name, and why there is no report."""
     newest: dict[str, int] = {}
     for each in services:
         newest[each.session] = max(newest.get(each.session, 0), each.last.frame)

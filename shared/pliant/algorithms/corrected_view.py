@@ -12,10 +12,10 @@ from pliant.algorithms.image.moved_image import Move, moved_image
 
 
 class CorrectedView:
-    """Moves what was seen to where the ideal camera would have seen it.
+    """Converts pixels to those of the ideal camera.
 
-    correction: as MapDelta.calibration_correction, or () for none.  What a rolling shutter does is
-    left: it moves pixels along the image, which depth hardly feels.
+    correction: as MapDelta.calibration_correction, or () for none.  A rolling shutter's
+    offset stays: it moves pixels along the image, with little effect on depth.
     camera: the ideal camera.   log_focal: of the image relative to the correction's, where it
     changes during a clip: the image is magnified by as much about ``centre``.
     """

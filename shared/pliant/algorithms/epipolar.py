@@ -41,7 +41,7 @@ class RelativePose:
 
     @cached_property
     def parallax_rad(self) -> F64:
-        """(N,) angle between the two rays of each point: of most motions nobody asks for it."""
+        """(N,) angle between the two rays of each point, computed on demand."""
         return parallax(self.T_b_a, self.rays_a, self.rays_b)
 
 
@@ -83,8 +83,8 @@ def rotation_between(points_a: F64, points_b: F64, *, scale: float) -> tuple[F64
 
 
 def relative_poses(points_a: F64, points_b: F64, *, gate: float) -> list[RelativePose]:
-    """Motions that may explain two views: several, for noise and planes leave room for more than
-    one, and more views than two decide.
+    """Motions that may explain two views: several, because noise and planes allow more than
+    one, and only further views decide.
 
     The essential matrix by two estimators that improve each sample on all points that agree with it
     (with the few points of a sample alone the noise decides), and the motions that a homography

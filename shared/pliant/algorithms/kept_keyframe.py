@@ -13,21 +13,20 @@ MAP_VERSION = 2
 
 @dataclass(frozen=True, kw_only=True)
 class KeptKeyframe:
-    """A keyframe of a map that is kept, and the points that hang on it.
+    """A keyframe of a saved map, and the landmarks of which it is the reference.
 
     id: ascending in a map, also over sessions.   segment: segments are worlds of their own.
     session, source_frame: the run that made it, from 0, and its frame there.
     turned: see ``Keyframe``.
-    given: width, height, fx, fy, cx, cy of the camera as it was given; correction, sigmas: what was
-    found wrong with it, as ``MapDelta.calibration_correction``.  Pixels are those of the ideal
+    given: width, height, fx, fy, cx, cy of the camera as it was given; correction, sigmas: its
+    estimated correction, as ``MapDelta.calibration_correction``.  Pixels are those of the ideal
     camera that these two make.
     T_world_camera: (4, 4).   motion: (6,) of the camera per frame interval, see ``Path``; 0 where
-    nobody knows.
-    seen_ids, seen_px, rolled_px: points of the map that it sees, where, and by how much farther a
-    rolling shutter had moved them.
-    corners_px, descriptors: of its ORB features; none where it is no place.
-    point_ids ... point_patches: of the points that hang on it, as in ``Landmarks``; S x S
-    grey levels of a patch.
+    it is unknown.
+    seen_ids, seen_px, rolled_px: observed landmarks, their pixels, and the rolling-shutter offsets
+    that were removed. corners_px, descriptors: of its ORB features; none where it is no place.
+    point_ids ... point_patches: of its landmarks, as in ``Landmarks``; S x S grey levels of a
+    patch.
     """
 
     id: int

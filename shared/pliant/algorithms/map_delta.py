@@ -20,7 +20,7 @@ WAITING, TRACKING, LOST = 0, 1, 2
 
 @dataclass(frozen=True, kw_only=True)
 class MapMoves:
-    """How an adjustment of the whole map moves it: what hangs on a keyframe moves with it.
+    """How an adjustment of the whole map moves it: content moves with its reference keyframe.
 
     keyframe_ids: ascending.  A keyframe that is not listed moves with the last one listed before
     it, so newer ones move rigidly; those older than the first stay.
@@ -42,7 +42,7 @@ class MapMoves:
         return MapMoves(keyframe_ids=ids, moves=matrix_to_similarity(both))
 
     def points(self, xyz: F64, hosts: I64) -> F64:
-        """Points (N, 3) that hang on keyframes (N,), moved."""
+        """Move points (N, 3) with their reference keyframes (N,)."""
         return transform_each(self.matrices(hosts), xyz)
 
 
@@ -55,17 +55,17 @@ class MapDelta:
     """The pose of a frame and everything that it changed in the map.
 
     A pose is position and quaternion, (x, y, z, qx, qy, qz, qw), of a T_a_b that maps points of b
-    to a.  The world is the camera of the keyframe that started the segment, from which it strays
-    a little while the map grows; the scale is arbitrary.  Ordinary frames hang on a keyframe
-    (T_keyframe_camera), so that moving a keyframe moves them for free.
+    to a.  The world is the camera of the keyframe that started the segment, from which it drifts
+    a little while the map grows; the scale is arbitrary.  Other frames have a reference keyframe
+    (T_keyframe_camera) and move with it.
 
     state: WAITING, TRACKING or LOST.
     reason: why the map cannot start or was lost; when TRACKING why the pose is doubtful, mostly "".
-    segment: id of the map segment that the camera is in, or was in last; an earlier one goes on
-        where its place is recognised.   -1 before the first.
+    segment: id of the map segment that the camera is in, or was in last; an earlier one is
+        continued when its place is recognised.   -1 before the first.
     inliers: points that support this frame's pose (reprojection error < 1.5 px).
     pose_frames: frames whose pose is new or changed; includes this frame when it is localised.
-    pose_segments, pose_keyframes: the segment and the keyframe id on which each of them hangs.
+    pose_segments, pose_keyframes: the segment and the reference keyframe of each.
     poses_keyframe_camera: T_keyframe_camera for each.
     pose_inliers: points that support each.
     keyframe_ids, keyframe_frames, keyframe_segments: keyframes that are new or have moved; frame -1
@@ -77,17 +77,17 @@ class MapDelta:
     point_keyframes: keyframes that observe the point.
     point_parallax_rad: largest angle between two of the rays that observe it.
     point_sigmas: standard deviation along the ray, as a share of the depth; both to 12 bits.
-    point_hosts: keyframe on which each of them hangs.
+    point_hosts: reference keyframe of each.
     removed_point_ids: points that no longer exist (wrong, or merged into another).
     moved_keyframes, moves: how the whole map moved before all else of this update: ``MapMoves``.
-        Keyframes and points move; of poses that hang on a keyframe, the distance to it scales.
+        Keyframes and points move; distances of poses to their reference keyframes scale.
     joined: segments that have become one, after ``moves`` and before all else: what belongs to the
         first of each row belongs to the second from now on, where ``moves`` has brought it.
-    same_places: keyframes that were found to show one place, the older one first: by which a loop
-        was closed, or segments were joined, or a camera that was lost was recognised.   -1 for a
+    same_places: pairs of keyframes at the same place, the older one first, from closed loops,
+        merged segments and relocalisations.   -1 for a
         frame that is no keyframe.
-    calibration_correction: (s, k1, k2, readout, a, b), what the last adjustment found wrong with
-        the calibration: a point of the map at (x, y) on the plane z = 1 is seen in the rectified
+    calibration_correction: (s, k1, k2, readout, a, b), the correction of the calibration by the
+        last adjustment: a point of the map at (x, y) on the plane z = 1 is seen in the rectified
         image at ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx``, likewise v with b, and a rolling
         shutter takes the rows of a frame in this share of the frame interval.   () where nothing
         was estimated.

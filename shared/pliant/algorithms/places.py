@@ -1,26 +1,26 @@
-"""Places that were seen before: what one is recognised by, and which of many an image looks like.
+"""Places: their description by corners, and the index that finds the places most similar to an
+image.
 
-Described by corners of an image at several scales: ORB (Rublee et al., "ORB: an efficient
-alternative to SIFT or SURF", ICCV 2011) as OpenCV has it: FAST corners of a pyramid, turned by
-their intensity centroid, 256 comparisons of pixels each.  The map's own points do not serve: of
-15,000 curvature extrema of a frame the 600 strongest, one in each part of the image, are 5 % the
-same from another view, where corners are a third and more.
+Description.  Corners of an image at several scales: ORB (Rublee et al., "ORB: an efficient
+alternative to SIFT or SURF", ICCV 2011) of OpenCV: FAST corners of a pyramid, rotated by their
+intensity centroid, 256 comparisons of pixels each.  The map's own points are unsuitable: of 15,000
+curvature extrema of a frame, the 600 strongest, one in each part of the image, are 5 % the same
+from another view, while corners are a third and more.
 
-Found without looking at each descriptor of each place.  The first bytes of a binary descriptor are
-hashes of it: its bits are comparisons that were chosen to depend on each other as little as
-possible, so descriptors of one corner often share 16 bits in a row, and others hardly ever
-(multi-index hashing, Norouzi et al., CVPR 2012).  Each such chunk is a word of its own; places are
-scored as texts are, by the words that they share with the image, weighted by how rare those are
-(Sivic and Zisserman, "Video Google", ICCV 2003).  Words that many places have say little and are
-passed over, so that a query takes as long as the square root of the number of places.  There is no
-vocabulary to train or to load; the index grows with the map.
+Index.  It does not compare each descriptor of each place.  The first bytes of a binary descriptor
+are hashes of it: its bits are comparisons chosen to be as independent as possible, so descriptors
+of one corner often share 16 consecutive bits, and others hardly ever (multi-index hashing, Norouzi
+et al., CVPR 2012).  Each such chunk is a word.  Places are scored by the words that they share with
+the image, weighted by how rare those are (Sivic and Zisserman, "Video Google", ICCV 2003).  Words
+of many places carry little information and are skipped, so a query takes time with the square root
+of the number of places.  There is no vocabulary to train or to load; the index grows with the map.
 
-Doubted where an image shows the same again, a step aside: tiles, chequers, windows, bars.  Where
-what is seen at X is seen at X + d as well, a camera that stands a step d aside sees the same: no
-pose is proved by it, whatever a map knows, for the pattern may go on where nothing is mapped.  The
-image itself tells, without noise, light or view between them.  Each two of its corners that look
-alike propose a step (RANSAC by one pair); it holds for a corner where the image has one that looks
-alike a step forth or back, which of the two are in view being chance.
+Repetition.  An image may repeat itself a step aside: tiles, chequers, windows, bars.  If the
+content at X is repeated at X + d, a camera that is a step d aside sees the same image.  Then it
+verifies no pose, because the pattern may continue outside the map.  The image itself shows this,
+free of noise, light or viewpoint.  Each two of its similar corners propose a step (RANSAC by one
+pair).  The step holds for a corner if the image has a similar one a step forth or back; which of
+the two is in view is chance.
 """
 
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Smooth the poses of a camera by how it moves, as far as the poses themselves call for it.
+"""Smooth the poses of a camera by a motion model, as far as their own noise requires.
 
 Each frame is placed by the map alone, with an error of its own: of the lens, of motion blur, of
 the rows of a rolling shutter.  Hands, vehicles and drones move more smoothly than these errors do.

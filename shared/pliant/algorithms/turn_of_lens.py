@@ -1,7 +1,7 @@
-"""Whether a turn explains two views of a camera of which little is known.
+"""Whether a rotation explains two views of an uncertain camera.
 
-A wrong focal length or distortion makes parallax of every turn: what remains of the flow beside a
-turn tells of motion only where no likely lens explains it.
+A wrong focal length or distortion makes parallax of every rotation: the residual flow of a rotation
+is evidence of translation only if no likely lens explains it.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ _WIDEST = 2.0
 """Standard deviations that a log focal length may be off."""
 
 _HELD = 1e-5
-"""Standard deviation of what is known."""
+"""Standard deviation of a certain parameter."""
 
 
 def turn_of_lens(

@@ -22,16 +22,16 @@ def evaluate(
     frames: int | None = None,
     offset: float | str = 0.0,
 ) -> Evaluation:
-    """Compare a trajectory with the truth, after an alignment with scale::
+    """Compare a trajectory with ground truth, after an alignment with scale::
 
         evaluation = pliant.evaluate("results/clip", "sequence/groundtruth.txt")
         evaluation.final.ate_m.rmse, evaluation.final.success_rate, evaluation.causal
-        evaluation.better  # an offset of the times with which the truth fits far better, or None
+        evaluation.better  # an offset of the times with which ground truth fits far better, or None
 
     result: of a run, its folder, a trajectory file or a ``Trajectory``.    groundtruth: a file that
     ``read_trajectory`` reads, its folder, ``built-in:NAME`` or a ``Trajectory``.    times: of
-    KITTI's poses.    frames: of the sequence, where no report.json says.    offset: is added to the
-    times of the poses: seconds, or frames as in "3f".
+    KITTI's poses.    frames: of the sequence, if no report.json has them.    offset: is added to
+    the times of the poses: seconds, or frames as in "3f".
 
     Raises ResultError.
     """

@@ -69,7 +69,7 @@ class KnownMap:
         grey, _ = rectifier.rectify(frame)
         grey = filled(grey, clearance_in(rectifier.mask(frame)))
         ideal = localiser.calibration.view.image(grey)
-        # A generator of its own: the answer depends on no image that was asked for before.
+        # Its own generator: the answer does not depend on earlier images.
         found = localiser.recognise(
             maxima_of(ideal, self._config.tracking), ideal, np.random.default_rng(self._config.seed)
         )

@@ -1,4 +1,4 @@
-"""What a run has left, as arrays: read from its recording when it is asked for."""
+"""A run's results as arrays, read from its recording on demand."""
 
 import base64
 import html
@@ -71,7 +71,7 @@ class Result(Mapped):
         result.trajectory.positions, result.points, result.mesh.positions
         result.keyframes[3].image, result.tracks(120).points_px
 
-    Everything is read when it is first asked for, and kept.
+    Everything is read at its first use, and kept.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -116,13 +116,14 @@ class Result(Mapped):
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Of the source, with what the images told of it: what calibration.yaml holds."""
+        """Of the source, with the run's estimate: the content of calibration.yaml."""
         return found_calibration(self._run)
 
     @cached_property
     def camera(self) -> PinholeCamera:
-        """Of the map: points project into its pixels where ``keyframes`` and ``tracks`` have them,
-        but for what the images told of the lens."""
+        """Of the map: landmarks project into its pixels where ``keyframes`` and ``tracks`` have
+        them, except for the estimated distortion.
+        """
         stream, longest = self._stream, self.history.longest_segment()
         return corrected_view(stream.camera, self._run.correction_of(longest)).camera
 

@@ -19,7 +19,7 @@ from pliant.recording import parts
 from pliant.results.folder import RECORDING_NAME, folder_name
 
 OnFrame = Callable[[int, F64 | None], object]
-"""Is told the number of a frame and its pose T_world_camera (4, 4); None where it has none."""
+"""Called with the number of a frame and its pose T_world_camera (4, 4), or None without a pose."""
 
 
 def run(

@@ -39,7 +39,7 @@ class Bus(Protocol):
         """Every message of a topic in order, until its end.  Blocks while there is none.
 
         Taking a message gives the sender credit for another, so a service that has to wait for
-        something else goes on taking, and holds what it has taken.
+        something else continues taking, and holds what it has taken.
         """
         ...
 
@@ -80,7 +80,7 @@ class Bus(Protocol):
     def restore(self) -> Any | None:
         """The state that ``checkpoint`` kept before this service died; None at a first start.
 
-        Topics go on from where they were then.
+        Topics continue from where they were then.
         """
         ...
 
@@ -136,7 +136,7 @@ class ObserverBus(Protocol):
 
 
 def resume(bus: Bus, start: Callable[[], _S]) -> _S:
-    """The state to go on from: the last checkpoint's, or what ``start`` makes at a first start."""
+    """The state to continue from: the last checkpoint's, or that of ``start`` at a first start."""
     state: _S | None = bus.restore()
     return start() if state is None else state
 

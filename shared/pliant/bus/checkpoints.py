@@ -1,7 +1,7 @@
-"""Checkpoints of a service: its state and its place in every topic, so that it can start again.
+"""Checkpoints of a service: its state and its position in every topic, from which it can restart.
 
-A checkpoint may be used only if no reader can ask for a message from before it, for the service
-will not make those again.  So some are kept, until an older one can never be needed: the newest
+A checkpoint is usable only if no reader can request a message from before it, because the service
+will not make those again.  So several are kept, until an older one can never be needed: the newest
 whose outputs every reader has safe.
 """
 

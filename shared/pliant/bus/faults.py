@@ -1,4 +1,4 @@
-"""What a service passed over, told once a second at most however much comes."""
+"""Faults that a service skipped, logged at most once a second."""
 
 from collections.abc import Mapping
 
@@ -7,7 +7,7 @@ from pliant.bus.outbox import Outbox
 
 
 class FaultLog:
-    """Remembers what was told, so that each message passed over is counted in one line."""
+    """Counts skipped messages, so that one line reports all of them."""
 
     def __init__(self, service: str) -> None:
         self._service = service

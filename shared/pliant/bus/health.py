@@ -1,6 +1,6 @@
-"""What every service tells of itself once a second, for people: ``pliant status``.
+"""The health of every service, published once a second for people: ``pliant status``.
 
-Not a topic: no credit, no numbers, never recorded, and nobody's output depends on it.
+Not a topic: no credit, no numbers, never recorded, and no output depends on it.
 """
 
 import os

@@ -1,8 +1,7 @@
 """One topic's incoming messages: in order, each once, whatever the network did.
 
-A message that was taken before (sent again after somebody's restart) is passed over and counted;
-one that comes too early is passed over too, and asked for again.  A state machine: no socket, no
-clock.
+A message that was taken before (sent again after a restart) is skipped and counted.  One that comes
+too early is skipped too, and requested again.  A state machine: no socket, no clock.
 """
 
 import sys
@@ -18,11 +17,11 @@ _WHY_CHARACTERS = 120
 class Inbox:
     """The messages of one topic that wait to be taken.
 
-    taken: messages taken so far, and so the number of the next.     limit, limit_bytes: of messages
-    that wait, one alone may be larger; a sender never has more than its window on the way, so more
-    are not from one of ours.
-    repeated, early, refused: counts of messages passed over.     why: the last was refused.
-    gap: something is missing, to be asked for.
+    taken: messages taken so far, and so the number of the next.     limit, limit_bytes: of waiting
+    messages; one alone may be larger.  A sender never has more than its window on the way, so more
+    are foreign.
+    repeated, early, refused: counts of skipped messages.     why: reason of the last refusal.
+    gap: something is missing and must be requested.
     """
 
     limit: int

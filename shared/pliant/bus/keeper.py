@@ -1,7 +1,7 @@
-"""The keeper of a bus: a thread that tells counts once a second, and sends again what is asked for.
+"""The keeper of a bus: a thread that reports counts once a second, and sends requested messages
+again.
 
-Whatever it fails of, the service's own thread raises at its next word to the bus: nobody waits for
-a thread that is gone.
+If it fails, the service's own thread raises the error at its next use of the bus.
 """
 
 import threading
@@ -16,15 +16,15 @@ from pliant.bus.links import IF_OLD, NOTHING, NOW, InLink, OutLink, Shared
 from pliant.bus.waits import TICK_S, Waiting
 from pliant.messages import codec
 
-_ASK_AGAIN_S = 0.1  # what was asked for takes a while, and whoever sends nonsense asks for nothing
+_ASK_AGAIN_S = 0.1  # a requested message takes a while; nonsense requests nothing
 
 
 @dataclass
 class Keeper:
-    """Speaks for its service beside the service's own thread.
+    """Speaks for its service, in parallel with the service's own thread.
 
-    restored: what the service took is its own; before that nothing is told of it.
-    on_tick: called once a second.     on_fault: told what was passed over, in a line.
+    restored: the service's position is valid; before that nothing is reported.
+    on_tick: called once a second.     on_fault: called with one line about skipped messages.
     """
 
     shared: Shared
@@ -56,7 +56,7 @@ class Keeper:
         self._thread.join()
 
     def begin(self) -> None:
-        """The service knows where it goes on: what it takes from now on counts."""
+        """The service's position is known: messages that it takes from now on count."""
         self.restored = True
         self.greet()
 
@@ -139,7 +139,7 @@ class Keeper:
         shared.session.put(f"{shared.prefix}/{health_key(health.service)}", codec.encode(health))
 
     def _advance_safe(self) -> None:
-        """What our newest usable checkpoint has taken will not be asked for again."""
+        """Messages before our newest usable checkpoint will not be requested again."""
         if self.checkpoints is None or self._done:
             return
         with self.shared.changed:

@@ -24,7 +24,7 @@ NOTHING, IF_OLD, NOW = 0, 1, 2
 """What a reader asks its sender to send again."""
 
 ENVELOPE = struct.Struct("<QQB")  # sequence number, incarnation of the sender, kind
-_CREDIT = struct.Struct("<QQQB")  # incarnation, taken, safe, what is asked for
+_CREDIT = struct.Struct("<QQQB")  # incarnation, taken, safe, request
 
 
 @dataclass
@@ -46,10 +46,10 @@ class Shared:
 class InLink:
     """An input.
 
-    safe: messages that we will never ask for again.     wanted: the service waits for this topic.
+    safe: messages that we will never request again.     wanted: the service waits for this topic.
     arrived: whether one came since the last tick.     ended: its end was kept before we started.
-    told: messages taken when we last told our counts.
-    asked_at: when we asked for what is missing.
+    told: messages taken when we last reported our counts.
+    asked_at: when we requested missing messages.
     """
 
     def __init__(self, shared: Shared, topic: Topic, sender: str, *, reader: str, limit: Window):
@@ -151,7 +151,9 @@ class OutLink:
             self._put(message)
 
     def send_again(self) -> None:
-        """Send what a reader has asked for.  Raises BusError where it is not kept any more."""
+        """Send the messages that a reader has requested.  Raises BusError if they are no longer
+        kept.
+        """
         if not self.box.asking:  # who is sending may be held up: do not wait for nothing
             return
         with self._sending:

@@ -1,11 +1,10 @@
-"""One topic's outgoing messages: numbers, credit, and what must be kept to be sent again.
+"""One topic's outgoing messages: numbers, credit, and the messages kept for repetition.
 
-A reader tells two counts.  ``taken``: messages that it has taken in; the sender never has more than
-a window of messages on the way to the slowest reader, beside those with which it may lag.
-``safe``: messages that it will never ask for again, whatever happens to it; what comes after is
-kept here.  A reader that remembers nothing beyond its own process says safe = taken; one that
-restarts from a checkpoint says the position of that checkpoint; the recorder says what is on its
-disk.  A state machine: no socket, no clock.
+A reader reports two counts.  ``taken``: messages that it has taken; the sender never has more than
+a window of messages on the way to the slowest reader, besides those with which it may lag.
+``safe``: messages that it will never request again, whatever happens; later ones are kept here.  A
+reader without a lasting state reports safe = taken; one that restarts from a checkpoint, that
+checkpoint's position; the recorder, what is on its disk.  A state machine: no socket, no clock.
 """
 
 import sys
@@ -20,9 +19,10 @@ from pliant.errors import BusError
 
 @dataclass
 class Reader:
-    """What a required reader has told.  incarnation: which start of it; -1 before it spoke.
+    """The reports of a required reader.  incarnation: which start of it; -1 before its first
+    report.
 
-    light: numbers of the messages that take no room in its window, of those that it may ask for.
+    light: numbers of the messages that take no room in its window, among those that it may request.
     """
 
     incarnation: int = -1
@@ -42,7 +42,7 @@ class Numbered:
 
 
 class Outbox:
-    """Messages of one topic, from the oldest that a reader may still ask for to the newest."""
+    """Messages of one topic, from the oldest that a reader may still request to the newest."""
 
     def __init__(
         self,
@@ -120,15 +120,15 @@ class Outbox:
         return came_back
 
     def safe(self) -> int:
-        """How many messages no reader will ever ask for again."""
+        """How many messages no reader will ever request again."""
         return min((reader.safe for reader in self.readers.values()), default=self.sent)
 
     def not_safe(self) -> list[str]:
-        """The readers that may ask for some of what was sent."""
+        """The readers that may request sent messages again."""
         return [name for name, reader in self.readers.items() if reader.safe < self.sent]
 
     def silent(self) -> list[str]:
-        """The readers that have not told their counts."""
+        """The readers that have not reported their counts."""
         return [name for name, reader in self.readers.items() if reader.incarnation < 0]
 
     def behind(self) -> list[str]:
@@ -179,10 +179,10 @@ class Outbox:
         return len(self._kept)
 
     def asked_for(self) -> tuple[Numbered, ...]:
-        """What readers have asked for and still lack, once.
+        """The messages that readers have requested and still lack, once.
 
-        By what they have told since: words that were held up on the way come in one go, and with
-        the last of them the first may ask for what is not kept any more.  Raises BusError.
+        By their latest report: delayed reports arrive together, and after the last of them the
+        first may request a message that is no longer kept.  Raises BusError.
         """
         taken = [self.readers[name].taken for name in self.asking]
         self.asking.clear()

@@ -24,7 +24,7 @@ from pliant.messages.topics import TOPICS
 CONNECT_TIMEOUT_S = 7.0  # with the start of Python, a user waits ten seconds at most
 _PATIENCE_MS = 60_000  # Zenoh's defaults lose messages after a stall of 5 to 10 s (its second line)
 TOKEN_LEASE_S = 5.0 + 1e-3 * _PATIENCE_MS
-"""By then the router has given up a service whose machine has vanished."""
+"""Seconds after which the router drops a service whose machine has vanished."""
 _LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103
 _SOCKET = "unixsock-stream"
 _FOLDER, _BUS = "pliant-", "bus"
@@ -217,7 +217,7 @@ def _clear_left(temporary: Path) -> None:
 
 
 def _listens(path: Path) -> bool:
-    """Whether somebody does at a Unix socket.  Raises OSError where that cannot be told."""
+    """Whether a process listens at a Unix socket.  Raises OSError if that is unknown."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.setblocking(False)
         try:

@@ -27,7 +27,7 @@ class Waiting:
     since: float = 0.0
 
     def begin(self, text: str, now: float) -> None:
-        """The service waits for this; the same wait goes on where it did not end in between."""
+        """The service waits for this; the same wait continues where it did not end in between."""
         if not self.text:
             self.since = now
         self.text = text
@@ -48,8 +48,8 @@ class Waiting:
 class Waits:
     """All waits of a service.
 
-    changed: the bus's lock, and what is told of every change.     patience_s: how long a peer may
-    be away.     interrupted: whether Ctrl-C has come where it raises nothing.
+    changed: the bus's lock, notified of every change.     patience_s: how long a peer may be away.
+    interrupted: whether Ctrl-C has come where it raises nothing.
     spent_s: how long each reader was waited for so far, by its name.
     """
 

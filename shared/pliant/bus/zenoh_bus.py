@@ -2,21 +2,21 @@
 
 Zenoh's BLOCK is no guarantee (a reader that stalls longer than the transport's patience loses
 messages and ``put`` never says so; a router that dies takes what it holds with it), hence sequence
-numbers and credits: a reader tells how many messages of a topic it has taken, and how many it will
-never ask for again; a sender never has more than a window on the way to its slowest required
-reader, and keeps what may be asked for.  A reader that finds a gap, or waits for what does not
-come, asks for it.  So each message is taken exactly once, in order, and memory is bounded.
+numbers and credits: a reader reports how many messages of a topic it has taken, and how many it
+will never request again.  A sender never has more than a window on the way to its slowest required
+reader, and keeps messages that may be requested.  A reader requests missing messages.  So each
+message is taken exactly once, in order, and memory is bounded.
 
 Who starts first does not matter: readers subscribe, then declare a liveliness token; a sender waits
 for the tokens of its required readers before its first message.  A peer that stays away for longer
 than our patience is named in an error, so that nothing waits for ever.
 
-With checkpoints a service that died goes on where it was: ``restore`` puts it back to the newest
+With checkpoints a service that died continues where it was: ``restore`` puts it back to the newest
 checkpoint that its readers allow, senders send again what came after, and what it makes a second
 time is passed over by those who had it.
 
 Callbacks only append to queues and notify: no Zenoh call is ever made inside one.  A thread of its
-own (``keeper.py``) tells counts once a second and sends again.
+own (``keeper.py``) reports counts once a second and repeats messages.
 """
 
 import sys
@@ -85,15 +85,15 @@ class ZenohBus:
         disturb: called before each message goes out or is taken; for tests, which delay there.
         identity: our certificate, for endpoints such as tls/host:7447.
         on_tick: called once a second, as long as we are well.
-        on_fault: told what was passed over, in a line a second at most.
-        interrupted: whether Ctrl-C has come where it raises nothing; asked while readers are not
-        here yet, for whom we would wait for ever.
+        on_fault: called with one line about skipped messages, at most once a second.
+        interrupted: whether Ctrl-C has come where it raises nothing; tested while required readers
+        are missing.
         Raises BusError when no endpoint answers, or when we are not the first and that one stays.
         """
         self._prefix = f"pliant/{session_name(session)}"
         lags = lags or {}
         own_lag = lags.get(service, Window(0, 0))
-        # Who may lag is waited for by what it has told: it tells all.
+        # A lagging reader is waited for by its reports, which cover all messages.
         self._tell_every = 1 if service in lags else max(1, window // 4)
         self._checkpoints = checkpoints
         self._packed = frozenset(packed)
@@ -178,7 +178,7 @@ class ZenohBus:
     # -- sending -------------------------------------------------------------------------------
 
     def untaken(self, topic: Topic, reader: str) -> int:
-        """How many messages of the topic the reader has yet to take, by what it told last."""
+        """How many messages of the topic the reader has yet to take, by its last report."""
         with self._changed:
             return self._outputs[topic.key].box.untaken(reader)
 
@@ -233,7 +233,7 @@ class ZenohBus:
             self.end(output.topic, complete=complete)
 
     def flush(self) -> None:
-        """Wait until the required readers will never ask for any of what was sent."""
+        """Wait until the required readers will never request sent messages again."""
         for output in self._outputs.values():
             if output.box.sent:
                 self._waits.for_readers(output, output.box.not_safe)
@@ -340,7 +340,7 @@ class ZenohBus:
     def restore(self) -> Any | None:
         """Our state at the newest checkpoint that our readers allow; None at a first start.
 
-        Every topic then goes on from there.  Raises StateError for a broken checkpoint.
+        Every topic then continues from there.  Raises StateError for a broken checkpoint.
         """
         if self._checkpoints is None:
             return None

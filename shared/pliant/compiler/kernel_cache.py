@@ -2,7 +2,7 @@
 
 Numba stamps a cached kernel with the text of the file that it stands in.  A helper or a constant
 from another file is compiled into the kernel all the same, so that after an edit or an upgrade an
-old kernel would go on running, silently.  Here the stamp covers every module of ours that the
+old kernel would continue running, silently.  Here the stamp covers every module of ours that the
 kernel's module imports, directly or not.
 
 Kernels are kept in NUMBA_CACHE_DIR, else beside their sources, else in Pliant's cache folder.

@@ -10,7 +10,7 @@ from pliant.errors import DatasetError
 
 
 class BrokenFrame(DatasetError):  # noqa: N818 (an error of one frame, not of the source)
-    """One frame does not decode or has another size; the run goes on without it."""
+    """One frame does not decode or has another size; the run continues without it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """The deforming built-in sequences: how their folders are filled.
 
-Beside what every rendered sequence has, the folder holds ``surfaces.npz``, the exact truth:
+Beside what every rendered sequence has, the folder holds ``surfaces.npz``, the exact ground truth:
 
     names                 (S,) of the sheets
     vertices_0, ...       (F, R, C, 3) float32, metres, world: the grid of each sheet in each frame

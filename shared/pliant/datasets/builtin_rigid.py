@@ -1,4 +1,4 @@
-"""The rigid built-in sequences: what they may be told, and how their folders are filled."""
+"""The rigid built-in sequences: their options, and how their folders are filled."""
 
 import hashlib
 from dataclasses import dataclass

@@ -65,7 +65,7 @@ class CameraDevice:
         self._index = index
         self._open_device = open_device
         self._clock_ns = clock_ns
-        # The camera is asked for the size that it is calibrated for.
+        # Request the size of the calibration.
         self._size: tuple[int, int] | None = None
         if spec.calibration is not None:
             wanted = read_calibration(spec.calibration)

@@ -1,6 +1,6 @@
 """EuRoC and other sequences in ASL format; the left camera is used.
 
-    SEQUENCE/mav0/cam0/data.csv       "nanoseconds,file" a line; seconds are told by themselves
+    SEQUENCE/mav0/cam0/data.csv       "nanoseconds,file" a line; seconds are recognised
     SEQUENCE/mav0/cam0/data/*.png
     SEQUENCE/mav0/cam0/sensor.yaml    the calibration (or --calibration FILE, e.g. Kalibr's)
     SEQUENCE/mav0/state_groundtruth_estimate0/data.csv

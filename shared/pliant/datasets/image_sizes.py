@@ -11,7 +11,7 @@ from pliant.datasets.jpeg import jpeg_size
 from pliant.datasets.rectifier import decode
 
 LOOKED_AT = 9
-"""Images that are asked for their size; that of most of them is the source's."""
+"""Images whose size is read; the most frequent size is the source's."""
 
 
 def most_frequent(sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:

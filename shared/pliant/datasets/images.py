@@ -89,7 +89,7 @@ def _read(index: int, image: ListedImage) -> SourceFrame:
     try:
         data = image.path.read_bytes()
     except OSError:
-        data = b""  # broken like an empty file: the run goes on without it
+        data = b""  # broken like an empty file: the run continues without it
     try:
         if isinstance(image.depth, StereoPair):
             depth = image.depth.depth(data)
@@ -143,9 +143,9 @@ def choose_calibration(
     kitti_camera: int = 0,
     pixel_aspect: float = 1.0,
 ) -> Calibration:
-    """The user's calibration or field of view, else what was found with the source.
+    """The user's calibration or field of view, or else that of the source.
 
-    Where there is none, a guess.  pixel_aspect: width over height of a pixel.
+    Without any, a guess.  pixel_aspect: width over height of a pixel.
     Raises CalibrationError where it is broken, or for other images.
     """
     if spec.fov_deg is not None:

@@ -2,7 +2,7 @@
 
 Read are the sizes, which tracks are pictures, the times of the samples, and the edit lists.  With
 an edit list a file keeps more samples than it shows (a lossless trim).  FFmpeg passes over some of
-these, and then nobody knows how many frames should come.  So where an edit list leaves something
+these, and then it is unknown how many frames should come.  So where an edit list leaves something
 out it is hidden, all samples are decoded, and the source passes over what is not shown.
 """
 

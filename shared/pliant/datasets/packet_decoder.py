@@ -87,7 +87,7 @@ _CALLS: dict[str, tuple[str, Any, list[Any]]] = {
 
 
 class Reader(Protocol):
-    """What tells properties as ``cv2.VideoCapture`` does."""
+    """Has properties as ``cv2.VideoCapture`` does."""
 
     def get(self, property_id: int, /) -> float: ...
 

@@ -19,7 +19,7 @@ from pliant.datasets.base import BrokenFrame, Dataset, SourceFrame
 from pliant.datasets.rectifier import decode
 
 _AHEAD_S = 15.0
-"""Of a file so much is looked at before its first frame, or until an overlay can be told."""
+"""Seconds of a file that are read before its first frame, or until an overlay can be recognised."""
 
 _PREFIX = "static_"
 

@@ -204,8 +204,9 @@ def _same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def file_version(file: Path) -> tuple[int, ...]:
-    """What tells a file from another of its name, or from what it was before it was written to;
-    () where there is none."""
+    """Identity of a file's content: distinguishes it from another file of its name, and from
+    earlier content; () without a file.
+    """
     try:
         status = file.stat()
     except OSError:

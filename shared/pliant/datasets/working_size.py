@@ -58,7 +58,7 @@ class SmallerImages:
         try:
             pixels = decode(frame)
         except BrokenFrame:
-            return frame  # told when it is rectified
+            return frame  # reported when it is rectified
         if pixels.shape[1::-1] != self.source_size:
             return frame
         return smaller(frame, pixels, self._side)

@@ -1,1 +1,3 @@
-"""How good a result is: trajectories, tracks and maps against the truth, and the reports of it."""
+"""Accuracy of a result: trajectories, tracks and maps compared with ground truth, and the
+reports.
+"""

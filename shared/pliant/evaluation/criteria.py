@@ -1,7 +1,7 @@
 """The criteria of VITAMIN-E section 5.2, and relative errors, for matched poses.
 
 Monocular scale is arbitrary: every accuracy here is after a Sim(3) alignment of the estimate to
-the truth, over all matched poses at once (Umeyama 1991), which is what ``evo_ape -as`` computes.
+ground truth, over all matched poses at once (Umeyama 1991), which is what ``evo_ape -as`` computes.
 """
 
 from dataclasses import dataclass
@@ -27,11 +27,11 @@ class Similarity:
     t: F64
 
     def apply(self, points: F64) -> F64:
-        """Map (N, 3) points of the estimate to the world of the truth."""
+        """Map (N, 3) points of the estimate to the world of ground truth."""
         return self.scale * points @ self.R.T + self.t
 
     def apply_poses(self, T_world_camera: F64) -> F64:
-        """Map (N, 4, 4) poses of the estimate to the world of the truth; they stay rigid."""
+        """Map (N, 4, 4) poses of the estimate to the world of ground truth; they stay rigid."""
         out = T_world_camera.copy()
         out[:, :3, :3] = self.R @ T_world_camera[:, :3, :3]
         out[:, :3, 3] = self.apply(T_world_camera[:, :3, 3])
@@ -77,7 +77,7 @@ def align(estimate: F64, truth: F64) -> Similarity:
     """The Sim(3) that brings (N, 4, 4) poses of the estimate nearest to the true ones.
 
     Raises ValueError with a reason where there are fewer than three poses, or where the estimate
-    or the truth stands still: no scale could be told.
+    or ground truth is static: the scale is undetermined.
     """
     positions, true_positions = estimate[:, :3, 3], truth[:, :3, 3]
     scale, R, t = align_umeyama(positions, true_positions, with_scale=True)

@@ -8,7 +8,7 @@ from pliant.results.page.chart import BLUE, ORANGE, Line, chart
 
 
 def error_over_time(evaluation: Evaluation) -> str:
-    """HTML: the distance to the true position, final and causal; "" where nothing was aligned."""
+    """HTML: the distance to the true position, final and online; "" where nothing was aligned."""
     parts = [part for part in (evaluation.final, evaluation.causal) if part and len(part.errors_m)]
     if not parts:
         return ""

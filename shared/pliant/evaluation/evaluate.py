@@ -27,7 +27,7 @@ from pliant.results.page.page import put_truth_in
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRequest:
-    """What the user asked for."""
+    """The request of a user."""
 
     results: Sequence[Path]
     groundtruth: str
@@ -45,7 +45,7 @@ class EvaluationRequest:
 
 
 def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
-    """Evaluate, write what was asked for, and say the figures.  Raises ResultError."""
+    """Evaluate, write the requested files, and print the figures.  Raises ResultError."""
     missing = [str(result) for result in request.results if not result.exists()]
     if missing:
         raise ResultError(f"{missing[0]}: no such result")
@@ -104,7 +104,7 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
 
 
 def _evaluated(result: Path, truth: Path, request: EvaluationRequest) -> Evaluation:
-    """Evaluate one result.  Raises ResultError where poses and truth do not meet in time."""
+    """Evaluate one result.  Raises ResultError if poses and ground truth do not overlap in time."""
     evaluation = evaluate_result(
         result,
         groundtruth=truth,
@@ -124,7 +124,7 @@ def _evaluated(result: Path, truth: Path, request: EvaluationRequest) -> Evaluat
 
 
 def _proposal(evaluation: Evaluation, better: TimeOffset) -> str:
-    """What a user may try where the times of poses and truth seem to differ."""
+    """What a user may try where the times of poses and ground truth seem to differ."""
     where = "later" if better.seconds > 0.0 else "earlier"
     return (
         f"ground truth fits far better {abs(better.seconds):.3f} s ({abs(better.frames):.1f} "

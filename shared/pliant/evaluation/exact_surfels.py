@@ -1,8 +1,9 @@
-"""Surfels against exact truth: each against the place of the material point that it was born on.
+"""Surfels compared with exact ground truth: the material points on which they were created.
 
 Metric, untrimmed, without any alignment.  The world is the camera of the frame in which the surfels
-start, for the truth as for the surfels: where the camera moves, its error is part of theirs.  The
-surfels of that first frame are judged.  A share of the depth is of each surfel's own true depth.
+start, for ground truth as for the surfels: where the camera moves, its error is part of theirs.
+The surfels of that first frame are judged.  A share of the depth is of each surfel's own true
+depth.
 """
 
 from dataclasses import dataclass, field
@@ -68,7 +69,7 @@ class _Start:
     ids: I64
     points: MaterialPoints
     positions: F64  # (N, 3) world of the surfels
-    T_truth_world: F64  # (4, 4) from the world of the surfels to that of the truth
+    T_truth_world: F64  # (4, 4) from the world of the surfels to that of ground truth
     size_m: F64  # (N,) a pixel on the surface
     others: list[F64]  # of each sheet the vertex that was nearest to each surfel, (N, 2)
 

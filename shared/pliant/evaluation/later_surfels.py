@@ -1,4 +1,4 @@
-"""Surfels that were born after the first frame against exact truth, and a scale that is not metric.
+"""Later surfels compared with exact ground truth, and a scale that is not metric.
 
 As in ``exact_surfels`` each is judged by the place of the material point that it was born on; the
 world is that of the first frame's surfels.

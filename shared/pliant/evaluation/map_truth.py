@@ -18,9 +18,9 @@ class MapTruth:
     """Points of a map against true depth.
 
     points: all that were given.      in_view: of those, in the image of their frame.
-    within: within 5 % of the true depth.      share: within / points, so that points that cannot
-    be seen where they were first told count as wrong.      median_error: median relative error of
-    those in view; NaN without any.      at_jumps: in view, beside a jump in depth.
+    within: within 5 % of the true depth.      share: within / points, so that points outside
+    the image in which they were first published count as wrong.      median_error: median relative
+    error of those in view; NaN without any.      at_jumps: in view, beside a jump in depth.
     """
 
     points: int
@@ -42,7 +42,7 @@ def evaluate_map(
     """Compare the depth of every point with the true depth at the pixel where it is seen.
 
     A point is moved to the true world by the Sim(3) of the trajectory and projected with the true
-    pose into **one** frame: the one whose map update first told of the point, which observed it.
+    pose into **one** frame: the one whose map update first published the point.
     True depth is interpolated (inverse depth, exact on planes); beside a jump in depth, where
     that makes no sense, the nearest of the four pixels around it in depth is taken.
 
@@ -84,6 +84,6 @@ def format_map(truth: MapTruth) -> str:
     return (
         f"map points within 5 % of the true depth: {100.0 * truth.share:.1f} % of {truth.points}"
         f" (median error {100.0 * truth.median_error:.2f} %)\n"
-        f"in view of the frame that first told of them: {truth.in_view}, beside a jump in depth: "
+        f"in view of the frame that first published them: {truth.in_view}, beside a jump in depth: "
         f"{truth.at_jumps}"
     )

@@ -10,7 +10,7 @@ _COLOURS = {"final": "#1668b8", "causal": "#e0751a"}
 
 
 def plot_errors(path: Path, evaluation: Evaluation, *, title: str | None = None) -> None:
-    """Write a PNG: distance to the true position over time, causal and final.
+    """Write a PNG: distance to the true position over time, online and final.
 
     Raises ResultError where matplotlib is not installed, or where neither trajectory could be
     aligned (then there is no error to draw).

@@ -55,7 +55,7 @@ class Summary:
 def summarise(evaluations: Sequence[Evaluation], *, kind: str = "final") -> Summary:
     """Mean and deviation of each criterion over runs.  kind: "final" or "causal".
 
-    Raises ResultError when there are no runs, or when one of them has no causal trajectory.
+    Raises ResultError when there are no runs, or when one of them has no online trajectory.
     """
     if not evaluations:
         raise ResultError("no runs to summarise")

@@ -1,6 +1,6 @@
-"""Behind ``pliant eval --surfels``: a recording of surfels against the truth of its source.
+"""Behind ``pliant eval --surfels``: a recording of surfels against ground truth of its source.
 
-A deforming built-in sequence has exact truth; any other source the true depth of its frames.
+A deforming built-in sequence has exact ground truth; any other source the true depth of its frames.
 """
 
 from collections.abc import Iterator

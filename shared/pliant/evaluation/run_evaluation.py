@@ -1,4 +1,4 @@
-"""Evaluate a run: its final and its causal trajectory by the criteria of VITAMIN-E section 5.2."""
+"""Evaluate a run: its final and its online trajectory by the criteria of VITAMIN-E section 5.2."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ from pliant.trajectory import (
 MIN_SUCCESS = 0.9
 """Below this share of localised frames a trial is a failure and gets no accuracy (section 5.2)."""
 MIN_COMPARED = 0.9
-"""Where a smaller share of the poses has a true pose, the truth may be of another recording."""
+"""Where a smaller share of the poses has a true pose, ground truth may be of another recording."""
 MAX_SHARE = 0.5
 """With an error above this share of the spread of the true positions it may be, too."""
 
@@ -43,14 +43,14 @@ CAUSAL_NAME = "trajectory_causal.txt"
 
 @dataclass(frozen=True, kw_only=True)
 class TrajectoryEvaluation:
-    """One trajectory against the truth.
+    """One trajectory against ground truth.
 
     To align each map segment by itself would flatter a run that was lost: only the longest is
     evaluated (it is what trajectory.txt holds), and the frames of those that were never joined to
-    it count as not localised.  Causal poses stay in the segment of their time.
+    it count as not localised.  Online poses stay in the segment of their time.
 
     kind: "final" (after all corrections) or "causal" (each pose as known when its frame was done).
-    frames: of the whole sequence; None where nobody said, and then there is no success rate.
+    frames: of the whole sequence; None if unknown, without a success rate.
     localised: frames with a pose in the longest segment.      other_segments: poses left out.
     success: True, False, or None (unknown).     reason: why there is no accuracy, else "".
     matched: localised frames that have a true pose within the time limit: the others have no error.
@@ -88,7 +88,7 @@ class TrajectoryEvaluation:
 
     @property
     def unlike(self) -> bool:
-        """Whether the error is of the size of the motion, as with the truth of another recording.
+        """Whether the error is of the size of the motion, as with another recording's ground truth.
 
         What is aligned with poses that have nothing to do with it shrinks to a point.
         """
@@ -96,7 +96,7 @@ class TrajectoryEvaluation:
 
     @property
     def apart(self) -> bool:
-        """Whether there is no accuracy for one reason alone: poses and truth do not meet in time.
+        """Whether there is no accuracy only because poses and ground truth do not overlap in time.
 
         A failure has none in any case, and fewer than three poses cannot be aligned.
         """
@@ -104,7 +104,7 @@ class TrajectoryEvaluation:
 
     @property
     def partly_compared(self) -> bool:
-        """Whether so many poses have no true pose that the user should look at the truth."""
+        """Whether so many poses have no true pose that the user should look at ground truth."""
         few = self.matched < MIN_COMPARED * self.localised
         return few and self.localised >= MIN_POSES and not self.apart
 
@@ -114,7 +114,7 @@ class Evaluation:
     """One run: both trajectories, and how often its map had to start anew before it could.
 
     offset_s: was added to the times of the poses.   better: a further offset with which the final
-    ones fit the truth far better.
+    ones fit ground truth far better.
     """
 
     result: str
@@ -136,7 +136,7 @@ def evaluate_trajectory(
     origin_ns: int | None = None,
     max_difference_ns: int = MAX_DIFFERENCE_NS,
 ) -> TrajectoryEvaluation:
-    """Compare an estimate with the truth; see TrajectoryEvaluation for what counts.
+    """Compare an estimate with ground truth; see TrajectoryEvaluation for what counts.
 
     frames: of the whole sequence.      other_segments: poses in each map segment but this one,
     which is the longest.       origin_ns: time 0 of times_s; the first pose where None.

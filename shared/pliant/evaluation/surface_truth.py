@@ -1,4 +1,4 @@
-"""The exact truth about a deforming built-in sequence, read from its folder."""
+"""The exact ground truth about a deforming built-in sequence, read from its folder."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -190,7 +190,7 @@ def scaled_mean(points: F64, truth: F64, share: float) -> float:
 def roc(scores: F64, inlier: BoolArray) -> tuple[F64, F64, float]:
     """False and true positive rates over all thresholds of a score, and the area below (AUC).
 
-    scores: (N,), high for inliers.    inlier: (N,) the truth.    AUC is NaN with one class only.
+    scores: (N,), high for inliers.    inlier: (N,) ground truth.    AUC is NaN with one class only.
     """
     order = np.argsort(-scores, kind="stable")
     ends = np.flatnonzero(np.append(np.diff(scores[order]) != 0.0, True))  # ties count as one step

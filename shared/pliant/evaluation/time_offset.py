@@ -1,7 +1,7 @@
 """How far the times of a trajectory and of its ground truth lie apart.
 
-Where the clocks of camera and truth differ, each pose is compared with a true one of another
-moment.  So positions are compared over a range of offsets, the truth interpolated in between.
+Where the clocks of camera and ground truth differ, each pose is compared with a true one of another
+moment.  So positions are compared over a range of offsets, ground truth interpolated in between.
 """
 
 import re
@@ -63,7 +63,7 @@ def shifted(trajectory: Trajectory, by_ns: int) -> Trajectory:
 
 
 def better_offset(estimate: Trajectory, truth: Trajectory) -> TimeOffset | None:
-    """The offset at which the truth fits far better; None where none does, or nobody can tell."""
+    """The offset at which ground truth fits far better; None without one, or if undecidable."""
     if min(len(estimate), len(truth)) < _LEAST_POSES:
         return None
     apart_ns = _apart_ns(estimate, truth)
@@ -137,7 +137,7 @@ def _refined(rmse: Callable[[float], float], best: float, step: float) -> float:
 
 
 def _covered(times: F64, true_times: F64, limit: float) -> BoolArray:
-    """Of which poses the truth tells the position at every offset."""
+    """Which poses have a true position at every offset."""
     gaps = np.diff(true_times) > _GAP * np.median(np.diff(true_times))
     begins, ends = true_times[:-1][gaps], true_times[1:][gaps]
     there = (times - limit >= true_times[0]) & (times + limit <= true_times[-1])

@@ -1,6 +1,6 @@
-"""Tracks against exact depth and poses: who is still on the point that they were born on.
+"""Tracks compared with exact depth and poses: which are still on their initial surface point.
 
-The truth of a track is the surface point seen at the sub-pixel position of its birth, followed
+Ground truth of a track is the surface point seen at the sub-pixel position of its birth, followed
 exactly by the true poses.  Births whose surface is not defined are left out: any of the four
 pixels around lies on a depth jump, within 1.5 px of one, or shows no surface.  A track that lives
 on while its surface point is hidden or out of view stays in the count, and is wrong as soon as it
@@ -26,7 +26,7 @@ MATURE_AGE = 10
 class AgeRow:
     """Tracks at one age, summed over all frames.
 
-    living: tracks of this age with a defined truth.      right: of those, within 2 px of it.
+    living: tracks of this age with a defined ground truth.      right: of those, within 2 px of it.
     median_px: median distance of the living ones; NaN without any.
     followable: births whose point stayed in view and unhidden in every frame up to this age.
     alive, alive_right: of the followable, those still tracked, and tracked within 2 px.
@@ -58,10 +58,10 @@ class AgeRow:
 
 @dataclass(frozen=True, kw_only=True)
 class TracksEvaluation:
-    """All tracks of a run against the truth.
+    """All tracks of a run against ground truth.
 
     living_median: median over the frames, from the first one in which age 10 is possible, of the
-        tracks of age >= 10 in a frame, with or without a defined truth.
+        tracks of age >= 10 in a frame, with or without a defined ground truth.
     mature_right: share within 2 px of all tracks of age >= 10 over all frames.
     """
 
@@ -74,7 +74,7 @@ class TracksEvaluation:
 
 
 class TracksTruth:
-    """Takes a run's tracks and the truth frame by frame; holds only what is being followed.
+    """Takes a run's tracks and ground truth frame by frame; holds only what is being followed.
 
     ``for ...: truth.add(tracks, depth_m, T_world_camera)``, then ``truth.evaluation()``.
     """
@@ -107,10 +107,10 @@ class TracksTruth:
         row, alive = _find(self._ids, tracks.ids)
         distance = np.full(len(self._ids), np.inf)
         distance[alive] = np.linalg.norm(points_px[row[alive]] - true_px[alive], axis=1)
-        # Behind the camera the truth has no pixel: a track that claims one is wrong.
+        # Behind the camera ground truth has no pixel: a track that claims one is wrong.
         distance[np.isnan(distance)] = np.inf
         self._count(tracks, self._frame - self._born, alive, distance)
-        # Forget the dead that are older than every age asked for.
+        # Forget dead tracks that are older than every requested age.
         keep = alive | (self._frame - self._born < max(self._ages))
         self._keep(keep)
         self._start(tracks, points_px, view)

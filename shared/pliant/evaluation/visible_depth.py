@@ -19,7 +19,7 @@ OCCLUSION = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class DepthView:
-    """One frame of the truth.
+    """One frame of ground truth.
 
     inverse_depth: (H, W), 1 / metres, 0 where there is no surface.
     broken: (H, W) pixels on a depth jump or beside one (within 1.5 px, so all 8 neighbours), or

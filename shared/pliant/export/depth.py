@@ -1,7 +1,7 @@
 """The depth and the normals of a run's keyframes, beside their images.
 
     images/000012.png     the keyframe, as ``IdealCamera`` sees it
-    masks/000012.png      black where the keyframe's mask has it ignored; depth is unknown there
+    masks/000012.png      black where the keyframe's mask ignores pixels; depth is unknown there
     depth/000012.png      16 bits, along the optical axis; 0: unknown
     normals/000012.png    RGB, 127.5 (n + 1) with n in the camera (x right, y down, z forward) and
                           towards it; black: unknown
@@ -10,8 +10,8 @@
     calib.yaml            the camera; ``depth_scale`` times a value is a depth
 
 So it is an RGB-D sequence that ``pliant run`` opens, too.  Depths are in the unit of the map, which
-is a metre only where something has told the scale; ``depth_scale`` is the power of ten of it at
-which the deepest fit: 0.001 where they are 6.6 to 65.5 units away, 0.0001 where they are nearer.
+is a metre only if the scale was measured.  ``depth_scale`` is the power of ten at which the largest
+depth fits: 0.001 for 6.6 to 65.5 units, 0.0001 for less.
 """
 
 from functools import partial

@@ -59,7 +59,7 @@ Export = Callable[..., None]
 result, and options of its own."""
 
 Progress = Callable[[int, int], None]
-"""Is told how much is done, of how much; less than 1: nobody knows."""
+"""Called with the amount done, and of how much; less than 1: unknown."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,9 @@ def export_result(
 
     every: of surfaces, which frames.    triangles: most of a textured mesh.
     clean: leave out its small pieces.    crop: only the surface or the points in this box.
-    progress: is told how many images have been read, and of how many.
+    progress: called with the number of images read, and of how many.
 
-    Raises ResultError for an unknown kind, and for what is there already unless ``force``.
+    Raises ResultError for an unknown kind, and for an existing output unless ``force``.
     """
     if to not in EXPORTS:
         raise ResultError(f"--to {to}: choose {', '.join(EXPORTS)}")

@@ -1,4 +1,4 @@
-"""Exports that other programs go on with: Foxglove, Rerun, clouds."""
+"""Exports that other programs continue with: Foxglove, Rerun, clouds."""
 
 from pathlib import Path
 

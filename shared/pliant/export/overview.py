@@ -56,7 +56,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """A frame of the run.  shown: None where it is not to be seen, but its tracks go on."""
+    """A frame of the run.  shown: None where it is not to be seen, but its tracks continue."""
 
     update: MapUpdate
     tracks: FrameTracks
@@ -121,7 +121,7 @@ def still_picture(frames: Iterable[ShownFrame], camera: PinholeCamera, what: Mad
 
 
 def _growing(frames: Iterable[ShownFrame], layout: Layout, what: Made) -> Iterator[tuple[U8, str]]:
-    """The tracks on the image beside the points that are there by then, and what is seen."""
+    """The tracks on the image next to the points mapped so far, with the visible ones."""
     view = choose_view(what.points.positions, what.poses, aspect=layout.map[0] / layout.map[1])
     history, painter = MapHistory(), TrackPainter(scale=1)
     for frame in frames:

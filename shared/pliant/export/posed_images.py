@@ -1,10 +1,10 @@
-"""Images of a run that fit its poses: what splats, NeRFs and stereo go on with.
+"""Images of a run that fit its poses, for splats, NeRFs and stereo.
 
-One for each keyframe: itself, or of the frames that are nearer to it than to another keyframe the
-sharpest, as ``--sharpest`` measures it, where that is clearly sharper: poses of keyframes are the
-better known.  Each is what an ideal pinhole camera would have taken at its pose, all of
-it at once: the lens as it was given and as the images told of it is taken out, a rolling shutter,
-too, and of the image there is what the lens has shown of it.
+One for each keyframe: its own image, or a clearly sharper one (as ``--sharpest`` measures it) of
+the frames that are nearer to it than to other keyframes; poses of keyframes are more accurate.
+Each is the image of an ideal pinhole camera with a global shutter at its pose: the given and the
+estimated distortion and the rolling shutter are removed, and pixels outside of the lens's image are
+masked.
 """
 
 from collections.abc import Callable, Iterator

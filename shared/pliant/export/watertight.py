@@ -1,9 +1,9 @@
 """A mesh closed to a solid: Open3D's screened Poisson reconstruction.
 
-Kazhdan and Hoppe 2013.  A surface that was filmed has a border, where nobody looked any more, and
-its reconstruction goes on from there for ever.  So the solid is given an end: a box a little
-larger than the mesh.  Where a first, coarse reconstruction has the box within the solid, the box's
-faces are points of the surface, too; where the cameras were the box stays open.
+Kazhdan and Hoppe 2013.  A filmed surface has a border, where the view ended, and its reconstruction
+continues from there without end.  So the solid is bounded by a box a little larger than the mesh.
+If a first, coarse reconstruction contains parts of the box, those parts are points of the surface,
+too; on the side of the cameras the box stays open.
 """
 
 import math

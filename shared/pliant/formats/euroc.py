@@ -19,7 +19,7 @@ from pliant.trajectory import Trajectory
 _HEADER = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 )
-# state_groundtruth_estimate0 goes on with velocity (3) and two biases (6).
+# state_groundtruth_estimate0 continues with velocity (3) and two biases (6).
 _FIELD_COUNTS = (8, 17)
 
 

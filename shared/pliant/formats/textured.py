@@ -36,7 +36,7 @@ class TexturedMesh:
 def write_glb(path: Path, mesh: TexturedMesh) -> None:
     """Binary glTF 2.0 with the texture inside; equal meshes give equal bytes.  Raises ResultError.
 
-    The colours are photographs, which have their light in them: the material asks for none.
+    The colours are photographs, which include their light: the material needs none.
     """
     blobs = [mesh.positions.astype("<f4").tobytes(), mesh.normals.astype("<f4").tobytes(),
              mesh.uvs.astype("<f4").tobytes(), mesh.triangles.astype("<u4").tobytes(),

@@ -26,7 +26,7 @@ class _Place:
 
 
 class KeyframeSpool:
-    """A temporary file; the last that was told of a keyframe counts.  A context manager.
+    """A temporary file; the last data of a keyframe count.  A context manager.
 
     Threads may read at the same time.
     """
@@ -91,7 +91,7 @@ class KeyframeSpool:
         return sorted(self._observations)
 
     def image(self, keyframe: int) -> bytes:
-        """The image of a keyframe; empty where none was told."""
+        """The image of a keyframe; empty without one."""
         place = self._images.get(keyframe)
         return self._read(place) if place is not None else b""
 
@@ -101,7 +101,7 @@ class KeyframeSpool:
         return self._read(place) if place is not None else b""
 
     def observations(self, keyframe: int) -> tuple[I64, F32]:
-        """Point ids (N,) and pixels (N, 2) of a keyframe.  KeyError where none were told."""
+        """Point ids (N,) and pixels (N, 2) of a keyframe.  KeyError without any."""
         raw = self._read(self._observations[keyframe])
         count = len(raw) // (_ID_BYTES + _PIXEL_BYTES)
         ids = np.frombuffer(raw, np.int64, count).copy()
@@ -109,7 +109,7 @@ class KeyframeSpool:
         return ids, pixels.reshape(-1, 2).copy()
 
     def surface(self, keyframe: int) -> DrawnTriangles:
-        """What a keyframe's depth map shows.  KeyError where that was not told."""
+        """What a keyframe's depth map shows.  KeyError without any."""
         raw = self._read(self._surfaces[keyframe])
         count = int(np.frombuffer(raw, np.int64, 1)[0])
         corners = np.frombuffer(raw, np.float32, 4 * count, _ID_BYTES).reshape(-1, 4)
@@ -126,7 +126,7 @@ class KeyframeSpool:
         return np.frombuffer(self._read(self._greys[keyframe]), np.uint8)
 
     def depth(self, keyframe: int) -> DenseDepth:
-        """The dense depth of a keyframe.  KeyError where that was not told."""
+        """The dense depth of a keyframe.  KeyError without any."""
         raw = self._read(self._depths[keyframe])
         height, width = np.frombuffer(raw, np.int64, 2).tolist()
         unit = np.frombuffer(raw, np.float64, 1, 16)[0]
@@ -138,7 +138,7 @@ class KeyframeSpool:
         )
 
     def _put(self, places: dict[int, _Place], keyframe: int, data: bytes) -> None:
-        """In the place of what was told before, where there is room."""
+        """In the place of the earlier data if there is room."""
         old = places.get(keyframe)
         with self._lock:
             if old is not None and len(data) <= old.room:

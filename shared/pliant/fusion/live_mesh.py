@@ -106,7 +106,7 @@ class LiveMesh:
         return float(np.median(moved))
 
     def changes(self, timer: StageTimer) -> MeshBlocks | None:
-        """The blocks that differ from what was told; None where nothing was put in."""
+        """The blocks that differ from the published ones; None without keyframes."""
         if not self._touched:
             return None
         with timer("coarse meshing"):
@@ -117,10 +117,10 @@ class LiveMesh:
             return new
 
     def again(self) -> tuple[MeshBlocks, tuple[int, int]]:
-        """The next blocks in turn, as they were told, and the span of packed keys they fill.
+        """The next blocks in turn, as published, and the span of packed keys that they fill.
 
-        Whoever came late, or missed a change, has all of them after one turn; and what he holds
-        within the span beside them is no more.  (0, -1): no span, as nothing is told again.
+        A reader that came late, or missed a change, has all of them after one turn, and removes
+        others within the span.  (0, -1): no span, because nothing is repeated.
         """
         if self._again == 0:
             return no_blocks(), (0, -1)

@@ -38,7 +38,7 @@ _NO_IMAGE = "it has no image"
 
 @dataclass(frozen=True)
 class LiveChange:
-    """Blocks of the live mesh of a segment that changed, or are told again.
+    """Blocks of the live mesh of a segment that changed, or are repeated.
 
     span: of packed keys; there are no other blocks within it.  (0, -1): it says nothing.
     """
@@ -98,9 +98,9 @@ class Mesher:
         frame: int,
         masks: Mapping[int, bytes] | None = None,
     ) -> None:
-        """Take in what a frame tells; cheap.  What is to be fused waits for ``fuse``.
+        """Take the messages of a frame; cheap.  Fusion waits for ``fuse``.
 
-        images: JPEG files of keyframes by their ids, each told once.    masks: of those that have
+        images: JPEG files of keyframes by their ids, each once.    masks: of those that have
         one, as of ``algorithms.image.masks``: what they cover is no surface.
         """
         self._map.take(update, frame)
@@ -133,7 +133,7 @@ class Mesher:
             self._again = self._untried()
 
     def _begin_live(self, segment: int) -> None:
-        """The camera is in another segment: what was seen of it before is fused one by one."""
+        """The camera is in another segment: its earlier keyframes are fused one by one."""
         self._segment, self._live, self._tried = segment, None, set()
         self._again = self._untried()
 
@@ -179,7 +179,7 @@ class Mesher:
                 self._begin_live(segment)
             self._fuse_one(keyframe, "settled" if settled else "fused", timer)
         self._follow_map(timer)
-        # What is fused again between keyframes is told with the next one, or when all of it is.
+        # Keyframes fused again are published with the next one, or when all are.
         if pending or not self._again:
             changed += self._changes(timer)
         return changed

@@ -1,4 +1,4 @@
-"""Messages in metres, once something has told how long a unit of the map is."""
+"""Messages in metres, once the length of a map unit is measured."""
 
 from dataclasses import replace
 from typing import Any

@@ -73,7 +73,7 @@ KEYFRAME = Topic("map/keyframe", Keyframe, per_frame=True, max_bytes=64 * _MIB)
 KEYFRAME_FINAL = Topic("map/keyframe_final", Keyframe, per_frame=False, max_bytes=512 * _MIB)
 # After the last frame: the map with all that was known, for sessions to come.
 MAP_KEPT = Topic("map/kept", MapKeyframe, per_frame=False, max_bytes=64 * _MIB)
-# In live mode, what of the live mesh is told depends on what there was time for.
+# In live mode, the published part of the live mesh depends on the time.
 # For viewers the changed blocks of 32 keyframes, or a final mesh of 8 million triangles.
 MESH_BLOCKS = Topic("mesh/blocks", MeshUpdate, per_frame=False, max_bytes=256 * _MIB, viewed=64)
 MESH_FINAL = Topic("mesh/final", MeshPiece, per_frame=False, viewed=64)

@@ -215,11 +215,11 @@ class MapKeyframe(Header, KeptKeyframe):
 
 @dataclass(frozen=True, kw_only=True)
 class MeshUpdate(Header, MeshBlocks):
-    """Blocks of the live mesh: those that changed, or (``again``) some told as they were before.
+    """Blocks of the live mesh: those that changed, or (``again``) unchanged ones.
 
     segment: of the map; a new one starts with an empty mesh.    voxel_size: in its units.
     first_key, last_key: of ``again``: between these packed keys, both included, there are no other
-    blocks than those of this message; so whoever missed that one became empty finds out.
+    blocks than those of this message; so a reader that missed an emptied block removes it.
     """
 
     segment: int

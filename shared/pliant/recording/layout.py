@@ -60,7 +60,7 @@ class Span:
 
 
 class Inflated:
-    """What compressed bytes hold, as far as they go.  Memory: a block, and what is asked for."""
+    """The intact content of compressed bytes.  Memory: a block, and the requested bytes."""
 
     def __init__(self, stored: Source, limit: int) -> None:
         """``limit``: nothing is inflated beyond what the chunk says that it holds."""

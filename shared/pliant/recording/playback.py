@@ -43,13 +43,14 @@ class Playback:
         end_s: float | None = None,
         lead_frames: int = 0,
     ) -> Iterator[Recorded]:
-        """What is recorded of these topics, from the first frame at ``start_s`` to ``end_s``.
+        """Yield the recorded messages of these topics, from the first frame at ``start_s`` to
+        ``end_s``.
 
-        Every per-frame topic begins with the same frame, but map updates ``lead_frames`` before
-        it, so that one who knows nothing yet is told the map.  The camera comes first wherever the
-        beginning is.  Ends of topics come as they were recorded, if nothing is cut off.  What is
-        said once the last frame is done (map/final) belongs to the whole and goes with it alone.
-        Raises RecordingError at damage and where nothing is left.
+        Every per-frame topic begins with the same frame, but map updates ``lead_frames`` before it,
+        so that a new reader gets the map.  The camera always comes first.  Ends of topics are as
+        recorded, if nothing is cut off.  Messages after the last frame (map/final) belong to the
+        whole and are only part of it.
+        Raises RecordingError at damage and if no message is left.
         """
         opening = self._opening(wanted)
         yield from opening

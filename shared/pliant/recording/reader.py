@@ -60,8 +60,8 @@ class Recording:
 
         Of a closed recording, damage to other topics' chunks is none: they are not read.
 
-        The final map comes last, as it was told: a recorder that was started again gets what
-        waited for it topic by topic, and so may have it before the updates that it corrects.
+        The final map comes last, as it was published: a restarted recorder gets waiting messages
+        topic by topic, and may have it before the updates that it corrects.
         """
         final: list[Recorded] = []
         for item in self.everything(*topics):

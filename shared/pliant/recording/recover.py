@@ -114,15 +114,15 @@ def _note(
 
 
 def mend(path: Path) -> tuple[dict[str, int], set[str]]:
-    """Close the part that was cut off; return the messages there are of each topic, and its end.
+    """Close the part that was cut off; return the number of messages of each topic, and its end.
 
-    For a recorder that is started again.  What is counted is on the disk, without a gap, under a
-    checksum: what else a power cut left of the last part is dropped, for its senders, who were not
-    told that it is safe, have it still.  Earlier parts were put on the disk when they were closed,
-    and are not read again.  A part of which nothing is readable is set aside.  An end counts
-    as a message of its topic.  ``path``: of the recording, whose parts lie beside it.
+    For a restarted recorder.  Counted messages are on the disk, without a gap, under a checksum.
+    Other data that a power cut left of the last part is dropped: its senders still have it, because
+    it was not reported as safe.  Earlier parts were synced when they were closed, and are not read
+    again.  A part without readable data is set aside.  An end counts as a message of its topic.
+    ``path``: of the recording, whose parts lie beside it.
 
-    Raises RecordingError where a part cannot be read or written.
+    Raises RecordingError if a part cannot be read or written.
     """
     books = _Books()
     files = parts_in(folder_of_parts(path))

@@ -2,7 +2,7 @@
 
 Nothing in the file is believed before it is checked: sizes against the file's own, chunks by their
 checksum.  Memory holds a chunk of the usual size, compressed and not, or one message of a larger
-one, whatever a length field says.  After damage the walk goes on with the next chunk whose header
+one, whatever a length field says.  After damage the walk continues with the next chunk whose header
 and checksum hold.
 """
 

@@ -79,7 +79,7 @@ class FilmOptions(Parameters):
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """One frame and the truth about it."""
+    """One frame and ground truth about it."""
 
     time_s: float
     T_world_camera: F64  # (4, 4), at the middle of the exposure

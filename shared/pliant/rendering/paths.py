@@ -100,7 +100,7 @@ class SampledPath:
 
 @dataclass(frozen=True)
 class TurnedPath:
-    """A path that is halted for a full turn on the spot, and then goes on.
+    """A path that is halted for a full turn on the spot, and then continues.
 
     axis: (3,) unit vector in the camera, about which it turns.   at_s: time of the halt.
     The turn starts and ends slowly.

@@ -1,4 +1,6 @@
-"""Renders the frames of a deforming sequence: image, exact depth, and what is seen where."""
+"""Renders the frames of a deforming sequence: image, exact depth, and the visible material
+points.
+"""
 
 from dataclasses import dataclass
 
@@ -40,7 +42,7 @@ def look(
     sheets: list[F64], T_world_camera: F64, camera: PinholeCamera,
     offset_px: tuple[float, float] = (0.0, 0.0),
 ) -> Sight:  # fmt: skip
-    """What is seen at ``offset_px`` from the pixels' centres.
+    """Return the visible points at ``offset_px`` from the pixels' centres.
 
     sheets: (R, C, 3) vertices of each, metres, world.
     """
@@ -55,8 +57,8 @@ def look(
 def look_at_pixels(
     sheets: list[F64], T_world_camera: F64, camera: PinholeCamera, pixels: F64
 ) -> tuple[I32, F64, F64]:
-    """What is seen at any (N, 2) pixels: number of the sheet (-1: nothing), (N, 2) column and row
-    in the grid of its vertices, and depth (0: nothing).
+    """Return the visible points at any (N, 2) pixels: number of the sheet (-1: none), (N, 2) column
+    and row in the grid of its vertices, and depth (0: none).
     """
     n = len(pixels)
     nearness, seen, where = np.zeros(n), np.full(n, -1, np.int32), np.zeros((n, 2))

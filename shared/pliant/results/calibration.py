@@ -1,4 +1,4 @@
-"""The calibration that a run leaves: the source's, with what the images told of it."""
+"""The calibration that a run writes: the source's, with the run's estimate."""
 
 import math
 from dataclasses import replace
@@ -40,7 +40,7 @@ _BENDS = 0.1
 began with the wrong one (two standard deviations of what draws adjustments that refute theirs)."""
 
 _SURE = 3.0
-"""Standard deviations of what was found that must lie between the two as well."""
+"""Minimum difference between the two, in standard deviations of the estimate."""
 
 _OFF_CENTRE = 0.03
 """Error of the principal point, as a share of the focal length, from which on the images contradict
@@ -98,7 +98,7 @@ def _corrected(
 ) -> Calibration:
     """camera: the rectified one, of which the correction speaks.
 
-    The focal length alone where no lens of the source's model is near what was found.
+    Only the focal length, if no lens of the source's model is near the estimate.
     """
     s, k1, k2, a, b = parts_of(correction)
     fx, fy = given.fx * math.exp(s), given.fy * math.exp(s)

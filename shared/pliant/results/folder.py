@@ -32,9 +32,9 @@ CONFIG_NAME = "config.yaml"
 REPORT_NAME = "report.json"
 PAGE_NAME = "report.html"
 STATE_FOLDER = "state"
-"""Checkpoints of the services, while a run goes on that may be started again."""
+"""Checkpoints of the services, during a run that may be restarted."""
 SESSION_NAME = "session.json"
-"""While a run goes on: how to reach it."""
+"""During a run: how to reach it."""
 CALIBRATION_NAME = "calibration.yaml"
 TRAJECTORY_NAME = "trajectory.txt"
 SURFELS_NAME = "surfels.npz"
@@ -166,7 +166,7 @@ def written(output: Path, *, force: bool) -> Generator[Held]:
             yield held_folder
         finally:
             try:
-                with suppress(PliantError):  # the next one who writes here tells of it
+                with suppress(PliantError):  # the next writer reports it
                     now = held_folder.path  # perhaps it has another name now
                     if now is not None:
                         _settle(now)

@@ -1,4 +1,4 @@
-"""What a run is worth, for who has no truth to compare it with: good, doubtful or bad."""
+"""The verdict on a run without ground truth: good, doubtful or bad."""
 
 from collections.abc import Sequence
 
@@ -17,12 +17,13 @@ DOUBTS = 0.25
 
 _FOLLOWED = 0.75
 """Share of the surfels in view with which a frame is followed well.  Nine tenths of the frames of
-sequences with truth that surfels stay on have 0.84 and more (cloth, sheets that slide, breathing
+sequences with ground truth that surfels stay on have 0.84 and more (cloth, sheets that slide,
+breathing
 tissue behind an instrument); where an instrument tears tissue about, half of them have 0.67."""
 
 
 def doubtful_frames(history: MapHistory) -> list[int]:
-    """Frames whose pose was told as doubtful."""
+    """Return the frames whose pose is flagged as doubtful."""
     return [
         frame
         for frame, (state, reason) in sorted(history.states.items())
@@ -34,13 +35,13 @@ def judge(
     *, frames: int, in_segments: list[int], doubtful: int, broken: int = 0, absent: int = 0,
     behind: int = 0, calibration: str = "", focal: str = "", failed: bool = False,
 ) -> tuple[str, str]:  # fmt: skip
-    """Good, doubtful or bad, and why.
+    """Return good, doubtful or bad, and the reasons.
 
-    frames: that came, but those that a mask covers.   in_segments: poses in each segment of the
-    map.   doubtful: poses told as such.   broken: frames that do not decode or have a wrong time.
-    absent: frames of the source that never came.   behind: frames without a pose that there was no
-    time for.   calibration: why it bends the map; "" where it does not.   focal: how the focal
-    length changes during the clip; "" where it does not.   failed: the source broke off.
+    frames: all, except those that a mask covers.   in_segments: poses in each segment of the map.
+    doubtful: poses with that flag.   broken: frames that do not decode or have a wrong time.
+    absent: frames of the source that never came.   behind: frames without a pose for lack of time.
+    calibration: why it bends the map; "" if it does not.   focal: how the focal length changes
+    during the clip; "" if it does not.   failed: the source broke off.
 
     All of them are frames of the source: they count as frames without a pose.
     """

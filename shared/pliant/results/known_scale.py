@@ -22,7 +22,7 @@ from pliant.yaml_text import load_yaml
 @dataclass(frozen=True, kw_only=True)
 class Scale:
     """metres_per_unit: of the recording.   sigma: its standard deviation, as a share of it.
-    source: what told it."""
+    source: of the measurement."""
 
     metres_per_unit: float
     sigma: float

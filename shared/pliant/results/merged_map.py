@@ -14,11 +14,11 @@ from pliant.wording import counted
 
 
 def merge_maps(first: Path, second: Path, output: Path, *, force: bool) -> Iterator[str]:
-    """Write the one map of two that show the same places, and tell of it in a few lines.
+    """Merge two maps that show the same places into one file, and describe it in a few lines.
 
     first, second: result folders or map files.   output: a file.   Raises MapError and ResultError,
-    and has written nothing then: for what is no map or not recognised, for an output that is read
-    from, and for one that is there already unless ``force``.
+    and then has written nothing: for an invalid map, without a common place, for an output that is
+    also an input, and for an existing one unless ``force``.
     """
     files = MapFile(first), MapFile(second)
     keep_apart(output, [file.path for file in files])

@@ -70,11 +70,11 @@ class Run:
 
     @property
     def calibration_correction(self) -> tuple[float, ...]:
-        """That of the last segment which has one, and so saw what was known before."""
+        """The correction of the last segment with one, which includes the earlier ones."""
         return self.corrections[max(self.corrections)] if self.corrections else ()
 
     def take_calibration(self, update: MapDelta) -> None:
-        """What an update of the map tells of the camera."""
+        """Take the calibration of a map update."""
         for gone, _ in update.joined.tolist():
             self.corrections.pop(gone, None)
         if update.calibration_correction:
@@ -167,9 +167,9 @@ def known_keyframes(recording: Recording) -> Iterator[MapKeyframe]:
 
 @dataclass(kw_only=True)
 class SeenKeyframe:
-    """What was told of a keyframe's image and of what it sees, last.
+    """The last image and observations of a keyframe.
 
-    jpeg: b"" where none was recorded.   mask: of that image; b"": all of it is used.
+    jpeg: b"" without a recorded image.   mask: of that image; b"": the whole image is used.
     point_ids: (N,).   points_px: (N, 2).
     """
 
@@ -180,7 +180,7 @@ class SeenKeyframe:
 
 
 def seen_by_keyframes(recording: Recording, wanted: Container[int]) -> dict[int, SeenKeyframe]:
-    """Of each of the wanted keyframes that a recording tells of, by id."""
+    """Return those of the wanted keyframes that a recording has, by id."""
     seen: dict[int, SeenKeyframe] = defaultdict(SeenKeyframe)
     for topic in (topics.KEYFRAME, topics.KEYFRAME_FINAL):
         for message in recording.decoded(topic):

@@ -73,7 +73,7 @@ def token(
 
 
 def topic_in(key: str) -> RosTopic | None:
-    """The topic of an entity's token; None where it tells of none."""
+    """The topic of an entity's token, or None."""
     parts = key.split("/")
     if len(parts) < 13 or parts[0] != _SPACE:
         return None
@@ -108,7 +108,7 @@ class Node:
     def subscribe(self, topic: RosTopic, take: Callable[[bytes], None]) -> Any:
         """Have ``take`` called with the CDR of each message, until what this returns goes.
 
-        Drivers look whether anybody subscribes, so the graph is told, too.
+        Drivers publish only with subscribers, so the subscription is announced in the graph, too.
         """
         subscriber = self.session.declare_subscriber(
             topic.key(self.domain), lambda sample: take(sample.payload.to_bytes())

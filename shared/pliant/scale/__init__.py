@@ -1,1 +1,1 @@
-"""How long a unit of a rigid run's map is: measured by what is known of the scene."""
+"""The length of a map unit of a rigid run, measured by a known length in the scene."""

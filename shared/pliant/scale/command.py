@@ -21,7 +21,7 @@ _WITHOUT_LENGTHS = ("images", "overlay", "picture", "overview")
 
 @dataclass(frozen=True, kw_only=True)
 class Known:
-    """What is known of the scene: one of these.
+    """A known length in the scene: one of these.
 
     points: two points of the map, and the metres between them.   marker: side of the markers.
     depth: a source with depth maps.
@@ -33,10 +33,10 @@ class Known:
 
 
 def scale_result(result: Path, known: Known) -> Iterator[str]:
-    """Measure, write the files of a result folder in metres, and say how long a unit was, and which
-    exports in the folder are not in metres.
+    """Measure the scale and write the files of a result folder in metres; return the length of a
+    unit, and the exports in the folder that are not in metres.
 
-    What was told before is forgotten.  Raises PliantError, and has written nothing then.
+    An earlier scale is replaced.  Raises PliantError, and then has written nothing.
     """
     given = [each for each in (known.points, known.marker, known.depth) if each is not None]
     if len(given) != 1:

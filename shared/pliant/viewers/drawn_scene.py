@@ -112,7 +112,7 @@ class Scene:
         return self._last
 
     def _begin(self, at: Moment, stream: CameraStream) -> None:
-        if self._rectifier is None:  # told again for those who come late
+        if self._rectifier is None:  # repeated for late viewers
             self._rectifier = Rectifier(calibration_from_yaml(stream.calibration))
             self._camera = stream.camera
             self._canvas.camera(at, stream.camera)
@@ -171,7 +171,7 @@ class Scene:
             self._draw_map(at)
 
     def _enter(self, at: Moment, segment: int) -> _World:
-        """A new world begins, or an earlier one goes on; the one before is drawn no more."""
+        """Begin a new world, or continue an earlier one; the one before is no longer drawn."""
         before = self._world
         if before.segment >= 0:
             self._draw_map(at)
@@ -246,7 +246,7 @@ class Scene:
         if not rows.size:
             return
         keyframe = self._world.keyframes.get(int(update.pose_keyframes[rows[0]]))
-        if keyframe is None:  # told before this viewer came
+        if keyframe is None:  # published before this viewer came
             return
         T_world_camera = pose_to_matrix(keyframe[1]) @ pose_to_matrix(
             update.poses_keyframe_camera[rows[0]]

@@ -214,7 +214,7 @@ class FoxgloveFile:
         cloud = self._kind("PointCloud")(
             frame_id=world_name(segment), point_stride=_ROW.itemsize, data=rows.tobytes()
         )
-        cloud.pose.position.SetInParent()  # zeros are there, too: some readers ask for them
+        cloud.pose.position.SetInParent()  # write zeros, too: some readers require them
         cloud.pose.orientation.w = 1.0
         for i, name in enumerate("xyz"):
             cloud.fields.add(name=name, offset=4 * i, type=_FLOAT32)

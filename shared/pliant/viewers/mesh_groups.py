@@ -23,7 +23,7 @@ class MeshGroups:
         self._changed: set[str] = set()
 
     def take(self, update: MeshUpdate) -> None:
-        """Put blocks in; those that are told again as they are held change nothing."""
+        """Add blocks; unchanged ones have no effect."""
         new = self.held.changes(update)
         self.held.apply(new)
         here, gone = new.keys[new.triangle_counts > 0], new.keys[new.triangle_counts == 0]

@@ -11,9 +11,9 @@ BLOCK_POINTS = 4096
 class PointBlocks:
     """Positions and colours of points, 25 bytes each; a viewer that missed updates stays right.
 
-    Points that live in the mapper's window are told again in each snapshot.  So after a gap, what
-    was told since the snapshot before the gap is in doubt: it may have been removed meanwhile.
-    Whatever the next snapshot does not confirm is taken away.
+    Points in the mapper's window are repeated in each snapshot.  After a gap, points since the
+    snapshot before the gap are uncertain: they may have been removed meanwhile.  Those that the
+    next snapshot does not confirm are removed.
     """
 
     def __init__(self) -> None:
@@ -21,7 +21,7 @@ class PointBlocks:
         self._rgb: U8 = np.zeros((0, 3), np.uint8)
         self._hosts: I64 = np.zeros(0, np.int64)
         self._alive = np.zeros(0, np.bool_)
-        self._recent = np.zeros(0, np.bool_)  # told since the last snapshot, or in it
+        self._recent = np.zeros(0, np.bool_)  # published since the last snapshot, or in it
         self._doubtful = np.zeros(0, np.bool_)
         self._changed: set[int] = set()
 

@@ -1,6 +1,6 @@
 """A run as Rerun entities: in its viewer, in a browser, or in an ``.rrd`` file.
 
-    map/camera/image, .../tracks, .../surfels   the image and what is seen in it, at the camera
+    map/camera/image, .../tracks, .../surfels   the image with its tracks, at the camera
     map/world/points/N, path                    the map; each block by itself: little is sent
     map/world/places                            lines between keyframes that show one place
     map/world/mesh/live/X_Y_Z, mesh/final/N     the mesh, in groups of blocks while it grows

@@ -1,11 +1,13 @@
-"""Rerun's page for browsers, which may reach this machine alone, and only who was told where it is.
+"""Rerun's page for browsers, restricted to this machine and to users with its address.
 
-Whatever it is told, that page fetches fonts from Google, asks GitHub for its newest release and
-reports its use to Rerun's makers.  So it is handed on with a policy, which the browser enforces.
+By itself, that page fetches fonts from Google, queries GitHub for its newest release and reports
+its use to Rerun's makers.  So it is served with a content security policy, which the browser
+enforces.
 
-A port of this machine is open to all its users, and to every web site whose name an attacker lets
-mean this machine (DNS rebinding): a request is answered only with the token of the address, and
-under a name of this machine.  The data come from the same port: Rerun's own server asks neither.
+A port of this machine is open to all its users, and to every web site whose name an attacker
+resolves to this machine (DNS rebinding).  So a request is answered only with the token of the
+address, and under a name of this machine.  The data come from the same port: Rerun's own server
+checks neither.
 """
 
 import hmac

@@ -9,7 +9,7 @@
 
 Axes are REP-103's: map has z up, with x along the first view; camera_link x forward, y left, z up;
 the optical frame x right, y down, z forward.  Stamps are capture times.  Path, points and mesh are
-told again to whoever subscribes later.
+repeated for later subscribers.
 """
 
 from collections import defaultdict
@@ -104,11 +104,11 @@ class RosCanvas:
         self._tell("pose", partial(serialised, stamped))
 
     def path(self, at: Moment, segment: int, positions: F64) -> None:
-        """The keyframes; where they look is not told."""
+        """Publish the keyframes, without their directions."""
         self._tell("path", partial(_path, at, world_name(segment), positions), keep="")
 
     def places(self, at: Moment, segment: int, lines: F64) -> None:
-        """Not told: the path tells where the camera was."""
+        """Not published: the path shows where the camera was."""
 
     def points(self, at: Moment, segment: int, points: PointBlocks, changed: list[int]) -> None:
         """The cloud."""
@@ -146,19 +146,23 @@ class RosCanvas:
         """ROS has no message for it."""
 
     def note(self, at: Moment, text: str) -> None:
-        """Not told: nobody in ROS can act on it."""
+        """Not published: ROS has no use for it."""
 
     # -- sending -------------------------------------------------------------------------------
 
     def _tell(self, key: str, make: Make, *, keep: str | None = None) -> None:
-        """Send, if anybody reads.  keep: under which name it is told again to others later."""
+        """Publish if there are subscribers.  keep: name under which it is repeated for
+        later ones.
+        """
         if keep is not None:
             self._kept[key][keep] = make
         if self._publishers[key].is_heard:
             self._publishers[key].put(make())
 
     def _tell_again(self) -> None:
-        """What was told, to those who came since: here, for Zenoh may not be called back from."""
+        """Repeat messages for new subscribers: here, because Zenoh may not be called from a
+        callback.
+        """
         while self._came:
             key = self._came.pop()
             for make in list(self._kept[key].values()):

@@ -184,8 +184,8 @@ class BundleResult:
         One for each observation of a ``BundleProblem`` (O,), inf for those left out as not finite;
         none (0,) for a ``BundleWindow``.
     correction: (6,) of the calibration, where it was unknown: see ``solve_schur``.
-    covariance: (6, 6) of the correction, where residuals have a standard deviation of 1 px, if it
-        was asked for.
+    covariance: (6, 6) of the correction, where residuals have a standard deviation of 1 px, if
+        requested.
     log_focal: (M,) of each camera relative to the shared focal length, (0,) where it is the same.
     """
 

@@ -91,7 +91,7 @@ def refine_pose(
     """Robust Gauss-Newton on one pose, points fixed (Eq. 11 alone).
 
     T_world_camera: (4, 4) start.  points_world: (N, 3).  points_px: (N, 2), NaN where not seen.
-    weights: (N,) of what is seen; None: all alike.
+    weights: (N,) of the observations; None: all alike.
     Returns the pose, (N,) whether the reprojection error is under inlier_px with the point in
     front, and the (6, 6) Hessian in px^2 in the order (translation, rotation) of
     ``T_camera_world = (exp(theta), rho) * T_camera_world``.  Without observations the pose stays.

@@ -21,7 +21,7 @@ _WIDEST = 1024
 
 
 def moved_image(pixels: U8, move: Move) -> U8:
-    """The new image of one (H, W) or (H, W, 3), interpolated; its border goes on outside."""
+    """The new image of one (H, W) or (H, W, 3), interpolated; its border continues outside."""
     moved = cv2.remap(pixels, *move, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
     return np.asarray(moved, np.uint8)
 

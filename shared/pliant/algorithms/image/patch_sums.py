@@ -245,6 +245,6 @@ class _PatchRows:
 
 @fast_kernel
 def prefetch_template(templates: F32, offset: int) -> None:
-    """Ask for the template at ``offset`` of flat templates; waits for nothing."""
+    """Prefetch the template at ``offset`` of flat templates, without waiting."""
     for start in range(0, TEMPLATE_FLOATS, CACHE_LINE_FLOATS):
         prefetch(templates, offset + start)

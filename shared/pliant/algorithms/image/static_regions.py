@@ -71,7 +71,7 @@ _STRAIGHT = 0.97
 """Bars leave this share of the rectangle around what they leave."""
 
 _MARGIN = 0.01
-"""Of the longer side: the mask reaches so far beyond what was found."""
+"""Margin of the mask beyond the detected region, share of the longer side."""
 
 _JOINED = 0.02
 """Of the longer side: letters that lie so near to each other are masked as one."""
@@ -79,8 +79,9 @@ _JOINED = 0.02
 
 @dataclass(frozen=True)
 class StaticMask:
-    """used: (H, W) of the size that was asked for.   shares: of the image, of each kind that was
-    found: "circle", "bars", "border" (of another shape), "overlay"."""
+    """used: (H, W) of the requested size.   shares: of the image, of each detected kind: "circle",
+    "bars", "border" (of another shape), "overlay".
+    """
 
     used: BoolArray
     shares: dict[str, float]

@@ -41,7 +41,7 @@ def call_llvm(builder: Any, name: str, result: Any, arguments: list[Any], **opti
 
 @cast(Any, intrinsic)
 def prefetch(typing_context: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line of element ``index`` (int64) of a flat array; waits for nothing.
+    """Prefetch the cache line of element ``index`` (int64) of a flat array, without waiting.
 
     An index outside of the array does no harm.
     """

@@ -116,7 +116,7 @@ class MapChanges:
             else np.zeros((0, 7)),
             point_ids=points.ids[rows],
             point_segments=points.segment[rows],
-            # To a ten-millionth, far below what is known: as files and viewers have it.
+            # float32 is far below the uncertainty; files and viewers have it, too.
             points_world=points.xyz[rows].astype(np.float32).astype(np.float64),
             point_colours=points.colours[rows],
             point_keyframes=points.keyframes[rows],

@@ -42,7 +42,7 @@ class Window:
     window and are its prior.
       rows: (N,) rows seen by any of them.
     columns: (capacity,) column of each row, OUTSIDE where it is not in the window.
-    u, v, seen: (M + 1, N).    w: weights of what is seen.    T_world_camera: (M + 1, 4, 4).
+    u, v, seen: (M + 1, N).    w: weights of the observations.    T_world_camera: (M + 1, 4, 4).
     """
 
     def __init__(

@@ -28,7 +28,7 @@ LAST_KEY = (1 << 63) - 1
 
 @dataclass(frozen=True, kw_only=True)
 class MeshBlocks:
-    """The whole surface of some blocks; it takes the place of what was known of them.
+    """The whole surface of some blocks, which replaces an earlier one.
 
     Vertices and triangles stand block after block, in the order of the keys.
 

@@ -64,7 +64,7 @@ class InMemory:
             sums[k][:used] = old[:used]
 
     def let_go(self) -> None:
-        """Told when none of the blocks will be needed soon."""
+        """Called when none of the blocks will be needed soon."""
 
 
 class BlockPool:
@@ -72,7 +72,7 @@ class BlockPool:
 
     Rows 0 to N - 1 are taken, without gaps, in an order that follows from the calls alone.
 
-    keys: (N, 3).    births: (N,) as told.    table: from key to row.    sums: of at least N rows,
+    keys: (N, 3).    births: (N,) as given.    table: from key to row.    sums: of at least N rows,
     elsewhere in memory after each ``add``.
     """
 

@@ -18,7 +18,7 @@ from pliant.compiler.kernel import fast_kernel
 ISOMETRIC, EQUIAREAL, GENERAL = 0, 2, 3
 MODELS = {"isometric": ISOMETRIC, "equiareal": EQUIAREAL, "general": GENERAL}
 """Columns of Table I, by the number of parameters that F has.  The conformal one is left out:
-whatever stretches is nearer to the truth with one of the last two."""
+whatever stretches is nearer to ground truth with one of the last two."""
 
 RIGID = 6
 MOST_PARAMETERS = RIGID + 3 + 2

@@ -132,7 +132,7 @@ def no_equilibrium(count: int) -> Equilibrium:
 class Evaluation(NamedTuple):
     """The photometric state of N surfels at their poses.  The last two may be empty."""
 
-    costs: F64  # (N,) DN^2, photometric; negative where a surfel is not in front, or not asked for
+    costs: F64  # (N,) DN^2, photometric; negative behind the camera, or not requested
     seen: F64  # (N,) samples that are not saturated
     homographies: F64  # (N, 9)
     sums: F64  # (N, FEATURES)

@@ -1,4 +1,4 @@
-"""What every report.html has: the template, the canvas, tables, and where the truth goes."""
+"""What every report.html has: the template, the canvas, tables, and the place of ground truth."""
 
 from collections.abc import Container, Iterable
 from html import escape
@@ -32,7 +32,7 @@ def fill_page(path: Path, report: dict[str, Any], names: Container[str], **parts
 
 
 def put_truth_in(path: Path, section: str) -> None:
-    """Put what the truth says into a page, instead of what it said before.  Raises OSError."""
+    """Put the comparison with ground truth into a page.  Raises OSError."""
     parts = path.read_text(encoding="utf-8").split(_TRUTH)
     if len(parts) == 3:
         write_whole(path, f"{parts[0]}{_TRUTH}{section}{_TRUTH}{parts[2]}")
