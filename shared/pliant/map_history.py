@@ -212,8 +212,8 @@ class MapHistory(CurrentMap):
         super().__init__()
         self.stamps_ns: dict[int, int] = {}
         self.causal: dict[int, tuple[int, F64]] = {}
-        """Segment and T_world_camera of each frame as estimated at frame time, without later changes of
-        the segment."""
+        """Segment and T_world_camera of each frame as estimated at frame time, without later
+        changes of the segment."""
         self.frames: dict[int, FramePose] = {}
         self.states: dict[int, tuple[int, str]] = {}
         self.same_places: list[tuple[int, int]] = []

@@ -74,9 +74,9 @@ def faults(text: str) -> list[str]:
 def descriptions(source: str) -> Iterator[str]:
     """Docstrings, those of constants among them, and blocks of comments."""
     for node in ast.walk(ast.parse(source)):
-        match node:
-            case ast.Expr(value=ast.Constant(value=str(text))):
-                yield inspect.cleandoc(text)
+        alone = node.value if isinstance(node, ast.Expr) else None
+        if isinstance(alone, ast.Constant) and isinstance(alone.value, str):
+            yield inspect.cleandoc(alone.value)
     block: list[str] = []
     last = 0
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
