@@ -24,10 +24,12 @@ PAGES = [
 ]
 LONGEST_LINE = 150  # characters, outside of tables and code
 LONGEST_SENTENCE = 40  # words of two letters and more, in docstrings and comments
-CODE = sorted(
-    file
-    for package in ("shared/pliant", "services/pliant_services")
-    for file in (ROOT / package).rglob("*.py")
+PACKAGES = sorted(
+    {
+        file.parent
+        for product in ("shared/pliant", "services/pliant_services")
+        for file in (ROOT / product).rglob("*.py")
+    }
 )
 
 # Idioms, each with the word to use.
@@ -89,6 +91,17 @@ def descriptions(source: str) -> Iterator[str]:
     yield "\n".join(block)
 
 
+def messages(source: str) -> Iterator[str]:
+    """Texts of three words and more that are no docstrings or pages: mostly for users."""
+    tree = ast.parse(source)
+    others = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        text = getattr(node, "value", None) if isinstance(node, ast.Constant) else None
+        if isinstance(text, str) and id(node) not in others and "<" not in text:
+            if len(text.split()) > 2:
+                yield text
+
+
 def words_of(description: str) -> str:
     """A docstring or comment without formulas, examples, quotations and the names of fields."""
     lines = [line for line in description.splitlines() if not line.startswith("    ")]
@@ -129,11 +142,20 @@ def test_help_is_in_plain_english() -> None:
     assert {name: said for name, said in found.items() if said} == {}
 
 
-@pytest.mark.parametrize("file", CODE, ids=lambda file: f"{file.parent.name}/{file.name}")
-def test_docstrings_and_comments_are_in_plain_english(file: Path) -> None:
-    texts = [words_of(text) for text in descriptions(file.read_text(encoding="utf-8"))]
-    assert not [said for text in texts for said in faults(text)]
-    assert not [said for text in texts for said in long_sentences(text)]
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.name)
+def test_docstrings_comments_and_messages_are_in_plain_english(package: Path) -> None:
+    found: dict[str, list[str]] = {}
+    for file in sorted(package.glob("*.py")):
+        source = file.read_text(encoding="utf-8")
+        texts = [words_of(text) for text in descriptions(source)]
+        said = [each for text in [*texts, *messages(source)] for each in faults(text)]
+        found[file.name] = said + [each for text in texts for each in long_sentences(text)]
+    assert {name: said for name, said in found.items() if said} == {}
+
+
+def test_messages_are_no_docstrings() -> None:
+    source = "def f(n):\n    'Told of it.'\n    raise ValueError(f'{n} is told as wrong')\n"
+    assert [*messages(source)] == [" is told as wrong"]
 
 
 def test_descriptions_are_read_without_their_code() -> None:

@@ -78,7 +78,8 @@ def test_what_is_too_little_is_less_than_enough(focal_px: float, noise_px: float
     ]
     reason = find_start(waiting, camera, MappingParameters())
     assert isinstance(reason, str)
-    told = re.fullmatch(r"too little parallax: (\S+) of (\S+) (px beside a turn|deg)", reason)
+    unit = "(px without the rotation|deg)"
+    told = re.fullmatch(rf"too little parallax: (\S+) of (\S+) {unit}", reason)
     assert told, reason
     assert float(told[1]) < float(told[2])
 

@@ -176,7 +176,7 @@ def format_mesh(truth: MeshTruth) -> str:
         f"relative error of depth: median {100 * t.median_error:.2f} %, "
         f"{100 * t.within:.1f} % within 5 %; with depths scaled by {t.fitted_scale:.4f} to fit "
         f"best: median {100 * t.fitted_median_error:.2f} %, {100 * t.fitted_within:.1f} %\n"
-        f"normals: median angle to the truth {t.normal_deg:.1f} deg\n"
+        f"normals: median angle to ground truth {t.normal_deg:.1f} deg\n"
         f"surface within 1 % of the diameter ({t.diameter_m:.2f} m): F-score {t.f_score:.3f}, "
         f"precision {t.precision:.3f}, recall {t.recall:.3f}"
     )

@@ -245,7 +245,7 @@ class Mesher:
                 self._live.put(keyframe, sight, correction, seen)
         except VolumeFullError as error:
             needed = error.needed_bytes
-            self._pass_over(keyframe, too_fine("coarse", tsdf, needed, "what was seen so far"))
+            self._pass_over(keyframe, too_fine("coarse", tsdf, needed, "the scene so far"))
             return
         self.counts[count] += 1
 

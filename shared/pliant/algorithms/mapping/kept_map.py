@@ -137,7 +137,7 @@ def take_in(
     order = np.argsort(points.ids[rows], kind="stable").astype(np.int32)
     ids, rows = points.ids[rows][order], rows[order]
     if (np.diff(ids) == 0).any():
-        raise ValueError("a point that comes twice")
+        raise ValueError("a repeated point")
     points.go_on_after(int(ids[-1]) if len(ids) else -1)
     segments: list[Segment] = []
     for number in sorted({each.segment for each in kept}):

@@ -191,8 +191,10 @@ def _normalise(camera: PinholeCamera, points_px: F32) -> F64:
 
 def _no_parallax(pairs: list[_Pair]) -> str:
     if max(pair.flow_px for pair in pairs) > 20.0 * _NOISE_PX:
-        return "pure rotation: a turn explains all of the motion"
-    return _too_little(max(pair.residual_px for pair in pairs), 2.0 * _NOISE_PX, "px beside a turn")
+        return "pure rotation: a rotation explains all of the motion"
+    return _too_little(
+        max(pair.residual_px for pair in pairs), 2.0 * _NOISE_PX, "px without the rotation"
+    )
 
 
 def _too_little(parallax: float, least: float, unit: str) -> str:
@@ -244,7 +246,7 @@ def _start_from(
     least_misfit, best, two_views = min(found, key=lambda each: each[0])
     for misfit, other, _ in found:
         if misfit < _AS_GOOD * least_misfit and not _agree(best, other):
-            return "two motions explain the tracks alike"
+            return "two motions explain the tracks equally well"
     reason = _why_not_with(two_views, start, wanted)
     if reason or most == len(shared):
         return reason or best

@@ -170,18 +170,21 @@ class MeshingParameters(Parameters):
     again_blocks: int = Field(
         default=64,
         ge=0,
-        description="Blocks that have not changed and are told again with each change, in turn, "
-        "for viewers that came late.",
+        description="Unchanged blocks repeated with each change, in turn, for late viewers.",
     )
     corrections: Literal["settled", "moved"] = Field(
         default="moved",
-        description="When a keyframe in the live mesh is put in again: as it leaves the window, "
-        "or also where the whole map has moved it by a voxel since (the former is to compare).",
+        description=(
+            "When a keyframe in the live mesh is fused again: when it leaves the window, or "
+            "also when the whole map has moved it by a voxel (settled is for comparison)."
+        ),
     )
     depth: Literal["dense", "points"] = Field(
         default="dense",
-        description="What the final mesh is made from: every pixel whose depth the images tell, "
-        "or the map's points alone, as the live mesh is.",
+        description=(
+            "Source of the final mesh: all pixels with a depth from the images, or only the "
+            "landmarks, as in the live mesh."
+        ),
     )
     surface: SurfaceParameters = SurfaceParameters()
     tsdf: TsdfParameters = TsdfParameters()
