@@ -96,10 +96,9 @@ def messages(source: str) -> Iterator[str]:
     tree = ast.parse(source)
     others = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
-        text = getattr(node, "value", None) if isinstance(node, ast.Constant) else None
-        if isinstance(text, str) and id(node) not in others and "<" not in text:
-            if len(text.split()) > 2:
-                yield text
+        text = node.value if isinstance(node, ast.Constant) and id(node) not in others else None
+        if isinstance(text, str) and "<" not in text and len(text.split()) > 2:
+            yield text
 
 
 def words_of(description: str) -> str:
