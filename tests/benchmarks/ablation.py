@@ -33,7 +33,7 @@ VARIANTS: dict[str, list[str]] = {
 
 
 def measure(sources: Sequence[str], *, only: Sequence[str], seeds: int) -> Iterator[str]:
-    """Final / causal ATE (share of the frames below 99 %), a column for each source.
+    """Final / online ATE (share of the frames below 99 %), a column for each source.
 
     only: of the switches, everything on beside them; none: all.   seeds: runs of each, numbered
     from 0.   Raises PliantError for a switch that there is not.

@@ -16,7 +16,7 @@ _HEADER = (
     "sequence",
     "ATE, final",
     "of the path",
-    "ATE, causal",
+    "ATE, online",
     "frames with a pose",
     "tracks",
     "mapped inliers",

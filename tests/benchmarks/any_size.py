@@ -20,7 +20,7 @@ from pliant.datasets.rectifier import decode
 from pliant.datasets.working_size import at_size, at_working_size
 
 _HEADER = (
-    *("source", "size", "worked on at", "tracks", "mapped inliers", "ATE, final / causal"),
+    *("source", "size", "worked on at", "tracks", "mapped inliers", "ATE, final / online"),
     "times the best",
 )
 

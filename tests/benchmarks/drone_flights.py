@@ -96,7 +96,7 @@ def measure(
     folder: Path, *, only: Sequence[str], frames: int | None, overrides: Sequence[str]
 ) -> Iterator[str]:
     """One row a flight: ATE, and the share of its frames in the longest segment."""
-    header = ("flight", "frames", "ATE, final", "ATE, causal", "of the path", "posed", "segments")
+    header = ("flight", "frames", "ATE, final", "ATE, online", "of the path", "posed", "segments")
     yield markdown_header(header)
     errors: list[float] = []
     for flight in flights(folder, only, frames):

@@ -1,4 +1,4 @@
-"""The rigid pipeline in this process: ATE of the final and the causal poses, and what it found."""
+"""The rigid pipeline in this process: ATE of the final and the online poses, and the estimates."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
 from pliant.trajectory import Trajectory
 
-_HEADER = ("sequence", "seed", "ATE, final", "ATE, causal", "frames with a pose")
+_HEADER = ("sequence", "seed", "ATE, final", "ATE, online", "frames with a pose")
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Mapped:
 
     @property
     def both(self) -> str:
-        """The final error, and the causal one."""
+        """The final error, and the online one."""
         return f"{self.ate} / {shown_ate(self.causal)}"
 
 

@@ -1,4 +1,4 @@
-"""A source cut in two: the second half localised in the map of the first, and going on in it."""
+"""A source cut in two: the second half localised in the map of the first, and extending it."""
 
 import tempfile
 import time

@@ -17,7 +17,7 @@ from pliant.evaluation.presentation import metres
 _FIRST, _LAST = 100, 10
 """Poses that are aligned, and that are measured."""
 _HEADER = (
-    *("source", "path", "places", "ATE final", "causal", "end error", "of the path"),
+    *("source", "path", "places", "ATE final", "online", "end error", "of the path"),
     *("compared", "pairs of places", "segments", "poses", "CPU a frame"),
 )
 

@@ -16,7 +16,7 @@ from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
 from pliant.trajectory import Trajectory
 
-_HEADER = ("sequence", "maps", "final: median", "mean", "worst", "causal: median", "mean", "worst")
+_HEADER = ("sequence", "maps", "final: median", "mean", "worst", "online: median", "mean", "worst")
 
 
 def measure(
@@ -46,7 +46,7 @@ def _errors(
     config: Config,
     following: int,
 ) -> tuple[float, float] | None:
-    """Final and causal error of a map of the first frames; None where none begins."""
+    """Final and online error of a map of the first frames; None where none begins."""
     history = MapHistory()
     pipeline = Pipeline(dataset.calibration, config, history)
     tracked = 0

@@ -29,7 +29,7 @@ from pliant.results.report import rigid_report
 from pliant.results.run import Run
 
 _HEADER = (
-    *("case", "frames posed", "segments", "ATE, final", "of the path", "ATE, causal"),
+    *("case", "frames posed", "segments", "ATE, final", "of the path", "ATE, online"),
     *("doubtful poses", "verdict"),
 )
 

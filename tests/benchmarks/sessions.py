@@ -24,7 +24,7 @@ _SEEN_S = 0.7
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 _KIDNAPPED = (
     *("source", "kidnapped", "times", "found", "frames until found: median", "worst", "segments"),
-    *("poses", "ATE", "worst", "causal", "worst"),
+    *("poses", "ATE", "worst", "online", "worst"),
 )
 
 

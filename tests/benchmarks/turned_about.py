@@ -22,7 +22,7 @@ from pliant.map_history import MapHistory
 from pliant.offline import Pipeline
 from pliant.trajectory import Trajectory
 
-_HEADER = ("sequence", "from frame", "how", "frames posed", "segments", "final", "causal")
+_HEADER = ("sequence", "from frame", "how", "frames posed", "segments", "final", "online")
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def measure(
                 )  # fmt: skip
     if found:
         final, causal = 100.0 * np.exp(np.log(found).mean(axis=0))
-        yield f"geometric means of {len(found)}: final {final:.3f} %, causal {causal:.3f} %"
+        yield f"geometric means of {len(found)}: final {final:.3f} %, online {causal:.3f} %"
 
 
 def _drive(

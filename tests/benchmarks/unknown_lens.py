@@ -20,7 +20,7 @@ _SAID = (None, 1.67, 0.87, 0.51)
 _GRID, _FITS = 24, 5
 _HEADER = (
     *("source", "said", "focal length", "told to be known to", "k1 and k2 at the corner"),
-    *("the whole lens, px", "ATE, final / causal", "times the calibrated one"),
+    *("the whole lens, px", "ATE, final / online", "times the calibrated one"),
 )
 
 

@@ -12,7 +12,7 @@ from pliant.evaluation.presentation import metres
 
 _DARK_S = 2.0
 _HEADER = (
-    *("source", "places", "ATE final", "of the same frames", "causal", "of the same frames"),
+    *("source", "places", "ATE final", "of the same frames", "online", "of the same frames"),
     *("poses", "segments", "CPU a frame"),
 )
 

@@ -23,7 +23,7 @@ from pliant.datasets.calibration import Calibration
 from pliant.formats.trajectory_files import read_trajectory
 
 _HEADER = (
-    *("case", "frames posed", "segments", "ATE, final", "of the path", "ATE, causal"),
+    *("case", "frames posed", "segments", "ATE, final", "of the path", "ATE, online"),
     *("doubtful poses", "verdict"),
 )
 _FPS = 30.0

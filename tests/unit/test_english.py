@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import typer
+from benchmarks.__main__ import app as bench
 
 import pliant_services.cli.commands  # noqa: F401  registers them
 from pliant_services.cli import app
@@ -137,6 +138,7 @@ def test_pages_are_in_plain_english(page: Path) -> None:
 
 def test_help_is_in_plain_english() -> None:
     texts = dict(help_texts(typer.main.get_command(app), "pliant"))
+    texts |= dict(help_texts(typer.main.get_command(bench), "scripts/bench"))
     found = {name: faults(text) for name, text in texts.items()}
     assert {name: said for name, said in found.items() if said} == {}
 

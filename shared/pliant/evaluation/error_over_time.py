@@ -3,7 +3,7 @@
 from html import escape
 
 from pliant.evaluation.presentation import metres
-from pliant.evaluation.run_evaluation import Evaluation
+from pliant.evaluation.run_evaluation import SHOWN, Evaluation
 from pliant.results.page.chart import BLUE, ORANGE, Line, chart
 
 
@@ -19,7 +19,7 @@ def error_over_time(evaluation: Evaluation) -> str:
         Line(part.times_s.tolist(), part.errors_m.tolist(), colours[part.kind][1]) for part in parts
     ]
     told = "; ".join(
-        f"{part.kind} ({colours[part.kind][0]}): "
+        f"{SHOWN[part.kind]} ({colours[part.kind][0]}): "
         + (f"RMSE {metres(part.ate_m.rmse)}" if part.ate_m else escape(part.reason))
         for part in parts
     )

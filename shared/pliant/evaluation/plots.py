@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from pliant.errors import ResultError
-from pliant.evaluation.run_evaluation import Evaluation
+from pliant.evaluation.run_evaluation import SHOWN, Evaluation
 
 _COLOURS = {"final": "#1668b8", "causal": "#e0751a"}
 
@@ -34,7 +34,7 @@ def plot_errors(path: Path, evaluation: Evaluation, *, title: str | None = None)
     FigureCanvasAgg(figure)
     axes: Any = figure.add_subplot()
     for part in parts:
-        label = part.kind
+        label = SHOWN[part.kind]
         if part.ate_m is not None:
             label += f", RMSE {part.ate_m.rmse * factor:.3g} {unit}"
         colour = _COLOURS[part.kind]

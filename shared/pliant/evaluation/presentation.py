@@ -10,7 +10,7 @@ import numpy as np
 
 from pliant.errors import ResultError
 from pliant.evaluation.criteria import ErrorStatistics, RelativeErrors
-from pliant.evaluation.run_evaluation import Evaluation, TrajectoryEvaluation
+from pliant.evaluation.run_evaluation import SHOWN, Evaluation, TrajectoryEvaluation
 from pliant.formats.text import write_bytes
 
 ALIGNMENT = "Sim(3) aligned (the scale of a single camera is unknown)"
@@ -154,7 +154,7 @@ def format_evaluation(evaluation: Evaluation) -> str:
     """A table of one run, ready to print."""
     parts = [evaluation.final] + ([evaluation.causal] if evaluation.causal else [])
     columns = [_rows(part) for part in parts]
-    rows = [[ALIGNMENT.split(" (")[0], *(part.kind for part in parts)]]
+    rows = [[ALIGNMENT.split(" (")[0], *(SHOWN[part.kind] for part in parts)]]
     rows += [[label, *cells] for label, *cells in zip(_LABELS, *columns, strict=True)]
     retries = evaluation.initialisation_retries
     lines = [
@@ -165,7 +165,7 @@ def format_evaluation(evaluation: Evaluation) -> str:
         "",
         f"initialisation retries: {'-' if retries is None else retries}",
     ]
-    lines += [f"{part.kind}: no accuracy, {part.reason}" for part in parts if part.reason]
+    lines += [f"{SHOWN[part.kind]}: no accuracy, {part.reason}" for part in parts if part.reason]
     final = evaluation.final
     if final.partly_compared:
         lines.append(
@@ -187,7 +187,7 @@ def format_summary(summary: Summary) -> str:
         return "-" if value is None else f"{show(value.mean)} ± {show(value.deviation)}{suffix}"
 
     rows = [
-        ["over " + str(summary.runs) + " runs", summary.kind],
+        ["over " + str(summary.runs) + " runs", SHOWN[summary.kind]],
         ["failures", str(summary.failures)],
         ["localised", cell(summary.success_rate, lambda x: f"{100 * x:.1f}", " %")],
         ["ATE RMSE", cell(summary.ate_m, metres)],

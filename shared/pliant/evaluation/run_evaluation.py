@@ -40,6 +40,9 @@ MAX_SHARE = 0.5
 FINAL_NAME = "trajectory.txt"
 CAUSAL_NAME = "trajectory_causal.txt"
 
+SHOWN = {"final": "final", "causal": "online"}
+"""The kinds of trajectories as people read them."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrajectoryEvaluation:

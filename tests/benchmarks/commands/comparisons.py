@@ -14,7 +14,7 @@ def unknown_lens(
     frames: Annotated[int | None, typer.Option(min=2, help="First frames [all].")] = None,
     overrides: Overrides = None,
 ) -> None:
-    """Sources without a calibration and with wrong ones: the lens that is found, and the error.
+    """Sources without a calibration and with wrong ones: the estimated calibration, and the error.
 
     scripts/bench unknown-lens path/to/tsukuba150 built-in:room --frames 200
     """
@@ -62,7 +62,7 @@ def surfel_speed(
     frames: Annotated[int, typer.Option(min=1, help="Frames to measure.")] = 17,
     surfels: Annotated[int, typer.Option(min=8, help="Most surfels.")] = 500,
 ) -> None:
-    """Surfels per stage, beside OpenCV's pyramidal LK for the same points.
+    """Surfels per stage, compared with OpenCV's pyramidal LK for the same points.
 
     scripts/bench surfel-speed path/to/cloth
     """
@@ -75,7 +75,7 @@ def surfel_speed(
 def exported_models(
     results: Annotated[list[Path], typer.Argument(help="Result folders of runs.")],
 ) -> None:
-    """COLMAP models of runs beside COLMAP's own of the same images: held-out reprojection.
+    """COLMAP models of runs and COLMAP's own of the same images: held-out reprojection.
 
     scripts/bench exported-models results/room
     """
@@ -88,7 +88,7 @@ def exported_models(
 def held_out(
     results: Annotated[list[Path], typer.Argument(help="Result folders of runs.")],
 ) -> None:
-    """The textured mesh beside frames that are no keyframes: ZNCC, holes, colours.
+    """The textured mesh compared with frames that are no keyframes: ZNCC, holes, colours.
 
     scripts/bench held-out results/room
     """

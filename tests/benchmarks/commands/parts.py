@@ -15,7 +15,7 @@ def bundle(
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="PNG of the cost over time.")] = None,
 ) -> None:
-    """Bundle adjustment beside Ceres (pyceres) and scipy: time to the same cost.  Ten minutes.
+    """Bundle adjustment, Ceres (pyceres) and scipy: time to the same cost.  Ten minutes.
 
     scripts/bench bundle --problems bundle_adjustment
     """

@@ -14,7 +14,7 @@ def tracking(
     frames: Annotated[int, typer.Option(help="Frames to measure.")] = 100,
     overrides: Overrides = None,
 ) -> None:
-    """Tracking per stage, beside OpenCV's pyramidal LK for the same points.
+    """Tracking per stage, compared with OpenCV's pyramidal LK for the same points.
 
     scripts/bench tracking built-in:room
     """
@@ -59,7 +59,7 @@ def second_pass(
     calibration: Annotated[Path | None, typer.Option(help="Of a video.")] = None,
     overrides: Overrides = None,
 ) -> None:
-    """What `--quality high` finds of what was lost, and what it costs, in this process.
+    """What `--quality high` recovers, and its cost, in this process.
 
     scripts/bench second-pass path/to/tum_fr1_rpy_first360
     """
@@ -110,7 +110,7 @@ def zoom(
 
 @app.command("kept-maps")
 def kept_maps(sources: Sources, overrides: Overrides = None) -> None:
-    """Sources cut in two: the second half localised in the map of the first, and going on in it.
+    """Sources cut in two: the second half localised in the map of the first, and extending it.
 
     scripts/bench kept-maps path/to/7scenes_redkitchen400 built-in:room
     """
@@ -148,7 +148,7 @@ def sessions(sources: Sources, overrides: Overrides = None) -> None:
 
 @app.command()
 def kidnappings(sources: Sources, overrides: Overrides = None) -> None:
-    """Sources whose camera is carried off ten times, in the dark and from image to image.
+    """Sources whose camera is relocated ten times, in the dark and by a cut.
 
     scripts/bench kidnappings built-in:room path/to/7scenes_redkitchen400
     """

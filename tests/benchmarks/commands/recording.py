@@ -38,7 +38,7 @@ def phone_clip(
     seconds: Annotated[float, typer.Option(min=1.0, help="Length of the clip.")] = 15.0,
     keep: Annotated[Path | None, typer.Option(help="Folder for clips and results.")] = None,
 ) -> None:
-    """Clips like a telephone's, 1920x1080, through `pliant run` without a calibration.
+    """Clips like a phone's, 1920x1080, through `pliant run` without a calibration.
 
     scripts/bench phone-clip path/to/tum_fr1_xyz
     """

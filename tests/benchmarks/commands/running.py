@@ -38,7 +38,7 @@ def in_process(
         typer.Option(help="Error of the given principal point, as a share of the focal length."),
     ] = 0.0,
 ) -> None:
-    """The rigid pipeline in one process, without services: final and causal ATE.
+    """The rigid pipeline in one process, without services: final and online ATE.
 
     scripts/bench in-process path/to/tsukuba150 built-in:room --set tracking.turn_patches=false
     """
@@ -141,7 +141,7 @@ def replay(
     service: Annotated[str, typer.Option(help="Which one.")] = "tracking",
     runs: Annotated[int, typer.Option(min=1, help="Of each, in turns.")] = 3,
 ) -> None:
-    """Frames a second of a replayed service, beside the same service on messages in memory.
+    """Frames per second of a replayed service, and of the same service on messages in memory.
 
     scripts/bench replay results/room --service tracking
     """
@@ -217,7 +217,7 @@ def ablation(
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each.")] = 1,
 ) -> None:
-    """What each addition to the paper is worth: final / causal ATE.
+    """What each addition to the paper is worth: final / online ATE.
 
     scripts/bench ablation built-in:room path/to/sequence
     """

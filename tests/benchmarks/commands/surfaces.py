@@ -58,7 +58,7 @@ def surfels(
     count: Annotated[int, typer.Option("--surfels", min=8, help="At most.")] = 200,
     quick: Annotated[bool, typer.Option("--quick", help="A few rows of each table.")] = False,
 ) -> None:
-    """Surfels on deforming sequences with exact truth: models, sizes, scales, cameras, troubles.
+    """Surfels on deforming sequences with ground truth: models, sizes, scales, cameras, troubles.
 
     scripts/bench surfels --tracks kinect_paper_tracks/mdh_23frames_301pts.npz
 
