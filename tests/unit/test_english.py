@@ -17,12 +17,7 @@ import pliant_services.cli.commands  # noqa: F401  registers them
 from pliant_services.cli import app
 
 ROOT = Path(__file__).parents[2]
-LATER = {"meshing.md"}  # Pages that are not rewritten yet.
-PAGES = [
-    page
-    for page in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
-    if page.name not in LATER
-]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 LONGEST_LINE = 150  # characters, outside of tables and code
 LONGEST_SENTENCE = 40  # words of two letters and more, in docstrings and comments
 PACKAGES = sorted(
