@@ -3,7 +3,8 @@
 LLVM, BLAS, numpy and OpenCV choose their code by what the processor can do, and each choice rounds
 in its own way; so do the threads of a BLAS.  They choose when they are loaded, and by their
 environment.  It is set here, by the first import of anything of Pliant's, and handed down to the
-processes that it starts.  Whoever imports numpy or OpenCV before has had them choose: ``in_force``.
+processes that it starts.  If numpy or OpenCV were imported before, they have chosen already:
+``in_force``.
 """
 
 import hashlib

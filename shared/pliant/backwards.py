@@ -1,9 +1,8 @@
-"""A source read backwards, where its map was lost: the map reaches back from what came later.
+"""Reads a source backwards where its map was lost, and extends the map to earlier frames.
 
-Tracking is mostly lost on the way from a mapped place into a stretch that is hard to see.  Read
-backwards, the stretch is entered from frames that are mapped: what lies before the first frame of a
-map, or between two segments, is mapped from what came later, and segments that see the same become
-one.
+Tracking is usually lost on the way from a mapped place into a difficult stretch.  Backwards, the
+camera enters this stretch from mapped frames: so frames before the first one of a map, or between
+two segments, are mapped from later ones, and segments that see the same place are merged.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Where Pliant keeps what it can make again: rendered sequences, compiled kernels."""
+"""The folder for data that can be made again: rendered sequences, compiled kernels."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Errors that are the user's to mend: one line with what, where and what to do, no traceback."""
+"""Errors that the user can fix: one line with what, where and what to do, no traceback."""
 
 
 class PliantError(Exception):

@@ -1,4 +1,4 @@
-"""Files and folders that are still there after a power cut, and that no link leads astray.
+"""Files and folders that survive a power cut, and are not written through links.
 
 A file's fsync puts its content on the disk, but not its name: that stands in its folder.  A file is
 written under a new name and takes its own when it is whole: what was there before stays until then,

@@ -1,4 +1,4 @@
-"""The depth of a new keyframe as our own map knows it: what surfels start from without a sensor.
+"""The depth of a new keyframe in our own map: the initial depth of surfels without a sensor.
 
 DSDT takes its first depth from a stereo pair or a sensor.  One camera alone has the map of bundle
 adjustment, as long as the scene holds nearly still: what moves meanwhile has no certain depth.

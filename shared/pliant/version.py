@@ -1,3 +1,3 @@
-"""The release, for whoever writes it down: loads nothing else."""
+"""The release number; this module loads nothing else."""
 
 __version__ = "0.1.0"

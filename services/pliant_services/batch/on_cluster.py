@@ -1,8 +1,8 @@
 """The clips of a batch on the machines of a Dask cluster, one task each.
 
-Dask says who runs what, and gives the clip of a machine that is lost to another one; nothing but
-the errand and its outcome goes over its connections.  Clips and results lie in folders that all
-machines see.  Whoever was killed, whatever is begun is gone on with (``one_run.py``).
+Dask assigns the clips, and gives the clip of a lost machine to another one; only the task and its
+outcome go over its connections.  Clips and results are in folders that all machines see.  Killed
+runs are resumed (``one_run.py``).
 """
 
 import logging
@@ -33,7 +33,7 @@ class Cluster:
     """A scheduler of Dask's that answers."""
 
     def __init__(self, address: str) -> None:
-        """Raises ResultError, and BusError where nobody answers there."""
+        """Raises ResultError, and BusError if no scheduler answers there."""
         self._address = address
         self._distributed = load_dask()
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # our own line says it
@@ -76,7 +76,7 @@ class Cluster:
             name, where, spent_s = event[1]
             if where:
                 begun(name, where)
-            elif spent_s is not None:  # cut off: nobody is given the outcome of what is cancelled
+            elif spent_s is not None:  # cancelled: its outcome is not delivered
                 over(name, Outcome(exit_code=None, seconds=spent_s))
             with changed:
                 (running.add if where else running.discard)(name)
@@ -119,7 +119,7 @@ def _run(name: str, errand: Errand, topic: str) -> Outcome:
     key = worker.get_current_task()
 
     def unwanted() -> bool:
-        """Whether nobody waits for it any more, or the worker leaves."""
+        """Whether its result is no longer awaited, or the worker leaves."""
         task = worker.state.tasks.get(key)
         leaves = worker.status.name in ("closing", "closed", "failed")
         return task is None or task.state == "cancelled" or leaves

@@ -1,4 +1,4 @@
-"""``pliant certs``: an authority and a certificate for everybody in a session."""
+"""``pliant certs``: an authority, and certificates for all members of a session."""
 
 from pathlib import Path
 from typing import Annotated

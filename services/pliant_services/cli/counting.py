@@ -1,4 +1,4 @@
-"""How far a command is, where somebody looks on."""
+"""The progress of a command, on a terminal."""
 
 import sys
 

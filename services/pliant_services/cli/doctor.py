@@ -1,4 +1,4 @@
-"""``pliant doctor``: is this installation whole?"""
+"""``pliant doctor``: checks this installation."""
 
 import importlib
 import shutil

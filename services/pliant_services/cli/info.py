@@ -1,4 +1,4 @@
-"""``pliant info``: what a recording holds."""
+"""``pliant info``: the content of a recording."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""``pliant map``: what a kept map holds, and two that become one."""
+"""``pliant map``: the content of a saved map, and the merge of two maps."""
 
 from pathlib import Path
 from typing import Annotated

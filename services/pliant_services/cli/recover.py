@@ -1,4 +1,4 @@
-"""``pliant recover``: a recording that was cut off, made whole."""
+"""``pliant recover``: repairs a truncated or damaged recording."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""``pliant replay``: a recording on the bus as if live, or services again on what was recorded."""
+"""``pliant replay``: a recording on the bus as if live, or services run again on a recording."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""``pliant status``: who is in the sessions of a router, and how each service fares."""
+"""``pliant status``: the services in the sessions of a router, and their health."""
 
 from typing import Annotated
 

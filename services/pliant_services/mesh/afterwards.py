@@ -1,8 +1,8 @@
-"""The mesh of a run whose services may be started again: fused from the recording when it is over.
+"""The mesh of a run whose services may be restarted: fused from the recording at the end.
 
-What a mesher holds is too much for checkpoints, and all of it stands in the log.  So it is a
-process that reads the recording and adds a part to it: as a whole, or, where it dies, not at all,
-and then it is started again.
+The state of a mesher is too large for checkpoints, and the recording contains all of its input.  So
+a process reads the recording and adds a complete part to it; if it dies, it adds nothing and is
+started again.
 """
 
 import subprocess

@@ -1,4 +1,4 @@
-"""Bundle adjustment: where the camera is and what it sees, from tracks alone.
+"""Bundle adjustment: camera poses and the map, from tracks.
 
 in   camera/stream    once
      map/known        before the first frame: a map of earlier sessions, to continue in

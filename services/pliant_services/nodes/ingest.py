@@ -1,4 +1,4 @@
-"""Ingest: frames from a source, rectified once for everybody.
+"""Ingest: frames from a source, rectified once for all services.
 
 in   an image folder, a video, a camera, a built-in sequence
 out  camera/stream   once: the camera

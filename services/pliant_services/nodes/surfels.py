@@ -1,4 +1,4 @@
-"""Surfels: follows small patches of a deforming surface, each on its own, from a depth on.
+"""Surfels: tracks small independent patches of a deforming surface, from an initial depth.
 
 in   camera/stream    once
      camera/image     every frame

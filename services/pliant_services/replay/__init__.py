@@ -1,1 +1,1 @@
-"""Behind ``pliant replay``: services again on what was recorded, and recordings as if live."""
+"""Behind ``pliant replay``: services run again on a recording, and recordings as if live."""

@@ -1,4 +1,4 @@
-"""Behind ``pliant replay``: from a result folder to a new one, and whether they agree."""
+"""Behind ``pliant replay``: from a result folder to a new one, with a comparison."""
 
 import sys
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,7 @@
-"""Runs services again on what was recorded: in one process, without a bus, at full speed.
+"""Runs services again on a recording: in one process, without a bus, at full speed.
 
-Services run one after the other, and what one makes goes to the new recording, from where the next
-one reads it: so memory stays that of one message, and nothing depends on timing.
+Services run one after the other.  The output of one goes to the new recording, from which the next
+one reads it.  So memory holds one message, and nothing depends on timing.
 """
 
 import importlib

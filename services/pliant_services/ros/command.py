@@ -1,4 +1,4 @@
-"""Behind ``pliant ros``: a viewer of a running session that hands it on to ROS 2.
+"""Behind ``pliant ros``: a viewer of a running session that publishes it to ROS 2.
 
 It sees what viewers see (``runtime/relay.py``), and nothing waits for it.
 """

@@ -1,4 +1,4 @@
-"""``pliant run --poses``: each pose as it is known, for whoever reads along.
+"""``pliant run --poses``: each pose as estimated at frame time, for other programs.
 
     pose FRAME SECONDS tx ty tz qx qy qz qw        T_world_camera
     pose FRAME SECONDS                             it has none, or none yet

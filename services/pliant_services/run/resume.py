@@ -1,4 +1,4 @@
-"""A run that was cut off, and is taken up again: what it was begun with, and how far it came."""
+"""Resuming an interrupted run: its original request, and how far it came."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The viewer that a run starts where asked to."""
+"""The viewer that a run starts on request."""
 
 import subprocess
 import sys

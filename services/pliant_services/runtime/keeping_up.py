@@ -1,7 +1,7 @@
-"""Live mode: a slow bundle adjustment maps only some frames, and the others keep their rate.
+"""Live mode: a slow bundle adjustment maps only some frames; all frames keep their rate.
 
-The ingest alone decides which frames, and its word is recorded with them: so what comes of them
-stays a function of the messages, in a replay, too.
+The ingest alone selects these frames, and its decision is recorded with them.  So the output is a
+function of the messages, in a replay, too.
 """
 
 from collections import deque

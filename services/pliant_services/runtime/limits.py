@@ -1,5 +1,6 @@
-"""What the shell lets a process have, looked at before services start: what Zenoh's threads lack
-later they do not say, and everybody waits for ever."""
+"""Limits of the shell, checked before services start: Zenoh's threads would hang without a
+message.
+"""
 
 import resource
 

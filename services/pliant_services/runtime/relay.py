@@ -1,6 +1,6 @@
 """Hands messages of a session on to viewers, without letting them slow it down.
 
-Services send reliably: whoever reads slowly holds them up.  So viewers do not read from them.  The
+Services send reliably: a slow reader delays them.  So viewers do not read from them.  The
 launcher, which hosts the router, takes the newest messages out of rings that drop the oldest, and
 sends them on under ``view/`` in a way that drops what a viewer does not take.  It does so only
 while a viewer is there; the camera, which is published once, is kept for late viewers.

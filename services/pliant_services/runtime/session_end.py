@@ -1,8 +1,8 @@
 """A service that no launcher watches, and the end of a session of such services.
 
-Each leaves a mark beside its checkpoints when it has done its part.  Started again after that, by
-whatever starts services again, it leaves at once.  The recorder is the last: it writes the results,
-then tells everybody that the session is over.
+Each writes a mark next to its checkpoints when it has finished.  If a supervisor starts it again
+after that, it exits at once.  The recorder is the last: it writes the results, then announces the
+end of the session.
 """
 
 import sys

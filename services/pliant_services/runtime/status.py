@@ -1,4 +1,4 @@
-"""Looks at a session from outside: what its services tell once a second, and their tokens."""
+"""Looks at a session from outside: the reports of its services once a second, and their tokens."""
 
 import threading
 import time

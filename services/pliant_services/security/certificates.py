@@ -1,4 +1,4 @@
-"""An authority of our own and a certificate for everybody in a session: ``pliant certs``."""
+"""Our own authority, and certificates for all members of a session: ``pliant certs``."""
 
 import ipaddress
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""A result in Open3D's window: points, mesh, the camera's path, lines between same places."""
+"""A result in Open3D's window: points, mesh, the camera's path, lines between matched places."""
 
 import ctypes
 import os

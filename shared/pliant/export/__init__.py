@@ -1,1 +1,1 @@
-"""What a result becomes for other programs and for the eye: ``pliant export``."""
+"""``pliant export``: results for other programs and as pictures."""

@@ -1,4 +1,4 @@
-"""A run as a COLMAP model: its posed images, their camera, and points with where they are seen.
+"""A run as a COLMAP model: its posed images, their camera, and points with their observations.
 
 Keyframes see what the mapper had them see.  The other frames see what their tracks lead to: a track
 is that of the point which the most keyframes see on it, where it lies no farther off than an inlier

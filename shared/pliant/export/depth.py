@@ -1,4 +1,4 @@
-"""The depth and the normals of a run's keyframes, beside their images.
+"""The depth and the normals of a run's keyframes, with their images.
 
     images/000012.png     the keyframe, as ``IdealCamera`` sees it
     masks/000012.png      black where the keyframe's mask ignores pixels; depth is unknown there

@@ -1,4 +1,4 @@
-"""Behind ``pliant export``: what a result folder becomes for other programs and for the eye."""
+"""Behind ``pliant export``: results for other programs and as pictures."""
 
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The images of a recording, made again from their source bytes, and as a folder of their own."""
+"""The images of a recording, made again from their source bytes, and as a folder."""
 
 from collections.abc import Container, Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The kinds of export by name, without what makes them: help pages list them."""
+"""The kinds of export by name, without their code: help pages list them."""
 
 KINDS = {
     "foxglove": "foxglove.mcap",

@@ -1,4 +1,4 @@
-"""Exports that other programs continue with: Foxglove, Rerun, clouds."""
+"""Exports for other programs: Foxglove, Rerun, point clouds."""
 
 from pathlib import Path
 

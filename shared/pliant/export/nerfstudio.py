@@ -1,4 +1,4 @@
-"""A run as nerfstudio's folder, which splat and NeRF trainers take as it is.
+"""A run as a nerfstudio folder, which splat and NeRF trainers read directly.
 
     transforms.json    the camera, and for each image its file and camera-to-world
     images/            see ``posed_images``

@@ -1,4 +1,4 @@
-"""A run for Gaussian splatting: what ``colmap`` and ``nerfstudio`` write, in one folder.
+"""A run for Gaussian splatting: the output of ``colmap`` and ``nerfstudio`` in one folder.
 
     images/, masks/           as of both, but of near-duplicate views only the sharp ones
     sparse/0/                 the COLMAP model; the dense points have no observations

@@ -1,4 +1,4 @@
-"""The mesh of a run with a texture of what its keyframes show, as glTF or OBJ."""
+"""The mesh of a run with a texture from its keyframes, as glTF or OBJ."""
 
 from pathlib import Path
 

@@ -1,1 +1,1 @@
-"""From keyframes to meshes: a live one that follows the map, and a final one from its last word."""
+"""From keyframes to meshes: a live one that follows the map, and a final one at the end."""

@@ -1,4 +1,4 @@
-"""A volume for a final mesh, which says what it would have taken where there is no room for it."""
+"""A volume for a final mesh, which reports the memory that it would need if it is too large."""
 
 import numpy as np
 

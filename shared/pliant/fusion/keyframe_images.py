@@ -1,4 +1,4 @@
-"""What the spool's image and mask of a keyframe show to the ideal camera."""
+"""A keyframe's image and mask, in the pixels of the ideal camera."""
 
 from functools import lru_cache
 

@@ -1,4 +1,4 @@
-"""Keyframes on disk: their images, observations and surfaces, of which memory holds the places."""
+"""Keyframes on disk: images, observations and surfaces; memory holds only their positions."""
 
 import tempfile
 from dataclasses import dataclass

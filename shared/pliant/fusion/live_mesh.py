@@ -1,4 +1,4 @@
-"""The coarse mesh of one map segment while it grows, and what of it has changed."""
+"""The coarse mesh of one map segment while it grows, and its changes."""
 
 import bisect
 from dataclasses import dataclass

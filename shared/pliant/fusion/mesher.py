@@ -1,4 +1,4 @@
-"""From keyframes to meshes: a live one that follows the map, and a final one from its last word.
+"""From keyframes to meshes: a live one that follows the map, and a final one at the end.
 
 VITAMIN-E section 4, but at keyframes instead of every frame.  While the map grows, a keyframe is a
 preview until it leaves the window of bundle adjustment; then its last pose, points and observations

@@ -1,4 +1,4 @@
-"""Work for all processors whose results come in the order of what was asked, whoever is first."""
+"""Work for all processors whose results come in the order of the requests."""
 
 import os
 from collections import deque

@@ -1,4 +1,4 @@
-"""Room for voxels: in memory up to a limit, beyond it in a temporary file.
+"""Memory for voxels: up to a limit in RAM, beyond it in a temporary file.
 
 The file is mapped, so that kernels read and write it as memory.  What a keyframe does not see stays
 on disk, and time per keyframe does not depend on the size of the scene.

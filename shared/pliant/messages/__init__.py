@@ -1,1 +1,1 @@
-"""What travels between processes: message types, the one table of topics, and the codec."""
+"""Messages between processes: their types, the one table of topics, and the codec."""

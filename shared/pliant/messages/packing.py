@@ -1,7 +1,7 @@
-"""Images made smaller for a link, exactly: rows as differences from the one above, then zstd.
+"""Lossless packing of images for a link: rows as differences from the one above, then zstd.
 
-On images of 752x480 that is as small as PNG, in a quarter of its time and less: see
-``scripts/bench images``.
+On images of 752x480 that is as small as PNG, in a quarter of its time and less: see ``scripts/bench
+images``.
 """
 
 import struct

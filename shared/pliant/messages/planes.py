@@ -1,4 +1,4 @@
-"""Arrays of wide numbers as recordings hold them: in planes, which zstd makes smaller.
+"""Planes: the form of wide numbers in recordings, which zstd compresses better.
 
 The lowest bytes of all numbers come first, then the next ones of all, up to the highest.  So the
 bytes that are alike, those of signs, exponents and the high ends of counters, lie together:

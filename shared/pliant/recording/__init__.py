@@ -1,1 +1,1 @@
-"""MCAP recordings: writing them so that nothing is lost, and reading them back."""
+"""MCAP recordings: written without loss, and read back."""

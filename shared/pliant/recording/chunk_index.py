@@ -1,4 +1,4 @@
-"""The index at the end of a recording: any moment is found without reading what precedes it."""
+"""The index at the end of a recording: it finds any moment without reading earlier data."""
 
 import heapq
 import zlib

@@ -1,4 +1,4 @@
-"""The file of a map that is kept, ``map.pliant``: MCAP, one message for each keyframe.
+"""The file of a saved map, ``map.pliant``: MCAP, one message for each keyframe.
 
 A metadata record ``map`` stands first: ``version`` of what the fields mean, ``release`` of Pliant,
 ``source`` of the last session and its ``calibration`` as YAML, and whether its lengths are

@@ -1,4 +1,4 @@
-"""Reads recordings, closed cleanly or cut off."""
+"""Reads recordings, complete or truncated."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

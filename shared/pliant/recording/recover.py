@@ -1,6 +1,7 @@
-"""Makes a clean, indexed recording of one that was cut off or damaged.
+"""Makes a clean, indexed recording of a truncated or damaged one.
 
-``pliant recover`` keeps all that it can; a recorder that is started again what it can vouch for.
+``pliant recover`` keeps all readable data; a restarted recorder only data that is certainly
+complete.
 """
 
 from collections.abc import Callable

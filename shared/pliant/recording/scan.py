@@ -1,6 +1,6 @@
-"""Walks an MCAP file record by record, also one that is cut off or damaged.
+"""Reads an MCAP file record by record, even if it is truncated or damaged.
 
-Nothing in the file is believed before it is checked: sizes against the file's own, chunks by their
+Everything in the file is checked before use: sizes against the file's own, chunks by their
 checksum.  Memory holds a chunk of the usual size, compressed and not, or one message of a larger
 one, whatever a length field says.  After damage the walk continues with the next chunk whose header
 and checksum hold.

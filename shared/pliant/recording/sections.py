@@ -1,4 +1,4 @@
-"""What a writer fills: a chunk, and at the end of the file what finds everything in all of them."""
+"""The parts of a file that a writer fills: chunks, and the index at the end."""
 
 import struct
 import zlib

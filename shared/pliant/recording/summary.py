@@ -1,4 +1,4 @@
-"""What a recording holds, whether it is whole, and what is missing: ``pliant info``."""
+"""``pliant info``: the content of a recording, whether it is complete, and what is missing."""
 
 from collections.abc import Iterator
 from contextlib import suppress

@@ -1,1 +1,1 @@
-"""A result folder: what a run leaves, written from its recording and read again."""
+"""A result folder: the output of a run, written from its recording and read again."""

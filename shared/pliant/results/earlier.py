@@ -1,7 +1,7 @@
 """An earlier result stays within its folder until the one that replaces it has its first frame.
 
-The names of folders tell how far that came, so that it can end at any point, by a kill or a power
-cut, and nothing is lost: ``earlier_result.half`` while entries move, either way;
+The names of folders show its progress, so that it may be interrupted at any point, by a kill or a
+power cut, without loss: ``earlier_result.half`` while entries move, either way;
 ``earlier_result.pliant`` once all are aside: what lies beside it is new, and this is a result that
 can be looked at; ``.pliant-replaced-*`` once it is not wanted any more.
 """

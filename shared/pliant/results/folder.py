@@ -1,4 +1,4 @@
-"""A result folder: the names of its files, who may write it, and what a run finds there."""
+"""A result folder: its file names, its lock, and its state before a run."""
 
 import errno
 import fcntl

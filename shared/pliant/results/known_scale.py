@@ -1,7 +1,7 @@
-"""How long a unit of a result is: ``scale.yaml`` in its folder, and what is read under it.
+"""The length of a result's unit: ``scale.yaml`` in its folder, and readers that apply it.
 
-The recording stays as it is, since a replay compares its bytes: whoever reads lengths of it for a
-result reads them through ``MetricRecording``.
+The recording is unchanged, because a replay compares its bytes.  Lengths for a result are read
+through ``MetricRecording``.
 """
 
 from collections.abc import Iterator

@@ -1,6 +1,6 @@
-"""Who holds a result folder, also where it is renamed meanwhile.
+"""The lock of a result folder, which holds even if the folder is renamed.
 
-The lock is the system's, so that of a process that died holds nobody up.
+It is a lock of the operating system, so that of a dead process is free.
 """
 
 import errno

@@ -1,4 +1,4 @@
-"""Two map files become one."""
+"""Merges two map files into one."""
 
 from collections.abc import Iterator
 from pathlib import Path

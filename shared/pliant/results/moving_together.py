@@ -1,4 +1,4 @@
-"""Surfels that move like one rigid thing: what they do before a camera that moves, too."""
+"""Detection of surfels that all move like one rigid body, as in front of a moving camera."""
 
 import numpy as np
 

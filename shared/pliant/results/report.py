@@ -1,4 +1,4 @@
-"""What report.json says of a run, the same in a few lines, and the exit code that follows."""
+"""The content of report.json, its summary in a few lines, and the exit code."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""A recording read as one run: what it says of frames, map, mesh and services."""
+"""A recording read as one run: its frames, map, mesh and services."""
 
 from collections import defaultdict
 from collections.abc import Container, Iterator

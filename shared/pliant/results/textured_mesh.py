@@ -1,4 +1,4 @@
-"""The mesh of a run with a texture of what its keyframes show."""
+"""The mesh of a run with a texture from its keyframes."""
 
 from collections.abc import Iterator
 from typing import cast

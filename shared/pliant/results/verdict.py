@@ -1,4 +1,4 @@
-"""What a run came to: its report in a few lines, and the exit code that follows."""
+"""The verdict of a run in a few lines, and the exit code."""
 
 import re
 from collections.abc import Mapping

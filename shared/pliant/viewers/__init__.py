@@ -1,1 +1,1 @@
-"""Runs for the eye: one fold from messages to drawings, and the programs that show them."""
+"""Viewers: the conversion from messages to drawings, and the programs that show them."""

@@ -1,4 +1,4 @@
-"""What a run looks like, whatever program draws it."""
+"""The drawing interface that every viewer implements."""
 
 from dataclasses import dataclass
 from typing import Protocol

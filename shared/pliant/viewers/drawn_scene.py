@@ -1,7 +1,7 @@
-"""The one fold from messages to drawings: the live viewer and the exporters share it.
+"""The conversion from messages to drawings, shared by the live viewer and the exporters.
 
-Messages of one topic come in order; topics need not be in step.  Some may be missing: a viewer
-gives no credit, and only the newest reach it when it is slow.
+Messages of one topic come in order; topics need not be synchronous.  Some may be missing: a viewer
+gives no credit, and a slow one receives only the newest.
 """
 
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""A run as Foxglove protobuf messages in an MCAP file, which opens without anything of ours.
+"""A run as Foxglove protobuf messages in an MCAP file, which opens without Pliant.
 
     /camera/image, /camera/calibration, /camera/tracks   every frame; the corrected one at the end
     /tf              map -> world -> camera, every frame with a pose
@@ -9,8 +9,8 @@
     /map/all_points  the whole map, once, at the end of a segment
     /surfels/quads, /surfels/points, /surfels/image   every frame of the deformable profile
 
-Stamps are capture times: a recording gives the same bytes each time.  Poses and points are as
-they were known at the time.  Needs its definitions: ``pip install 'pliant[foxglove]'``.
+Stamps are capture times: a recording gives the same bytes each time.  Poses and points are as they
+were known at the time.  Needs its definitions: ``pip install 'pliant[foxglove]'``.
 """
 
 import importlib

@@ -1,7 +1,8 @@
-"""The live mesh as a viewer holds it: in groups of blocks, of which those that changed are drawn.
+"""The live mesh of a viewer: in groups of blocks, of which changed ones are drawn.
 
-A block by itself would be an entity of a hundred triangles, and thousands of them are slow to draw;
-the whole mesh again with each keyframe would cost with the map and not with the change.
+A single block would be an entity of a hundred triangles, and thousands of them are slow to draw.
+The cost of drawing the whole mesh with each keyframe would grow with the map and not with the
+change.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""The points of the map by id, in blocks: what changes is drawn again without the rest."""
+"""The points of the map by id, in blocks: only changed blocks are drawn again."""
 
 import numpy as np
 

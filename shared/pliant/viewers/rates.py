@@ -1,4 +1,4 @@
-"""Frames per second of each service, from when its reports came."""
+"""Frames per second of each service, by the arrival of its reports."""
 
 _WINDOW_NS = 1_000_000_000
 """A rate is the mean over at least so long."""

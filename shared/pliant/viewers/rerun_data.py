@@ -1,4 +1,4 @@
-"""What browsers are shown of a run: each has it from the beginning, or what there is room for."""
+"""The data of a run for browsers: all from the beginning, up to a memory limit."""
 
 import threading
 from collections import deque

@@ -1,4 +1,4 @@
-"""The meshes of a run on a canvas: the live one as it grows, then the final one in its place."""
+"""The meshes of a run on a canvas: the growing live mesh, then the final one."""
 
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh, no_blocks, unwelded
 from pliant.errors import MessageError

@@ -1,4 +1,4 @@
-"""The surfels of a run on a canvas, and the camera that sees them."""
+"""The surfels of a run on a canvas, and their camera."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Surfels for the eye: each a small quad along its frame vectors, coloured by how it fares."""
+"""Surfels as small quads along their frame vectors, coloured by state."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What would make the next run of such a video better, in words."""
+"""Advice for the next recording of such a scene."""
 
 import itertools
 from collections.abc import Mapping

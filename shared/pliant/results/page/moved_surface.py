@@ -1,4 +1,4 @@
-"""The surface of a deforming scene as a run has left it, coloured by how far it has moved."""
+"""The surface of a deforming scene at the end of a run, coloured by its motion."""
 
 from dataclasses import dataclass, field
 

@@ -1,4 +1,4 @@
-"""What every report.html has: the template, the canvas, tables, and the place of ground truth."""
+"""Common parts of every report.html: template, canvas, tables, and the place of ground truth."""
 
 from collections.abc import Container, Iterable
 from html import escape
