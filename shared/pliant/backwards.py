@@ -215,8 +215,7 @@ def final_update(before: MapHistory, after: MapHistory, last: MapDelta) -> MapDe
     """
     frames, keyframes, points = after.frames, after.keyframes, after.points()
     poses = [pose.pose_keyframe_camera for pose in frames.values()]
-    readout = [-1.0 if n == 3 else 1.0 for n in range(6)]
-    correction = zip(last.calibration_correction, readout, strict=False)
+    correction = enumerate(last.calibration_correction)
     return replace(
         last,
         pose_frames=np.array(list(frames), np.int64),
@@ -240,7 +239,7 @@ def final_update(before: MapHistory, after: MapHistory, last: MapDelta) -> MapDe
         moved_keyframes=np.zeros(0, np.int64),
         moves=np.zeros((0, 8)),
         same_places=np.array(after.same_places, np.int64).reshape(-1, 2),
-        calibration_correction=tuple(value * sign for value, sign in correction),
+        calibration_correction=tuple(-q if n == 3 else q for n, q in correction),
         snapshot=True,
     )
 

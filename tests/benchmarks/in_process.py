@@ -97,15 +97,17 @@ def measure(
     seeds: Sequence[int],
     focal: float,
     off_centre: float = 0.0,
+    aspect: float = 1.0,
 ) -> Iterator[str]:
     """A row for each source and seed.   focal: the given focal length is multiplied by this.
-    off_centre: added to the principal point, across, as a share of the focal length."""
+    off_centre: added to the principal point, across, as a share of the focal length.   aspect: the
+    given fx alone is multiplied by this, as of video that was resized to another shape."""
     yield markdown_header(_HEADER)
     for source in sources:
         dataset = open_source(source, load_config(None, overrides).ingest)
         given = dataset.calibration
         cx = given.cx + off_centre * given.fx
-        lens = replace(given, fx=focal * given.fx, fy=focal * given.fy, cx=cx)
+        lens = replace(given, fx=aspect * focal * given.fx, fy=focal * given.fy, cx=cx)
         for seed in seeds:
             found = run(dataset, [*overrides, f"seed={seed}"], calibration=lens)
             ates = shown_ate(found.final), shown_ate(found.causal)

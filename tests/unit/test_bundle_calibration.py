@@ -7,23 +7,23 @@ import pytest
 from bundle_scene import make_scene, numeric_jacobian, project
 
 from pliant.algorithms.bundle.calibration import SharedCalibration, ideal_pixels
-from pliant.algorithms.bundle.normal_equations import SHARED
 from pliant.algorithms.bundle.packed_layout import build_packed_layout
-from pliant.algorithms.bundle.problem import BundleParameters, CalibrationUncertainty
+from pliant.algorithms.bundle.problem import SHARED, BundleParameters, CalibrationUncertainty
 from pliant.algorithms.bundle.schur import SchurSystem, solve_schur, system_at
 from pliant.algorithms.camera import PinholeCamera
 
 EXACT = BundleParameters(kernel_sigma_px=0.0, max_iterations=60, min_relative_decrease=1e-10)
 ROBUST = BundleParameters(kernel_sigma_px=1.0, max_iterations=60, min_relative_decrease=1e-7)
 FREE = CalibrationUncertainty(
-    focal=1.0, k1=1.0, k2=1.0, readout=1.0, principal_point=1.0, prior_px=1e-3
+    focal=1.0, k1=1.0, k2=1.0, readout=1.0, principal_point=1.0, aspect=1.0, prior_px=1e-3
 )
 
 
-def with_lens(problem, s=0.0, k1=0.0, k2=0.0, a=0.0, b=0.0):
+def with_lens(problem, s=0.0, k1=0.0, k2=0.0, a=0.0, b=0.0, t=0.0):
     """The problem as a camera with this lens is believed to see it."""
     intrinsics = problem.intrinsics.copy()
     intrinsics[:, :2] *= np.exp(s)
+    intrinsics[:, 1] *= np.exp(t)
     intrinsics[:, 2:4] += intrinsics[:, :2] * (a, b)
     intrinsics[:, 4:] = k1, k2
     return dataclasses.replace(problem, intrinsics=intrinsics)
@@ -61,9 +61,7 @@ def calibration_jacobian(problem, q, step=1e-6):
     return J, problem.points_px.astype(np.float64).reshape(-1) - predicted(q)
 
 
-@pytest.mark.parametrize(
-    "calibration", [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.03, -0.2, 0.08, 0.4, 0.02, -0.05)]
-)
+@pytest.mark.parametrize("calibration", [(0.0,) * 7, (0.03, -0.2, 0.08, 0.4, 0.02, -0.05, 0.07)])
 def test_the_blocks_are_those_of_finite_differences(calibration):
     problem = with_flow(make_scene(cameras=4, points=20, noise_px=1.0, visible=0.8).problem)
     q = np.array(calibration)
@@ -72,22 +70,25 @@ def test_the_blocks_are_those_of_finite_differences(calibration):
     system.linearise(system.state(layout.cameras.motion, layout.points, q))
     J, r = calibration_jacobian(problem, q)
     H, g, M = J.T @ J, J.T @ r, len(layout.free)
-    np.testing.assert_allclose(system.shared.own, np.tril(H), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(system.shared.gradient, g, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(
+        system.shared.own[:SHARED, :SHARED], np.tril(H), rtol=1e-5, atol=1e-6
+    )
+    np.testing.assert_allclose(system.shared.gradient[:SHARED], g, rtol=1e-5, atol=1e-3)
     other = -numeric_jacobian(with_lens(problem, *q[:3], *q[4:]))
     cross = (J.T @ other[:, : 6 * M]).reshape(SHARED, M, 6).transpose(1, 0, 2).reshape(M, -1)
     near = 1e-5 * np.abs(cross).max()
-    np.testing.assert_allclose(system.shared.cameras, cross, rtol=1e-5, atol=near)
+    np.testing.assert_allclose(system.shared.cameras[:, : 6 * SHARED], cross, rtol=1e-5, atol=near)
     cross = (J.T @ other[:, 6 * M :]).reshape(SHARED, -1, 3).transpose(1, 0, 2)
-    found = system.shared.points[layout.column]
+    found = system.shared.points[layout.column, : 3 * SHARED]
     near = 1e-5 * np.abs(cross).max()
     np.testing.assert_allclose(found, cross.reshape(len(found), -1), rtol=1e-5, atol=near)
 
 
-def test_a_step_solves_the_whole_system():
+@pytest.mark.parametrize("aspect", [0.0, 0.02])
+def test_a_step_solves_the_whole_system(aspect):
     """The bordered Eq. 9 and Eq. 10 together are the solution of the damped dense system."""
     problem = with_flow(make_scene(cameras=5, points=30, noise_px=1.0, visible=0.8).problem)
-    uncertainty = CalibrationUncertainty(focal=0.01, k1=0.02, k2=0.0, readout=0.1, prior_px=30.0)
+    uncertainty = CalibrationUncertainty(aspect=aspect, prior_px=30.0)
     damping, M = 1e-3, 5
     J = -np.concatenate(
         [numeric_jacobian(problem), -calibration_jacobian(problem, np.zeros(SHARED))[0]], axis=1
@@ -114,17 +115,17 @@ def test_a_step_solves_the_whole_system():
 @pytest.mark.parametrize(
     "truth",
     [
-        (0.02, 0.0, 0.0, 0.0, 0.0),
-        (0.0, -0.05, 0.0, 0.0, 0.0),
-        (-0.03, 0.06, 0.0, 0.03, 0.0),
-        (0.01, -0.1, 0.05, -0.01, 0.02),
+        (0.02, 0.0, 0.0, 0.0, 0.0, 0.0),
+        (0.0, -0.05, 0.0, 0.0, 0.0, 0.0),
+        (-0.03, 0.06, 0.0, 0.03, 0.0, 0.0),
+        (0.01, -0.1, 0.05, -0.01, 0.02, -0.03),
     ],
 )
 def test_a_wrong_calibration_is_recovered_with_the_poses(truth):
-    s, k1, k2, a, b = truth
+    s, k1, k2, a, b, t = truth
     scene = make_scene(cameras=8, points=300, distortion=(k1, k2))
     # One who believes in another pinhole, and in no distortion.
-    problem = with_lens(scene.problem, s=-s, a=-a, b=-b)
+    problem = with_lens(scene.problem, s=-s, a=-a, b=-b * np.exp(t), t=-t)
     result = solve_schur(problem, EXACT, uncertainty=FREE)
     found = result.correction
     np.testing.assert_allclose(np.delete(found, 3), truth, atol=2e-3)
@@ -155,7 +156,7 @@ def test_the_readout_of_a_rolling_shutter_is_found():
     problem = dataclasses.replace(problem, points_px=moved)
     result = solve_schur(problem, EXACT, uncertainty=FREE)
     found = result.correction
-    np.testing.assert_allclose(found, (0.0, 0.0, 0.0, 0.7, 0.0, 0.0), atol=2e-3)
+    np.testing.assert_allclose(found, (0.0, 0.0, 0.0, 0.7, 0.0, 0.0, 0.0), atol=2e-3)
     np.testing.assert_allclose(result.T_world_camera, scene.T_world_camera, atol=2e-3)
     problem = dataclasses.replace(problem, readout_flow=None)
     assert solve_schur(problem, EXACT, uncertainty=FREE).correction[3] == 0.0
@@ -208,18 +209,22 @@ def test_cameras_with_different_lenses_are_refused():
 
 @pytest.mark.parametrize(
     "correction",
-    [(0.02, 0.0, 0.0, 0.0, 0.0), (-0.01, -0.05, 0.0, 0.02, 0.0), (0.0, 0.1, -0.03, 0.01, -0.02)],
+    [
+        (0.02, 0.0, 0.0, 0.0, 0.0, 0.0),
+        (-0.01, -0.05, 0.0, 0.02, 0.0, 0.03),
+        (0.0, 0.1, -0.03, 0.01, -0.02, -0.05),
+    ],
 )
 def test_ideal_pixels_undo_the_correction(correction):
     camera = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
     xy = np.random.default_rng(0).uniform((-0.6, -0.45), (0.6, 0.45), (200, 2))
     xy[0] = 0.0
-    s, k1, k2, a, b = correction
+    s, k1, k2, a, b, t = correction
     r2 = (xy**2).sum(axis=1, keepdims=True)
-    seen = np.exp(s) * (xy * (1.0 + k1 * r2 + k2 * r2**2) + (a, b))
+    seen = np.exp([s, s + t]) * (xy * (1.0 + k1 * r2 + k2 * r2**2) + (a, b))
     focal, centre = np.array([500.0, 520.0]), np.array([320.0, 240.0])
     px = (seen * focal + centre).astype(np.float32)
-    ideal = ideal_pixels(px, camera, np.array([s, k1, k2, 0.0, a, b]))
+    ideal = ideal_pixels(px, camera, np.array([s, k1, k2, 0.0, a, b, t]))
     np.testing.assert_allclose(ideal, xy * focal + centre, atol=2e-3)
 
 
@@ -227,16 +232,23 @@ def test_ideal_pixels_undo_the_correction(correction):
 def test_an_ideal_pixel_is_the_same_alone_and_among_many(lens):
     camera = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
     px = np.random.default_rng(0).uniform((-600, -450), (1240, 930), (300, 2)).astype(np.float32)
-    correction = np.array([0.01, *lens, 0.0, 0.01, -0.02])
+    correction = np.array([0.01, *lens, 0.0, 0.01, -0.02, 0.03])
     alone = [ideal_pixels(each, camera, correction) for each in px[:, None]]
     np.testing.assert_array_equal(ideal_pixels(px, camera, correction), np.concatenate(alone))
 
 
-def test_the_gain_of_a_principal_point_is_what_the_cost_falls_by_with_it():
-    held = FREE.model_copy(update={"principal_point": 0.0})
-    believed = with_lens(make_scene(cameras=6, points=150, noise_px=0.3).problem, a=0.01, b=-0.005)
+@pytest.mark.parametrize(
+    ("name", "unknowns", "wrong"),
+    [
+        ("principal_point", slice(4, 6), {"a": 0.01, "b": -0.005}),
+        ("aspect", slice(6, 7), {"t": 0.01}),
+    ],
+)
+def test_the_gain_of_an_unknown_is_what_the_cost_falls_by_with_it(name, unknowns, wrong):
+    held = FREE.model_copy(update={name: 0.0})
+    believed = with_lens(make_scene(cameras=6, points=150, noise_px=0.3).problem, **wrong)
     found = solve_schur(believed, EXACT, uncertainty=held)
     free = solve_schur(believed, EXACT, uncertainty=FREE, start=found.correction)
-    gain = system_at(believed, found, EXACT, FREE).gain_of_principal_point()
+    gain = system_at(believed, found, EXACT, FREE).gain_of_shared(unknowns)
     assert gain == pytest.approx(2.0 * (found.final_cost - free.final_cost), rel=0.1)
-    assert system_at(believed, free, EXACT, FREE).gain_of_principal_point() < 1e-3 * gain
+    assert system_at(believed, free, EXACT, FREE).gain_of_shared(unknowns) < 1e-3 * gain

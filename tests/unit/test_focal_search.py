@@ -68,7 +68,7 @@ def free(problem, start):
 
 @pytest.mark.parametrize("s", [-0.7, -0.4, 0.5])
 def test_the_focal_length_of_a_map_of_a_plane_is_found_from_afar(problem, s):
-    start = np.array([s, 0.0, 0.0, 0.0, 0.0, 0.0])
+    start = np.array([s, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     bent = made_with(problem, s)
     stuck = free(bent, start)
     found = free(*best_along_focal(bent, ITERATIONS, UNKNOWN, start))
@@ -78,7 +78,7 @@ def test_the_focal_length_of_a_map_of_a_plane_is_found_from_afar(problem, s):
 
 
 def test_a_map_that_is_right_stays(problem):
-    searched, start = best_along_focal(problem, ITERATIONS, UNKNOWN, np.zeros(6))
+    searched, start = best_along_focal(problem, ITERATIONS, UNKNOWN, np.zeros(7))
     assert start[0] == 0.0
     moved = searched.T_world_camera[:, :3, 3] - problem.T_world_camera[:, :3, 3]
     assert np.abs(moved).max() < 0.01

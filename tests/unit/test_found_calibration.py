@@ -117,6 +117,19 @@ def test_a_principal_point_that_the_images_contradict_is_told_and_far_off_is_a_d
     assert found_calibration(run).cx == pytest.approx(310.0 + 0.04 * 520.0)
 
 
+def test_pixels_that_are_not_square_are_reported_and_far_from_square_are_a_doubt():
+    near, off, far = ((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, t) for t in (0.006, -0.02, 0.05))
+    assert not calibration_verdict(run_with(PINHOLE, near, (1e-3,) * 7), {})
+    run = run_with(PINHOLE, off, (1e-3,) * 7)
+    assert "fy / fx 0.980 times the given one" in calibration_verdict(run, {})
+    assert not calibration_doubt(run, {})
+    doubt = calibration_doubt(run_with(PINHOLE, far, (1e-3,) * 7), {})
+    assert "fy / fx 1.051 times the given one" in doubt
+    found = found_calibration(run)
+    assert found.fx == pytest.approx(520.0)
+    assert found.fy == pytest.approx(510.0 * math.exp(-0.02))
+
+
 def test_what_bends_the_map_is_a_doubt_and_what_was_corrected_is_none():
     guess = calibration_from_fov(640, 480, 60.0)
     open_still = run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.09,) * 4)

@@ -214,8 +214,8 @@ def test_frames_of_a_rolling_shutter_are_localised_as_if_taken_at_once(
     errors: list[float] = []
     for known in (0.0, readout):
         published = Published()
-        correction = np.array([0.0, 0.0, 0.0, known, 0.0, 0.0])
-        of_camera = [replace(k, correction=correction, sigmas=np.full(6, 1e-3)) for k in kept]
+        correction = np.array([0.0, 0.0, 0.0, known, 0.0, 0.0, 0.0])
+        of_camera = [replace(k, correction=correction, sigmas=np.full(7, 1e-3)) for k in kept]
         localiser = Localiser(CAMERA, PARAMETERS, 0, known=of_camera)
         assert localiser.calibration.readout == known
         for k, tracks in enumerate(frames):
@@ -238,6 +238,19 @@ def test_another_camera_sees_the_map_with_its_own_calibration(kept: list[MapKeyf
         errors = np.linalg.norm(other.project(seen) - keyframe.points_px, axis=1)
         assert np.median(errors) < 1.0
     assert not np.array_equal(points.patches[: len(kept[0].point_ids)], kept[0].point_patches)
+
+
+def test_a_map_from_before_the_aspect_ratio_is_read_with_a_correct_one(
+    tmp_path: Path, kept: list[MapKeyframe]
+) -> None:
+    old = [replace(each) for each in kept]
+    for each in old:
+        for name in ("correction", "sigmas"):
+            object.__setattr__(each, name, getattr(each, name)[:6])
+    write_map(tmp_path / MAP_NAME, MapHeader(version=2), old)
+    for was, now in zip(kept, MapFile(tmp_path).keyframes(), strict=True):
+        np.testing.assert_array_equal(now.correction, [*was.correction[:6], 0.0])
+        np.testing.assert_array_equal(now.sigmas, [*was.sigmas[:6], 0.0])
 
 
 def test_a_map_that_cannot_be_is_refused_in_one_line(

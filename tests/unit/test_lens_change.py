@@ -22,8 +22,8 @@ from pliant.algorithms.mapping.self_calibration import SelfCalibration
 
 GIVEN = CalibrationUncertainty()
 KNOWN = SelfCalibration.of(CAMERA, GIVEN)
-FOUND = np.array([0.04, -0.05, 0.01, 0.0, 0.0, 0.0])
-COVARIANCE = np.diag([0.005, 0.004, 0.0, 0.02, 0.0, 0.0]) ** 2
+FOUND = np.array([0.04, -0.05, 0.01, 0.0, 0.0, 0.0, 0.0])
+COVARIANCE = np.diag([0.005, 0.004, 0.0, 0.02, 0.0, 0.0, 0.0]) ** 2
 OTHER = KNOWN.with_lens(FOUND, COVARIANCE)
 
 
@@ -63,7 +63,7 @@ def test_points_are_seen_where_their_hosts_saw_them(active, monkeypatch):
 
 
 def test_what_a_rolling_shutter_moved_goes_along(active):
-    known = replace(KNOWN, correction=np.array([0.0, 0, 0, 0.5, 0, 0]))
+    known = replace(KNOWN, correction=np.array([0.0, 0, 0, 0.5, 0, 0, 0]))
     keyframe = active.keyframes[3]
     keyframe.rolled_px = keyframe.rolled_px + np.float32(2.0)
     seen, at_once = keyframe.points_px + keyframe.rolled_px, keyframe.points_px
@@ -103,12 +103,12 @@ def test_earlier_segments_and_waiting_frames_follow(active):
     ],
 )
 def test_a_lens_is_refuted_when_it_is_certain_and_unlikely(focal, k1, sigma, refuted):
-    found = np.array([focal, k1, 0.0, 0.7, 0.0, 0.0])
-    covariance = np.diag([sigma, sigma, 0.0, 0.01, 0.0, 0.0]) ** 2
+    found = np.array([focal, k1, 0.0, 0.7, 0.0, 0.0, 0.0])
+    covariance = np.diag([sigma, sigma, 0.0, 0.01, 0.0, 0.0, 0.0]) ** 2
     assert KNOWN.is_refuted(found, covariance, GIVEN) == refuted
     held = CalibrationUncertainty(focal=0.0, k1=0.0)
-    assert not KNOWN.is_refuted(found, np.zeros((6, 6)), held)
-    assert not KNOWN.is_refuted(found, np.full((6, 6), np.inf), GIVEN)
+    assert not KNOWN.is_refuted(found, np.zeros((7, 7)), held)
+    assert not KNOWN.is_refuted(found, np.full((7, 7), np.inf), GIVEN)
     lens = KNOWN.with_lens(found, covariance)
     assert lens.readout == 0.0
     assert lens.sigmas[3] == KNOWN.sigmas[3]

@@ -22,7 +22,7 @@ AXIS_HALF_BORDER = np.array([(320, 240), (160, 240), (0, 240)], np.float32)
 
 def found(sigma: float, k1_sigma: float):
     """A covariance of the calibration."""
-    return np.diag([sigma**2, k1_sigma**2, 0.0, 0.0, 0.0, 0.0])
+    return np.diag([sigma**2, k1_sigma**2, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def test_what_the_lens_may_move_is_noise_beside_a_pixel():
@@ -56,7 +56,7 @@ def test_an_adjustment_of_k1_lets_more_of_the_image_count(uncertain, covariance,
     )  # fmt: skip
     known = SelfCalibration.of(CAMERA, uncertain)
     if covariance is not None:
-        known = known.corrected(np.zeros(6), covariance, 9)
+        known = known.corrected(np.zeros(7), covariance, 9)
     seen = list_observations([keyframe], points, known, MappingParameters(calibration=uncertain))
     expected = weigh(AXIS_HALF_BORDER, CAMERA, sigmas)
     np.testing.assert_array_equal(seen.weights[np.argsort(-seen.px[:, 0])], expected)
@@ -76,5 +76,5 @@ def test_the_window_counts_as_much_as_is_known_of_its_camera():
     )  # fmt: skip
     active.rebuild_window()
     np.testing.assert_array_equal(active.window.w[0], weigh(AXIS_HALF_BORDER, CAMERA, (0.02, 0.0)))
-    active.see_anew(given.with_lens(np.zeros(6), found(0.001, 0.002)))
+    active.see_anew(given.with_lens(np.zeros(7), found(0.001, 0.002)))
     np.testing.assert_array_equal(active.window.w[0], weigh(AXIS_HALF_BORDER, CAMERA, (0.002, 0.0)))

@@ -123,8 +123,8 @@ def test_another_wall_is_not_merged(two: Two) -> None:
 
 
 def test_another_correction_of_the_camera_moves_nothing_in_the_image(two: Two) -> None:
-    correction = np.array([0.02, -0.01, 0.0, 0.0, 0.003, 0.0])
-    other = SelfCalibration(CAMERA, correction, np.eye(6))
+    correction = np.array([0.02, -0.01, 0.0, 0.0, 0.003, 0.0, -0.02])
+    other = SelfCalibration(CAMERA, correction, np.eye(7))
     before = two[0][-1]
     own = SelfCalibration(CAMERA, before.correction, np.diag(before.sigmas**2))
     moved = corrected_as(before, other)
@@ -139,8 +139,8 @@ def test_a_map_of_another_focal_length_is_merged_as_this_one_would_have_it(two: 
     """The rays of one image differ by a twentieth, 20 px at its border."""
     first, second = two
     own = second[0].correction
-    other = SelfCalibration(CAMERA, own + np.array([0.05, 0, 0, 0, 0, 0]), np.eye(6))
-    before = SelfCalibration(CAMERA, own, np.eye(6)).view.camera
+    other = SelfCalibration(CAMERA, own + np.array([0.05, 0, 0, 0, 0, 0, 0]), np.eye(7))
+    before = SelfCalibration(CAMERA, own, np.eye(7)).view.camera
     made: list[MapKeyframe] = []
     for each in second:
         here = transform(inverse(each.T_world_camera), each.points_world)

@@ -43,8 +43,8 @@ def test_an_image_is_where_lens_and_shutter_have_moved_the_tracks():
         rng.integers(0, 256, (12, 16), np.uint8), (CAMERA.width, CAMERA.height),
         interpolation=cv2.INTER_CUBIC,
     )  # fmt: skip
-    correction = np.array([0.01, 0.04, -0.01, 0.3, 0.002, -0.003])
-    known = SelfCalibration(CAMERA, correction, np.zeros((6, 6)))
+    correction = np.array([0.01, 0.04, -0.01, 0.3, 0.002, -0.003, 0.004])
+    known = SelfCalibration(CAMERA, correction, np.zeros((7, 7)))
     motion = np.array([0.01, -0.02, 0.0, 0.03, 0.0, 0.01])
     rolled = RolledFrame(known.view, 0.3, motion, 0.2)
     lens = IdealFrame.of(Frame(0, 0, FrameExtrema.empty(), smooth), known)

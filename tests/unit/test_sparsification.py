@@ -162,7 +162,7 @@ def test_a_segment_that_is_left_keeps_what_is_not_published_yet() -> None:
     left = segment([list(range(10 * k, 10 * k + 25)) for k in range(30)])
     window = WindowParameters(keyframes=16, kept_observations=1000, kept_per_keyframe=5)
     earlier = EarlierSegments()
-    earlier.keep(left, SelfCalibration(CAMERA, np.zeros(6), np.zeros((6, 6))))
+    earlier.keep(left, SelfCalibration(CAMERA, np.zeros(7), np.zeros((7, 7))))
     before = [keyframe.rows.copy() for keyframe in left.keyframes[-16:]]
     earlier.share_room(left.points, window)
     for keyframe, rows in zip(left.keyframes[-16:], before, strict=True):
@@ -180,7 +180,7 @@ def test_two_segments_that_become_one_have_not_been_adjusted_as_one() -> None:
 
 def test_what_a_segment_without_room_had_is_given_up_with_it() -> None:
     left = segment([list(range(10 * k, 10 * k + 25)) for k in range(30)])
-    atlas = Atlas(SelfCalibration(CAMERA, np.zeros(6), np.zeros((6, 6))), MappingParameters())
+    atlas = Atlas(SelfCalibration(CAMERA, np.zeros(7), np.zeros((7, 7))), MappingParameters())
     atlas.points = left.points
     left.dropped.take_in(
         DroppedKeyframes(ids=np.array([30]), hosts=np.array([30]), centres=np.zeros((1, 3)))

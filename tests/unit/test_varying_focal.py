@@ -8,9 +8,8 @@ from bundle_scene import make_scene, numeric_jacobian, project
 from test_bundle_calibration import EXACT, FREE, calibration_jacobian, with_flow
 
 from pliant.algorithms.bundle.calibration import SharedCalibration
-from pliant.algorithms.bundle.normal_equations import SHARED
 from pliant.algorithms.bundle.packed_layout import build_packed_layout
-from pliant.algorithms.bundle.problem import CalibrationUncertainty
+from pliant.algorithms.bundle.problem import SHARED, CalibrationUncertainty
 from pliant.algorithms.bundle.schur import SchurSystem, solve_schur
 from pliant.algorithms.bundle.varying_focal import FocalWalk, VaryingFocal
 
@@ -36,11 +35,11 @@ def dense_prior(z, prior_px):
     return H, -H @ z
 
 
-@pytest.mark.parametrize("cameras", [5, 8])
-def test_a_step_solves_the_whole_system(cameras):
+@pytest.mark.parametrize(("cameras", "aspect"), [(5, 0.0), (8, 0.0), (8, 0.02)])
+def test_a_step_solves_the_whole_system(cameras, aspect):
     """Poses, shared calibration, focal lengths and points: as the damped dense system."""
     problem = with_flow(make_scene(cameras=cameras, points=30, noise_px=1.0, visible=0.8).problem)
-    uncertainty = CalibrationUncertainty(focal=0.01, k1=0.02, k2=0.0, readout=0.1, prior_px=30.0)
+    uncertainty = CalibrationUncertainty(aspect=aspect, prior_px=30.0)
     M, z = cameras, np.linspace(-0.02, 0.03, cameras) ** 2
     seen = zoomed(problem, z)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.bundle.calibration import ideal_pixels
+from pliant.algorithms.bundle.problem import SHARED
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.moved_image import Move, moved_image
 
@@ -28,8 +29,8 @@ class CorrectedView:
         centre: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self.camera = camera
-        s, k1, k2, a, b = parts_of(correction)
-        self._correction = np.array([s, k1, k2, 0.0, a, b])
+        s, k1, k2, a, b, t = parts_of(correction)
+        self._correction = np.array([s, k1, k2, 0.0, a, b, t])
         self._log_focal, self._centre = log_focal, centre
 
     @property
@@ -96,11 +97,11 @@ class CorrectedView:
     def _seen(self, x: F64, y: F64) -> tuple[F64, F64]:
         """Pixels of the rectified image that see points of the plane z = 1."""
         camera = self.camera
-        s, k1, k2, _, a, b = self._correction.tolist()
+        s, k1, k2, _, a, b, t = self._correction.tolist()
         squared = x * x + y * y
         factor = 1.0 + k1 * squared + k2 * squared**2
         u = camera.cx + np.exp(s) * camera.fx * (x * factor + a)
-        return u, camera.cy + np.exp(s) * camera.fy * (y * factor + b)
+        return u, camera.cy + np.exp(s + t) * camera.fy * (y * factor + b)
 
 
 def moved_px(
@@ -114,11 +115,11 @@ def moved_px(
     return after.pixels(seen if log_factors is None else after.magnified(seen, -log_factors))
 
 
-def parts_of(correction: tuple[float, ...]) -> tuple[float, float, float, float, float]:
-    """(s, k1, k2, a, b) of a correction, also of a recording from before the last two."""
-    known = (*correction, *np.zeros(6))[:6] if len(correction) >= 3 else np.zeros(6)
-    s, k1, k2, _, a, b = (float(each) for each in known)
-    return s, k1, k2, a, b
+def parts_of(correction: tuple[float, ...]) -> tuple[float, float, float, float, float, float]:
+    """(s, k1, k2, a, b, t) of a correction, also of a recording from before the last three."""
+    known = (*correction, *np.zeros(SHARED))[:SHARED] if len(correction) >= 3 else np.zeros(SHARED)
+    s, k1, k2, _, a, b, t = (float(each) for each in known)
+    return s, k1, k2, a, b, t
 
 
 @lru_cache(maxsize=4)
@@ -129,7 +130,7 @@ def corrected_view(
 
     camera: the one that was believed in.    correction, log_focal: as of ``CorrectedView``.
     """
-    s, k1, k2, a, b = parts_of(correction)
-    fx, fy = camera.fx * float(np.exp(s)), camera.fy * float(np.exp(s))
+    s, k1, k2, a, b, t = parts_of(correction)
+    fx, fy = camera.fx * float(np.exp(s)), camera.fy * float(np.exp(s + t))
     found = replace(camera, fx=fx, fy=fy, cx=camera.cx + fx * a, cy=camera.cy + fy * b)
     return CorrectedView(found, (0.0, k1, k2), log_focal, (camera.cx, camera.cy))

@@ -3,12 +3,15 @@
 from dataclasses import dataclass
 from typing import Annotated
 
+import numpy as np
+
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, Shape
+from pliant.algorithms.bundle.problem import SHARED
 from pliant.algorithms.camera import PinholeCamera
 
-MAP_VERSION = 2
+MAP_VERSION = 3
 """Of what its fields mean, and of how the file has them; a map of a newer version is refused.
-2: arrays are in planes, see ``pliant.messages.planes``."""
+2: arrays are in planes, see ``pliant.messages.planes``.   3: corrections have an aspect ratio."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +38,8 @@ class KeptKeyframe:
     source_frame: int
     turned: bool
     given: Annotated[F64, Shape(6)]
-    correction: Annotated[F64, Shape(6)]
-    sigmas: Annotated[F64, Shape(6)]
+    correction: Annotated[F64, Shape("Q")]
+    sigmas: Annotated[F64, Shape("Q")]
     T_world_camera: Annotated[F64, Shape(4, 4)]
     motion: Annotated[F64, Shape(6)]
     seen_ids: Annotated[I64, Shape("N")]
@@ -52,6 +55,13 @@ class KeptKeyframe:
     point_sigmas: Annotated[F32, Shape("P")]
     point_kappas: Annotated[F32, Shape("P")]
     point_patches: Annotated[U8, Shape("P", "S", "S")]
+
+    def __post_init__(self) -> None:
+        """Those of a version before 3 end before the aspect ratio, which was right."""
+        for name in ("correction", "sigmas"):
+            known = getattr(self, name)
+            if known.shape == (SHARED - 1,):
+                object.__setattr__(self, name, np.append(known, 0.0))
 
     @property
     def given_camera(self) -> PinholeCamera:

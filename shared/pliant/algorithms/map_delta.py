@@ -86,11 +86,11 @@ class MapDelta:
     same_places: pairs of keyframes at the same place, the older one first, from closed loops,
         merged segments and relocalisations.   -1 for a
         frame that is no keyframe.
-    calibration_correction: (s, k1, k2, readout, a, b), the correction of the calibration by the
+    calibration_correction: (s, k1, k2, readout, a, b, t), the correction of the calibration by the
         last adjustment: a point of the map at (x, y) on the plane z = 1 is seen in the rectified
-        image at ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx``, likewise v with b, and a rolling
-        shutter takes the rows of a frame in this share of the frame interval.   () where nothing
-        was estimated.
+        image at ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx``, likewise v with s + t and b, and
+        a rolling shutter takes the rows of a frame in this share of the frame interval.   () where
+        nothing was estimated.
     calibration_sigmas: standard deviation of each of these, at residuals of 1 px.
     focal_keyframes, log_focals: keyframes whose focal length is e^log_focal times that of the
         corrected calibration: of clips in which it changes.

@@ -154,10 +154,10 @@ class Mesher:
 
     def _left_of(self, correction: tuple[float, ...]) -> tuple[float, ...]:
         """What of a correction is left beside the pinhole that was frozen."""
-        s, k1, k2, a, b = parts_of(correction)
-        s0, _, _, a0, b0 = self._frozen
-        share = float(np.exp(s0 - s))
-        return (s - s0, k1, k2, 0.0, a - share * a0, b - share * b0)
+        s, k1, k2, a, b, t = parts_of(correction)
+        s0, _, _, a0, b0, t0 = self._frozen
+        across, down = float(np.exp(s0 - s)), float(np.exp(s0 + t0 - s - t))
+        return (s - s0, k1, k2, 0.0, a - across * a0, b - down * b0, t - t0)
 
     def fuse(self, *, newest_only: bool = False, timer: StageTimer = no_stages) -> list[LiveChange]:
         """Fuse what waits; returns what changed.

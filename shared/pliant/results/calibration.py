@@ -49,6 +49,9 @@ the calibration."""
 _FAR_OFF_CENTRE = 0.05
 """As ``_BENDS`` of the principal point: online poses are wrong until it is found."""
 
+_NOT_SQUARE, _FAR_FROM_SQUARE = 0.01, 0.03
+"""As these two of the logarithm of the aspect ratio."""
+
 _FORWARD = math.cos(math.radians(15.0))
 _TURN_DEG = 20.0
 """Motion that leaves the focal length open: along the axis, or turning by less than this."""
@@ -100,8 +103,8 @@ def _corrected(
 
     Only the focal length, if no lens of the source's model is near the estimate.
     """
-    s, k1, k2, a, b = parts_of(correction)
-    fx, fy = given.fx * math.exp(s), given.fy * math.exp(s)
+    s, k1, k2, a, b, t = parts_of(correction)
+    fx, fy = given.fx * math.exp(s), given.fy * math.exp(s + t)
     scaled = replace(given, fx=fx, fy=fy, cx=given.cx + fx * a, cy=given.cy + fy * b)
     if k1 == 0.0 and k2 == 0.0 and not given.lens.distorts:
         return scaled
@@ -160,8 +163,9 @@ def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
         return f"{FOUND} ({known}): pass calibration.yaml to the next run"
     if not _is_contradicted(run):
         return ""
-    _, _, _, a, b = parts_of(correction)
+    _, _, _, a, b, t = parts_of(correction)
     point = f"principal point {focal * a:+.0f}, {focal * b:+.0f} px, " if a or b else ""
+    point += f"fy / fx {math.exp(t):.3f} times the given one, " if t else ""
     return (
         f"the images contradict the calibration: focal length {math.exp(correction[0]):.3f} times "
         f"the given one ({sure}), k1 {correction[1]:+.3f}, {point}"
@@ -191,6 +195,7 @@ def calibration_doubt(run: Run, final: dict[int, Any]) -> str:
         return ""
     guessed = run.stream.focal_sigma > 0.0
     far = abs(correction[0]) > _BENDS or _off_centre(correction) > _FAR_OFF_CENTRE
+    far = far or abs(parts_of(correction)[-1]) > _FAR_FROM_SQUARE
     bent = sigmas[0] > _KNOWN if guessed else far and _is_contradicted(run)
     return calibration_verdict(run, final) if bent else ""
 
@@ -201,7 +206,8 @@ def _is_contradicted(run: Run) -> bool:
     if run.stream is None or run.stream.focal_sigma > 0.0 or len(sigmas) < 2:
         return False
     priors = CalibrationUncertainty().sigmas[:2].tolist()
-    return _off_centre(correction) > _OFF_CENTRE or any(
+    off = _off_centre(correction) > _OFF_CENTRE or abs(parts_of(correction)[-1]) > _NOT_SQUARE
+    return off or any(
         abs(q) > max(_CONTRADICTED * prior, _SURE * sigma)
         for q, prior, sigma in zip(correction[:2], priors, sigmas[:2], strict=True)
     )
@@ -209,7 +215,7 @@ def _is_contradicted(run: Run) -> bool:
 
 def _off_centre(correction: tuple[float, ...]) -> float:
     """How far the principal point is from the given one, as a share of the focal length."""
-    _, _, _, a, b = parts_of(correction)
+    _, _, _, a, b, _ = parts_of(correction)
     return math.hypot(a, b)
 
 

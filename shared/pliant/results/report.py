@@ -189,10 +189,10 @@ def _correction(run: Run) -> dict[str, float] | None:
     correction = run.calibration_correction
     if len(correction) < 3:
         return None
-    s, k1, k2, a, b = parts_of(correction)
+    s, k1, k2, a, b, t = parts_of(correction)
     readout = correction[3] if len(correction) > 3 else 0.0
     found = {"focal_factor": float(np.exp(s)), "k1": k1, "k2": k2, "readout": readout}
-    found |= {"principal_x": a, "principal_y": b}
+    found |= {"principal_x": a, "principal_y": b, "aspect_factor": float(np.exp(t))}
     if run.calibration_sigmas:
         found["focal_sigma"] = focal_sigma(run)
     if run.focal_range is not None:

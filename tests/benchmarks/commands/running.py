@@ -37,6 +37,7 @@ def in_process(
         float,
         typer.Option(help="Error of the given principal point, as a share of the focal length."),
     ] = 0.0,
+    aspect: Annotated[float, typer.Option(help="Times the given fx alone: a wrong shape.")] = 1.0,
 ) -> None:
     """The rigid pipeline in one process, without services: final and online ATE.
 
@@ -44,7 +45,7 @@ def in_process(
     """
     from benchmarks.in_process import measure
 
-    show(measure(sources, overrides or [], range(seed, seed + seeds), focal, off_centre))
+    show(measure(sources, overrides or [], range(seed, seed + seeds), focal, off_centre, aspect))
 
 
 @app.command("map-starts")

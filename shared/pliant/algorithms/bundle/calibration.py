@@ -1,9 +1,14 @@
 """A calibration that all cameras share as a further unknown of bundle adjustment.
 
-The projection is ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx`` with r^2 = x^2 + y^2 on the
-plane z = 1, likewise for v with b, and the unknowns are q = (s, k1, k2, readout, a, b), where
-(a, b) is the error of the principal point.  At (a, b) = 0 the derivative by one of the first
-three is ``K (x, y)^T h_q`` with K = diag(fx e^s, fy e^s) and
+The projection is
+
+    u = fx e^s       ((1 + k1 r^2 + k2 r^4) x + a) + cx
+    v = fy e^(s + t) ((1 + k1 r^2 + k2 r^4) y + b) + cy
+
+with r^2 = x^2 + y^2 on the plane z = 1, and the unknowns are q = (s, k1, k2, readout, a, b, t),
+where (a, b) is the error of the principal point, and t that of the aspect ratio fy / fx.  At (a, b)
+= 0 the derivative by one of the first three is ``K (x, y)^T h_q`` with K = diag(fx e^s,
+fy e^(s + t)) and
 
     h = (1 + k1 r^2 + k2 r^4,  r^2,  r^4)       for  s, k1, k2.
 
@@ -14,10 +19,11 @@ So a calibration unknown moves the point on the plane z = 1 as if by
     A_q = (x, y)^T rho_q,     rho_q = h_q / (1 + 3 k1 r^2 + 5 k2 r^4),     F A_q = d(u, v) / dq.
 
 The fourth unknown is the readout of a rolling shutter, as a share of the frame interval: it moves
-an observation by the readout times its flow, so that ``A = F^-1 flow``.  The last two move all
+an observation by the readout times its flow, so that ``A = F^-1 flow``.  The next two move all
 of them alike: ``A = D^-1 (1, 0)^T`` and ``D^-1 (0, 1)^T``; and where they are not 0, s moves by
-``D^-1 (a, b)^T`` as well.  An unknown enters the Hessian of Eq. 7 like a column of B (see
-``projection``): with M and e of that module its blocks are
+``D^-1 (a, b)^T`` as well.  The last has dv/dt = v - cy, so that ``A = D^-1 (0, d y + b)^T``.  An
+unknown enters the Hessian of Eq. 7 like a column of B (see ``projection``): with M and e of that
+module its blocks are
 
     H_qq = sum A^T M A     H_qc = sum A^T M B     H_qp = sum A^T M P     - g_q = sum A^T e.
 
@@ -26,8 +32,9 @@ So the calibration is one more camera, which sees every point, and Eq. 9 becomes
     (S_cc  S_qc^T) (dx_c)   (b_c)
     (S_qc  S_qq  ) (dx_q) = (b_q)     S = H + damping diag(H) - U U^T,  U_q = H_qp L^-T,
 
-as sparse as before, with one row and one column of blocks that are full.  A prior at the given
-calibration adds its precision to H_qq and its gradient to b_q.
+as sparse as before, with one row and one column of blocks that are full.  A block has six unknowns:
+with a free aspect ratio there are two such cameras, the second with five empty unknowns.  A prior
+at the given calibration adds its precision to H_qq and its gradient to b_q.
 """
 
 from typing import Any, NamedTuple
@@ -36,9 +43,9 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, BoolArray
 from pliant.algorithms.bundle.dense_layout import BLOCK
-from pliant.algorithms.bundle.normal_equations import RECORD, SHARED
+from pliant.algorithms.bundle.normal_equations import RECORD
 from pliant.algorithms.bundle.packed_layout import PackedLayout, Slots
-from pliant.algorithms.bundle.problem import CalibrationUncertainty
+from pliant.algorithms.bundle.problem import SHARED, CalibrationUncertainty
 from pliant.algorithms.bundle.projection import (
     Cameras,
     apply_metric,
@@ -50,7 +57,6 @@ from pliant.algorithms.bundle.projection import (
 from pliant.algorithms.camera import PinholeCamera
 from pliant.compiler.kernel import fast_kernel, kernel
 
-LOWER = np.tril_indices(SHARED)
 _NEWTON_STEPS = 8
 _SQUARES_TO_ROUNDING = 1e-8
 """A Newton step after which the error, about its square, is below rounding."""
@@ -62,8 +68,9 @@ _FARTHEST = 4.0
 class SharedBlocks(NamedTuple):
     """The blocks of a shared calibration in one state.
 
-    own: (SHARED, SHARED) lower triangle of H_qq, without the prior.     gradient: (SHARED,) -g_q.
-    cameras: (M, 6 SHARED) H_qc of each camera by rows.     points: (P, 3 SHARED) H_qp by rows.
+    Of R blocks of six unknowns, those of q first.
+    own: (6 R, 6 R) lower triangle of H_qq, without the prior.     gradient: (6 R,) -g_q.
+    cameras: (M, 36 R) H_qc of each camera by rows.     points: (P, 18 R) H_qp by rows.
     """
 
     own: F64
@@ -74,7 +81,7 @@ class SharedBlocks(NamedTuple):
 
 def no_shared_blocks() -> SharedBlocks:
     """Return the blocks of a fixed calibration."""
-    return SharedBlocks(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 3 * SHARED)))
+    return SharedBlocks(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 18)))
 
 
 class SharedCalibration:
@@ -99,10 +106,12 @@ class SharedCalibration:
             raise ValueError("an unknown calibration must be that of all cameras")
         sigmas = uncertainty.sigmas
         self.layout = layout
-        self.given: F64 = np.array([0.0, lens[0, 0], lens[0, 1], 0.0, 0.0, 0.0])
+        self.given: F64 = np.zeros(SHARED)
+        self.given[1:3] = lens[0]
         self.start: F64 = self.given if start is None else start.copy()
         self.unknown = sigmas > 0.0
         self.unknown[3] &= layout.flow.size > 0
+        self.borders = 1 + int(self.unknown[6])
         self.precision: F64 = np.zeros(SHARED)
         self.precision[self.unknown] = (uncertainty.prior_px / sigmas[self.unknown]) ** 2
 
@@ -111,7 +120,8 @@ class SharedCalibration:
         layout = self.layout
         pinhole = layout.cameras.pinhole.copy()
         pinhole[:, :2] *= np.exp(q[0])
-        pinhole[:, 2:] += pinhole[:, :2] * q[4:]
+        pinhole[:, 1] *= np.exp(q[6])
+        pinhole[:, 2:] += pinhole[:, :2] * q[4:6]
         lens = np.tile(q[1:3], (len(pinhole), 1))
         cameras = layout.cameras._replace(pinhole=pinhole, lens=lens)
         if not self.unknown[3]:
@@ -126,15 +136,23 @@ class SharedCalibration:
 
     def linearise(self, cameras: Cameras, records: F64, q: F64) -> SharedBlocks:
         """The blocks in the state of the records, at a calibration."""
-        layout = self.layout
+        layout, width = self.layout, 6 * self.borders
         blocks = SharedBlocks(
-            own=np.zeros((SHARED, SHARED)),
-            gradient=np.zeros(SHARED),
-            cameras=np.zeros((len(layout.free), 6 * SHARED)),
-            points=np.zeros((layout.points.shape[1], 3 * SHARED)),
+            own=np.zeros((width, width)),
+            gradient=np.zeros(width),
+            cameras=np.zeros((len(layout.free), 6 * width)),
+            points=np.zeros((layout.points.shape[1], 3 * width)),
         )
-        _add_shared(cameras, layout.slots, layout.flow, self.unknown, q[4:], records, blocks)
+        _add_shared(cameras, layout.slots, layout.flow, self.unknown, q[4:6], records, blocks)
         return blocks
+
+    def padded(self, q: F64) -> F64:
+        """(6 R,) of q (SHARED,): with the unknowns of its blocks that stay empty."""
+        return np.concatenate([q, np.zeros(6 * self.borders)])[: 6 * self.borders]
+
+    def change(self, solution: F64) -> F64:
+        """(SHARED,) of the solution (N, 6) of the reduced system."""
+        return np.concatenate([solution[-self.borders :].ravel(), np.zeros(SHARED)])[:SHARED]
 
 
 @fast_kernel
@@ -196,6 +214,9 @@ def _moves(cameras: Cameras, m: int, principal: F64, local: F64, A: F64) -> None
         A[4 * BLOCK + i], A[5 * BLOCK + i] = s2 * x, s2 * y
         A[8 * BLOCK + i], A[9 * BLOCK + i] = d0, d1
         A[10 * BLOCK + i], A[11 * BLOCK + i] = d1, d2
+        n2 = x * x + y * y
+        below = (1.0 + n2 * (k1 + k2 * n2)) * y + c
+        A[12 * BLOCK + i], A[13 * BLOCK + i] = d1 * below, d2 * below
 
 
 @fast_kernel
@@ -278,18 +299,21 @@ def ideal_pixels(points_px: F32, camera: PinholeCamera, correction: F64) -> F32:
     """Move pixels (N, 2) of the image to where ``camera`` would see them if its calibration were
     correct.
 
-    correction: (6,) of ``solve_schur``; the readout is not removed here.  Newton's method on the
-    radius, to rounding for corrections under which the radius grows with the angle; otherwise the
-    nearest value that it reaches.
+    correction: (SHARED,) of ``solve_schur``; the readout is not removed here.  Newton's method on
+    the radius, to rounding for corrections under which the radius grows with the angle; otherwise
+    the nearest value that it reaches.
     """
     ideal = np.empty((len(points_px), 2), np.float32)
     K = camera.intrinsics
-    _ideal_pixels(points_px, K, correction, np.exp(-correction[0]), ideal)
+    s, t = correction[0], correction[6]
+    _ideal_pixels(points_px, K, correction, (np.exp(-s), np.exp(-s - t)), ideal)
     return ideal
 
 
 @kernel
-def _ideal_pixels(points_px: F32, K: F64, correction: F64, shrunk: float, ideal: F32) -> None:
+def _ideal_pixels(
+    points_px: F32, K: F64, correction: F64, shrunk: tuple[float, float], ideal: F32
+) -> None:
     """In blocks: a step is SIMD code.  Each point stops once it has converged."""
     k1, k2, a, b = correction[1], correction[2], correction[4], correction[5]
     fx, fy, cx, cy = K
@@ -298,8 +322,8 @@ def _ideal_pixels(points_px: F32, K: F64, correction: F64, shrunk: float, ideal:
     for first in range(0, points_px.shape[0], BLOCK):
         size = min(BLOCK, points_px.shape[0] - first)
         for i in range(size):
-            x[i] = shrunk / fx * (points_px[first + i, 0] - np.float32(cx)) - a
-            y[i] = shrunk / fy * (points_px[first + i, 1] - np.float32(cy)) - b
+            x[i] = shrunk[0] / fx * (points_px[first + i, 0] - np.float32(cx)) - a
+            y[i] = shrunk[1] / fy * (points_px[first + i, 1] - np.float32(cy)) - b
             wanted[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
         r[:], settled[:size], settled[size:] = wanted, False, True
         for _ in range(_NEWTON_STEPS):

@@ -12,7 +12,8 @@ So another damping costs no projection.  With ``L L^T = H_pp + damping diag(H_pp
     (H_cc + damping diag(H_cc) - U U^T) dx_c = - g_c - U y        L^T dx_p = y - U^T dx_c.
 
 A calibration that all cameras share is one more camera c with the rows ``A^T M P`` of
-``calibration``; it observes every point, so its H_cp is stored as a sum, one block per point.
+``calibration``, or two for more than six unknowns; it observes every point, so its H_cp is stored
+as a sum, one block per point.
 
 Linearisation goes camera by camera, in SIMD over blocks of observations; elimination goes point by
 point, over the records of each point in ascending order of their cameras.
@@ -47,16 +48,16 @@ from pliant.compiler.kernel import fast_kernel
 
 RECORD, FACTOR = 8, 9
 """Numbers kept of an observation, and of a point."""
-SHARED = 6
-"""Unknowns of a shared calibration: see ``calibration``."""
+MOST_BORDERS = 2
+"""Blocks of six that a shared calibration has at most."""
 _SINGULAR = 1e-14
 
 
 class Linearised(NamedTuple):
     """The linearised observations of one state, independent of the damping.
 
-    records: (O + 1, RECORD).     motion: (M, 12).     shared: (P, SHARED 3) H_cp of the shared
-    calibration by rows, whose position is the last; (0, ...): there is none.
+    records: (O + 1, RECORD).     motion: (M, 12).     shared: (P, 18 R) H_cp by rows of the shared
+    calibration, whose R blocks of six are the last; (0, ...): there is none.
     """
 
     records: F64
@@ -88,7 +89,7 @@ class Scratch(NamedTuple):
 
 def scratch_for(cameras: int) -> Scratch:
     """Return memory for points with at most this many observations, and a shared calibration."""
-    size = cameras + 1
+    size = cameras + MOST_BORDERS
     return Scratch(np.empty((size, 9)), np.empty((size, 18)), np.empty(size, np.int64))
 
 
@@ -342,17 +343,21 @@ def eliminate_points(
                     subtract_product3(S, np.uintp(block[np.uintp(rows[c]), at]), U, c, a)
         if shared.shape[0] == 0:
             continue
-        last, a = np.uintp(b.shape[0] - 1), np.uintp(count)
-        rows[a] = last
-        for q in range(SHARED):
-            e0 = shared[n, 3 * q] * i00
-            e1 = (shared[n, 3 * q + 1] - l10 * e0) * i11
-            e2 = (shared[n, 3 * q + 2] - l20 * e0 - l21 * e1) * i22
-            U[a, q], U[a, 6 + q], U[a, 12 + q] = e0, e1, e2
-            b[last, q] -= e0 * y0 + e1 * y1 + e2 * y2
-        for second in range(count + 1):
-            c = np.uintp(second)
-            subtract_product3(S, np.uintp(block[last, np.uintp(rows[c])]), U, a, c)
+        borders = shared.shape[1] // 18
+        for border in range(borders):
+            last, a = np.uintp(b.shape[0] - borders + border), np.uintp(count)
+            rows[a] = last
+            for q in range(6):
+                at = np.uintp(18 * border + 3 * q)
+                e0 = shared[n, at] * i00
+                e1 = (shared[n, at + 1] - l10 * e0) * i11
+                e2 = (shared[n, at + 2] - l20 * e0 - l21 * e1) * i22
+                U[a, q], U[a, 6 + q], U[a, 12 + q] = e0, e1, e2
+                b[last, q] -= e0 * y0 + e1 * y1 + e2 * y2
+            count += 1
+            for second in range(count):
+                c = np.uintp(second)
+                subtract_product3(S, np.uintp(block[last, np.uintp(rows[c])]), U, a, c)
 
 
 @fast_kernel
@@ -361,7 +366,7 @@ def substitute(
 ) -> None:
     """Move the points (Eq. 10).
 
-    steps: (M, 6) of every camera, 0 where fixed.     change: (SHARED,) of the shared calibration.
+    steps: (M, 6) of every camera, 0 where fixed.     change: (6 R,) of the shared calibration.
     points, out: (3, P).
     """
     records, shared, places, motion = state.records, state.shared, state.places, state.motion
@@ -380,7 +385,7 @@ def substitute(
             t0 += a * p0 + c * q0
             t1 += a * p1 + c * q1
             t2 += a * p2 + c * q2
-        for q in range(SHARED if shared.shape[0] else 0):
+        for q in range(change.size):
             t0 += shared[n, 3 * q] * change[q]
             t1 += shared[n, 3 * q + 1] * change[q]
             t2 += shared[n, 3 * q + 2] * change[q]

@@ -72,7 +72,7 @@ def optimise_pose_graph(S: F64, edges: Edges, fixed: BoolArray) -> tuple[F64, F6
     met = np.eye(int((~fixed).sum()), dtype=np.bool_)
     both = (free[edges.i] >= 0) & (free[edges.j] >= 0)
     met[free[edges.i[both]], free[edges.j[both]]] = True
-    pattern = find_pattern(met | met.T, bordered=False)
+    pattern = find_pattern(met | met.T, borders=0)
     position = np.where(fixed, -1, pattern.position[free])
     found, chi2 = S, np.square(residuals(S, edges) / edges.sigmas).sum(axis=1)
     widening = 1.0

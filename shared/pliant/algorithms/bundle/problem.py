@@ -14,6 +14,9 @@ from pliant.algorithms.arrays import F32, F64, I32, BoolArray, Shape, check_arra
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.parameters import Parameters
 
+SHARED = 7
+"""Unknowns of a calibration that all cameras share: see ``calibration``."""
+
 
 class BundleParameters(Parameters):
     """Parameters shared by all bundle adjustment solvers."""
@@ -92,6 +95,12 @@ class CalibrationUncertainty(Parameters):
             "length; 0: fixed until the images contradict it"
         ),
     )
+    aspect: float = Field(
+        default=0.0,
+        ge=0.0,
+        description="Standard deviation of the logarithm of fy / fx beside the given one; 0 holds "
+        "it until the images contradict it",
+    )
     prior_px: float = Field(
         default=1.0,
         gt=0.0,
@@ -103,9 +112,10 @@ class CalibrationUncertainty(Parameters):
 
     @property
     def sigmas(self) -> F64:
-        """(6,) of the focal factor's logarithm, k1, k2, the readout and the principal point."""
+        """(SHARED,) of the focal factor's logarithm, k1, k2, the readout, the principal point and
+        the logarithm of the aspect ratio."""
         point = self.principal_point
-        return np.array([self.focal, self.k1, self.k2, self.readout, point, point])
+        return np.array([self.focal, self.k1, self.k2, self.readout, point, point, self.aspect])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,9 +193,9 @@ class BundleResult:
     squared_residuals: px^2 without kernel or weight; inf where the point lies behind the camera.
         One for each observation of a ``BundleProblem`` (O,), inf for those left out as not finite;
         none (0,) for a ``BundleWindow``.
-    correction: (6,) of the calibration, where it was unknown: see ``solve_schur``.
-    covariance: (6, 6) of the correction, where residuals have a standard deviation of 1 px, if
-        requested.
+    correction: (SHARED,) of the calibration, where it was unknown: see ``solve_schur``.
+    covariance: (SHARED, SHARED) of the correction, where residuals have a standard deviation of
+        1 px, if requested.
     log_focal: (M,) of each camera relative to the shared focal length, (0,) where it is the same.
     """
 
@@ -197,8 +207,8 @@ class BundleResult:
     converged: bool
     squared_residuals: F32
     costs: F64 = field(default_factory=lambda: np.zeros(0))
-    correction: F64 = field(default_factory=lambda: np.zeros(6))
-    covariance: F64 = field(default_factory=lambda: np.zeros((6, 6)))
+    correction: F64 = field(default_factory=lambda: np.zeros(SHARED))
+    covariance: F64 = field(default_factory=lambda: np.zeros((SHARED, SHARED)))
     log_focal: F64 = field(default_factory=lambda: np.zeros(0))
 
     def residual_variance(self, problem: "BundleProblem") -> float:

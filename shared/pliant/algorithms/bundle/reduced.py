@@ -113,13 +113,13 @@ class Pattern(NamedTuple):
     row: I32
 
 
-def find_pattern(meetings: BoolArray, *, bordered: bool) -> Pattern:
+def find_pattern(meetings: BoolArray, *, borders: int) -> Pattern:
     """Order the F cameras.  meetings: (F, F) symmetric, whether two of them observe a common point.
 
-    bordered: one more position, the last, has a block with all of them.
+    borders: number of further positions, the last ones, which have a block with all of them.
     """
     F = len(meetings)
-    N = F + int(bordered)
+    N = F + borders
     filled = np.ones((N, N), np.bool_)
     filled[:F, :F] = meetings
     position = _order(filled, F)

@@ -8,7 +8,6 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, BoolArray
 from pliant.algorithms.bundle.calibration import (
-    LOWER,
     SharedCalibration,
     no_shared_blocks,
 )
@@ -16,7 +15,6 @@ from pliant.algorithms.bundle.dense_layout import points_of, poses_of
 from pliant.algorithms.bundle.normal_equations import (
     FACTOR,
     RECORD,
-    SHARED,
     CameraSystem,
     Linearised,
     cost_of_observations,
@@ -33,6 +31,7 @@ from pliant.algorithms.bundle.packed_layout import (
     build_packed_layout,
 )
 from pliant.algorithms.bundle.problem import (
+    SHARED,
     AnyProblem,
     BundleParameters,
     BundleProblem,
@@ -40,8 +39,8 @@ from pliant.algorithms.bundle.problem import (
     CalibrationUncertainty,
 )
 from pliant.algorithms.bundle.projection import Cameras, limits_of, move_cameras
-from pliant.algorithms.bundle.reduced import LOWER as LOWER6
 from pliant.algorithms.bundle.reduced import (
+    LOWER,
     factor_reduced,
     find_pattern,
     solve_reduced,
@@ -80,13 +79,14 @@ def solve_schur(
     does not increase the cost.
 
     uncertainty: of the calibration, which is then a further unknown that all cameras share; None:
-    it is fixed.  The result's ``correction`` (s, k1, k2, readout, a, b) means that the observations
-    follow ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx + readout flow``, likewise for v with b.
+    it is fixed.  The result's ``correction`` (s, k1, k2, readout, a, b, t) means that the
+    observations follow ``u = fx e^s ((1 + k1 r^2 + k2 r^4) x + a) + cx + readout flow``, likewise
+    for v with s + t and b.
     The costs include the prior, at k1 and k2 of the problem's intrinsics.
     with_covariance: the result contains the covariance of the correction.
-    start: (6,) initial correction, None: the mean of the prior.  Several views determine the focal
-    length by rotation, and by parallax that differs across the image.  Otherwise (no rotation, one
-    plane, forward motion) the prior determines it, as ``covariance`` then shows.
+    start: (SHARED,) initial correction, None: the mean of the prior.  Several views determine the
+    focal length by rotation, and by parallax that differs across the image.  Otherwise (no
+    rotation, one plane, forward motion) the prior determines it, as ``covariance`` then shows.
     doubled: twice each step is tried as well, which takes some 0.6 of the iterations to
     convergence.
     walk: prior of the focal length of each camera relative to the shared one; None: they are equal.
@@ -210,7 +210,7 @@ class SchurSystem:
         else:
             all_met = _meetings(layout.places, np.arange(M, dtype=np.int32), M)
             met = focal.meetings(all_met, self._moving)
-        self.pattern = find_pattern(met, bordered=calibration is not None)
+        self.pattern = find_pattern(met, borders=0 if calibration is None else calibration.borders)
         self._position = free
         self._position[self._moving] = self.pattern.position[: len(self._moving)]
         if focal is not None:
@@ -256,7 +256,7 @@ class SchurSystem:
         if self.calibration is not None:
             self.shared = self.calibration.linearise(cameras, self._records, state.calibration)
             if self.focal is not None:
-                unknown, principal = self.calibration.unknown, state.calibration[4:]
+                unknown, principal = self.calibration.unknown, state.calibration[4:6]
                 self.focal.linearise(cameras, self._records, unknown, principal)
         self.at = state
 
@@ -277,11 +277,12 @@ class SchurSystem:
             return None
         steps = np.zeros((len(state.motion), 6))
         steps[self._moving] = solution[self._position[self._moving]]
-        change = np.zeros(SHARED)
+        change, padded = np.zeros(SHARED), _NONE
         if self.calibration is not None:
-            change = solution[-1, :SHARED].copy()
+            change = self.calibration.change(solution)
+            padded = self.calibration.padded(change)
         moved = np.empty_like(state.points)
-        substitute(self._linearised(state), steps, change, self._factors, state.points, moved)
+        substitute(self._linearised(state), steps, padded, self._factors, state.points, moved)
         refocus = state.focal  # (0,): there is none
         if self.focal is not None:
             refocus = self.focal.steps(solution)
@@ -311,9 +312,9 @@ class SchurSystem:
         factored = factor_reduced(self.pattern, S, _GAUGE_DAMPING * diagonal)
         for k in np.flatnonzero(self.calibration.unknown):
             b[:] = 0.0
-            b[-1, k] = 1.0
+            b[k // 6 - self.calibration.borders, k % 6] = 1.0
             solution = substitute_reduced(self.pattern, S, b) if factored else None
-            covariance[:, k] = np.inf if solution is None else solution[-1, :SHARED]
+            covariance[:, k] = np.inf if solution is None else self.calibration.change(solution)
         return covariance
 
     def gain_of_focal(self) -> tuple[float, F64]:
@@ -326,10 +327,14 @@ class SchurSystem:
         gain, solution = self._gain_of(unknowns)
         return gain, self.focal.steps(solution)
 
-    def gain_of_principal_point(self) -> float:
-        """As ``gain_of_focal``, px^2, for the principal point that all cameras share."""
+    def gain_of_shared(self, some: slice) -> float:
+        """As ``gain_of_focal``, px^2, for some of the unknowns (SHARED,) that all cameras share."""
+        assert self.calibration is not None
         unknowns = np.zeros((len(self.pattern.start) - 1, 6), np.bool_)
-        unknowns[-1, 4:SHARED] = True
+        chosen = np.zeros(SHARED)
+        chosen[some] = 1.0
+        borders = self.calibration.borders
+        unknowns[-borders:] = self.calibration.padded(chosen).reshape(-1, 6) > 0.0
         return self._gain_of(unknowns)[0]
 
     def _gain_of(self, unknowns: BoolArray) -> tuple[float, F64]:
@@ -359,17 +364,22 @@ class SchurSystem:
             self._linearised(state), damping, system, self._scratch, self._factors
         )  # fmt: skip
         at, normal = self._position[self._moving], self.normal[self._moving]
-        S[pattern.start[at, None], 6 * LOWER6[0] + LOWER6[1]] += normal[:, :21]
+        S[pattern.start[at, None], 6 * LOWER[0] + LOWER[1]] += normal[:, :21]
         b[at] += normal[:, 21:]
-        diagonal[at] = normal[:, np.flatnonzero(LOWER6[0] == LOWER6[1])]
+        diagonal[at] = normal[:, np.flatnonzero(LOWER[0] == LOWER[1])]
         if self.calibration is not None:
-            shared, prior = self.shared, self.calibration.precision
-            own = shared.own + np.diag(prior)
-            S[pattern.start[-2], 6 * LOWER[0] + LOWER[1]] += own[LOWER]
-            S[pattern.block[-1, at], : 6 * SHARED] += shared.cameras[self._moving]
-            departure = state.calibration - self.calibration.given
-            b[-1, :SHARED] += shared.gradient - prior * departure
-            diagonal[-1, :SHARED] = np.diag(own)
+            shared, known = self.shared, self.calibration
+            own = shared.own + np.diag(known.padded(known.precision))
+            cross = shared.cameras[self._moving]
+            first = N - known.borders
+            for r in range(known.borders):
+                for c in range(r + 1):
+                    block = own[6 * r : 6 * r + 6, 6 * c : 6 * c + 6]
+                    S[pattern.block[first + r, first + c]] += block.ravel()
+                S[pattern.block[first + r, at]] += cross[:, 36 * r : 36 * r + 36]
+            pull = known.precision * (state.calibration - known.given)
+            b[-known.borders :] += (shared.gradient - known.padded(pull)).reshape(-1, 6)
+            diagonal[-known.borders :] = np.diag(own).reshape(-1, 6)
         if self.focal is not None:
             self.focal.add_to(
                 system, self._linearised(state), self._scratch, self._factors, diagonal, state.focal

@@ -22,12 +22,12 @@ from pliant.algorithms.bundle.calibration import camera_moves
 from pliant.algorithms.bundle.dense_layout import BLOCK
 from pliant.algorithms.bundle.normal_equations import (
     RECORD,
-    SHARED,
     CameraSystem,
     Linearised,
     Scratch,
 )
 from pliant.algorithms.bundle.packed_layout import PackedLayout, Slots
+from pliant.algorithms.bundle.problem import SHARED
 from pliant.algorithms.bundle.projection import Cameras, apply_metric, couple, motion_of, point_rows
 from pliant.algorithms.bundle.reduced import subtract_product3
 from pliant.compiler.kernel import fast_kernel, kernel
@@ -61,7 +61,7 @@ class FocalWalk:
 class FocalBlocks(NamedTuple):
     """The blocks of the focal lengths in one state.
 
-    own: (M, SHARED) of each z and the shared calibration; the first is its own H_zz, too.
+    own: (M, 6 R) of each z and the shared calibration; the first is its own H_zz, too.
     gradient: (M,) -g_z.   cameras: (M, 6) H_zc.   points: (O + 1, 3) H_zp of each place.
     """
 
@@ -120,8 +120,9 @@ class VaryingFocal:
         calibration.
         """
         layout, M = self.layout, len(self.start)
+        width = 6 * (1 + int(unknown[6]))
         blocks = FocalBlocks(
-            np.zeros((M, SHARED)), np.zeros(M), np.zeros((M, 6)), np.zeros((len(records), 3))
+            np.zeros((M, width)), np.zeros(M), np.zeros((M, 6)), np.zeros((len(records), 3))
         )
         _add_focal(cameras, layout.slots, layout.flow, unknown, principal, records, blocks)
         self._blocks = blocks
@@ -266,15 +267,19 @@ def eliminate_focal(
             U[a, 12], U[a, 13], U[a, 14], U[a, 15], U[a, 16], U[a, 17] = couple(x, y, iz, a2, c2)
             rows[a] = free[m]
             count += 1
-        for q in range(SHARED):
+        borders = shared.shape[1] // 18
+        for q in range(6 * borders):
             e0 = shared[n, 3 * q] * i00
             e1 = (shared[n, 3 * q + 1] - l10 * e0) * i11
             e2 = (shared[n, 3 * q + 2] - l20 * e0 - l21 * e1) * i22
-            U[count, q], U[count, 6 + q], U[count, 12 + q] = e0, e1, e2
-        rows[count] = b.shape[0] - 1
+            a, r = count + q // 6, q % 6
+            U[a, r], U[a, 6 + r], U[a, 12 + r] = e0, e1, e2
+        for border in range(borders):
+            rows[count] = b.shape[0] - borders + border
+            count += 1
         for first in range(focal):
             f, row = np.uintp(first), rows[first]
-            for second in range(first, count + 1):
+            for second in range(first, count):
                 c = np.uintp(second)
                 if row >= rows[c]:
                     subtract_product3(S, np.uintp(block[row, rows[c]]), U, f, c)
@@ -294,7 +299,7 @@ def _assemble(
 ) -> None:
     """Add the focal lengths' own blocks of H, and their prior."""
     free, block, S, b = system.position, system.block, system.S, system.b
-    last = b.shape[0] - 1
+    first = b.shape[0] - blocks.own.shape[1] // 6
     for m in range(pull.size):
         at, r = position[m // PER_BLOCK], m % PER_BLOCK
         own = blocks.own[m, 0] + spread[m]
@@ -305,8 +310,8 @@ def _assemble(
         S[block[at, at], 7 * r] += own
         diagonal[at, r] = own
         b[at, r] += blocks.gradient[m] + pull[m]
-        for q in range(SHARED):
-            S[block[last, at], 6 * q + r] += blocks.own[m, q]
+        for q in range(blocks.own.shape[1]):
+            S[block[first + q // 6, at], 6 * (q % 6) + r] += blocks.own[m, q]
         camera = free[m]
         for k in range(6 if camera >= 0 else 0):
             if at > camera:

@@ -23,8 +23,8 @@ from pliant.algorithms.bundle.problem import (
 )
 from pliant.algorithms.bundle.schur import system_at
 from pliant.algorithms.bundle.varying_focal import FocalWalk
+from pliant.algorithms.mapping.held_unknowns import PRINCIPAL_POINT, freed
 from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.principal_point import with_principal_point
 
 RATE = 0.05
 """Standard deviation of the log focal length after a second: weak compared with the keyframes."""
@@ -109,7 +109,7 @@ def evidence_of_change(
     if M < 3 or variance == 0.0:
         return Evidence(0.0, np.zeros(M), gaps)
     # A common error of the given focal length is no change.
-    wide = with_principal_point(uncertainty)
+    wide = freed(uncertainty, PRINCIPAL_POINT)
     wide = wide.model_copy(update={"focal": max(wide.focal, SPREAD)})
     walk = walk_from(np.zeros(M), gaps)
     gain, step = system_at(problem, found, parameters, wide, walk).gain_of_focal()

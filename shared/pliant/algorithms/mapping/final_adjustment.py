@@ -17,15 +17,12 @@ from pliant.algorithms.geometry import inverse, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.mapping.changing_focal import evidence_of_change, gaps_s, walk_from
 from pliant.algorithms.mapping.focal_search import best_along_focal
+from pliant.algorithms.mapping.held_unknowns import PRINCIPAL_POINT, contradicted, freed
 from pliant.algorithms.mapping.inverse_depth import at_infinity
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
 from pliant.algorithms.mapping.observation_table import list_errors, weigh
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.principal_point import (
-    contradicts_principal_point,
-    with_principal_point,
-)
 from pliant.algorithms.mapping.rolling_shutter import readout_flow
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.triangulation import spread_of_rays
@@ -233,8 +230,8 @@ def adjust_list(
     """Adjust all but the first keyframe, all landmarks of two keyframes, and the calibration.
 
     ``seen`` is changed, except for its observations, which are pixels of the rectified image.
-    known: of the camera.   start: (6,) initial correction of the calibration.   varying: the focal
-    length may change between keyframes, see ``changing_focal``.
+    known: of the camera.   start: (SHARED,) initial correction of the calibration.   varying: the
+    focal length may change between keyframes, see ``changing_focal``.
     """
     counts = np.bincount(seen.point, minlength=len(seen.rows))
     chosen = counts >= 2
@@ -251,12 +248,12 @@ def adjust_list(
     )  # fmt: skip
     found = solve()
     if varying and uncertainty is not None:
-        if contradicts_principal_point(problem, found, bundle, uncertainty):
-            uncertainty = with_principal_point(uncertainty)
+        if wrong := contradicted(problem, found, bundle, uncertainty):
+            uncertainty = freed(uncertainty, *wrong)
             found = solve(uncertainty=uncertainty, start=found.correction)
         evidence = evidence_of_change(problem, found, bundle, uncertainty, seen.gaps_s)
         if known.changes or evidence.calls_for_more:
-            wide = with_principal_point(uncertainty)
+            wide = freed(uncertainty, PRINCIPAL_POINT)
             other = solve(walk=walk_from(seen.log_focal, seen.gaps_s), uncertainty=wide)
             confirmed = evidence.confirmed_by(other.log_focal, known=known.changes)
             found = other if confirmed else found

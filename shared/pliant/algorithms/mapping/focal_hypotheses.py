@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.bundle.problem import BundleProblem, BundleResult, shared_intrinsics
+from pliant.algorithms.bundle.problem import SHARED, BundleProblem, BundleResult, shared_intrinsics
 from pliant.algorithms.bundle.schur import solve_schur
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.mapping.backfill import backfill
 from pliant.algorithms.mapping.first_map import BufferedFrame, Start
+from pliant.algorithms.mapping.held_unknowns import ASPECT, PRINCIPAL_POINT
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.self_calibration import GROWTH, SelfCalibration, is_guess
 from pliant.algorithms.mapping.start import find_start, waits_long, why_no_start
@@ -46,7 +47,7 @@ def _find_start_of_guess(
     wrong one.
     """
     sigma = parameters.calibration.focal
-    tried = [known.correction + k * sigma * np.eye(6)[0] for k in _HYPOTHESES]
+    tried = [known.correction + k * sigma * np.eye(SHARED)[0] for k in _HYPOTHESES]
     cameras = [corrected_view(known.given, tuple(each.tolist())).camera for each in tried]
     reason = why_no_start(waiting, known.view.camera, parameters)
     if reason:
@@ -84,6 +85,6 @@ def _refine(start: Start, camera: PinholeCamera, parameters: MappingParameters) 
         intrinsics=shared_intrinsics(camera, count),
         fixed_cameras=np.arange(count) == 0,
     )
-    held = {"k1": 0.0, "k2": 0.0, "readout": 0.0, "principal_point": 0.0}
+    held = {"k1": 0.0, "k2": 0.0, "readout": 0.0, PRINCIPAL_POINT: 0.0, ASPECT: 0.0}
     uncertainty = parameters.calibration.model_copy(update=held)
     return solve_schur(problem, parameters.bundle, uncertainty=uncertainty)

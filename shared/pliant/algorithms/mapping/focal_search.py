@@ -30,9 +30,9 @@ def best_along_focal(
     uncertainty: CalibrationUncertainty,
     start: F64,
 ) -> tuple[BundleProblem, F64]:
-    """Return the problem and the correction (6,) from which to adjust with a free focal length.
+    """Return problem and correction (SHARED,) from which to adjust with a free focal length.
 
-    start: (6,) correction that the problem's poses and landmarks were made with.
+    start: (SHARED,) correction that the problem's poses and landmarks were made with.
     """
     held = uncertainty.model_copy(update={"focal": 0.0})
 

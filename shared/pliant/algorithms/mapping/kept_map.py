@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, I32, I64, U8, check_arrays
+from pliant.algorithms.bundle.problem import SHARED
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view, moved_px
 from pliant.algorithms.kept_keyframe import KeptKeyframe
@@ -54,6 +55,8 @@ def check(kept: KeptKeyframe) -> None:
     real = (kept.given, kept.correction, kept.T_world_camera, kept.motion, kept.points_world)
     if not all(np.isfinite(each).all() for each in (*real, kept.seen_px, kept.corners_px)):
         raise ValueError("non-finite values")
+    if kept.correction.shape != (SHARED,):
+        raise ValueError(f"a correction of {len(kept.correction)} values")
     if kept.given[:2].max() > _LONGEST_SIDE_PX:
         raise ValueError("an invalid camera")
     R, last = kept.T_world_camera[:3, :3], kept.T_world_camera[3]

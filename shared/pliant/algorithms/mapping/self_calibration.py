@@ -10,12 +10,12 @@ import dataclasses
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.bundle.problem import CalibrationUncertainty
+from pliant.algorithms.bundle.problem import SHARED, CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.mapping.held_unknowns import ASPECT, PRINCIPAL_POINT, freed, freed_as
 from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.principal_point import PRINCIPAL_POINT, with_principal_point
 from pliant.algorithms.tracks import FrameExtrema
 
 _GUESS = 0.05
@@ -24,7 +24,7 @@ _GUESS = 0.05
 _LENS = 0.1
 """Standard deviations of k1 and k2 of an unknown camera."""
 
-_OF_LENS = np.arange(6) != 3
+_OF_LENS = np.arange(SHARED) != 3
 """Which unknowns of a correction move pixels: all but the readout."""
 
 _CERTAIN = 4.0
@@ -50,7 +50,7 @@ class SelfCalibration:
     """The current estimate of a camera's calibration.
 
     given: the given camera of the rectified images.
-    correction: (6,) of it, see ``solve_schur``.   covariance: (6, 6) of that.
+    correction: (SHARED,) of it, see ``solve_schur``.   covariance: (SHARED, SHARED) of that.
     next_keyframes: the number of keyframes at which the calibration is estimated again.
     changes: whether the focal length changes during the clip.   log_focal: of the newest frame
     relative to the correction's: see ``changing_focal``.
@@ -66,11 +66,11 @@ class SelfCalibration:
     @staticmethod
     def of(camera: PinholeCamera, uncertainty: CalibrationUncertainty) -> "SelfCalibration":
         """Return the calibration before any frame."""
-        return SelfCalibration(camera, np.zeros(6), np.diag(uncertainty.sigmas**2))
+        return SelfCalibration(camera, np.zeros(SHARED), np.diag(uncertainty.sigmas**2))
 
     @property
     def sigmas(self) -> F64:
-        """(6,) standard deviations of the correction."""
+        """(SHARED,) standard deviations of the correction."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     def k_sigmas(self, given: CalibrationUncertainty) -> tuple[float, float]:
@@ -103,36 +103,30 @@ class SelfCalibration:
 
     @property
     def in_use(self) -> F64:
-        """(6,) the correction in use for mapping."""
+        """(SHARED,) the correction in use for mapping."""
         correction = self.correction.copy()
         correction[3] = self.readout
         return correction
 
     def is_refuted(self, correction: F64, covariance: F64, given: CalibrationUncertainty) -> bool:
-        """Whether an estimated correction (6,) with its covariance (6, 6) differs significantly
+        """Whether an estimated correction (SHARED,) with its covariance differs significantly
         from the lens in use, and is unlikely under the given uncertainty.
         """
         far = _is_far(correction - self.correction, covariance, _CERTAIN)
-        believed = with_principal_point(given)
+        believed = freed(given, PRINCIPAL_POINT, ASPECT)
         return far and _is_far(correction, np.diag(believed.sigmas**2), _UNLIKELY)
 
     def prior(self, given: CalibrationUncertainty, start: F64) -> CalibrationUncertainty:
-        """The prior of an adjustment from a correction (6,) towards the given calibration:
-        negligible once that is refuted.
+        """The prior of an adjustment from a correction (SHARED,) towards the given
+        calibration: negligible once that is refuted.
         """
         wider: dict[str, float] = {}
         if given.readout > 0.0 and start[3]:
             wider["readout"] = max(given.readout, _ROLLING)
-        if start[4:].any():
-            given = with_principal_point(given)
-        nothing = dataclasses.replace(self, correction=np.zeros(6))
+        given = freed_as(given, start)
+        nothing = dataclasses.replace(self, correction=np.zeros(SHARED))
         if nothing.is_refuted(self.correction, self.covariance, given):
-            widths = {
-                "focal": _GUESS,
-                "k1": _LENS,
-                "k2": _LENS,
-                "principal_point": PRINCIPAL_POINT,
-            }
+            widths = {"focal": _GUESS, "k1": _LENS, "k2": _LENS}
             known = given.model_dump()
             wider |= {k: max(known[k], width) for k, width in widths.items() if known[k] > 0.0}
         return given.model_copy(update=wider)
@@ -217,7 +211,7 @@ def widened(parameters: MappingParameters, focal_sigma: float) -> MappingParamet
     wider: dict[str, float] = {"focal": focal_sigma}
     if focal_sigma > _GUESS:
         wider |= {"k1": max(prior.k1, _LENS), "k2": max(prior.k2, _LENS)}
-        wider["principal_point"] = max(prior.principal_point, PRINCIPAL_POINT)
+        prior = freed(prior, PRINCIPAL_POINT)
     return parameters.model_copy(update={"calibration": prior.model_copy(update=wider)})
 
 
