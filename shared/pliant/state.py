@@ -32,7 +32,7 @@ _ROOMS = (
 _CLASSES = {
     *("ExtremaTracker", "BriefExtractor", "Mapper", "BootstrapMapper", "Localiser", "Atlas"),
     *("ActiveMap", "EarlierSegments", "Landmarks", "TrackLinks", "Window", "FramePoses"),
-    *("MapChanges", "KeyframeChanges"),
+    "Journal",
     *("SurfelTracker", "MapDepth", "CurrentMap", "_PointTable"),
 }
 """Those that are no records: neither dataclasses, nor named tuples, nor parameters."""

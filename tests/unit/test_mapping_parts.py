@@ -58,7 +58,6 @@ def test_rows_grow_and_keep_what_they_hold():
     more = points.allocate(5000)
     np.testing.assert_array_equal(points.xyz[:10], np.arange(30).reshape(10, 3))
     assert not points.xyz[more].any()
-    assert np.isnan(points.published_xyz[more]).all()
     assert (points.alias[more] == more).all()
 
 
@@ -66,15 +65,13 @@ def test_of_a_row_merged_twice_the_last_holds_and_it_goes_once():
     points = Landmarks()
     rows = points.allocate(4)
     points.promote(rows)
-    points.published_xyz[rows] = 0.0
-    points.published_sigmas[rows] = 1.0
     points.first_keyframe[rows] = [5, 3, 9, 1]
     points.merge(rows[[1, 0, 1]], rows[[2, 3, 0]])
     assert points.alias[rows].tolist() == [3, 0, 2, 3]
     assert points.state[rows].tolist() == [MERGED, MERGED, MAPPED, MAPPED]
-    assert points.take_removed().tolist() == [0, 1]
+    gone, ids = points.take_removed()
+    assert sorted(zip(gone.tolist(), ids.tolist())) == [(0, 0), (1, 1)]
     assert points.first_keyframe[rows].tolist() == [3, 3, 3, 1]
-    assert np.isnan(points.published_sigmas[rows]).tolist() == [True, False, True, False]
 
 
 def test_observations_of_merged_rows_become_one():

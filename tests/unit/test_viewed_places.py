@@ -9,9 +9,9 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import matrix_to_pose
 from pliant.algorithms.map_delta import TRACKING, MapDelta, MapMoves
+from pliant.algorithms.mapping.journal import Journal, Outcome
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.landmarks import Landmarks
-from pliant.algorithms.mapping.publication import MapChanges
 from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.types import Header, MapUpdate
@@ -53,11 +53,9 @@ def keyframe(number: int, segment: int, x: float) -> Keyframe:
     )  # fmt: skip
 
 
-def update(changes: MapChanges, segment: int, keyframes: list[Keyframe], **others: Any) -> MapDelta:
-    delta = changes.publish(
-        state=TRACKING, reason="", segment=segment, inliers=99, keyframes=keyframes,
-        points=Landmarks(), rows=np.zeros(0, np.int32), centre=np.zeros(3), snapshot=True,
-    )  # fmt: skip
+def update(changes: Journal, segment: int, keyframes: list[Keyframe], **others: Any) -> MapDelta:
+    changes.add_changed(keyframes, np.zeros(0, np.int32))
+    delta = changes.publish(Outcome(TRACKING, "", 99, segment, np.zeros(3), snapshot=True))
     return replace(delta, **others)
 
 
@@ -75,7 +73,7 @@ class Viewed:
 
 
 def test_a_viewer_shows_a_loop_as_it_closes_and_moves_it_with_the_map() -> None:
-    viewed, changes = Viewed(), MapChanges()
+    viewed, changes = Viewed(), Journal(Landmarks())
     keyframes = [keyframe(k, 0, float(k)) for k in range(4)]
     viewed.take(update(changes, 0, keyframes), 30)
     assert not viewed.drawn.lines
@@ -100,7 +98,7 @@ def test_a_viewer_shows_a_loop_as_it_closes_and_moves_it_with_the_map() -> None:
 
 
 def test_a_viewer_says_where_a_lost_camera_is_recognised() -> None:
-    viewed, changes = Viewed(), MapChanges()
+    viewed, changes = Viewed(), Journal(Landmarks())
     viewed.take(update(changes, 0, [keyframe(k, 0, float(k)) for k in range(3)]), 20)
     changes.add_same_places([(1, 5)])
     viewed.take(update(changes, 0, [keyframe(5, 0, 1.5)]), 50)
@@ -113,7 +111,7 @@ def test_a_viewer_says_where_a_lost_camera_is_recognised() -> None:
 
 
 def test_a_viewer_shows_what_joins_two_segments_once() -> None:
-    viewed, changes = Viewed(), MapChanges()
+    viewed, changes = Viewed(), Journal(Landmarks())
     viewed.take(update(changes, 0, [keyframe(0, 0, 0.0)]), 0)
     viewed.take(update(changes, 1, [keyframe(7, 1, 7.0)]), 70)
     changes.join(1, 0)
@@ -127,7 +125,7 @@ def test_a_viewer_shows_what_joins_two_segments_once() -> None:
 
 
 def test_results_have_the_places_and_the_page_draws_them() -> None:
-    history, changes = MapHistory(), MapChanges()
+    history, changes = MapHistory(), Journal(Landmarks())
     history.apply(update(changes, 0, [keyframe(0, 0, 0.0)]), frame=0, stamp_ns=0)
     changes.add_same_places([(0, 4), (0, -1)])
     history.apply(update(changes, 0, [keyframe(4, 0, 4.0)]), frame=40, stamp_ns=40)

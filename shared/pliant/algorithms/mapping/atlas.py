@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, U8
+from pliant.algorithms.arrays import F32, F64, I64, U8
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapMoves
@@ -23,6 +23,7 @@ from pliant.algorithms.mapping.first_map import BufferedFrame, Start
 from pliant.algorithms.mapping.frame import IdealFrame
 from pliant.algorithms.mapping.frame_focal import refocused
 from pliant.algorithms.mapping.global_adjustment import AdjustmentResult, GlobalAdjustment, held
+from pliant.algorithms.mapping.journal import Journal
 from pliant.algorithms.mapping.kept_map import Origin, keep, spans_of, take_in
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.known_places import KnownPlaces, SegmentMerges, join
@@ -360,21 +361,17 @@ class Atlas:
             moved.append(self._adjust(active))
         return moved
 
-    def take_changed(self, *, everything: bool) -> tuple[list[Keyframe], I32]:
-        """Return the keyframes, and rows of the landmarks, that may need to be published.
+    def note_changed(self, journal: Journal, *, everything: bool) -> None:
+        """Tell the journal which keyframes and landmarks may need to be published.
 
         everything: all landmarks of the window, not only the new ones of the last frame.
         """
         adjusted, self._adjusted = self._adjusted, False
-        keyframes: list[Keyframe] = []
-        rows = np.zeros(0, np.int32)
         if self.active is not None and adjusted:
-            keyframes, rows = self.active.keyframes, self.active.segment.mapped_rows()
+            journal.add_changed(self.active.keyframes, self.active.segment.mapped_rows())
         elif self.active is not None:
             window = self.active.window
-            keyframes = window.keyframes
-            rows = window.rows if everything else self.points.unpublished(window.current_rows())
+            rows = window.rows if everything else journal.unpublished(window.current_rows())
+            journal.add_changed(window.keyframes, rows)
         for earlier in self._earlier.adjusted:
-            keyframes = [*keyframes, *earlier.keyframes]
-            rows = np.concatenate([rows, earlier.mapped_rows()])
-        return keyframes, rows
+            journal.add_changed(earlier.keyframes, earlier.mapped_rows())

@@ -6,9 +6,8 @@ the focal length is certain, or no more frames can wait, the map begins again wi
 with the estimated camera.
 """
 
-import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +17,9 @@ from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDel
 from pliant.algorithms.mapping.first_map import keep_newest
 from pliant.algorithms.mapping.frame import Frame
 from pliant.algorithms.mapping.global_adjustment import GlobalAdjustment
+from pliant.algorithms.mapping.journal import Journal, Outcome
 from pliant.algorithms.mapping.kept_map import known_camera
+from pliant.algorithms.mapping.landmarks import Landmarks
 from pliant.algorithms.mapping.localiser import Localiser
 from pliant.algorithms.mapping.mapper import Mapper
 from pliant.algorithms.mapping.parameters import MappingParameters
@@ -45,7 +46,6 @@ class BootstrapMapper:
     """A mapper that waits for its calibration, with the interface of ``Mapper``.
 
     mapper: the trial, or the final one.    taken: during the trial, the newest frames.
-    first: the first of them that the trial gave a pose.
     """
 
     def __init__(
@@ -61,38 +61,35 @@ class BootstrapMapper:
         self._mapper = Mapper(camera, parameters, seed)
         self._taken: list[_Taken] = []
         self._on_trial = True
-        self._first: int | None = None
 
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
         """As ``Mapper.process``."""
-        delta = self._mapper.process(frame, timer)
         if not self._on_trial:
-            return delta
-        taken = _Taken(frame)
+            return self._mapper.process(frame, timer)
+        outcome = self._mapper.take(frame, timer)
+        taken, first = _Taken(frame), self._first
         kept = keep_newest(self._taken, taken, self._anew[1].start)
         uncertain = float(self._mapper.calibration.sigmas[0])
-        if delta.state == TRACKING:
-            if self._first is None:
-                self._first = int(delta.pose_frames.min())
-            if uncertain < _KNOWN or kept[0].frame.number > self._first:
-                self._taken.append(taken)
-                return self._begin(timer)
+        ready = first is not None and (uncertain < _KNOWN or kept[0].frame.number > first)
+        if ready and outcome.state == TRACKING:
+            self._taken.append(taken)
+            outcome = self._map_all_taken(timer)
+            return self._mapper.publish(outcome)  # of another mapper by now
         self._taken = kept
-        reason = delta.reason or f"the focal length is known to {100.0 * uncertain:.1f} %"
-        return _nothing(delta, reason)
+        reason = outcome.reason or f"the focal length is known to {100.0 * uncertain:.1f} %"
+        return _nothing(reason)
 
     def only_localise(self, frame: Frame, otherwise: str) -> MapDelta:
         """As ``Mapper.only_localise``; a trial continues until the next mapped frame."""
-        delta = self._mapper.only_localise(frame, otherwise)
         if not self._on_trial:
-            return delta
+            return self._mapper.only_localise(frame, otherwise)
+        self._mapper.take_tracks(frame, otherwise)
         self._taken.append(_Taken(frame, is_mapped=False))
-        return _nothing(delta, otherwise)
+        return _nothing(otherwise)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
         """As ``Mapper.skip``."""
-        delta = self._mapper.skip(frame, reason)
-        return _nothing(delta, reason) if self._on_trial else delta
+        return _nothing(reason) if self._on_trial else self._mapper.skip(frame, reason)
 
     @property
     def waiting_frames(self) -> list[int]:
@@ -118,10 +115,9 @@ class BootstrapMapper:
 
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """As ``Mapper.finish``; a trial still running ends first."""
-        begins = self._on_trial and (self._first is not None or self._mapper.start_at_last())
-        begun = self._begin(no_stages) if begins else None
-        final = self._mapper.finish(timer)
-        return final if begun is None else _joined([begun, final])
+        if self._on_trial and (self._first is not None or self._mapper.start_at_last()):
+            self._map_all_taken(no_stages)
+        return self._mapper.finish(timer)
 
     def kept(self) -> Iterator[KeptKeyframe]:
         """As ``Mapper.kept``; the loaded map if the trial found none."""
@@ -130,24 +126,28 @@ class BootstrapMapper:
     def publish_keyframes(self) -> KeyframeDelta:
         """As ``Mapper.publish_keyframes``."""
         if self._on_trial:
-            return Mapper(*self._anew).publish_keyframes()
+            return Journal(Landmarks()).publish_keyframes(None, self._mapper.calibration)
         return self._mapper.publish_keyframes()
 
-    def _begin(self, timer: StageTimer) -> MapDelta:
-        """Map all waiting frames with the camera that the trial has estimated."""
+    @property
+    def _first(self) -> int | None:
+        """The first frame that the trial gave a pose."""
+        return self._mapper.journal.first_frame
+
+    def _map_all_taken(self, timer: StageTimer) -> Outcome:
+        """Map all waiting frames with the estimated camera.  Returns the newest outcome."""
         self._mapper = Mapper(*self._anew, calibration=self._mapper.calibration, known=self._known)
         self._on_trial = False
-        deltas: list[MapDelta] = []
-        for taken in self._taken:
-            deltas.append(self._again(taken, timer))
-            self._mapper.atlas.stay()
-        self._taken = []
-        return _joined(deltas)
+        taken, self._taken = self._taken, []
+        return [self._again(each, timer) for each in taken][-1]
 
-    def _again(self, taken: _Taken, timer: StageTimer) -> MapDelta:
+    def _again(self, taken: _Taken, timer: StageTimer) -> Outcome:
         if taken.is_mapped:
-            return self._mapper.process(taken.frame, timer)
-        return self._mapper.only_localise(taken.frame, "")
+            outcome = self._mapper.take(taken.frame, timer)
+        else:
+            outcome = self._mapper.take_tracks(taken.frame, "")
+        self._mapper.atlas.stay()
+        return outcome
 
 
 def mapper_for(
@@ -170,34 +170,6 @@ def mapper_for(
     return Mapper(camera, parameters, seed, known=known)
 
 
-_ARRAYS = [field.name for field in dataclasses.fields(MapDelta) if "Annotated" in str(field.type)]
-_KEYS = {"pose": "pose_frames", "keyframe": "keyframe_ids", "point": "point_ids"}
-"""Key fields of the row arrays, by the prefix of their names."""
-
-
-def _nothing(delta: MapDelta, reason: str) -> MapDelta:
+def _nothing(reason: str) -> MapDelta:
     """The update of a frame on trial."""
-    empty: dict[str, Any] = {name: getattr(delta, name)[:0] for name in _ARRAYS}
-    return dataclasses.replace(
-        delta, state=WAITING, reason=reason, segment=-1, inliers=0, snapshot=False,
-        calibration_correction=(), calibration_sigmas=(), **empty,
-    )  # fmt: skip
-
-
-def _joined(deltas: list[MapDelta]) -> MapDelta:
-    """Combine the changes of a map's first frames; of repeated changes the last counts.
-
-    Landmarks that were removed before publication are left out.
-    """
-    removed = np.concatenate([delta.removed_point_ids for delta in deltas])
-    joined: dict[str, Any] = {"removed_point_ids": removed[:0]}
-    for kind, key in _KEYS.items():
-        ids = np.concatenate([getattr(delta, key) for delta in deltas])
-        _, last = np.unique(ids[::-1], return_index=True)
-        rows = np.sort(len(ids) - 1 - last)
-        if kind == "point":
-            rows = rows[~np.isin(ids[rows], removed)]
-        for name in _ARRAYS:
-            if name.startswith((f"{kind}_", f"{kind}s_")):
-                joined[name] = np.concatenate([getattr(delta, name) for delta in deltas])[rows]
-    return dataclasses.replace(deltas[-1], **joined)
+    return Journal(Landmarks()).publish(Outcome(WAITING, reason, 0, -1, np.zeros(3)))

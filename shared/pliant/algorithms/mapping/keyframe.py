@@ -15,7 +15,6 @@ class Keyframe:
 
     rows: (n,) rows of landmarks or candidates, each at most once.    points_px: (n, 2).
     rolled_px: (n, 2) rolling-shutter offset that was removed, see ``rolling_shutter``.
-    published_pose: T_world_camera when last published.
     is_pure_rotation: it has the position of the last one: a pure rotation determines no depths, and
     its pose depends on all its observations when it was made.
     stamp_ns: capture time; -1: unknown.   log_focal: its focal length relative to the calibration,
@@ -34,7 +33,6 @@ class Keyframe:
     is_pure_rotation: bool = False
     stamp_ns: int = -1
     log_focal: float = 0.0
-    published_pose: F64 | None = None
     focus: F64 | None = None
 
     def keep(self, mask: BoolArray) -> None:

@@ -30,8 +30,7 @@ class Landmarks:
     alias: the row that a MERGED one stands for; itself otherwise.
     xyz: world position of landmarks, and the provisional one of candidates.
     spread: (3,) depth sigma along the ray, see ``inverse_depth``; 0 for landmarks, NaN for
-    candidates without a position.    published_xyz: as last published, NaN before.
-    published_sigmas: ``sigmas`` when last published.    segment: of the map.
+    candidates without a position.    segment: of the map.
     first_keyframe: keyframe id of the first observation.
     keyframes, parallax_rad, sigmas: as MapDelta defines them.
     base_keyframes, base_parallax_rad: the part of these from keyframes outside the window.
@@ -49,8 +48,6 @@ class Landmarks:
         self.segment: I32 = np.zeros(1024, np.int32)
         self.xyz: F64 = np.zeros((1024, 3))
         self.spread: F64 = np.zeros((1024, 3))
-        self.published_xyz: F64 = np.zeros((1024, 3))
-        self.published_sigmas: F32 = np.zeros(1024, np.float32)
         self.colours: U8 = np.zeros((1024, 3), np.uint8)
         self.first_keyframe: I32 = np.zeros(1024, np.int32)
         self.base_keyframes: I32 = np.zeros(1024, np.int32)
@@ -67,7 +64,7 @@ class Landmarks:
         """Points of the map that were published and are not kept any more."""
         self._free: I32 = np.zeros(0, np.int32)
         self._next_id = 0
-        self._removed: list[I64] = []
+        self._removed: list[tuple[I32, I64]] = []
 
     def allocate(self, count: int, *, segment: int = 0, keyframe: int = 0) -> I32:
         """Return rows of ``count`` new candidates, cleared.   keyframe: id of the first that sees
@@ -90,8 +87,6 @@ class Landmarks:
         self.ids[rows] = -1
         self.alias[rows] = rows
         self.spread[rows] = np.nan
-        self.published_xyz[rows] = np.nan
-        self.published_sigmas[rows] = np.nan
         self.segment[rows] = segment
         self.first_keyframe[rows] = keyframe
         return rows
@@ -124,9 +119,8 @@ class Landmarks:
         self.ids[rows] = kept.point_ids
         self.segment[rows] = kept.segment
         self.first_keyframe[rows] = kept.id
-        self.xyz[rows] = self.published_xyz[rows] = kept.points_world
+        self.xyz[rows] = kept.points_world
         self.spread[rows] = 0.0
-        self.published_sigmas[rows] = np.nan  # published again once this session observes them
         self.colours[rows] = kept.point_colours
         self.keyframes[rows] = self.base_keyframes[rows] = kept.point_keyframes
         self.parallax_rad[rows] = self.base_parallax_rad[rows] = kept.point_parallax_rad
@@ -139,21 +133,11 @@ class Landmarks:
         self.xyz[rows] = xyz
 
     def move(self, segment: int, moves: MapMoves) -> None:
-        """Move a segment, including its published positions."""
+        """Move a segment."""
         rows = self.used(segment)
         S = moves.matrices(self.first_keyframe[rows].astype(np.int64))
         self.xyz[rows] = transform_each(S, self.xyz[rows])
-        self.published_xyz[rows] = transform_each(S, self.published_xyz[rows])
         self.spread[rows] = (S[:, :3, :3] @ self.spread[rows][:, :, None])[:, :, 0]
-
-    def move_published(self, rows: I32, moves: MapMoves) -> None:
-        """Record a published motion of adjusted landmarks."""
-        hosts = self.first_keyframe[rows].astype(np.int64)
-        self.published_xyz[rows] = moves.points(self.published_xyz[rows], hosts)
-
-    def unpublished(self, rows: I32) -> I32:
-        """Return the rows that were never published."""
-        return rows[np.isnan(self.published_sigmas[rows])]
 
     def promote(self, rows: I32) -> None:
         """Turn candidates into landmarks, with ids in the given order."""
@@ -164,29 +148,25 @@ class Landmarks:
 
     def merge(self, old: I32, new: I32) -> None:
         """Merge rows into others, none of which is merged; of a row named twice the last counts."""
-        self._note_removed(np.unique(old[self.state[old] == MAPPED]))
+        gone = np.unique(old[self.state[old] == MAPPED])
+        self._removed.append((gone, self.ids[gone]))
         self.state[old] = MERGED
         self.alias[old] = new
         older = self.first_keyframe[old] < self.first_keyframe[new]
         self.first_keyframe[new[older]] = self.first_keyframe[old[older]]
-        self.published_sigmas[new[older]] = np.nan  # publish their new reference keyframe
 
     def remove(self, rows: I32) -> None:
         """Remove landmarks.  They may return as candidates while their tracks live."""
-        self._note_removed(rows)
+        self._removed.append((rows, self.ids[rows]))
         self.state[rows] = CANDIDATE
         self.ids[rows] = -1
-        self.published_xyz[rows] = np.nan
-        self.published_sigmas[rows] = np.nan
 
-    def _note_removed(self, rows: I32) -> None:
-        """Record removed landmarks that were published."""
-        self._removed.append(self.ids[rows[np.isfinite(self.published_xyz[rows, 0])]])
-
-    def take_removed(self) -> I64:
-        """Return the ids of the landmarks removed since the last call."""
-        removed, self._removed = self._removed, []
-        return np.concatenate([*removed, np.zeros(0, np.int64)])
+    def take_removed(self) -> tuple[I32, I64]:
+        """Return rows and ids of the landmarks removed since the last call."""
+        removed = [(np.zeros(0, np.int32), np.zeros(0, np.int64)), *self._removed]
+        self._removed = []
+        rows, ids = zip(*removed)
+        return np.concatenate(rows), np.concatenate(ids)
 
     def go_on_after(self, last_id: int) -> None:
         """Reserve the ids up to this one for another map."""

@@ -19,6 +19,7 @@ from pliant.algorithms.mapping.active_map import ActiveMap
 from pliant.algorithms.mapping.frame import Frame, IdealFrame, PlacedFrame
 from pliant.algorithms.mapping.frame_pose import localise, reacquire_points, to_global_shutter
 from pliant.algorithms.mapping.global_adjustment import GlobalAdjustment
+from pliant.algorithms.mapping.journal import Journal, Outcome
 from pliant.algorithms.mapping.kept_map import known_camera, take_in
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.known_places import KnownPlaces
@@ -27,7 +28,6 @@ from pliant.algorithms.mapping.localisation import Motion
 from pliant.algorithms.mapping.observation_table import reprojection_errors
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.pose_quality import support_of, why_doubtful
-from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import Recognised, is_same_pose
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.mapping.tracked_pose import pose_by_tracks
@@ -59,7 +59,7 @@ class Localiser:
         self.global_adjustment = GlobalAdjustment()
         self._generator = np.random.default_rng(seed)
         self._points = Landmarks()
-        self._changes = MapChanges()
+        self._journal = Journal(self._points)
         self._places = KnownPlaces()
         self._segments = take_in(known, self._points, self.calibration)
         self._places.know(known, self.calibration)
@@ -84,7 +84,7 @@ class Localiser:
             return self._publish(LOST, f"lost: {inliers} points of the map are seen", 0)
         if self._motion is None:
             self._motion = Motion.at(frame.number, frame.stamp_ns, placed.T_world_camera)
-            self._changes.add_same_places([(self._reference.id, -1)])
+            self._journal.add_same_places([(self._reference.id, -1)])
         else:
             tracked = placed.support.tracked
             self._motion = self._motion.then(
@@ -144,7 +144,7 @@ class Localiser:
 
     def publish_keyframes(self) -> KeyframeDelta:
         """There are no new keyframes."""
-        return KeyframeChanges(self._points).publish(None, self.calibration)
+        return self._journal.publish_keyframes(None, self.calibration)
 
     def _locate(self, frame: IdealFrame, timer: StageTimer) -> F64 | None:
         there = None
@@ -211,7 +211,7 @@ class Localiser:
         self, reference: Keyframe, placed: PlacedFrame, *, has_activated: bool = False
     ) -> MapDelta:
         support = placed.support
-        self._changes.add_pose(
+        self._journal.add_pose(
             placed.frame.number, reference, placed.T_world_camera, support.inliers
         )
         why = why_doubtful(support, self._parameters.support)
@@ -221,18 +221,12 @@ class Localiser:
         self, state: int, reason: str, inliers: int, *, has_activated: bool = False
     ) -> MapDelta:
         active, reference = self._map, self._reference
-        rows = np.zeros(0, np.int32)
-        if active is not None and has_activated:
-            rows = active.nearby()
-        delta = self._changes.publish(
-            state=state,
-            reason=reason,
-            segment=-1 if active is None else active.segment.id,
-            inliers=inliers,
-            keyframes=[] if reference is None else [reference],
-            points=self._points,
-            rows=rows,
-            centre=self._activated_from[:3, 3].copy(),
-            snapshot=False,
+        self._journal.add_changed(
+            [] if reference is None else [reference],
+            active.nearby() if active is not None and has_activated else np.zeros(0, np.int32),
         )
-        return self.calibration.published_with(delta)
+        self._points.take_removed()  # readers keep merged landmarks: the map does not change
+        segment = -1 if active is None else active.segment.id
+        centre = self._activated_from[:3, 3].copy()
+        outcome = Outcome(state, reason, inliers, segment, centre)
+        return self.calibration.published_with(self._journal.publish(outcome))

@@ -35,6 +35,7 @@ from pliant.algorithms.mapping.initialisation_buffer import (
     earlier_poses,
     returned_poses,
 )
+from pliant.algorithms.mapping.journal import Journal, Outcome
 from pliant.algorithms.mapping.kept_map import known_camera
 from pliant.algorithms.mapping.keyframe import Keyframe
 from pliant.algorithms.mapping.keyframe_rule import is_due
@@ -48,7 +49,6 @@ from pliant.algorithms.mapping.ordinary_frames import (
 )
 from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.mapping.pose_quality import why_doubtful
-from pliant.algorithms.mapping.publication import KeyframeChanges, MapChanges
 from pliant.algorithms.mapping.relocalisation import is_same_pose
 from pliant.algorithms.mapping.segment import Moved, Segment
 from pliant.algorithms.mapping.self_calibration import SelfCalibration
@@ -87,9 +87,7 @@ class Mapper:
         self.atlas = Atlas(calibration, parameters, known)
         self._parameters = parameters
         self._generator = np.random.default_rng(seed)
-        self._changes = MapChanges()
-        last = known[-1].id if known else -1
-        self._keyframe_changes = KeyframeChanges(self.atlas.points, after=last)
+        self.journal = Journal(self.atlas.points, after=known[-1].id if known else -1)
         self._waiting = InitialisationBuffer()
         self._stamps_ns: dict[int, int] = {}  # capture time of each frame
         self._motion = Motion.at(0, 0, np.eye(4))  # in the active segment
@@ -129,6 +127,10 @@ class Mapper:
         return self.atlas.kept()
 
     def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
+        """Localise a frame, extend the map, and return what readers need."""
+        return self.publish(self.take(frame, timer))
+
+    def take(self, frame: Frame, timer: StageTimer = no_stages) -> Outcome:
         """Localise a frame and extend the map."""
         ideal = self._catch_up(frame, timer)
         located = self._locate(ideal, timer)
@@ -158,7 +160,7 @@ class Mapper:
         self._go_on_from(active, placed, self._motion.then)
         if self._keyframe_is_new:
             self.atlas.request(frame.number)
-        return self._publish_placed(placed)
+        return self._tracked(placed)
 
     def _catch_up(self, frame: Frame, timer: StageTimer) -> IdealFrame:
         """Apply finished corrections of map and calibration, and correct the frame by them."""
@@ -195,7 +197,7 @@ class Mapper:
         self.follow(self.atlas.calibrate())
         self._keyframe_ns = frame.stamp_ns
         if self._recognised is not None:
-            self._changes.add_same_places([(self._recognised, keyframe.id)])
+            self.journal.add_same_places([(self._recognised, keyframe.id)])
             self._recognised = None
         with timer("places"):
             self.atlas.remember(keyframe, frame)
@@ -215,19 +217,19 @@ class Mapper:
         )
         self._add_pose(number, keyframe, T_world_camera, support.inliers)
 
-    def _publish_placed(self, placed: PlacedFrame) -> MapDelta:
+    def _tracked(self, placed: PlacedFrame) -> Outcome:
         why = why_doubtful(placed.support, self._parameters.support)
-        return self._publish(TRACKING, why, placed.support.inliers)
+        return self._outcome(TRACKING, why, placed.support.inliers)
 
     def follow(self, moved: list[Moved]) -> None:
         """Move the motion model with the map, and publish the move."""
         for each in moved:
             self._motion = self._motion.moved(each.S)
             if each.moves is not None:
-                self._changes.move(each.moves)
+                self.journal.move(each.moves)
             if each.gone is not None:
-                self._changes.join(each.gone, self.atlas.segment)
-            self._changes.add_same_places(each.same_places)
+                self.journal.join(each.gone, self.atlas.segment)
+            self.journal.add_same_places(each.same_places)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
         """Skip a frame without pixels (dropped or broken) or without time: it gets no pose.
@@ -235,8 +237,11 @@ class Mapper:
         Only mapped frames decide whether the camera is lost: the state is unchanged.  Surviving
         tracks continue in the next frame.
         """
+        return self.publish(self._passed_over(reason))
+
+    def _passed_over(self, reason: str) -> Outcome:
         state = LOST if self._lost_frames else TRACKING
-        return self._publish(WAITING if self.atlas.active is None else state, reason, 0)
+        return self._outcome(WAITING if self.atlas.active is None else state, reason, 0)
 
     def only_localise(self, frame: Frame, otherwise: str) -> MapDelta:
         """Localise a frame by its tracks in the map as it is, when there is no time to map it.
@@ -244,6 +249,10 @@ class Mapper:
         A frame without a pose waits until the next mapped frame has one.  otherwise: the reason
         that it is published with.
         """
+        return self.publish(self.take_tracks(frame, otherwise))
+
+    def take_tracks(self, frame: Frame, otherwise: str) -> Outcome:
+        """Localise a frame as ``only_localise`` does."""
         active, found = self.atlas.active, None
         self._stamps_ns[frame.number] = frame.stamp_ns
         self._keyframe_is_new = False
@@ -254,10 +263,10 @@ class Mapper:
         if active is None or found is None:
             ideal = IdealFrame.of(frame, self.calibration)
             self._waiting = self._waiting.then(ideal, self._parameters)
-            return self.skip(frame.number, otherwise)
+            return self._passed_over(otherwise)
         active.add_ordinary(found)
         self._go_on_from(active, found, self._motion.then_unmapped)
-        return self._publish_placed(found)
+        return self._tracked(found)
 
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
         """Apply the remaining corrections at the end of the stream."""
@@ -268,12 +277,12 @@ class Mapper:
                 self._correct(segment, segment.ordinary.take_all(), seen_by)
                 self._smooth(segment, seen_by)
         if self.atlas.active is None:
-            return self._publish(WAITING, "the stream has ended", 0, snapshot=True)
-        self._keyframe_changes.settle(self.atlas.active.keyframes)
-        return self._publish(TRACKING, "", 0, snapshot=True)
+            return self.publish(self._outcome(WAITING, "the stream has ended", 0, snapshot=True))
+        self.journal.settle(self.atlas.active.keyframes)
+        return self.publish(self._outcome(TRACKING, "", 0, snapshot=True))
 
     def _add_pose(self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int) -> None:
-        self._changes.add_pose(frame, keyframe, T_world_camera, inliers)
+        self.journal.add_pose(frame, keyframe, T_world_camera, inliers)
         self.atlas.add_pose(frame, keyframe, T_world_camera, inliers)
 
     def _correct(
@@ -282,7 +291,7 @@ class Mapper:
         """Place frames again in the current map.   seen_by: the calibration of their pixels."""
         for each in refined_poses(frames, segment.points, seen_by, self._parameters):
             pose = each.frame, each.keyframe, each.T_world_camera, each.inliers
-            self._changes.add_pose(*pose)
+            self.journal.add_pose(*pose)
             segment.path.refine(*pose, each.information)
 
     def _smooth(self, segment: Segment, seen_by: SelfCalibration) -> None:
@@ -292,28 +301,28 @@ class Mapper:
             self._parameters,
         )  # fmt: skip
         for each in smoothed:
-            self._changes.add_pose(each.frame, each.keyframe, each.T_world_camera, each.inliers)
+            self.journal.add_pose(each.frame, each.keyframe, each.T_world_camera, each.inliers)
 
     def publish_keyframes(self) -> KeyframeDelta:
         """Return the keyframe changes after the last frame, or after ``finish``."""
         active = self.atlas.active
         if active is None:
-            return self._keyframe_changes.publish(None, self.calibration)
-        self._keyframe_changes.settle(active.keyframes[: -self._parameters.window.keyframes])
-        return self._keyframe_changes.publish(active.keyframes[-1], self.calibration)
+            return self.journal.publish_keyframes(None, self.calibration)
+        self.journal.settle(active.keyframes[: -self._parameters.window.keyframes])
+        return self.journal.publish_keyframes(active.keyframes[-1], self.calibration)
 
     @property
     def waiting_frames(self) -> list[int]:
         """Numbers of the frames from which a map may still start."""
         return [waiting.frame for waiting in self._waiting.frames]
 
-    def _wait(self, frame: IdealFrame, timer: StageTimer) -> MapDelta:
+    def _wait(self, frame: IdealFrame, timer: StageTimer) -> Outcome:
         self._waiting = self._waiting.then(frame, self._parameters)
         with timer("start"):
             begun = self._begin_where_possible(self._parameters)
         if isinstance(begun, str):
-            return self._publish(WAITING, self._flaw(frame) or begun, 0)
-        return self._publish(TRACKING, "", begun)
+            return self._outcome(WAITING, self._flaw(frame) or begun, 0)
+        return self._outcome(TRACKING, "", begun)
 
     def _flaw(self, frame: IdealFrame) -> str:
         """Why the image has fewer tracks than a start needs, if it is visible."""
@@ -389,7 +398,7 @@ class Mapper:
         ):
             return there
         if self.atlas.active is not None:
-            self._keyframe_changes.settle(self.atlas.active.keyframes)
+            self.journal.settle(self.atlas.active.keyframes)
         self.atlas.go_on(keyframe, frame.tracks.ids)
         self._motion = Motion.at(frame.number, frame.stamp_ns, pose)
         self._recognised = keyframe.id
@@ -410,7 +419,7 @@ class Mapper:
         for each in placed:
             self._add_pose(each.frame, keyframe, each.T_world_camera, each.inliers)
 
-    def _lost(self, active: ActiveMap, frame: IdealFrame) -> MapDelta:
+    def _lost(self, active: ActiveMap, frame: IdealFrame) -> Outcome:
         """The frame has no pose.  After some time without one the segment is closed.
 
         Frames are stored meanwhile, so that a new segment has the poses of its own frames.
@@ -419,37 +428,29 @@ class Mapper:
         reason = f"lost: the pose of frame {frame.number} is not supported, {seen} mapped tracks"
         self._lost_frames += 1
         self._waiting = self._waiting.then(frame, self._parameters)
-        delta = self._publish(LOST, self._flaw(frame) or reason, 0)
+        outcome = self._outcome(LOST, self._flaw(frame) or reason, 0)
         long = self._motion.lost_s(frame.stamp_ns) > self._parameters.localisation.max_lost_s
         if long and self._lost_frames >= _LEAST_LOST:
-            self._keyframe_changes.settle(active.keyframes)
+            self.journal.settle(active.keyframes)
             self.atlas.leave()
             self._lost_frames = 0
-        return delta
+        return outcome
 
-    def _publish(self, state: int, reason: str, inliers: int, snapshot: bool = False) -> MapDelta:
-        # Regularly everything active is published, for late readers.
+    def _outcome(self, state: int, reason: str, inliers: int, snapshot: bool = False) -> Outcome:
+        # Now and then everything active is published, for those who came late.
         self._published_frames += 1
         snapshot = snapshot or self._published_frames % self._parameters.snapshot_frames == 0
-        # Between keyframes only new landmarks are published; motions follow with the next one.
-        keyframes, rows = self.atlas.take_changed(everything=snapshot or self._keyframe_is_new)
+        # Between keyframes points are new; how they move is told with the next one.
+        self.atlas.note_changed(self.journal, everything=snapshot or self._keyframe_is_new)
         centre = np.zeros(3)
         if self.atlas.active is not None:
             centre = self.atlas.active.keyframes[-1].T_world_camera[:3, 3].copy()
-        self._changes.remove_points(self.atlas.points.take_removed())
-        delta = self._changes.publish(
-            state=state,
-            reason=reason,
-            segment=self.atlas.segment,
-            inliers=inliers,
-            keyframes=keyframes,
-            points=self.atlas.points,
-            rows=rows,
-            centre=centre,
-            snapshot=snapshot,
-        )
-        delta = self.calibration.published_with(delta)
-        if snapshot and self.calibration.changes:
+        return Outcome(state, reason, inliers, self.atlas.segment, centre, snapshot)
+
+    def publish(self, outcome: Outcome) -> MapDelta:
+        """Return the changes since the last call.   outcome: of the last frame."""
+        delta = self.calibration.published_with(self.journal.publish(outcome))
+        if outcome.snapshot and self.calibration.changes:
             made = [k for segment, _ in self.atlas.everything() for k in segment.keyframes]
             delta = replace(
                 delta,

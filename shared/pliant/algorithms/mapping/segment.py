@@ -230,12 +230,7 @@ class Segment:
         S = moves.matrices(np.array([keyframe.id for keyframe in keyframes], np.int64))
         poses = move_by_similarity(S, np.array([keyframe.T_world_camera for keyframe in keyframes]))
         for keyframe, move, T_world_camera in zip(keyframes, S, poses, strict=True):
-            still = keyframe.published_pose is not None and np.array_equal(
-                keyframe.published_pose, keyframe.T_world_camera
-            )
             keyframe.T_world_camera = T_world_camera
-            if still:  # readers of the move need the pose
-                keyframe.published_pose = T_world_camera.copy()
             if keyframe.focus is not None:
                 keyframe.focus = move[:3, :3] @ keyframe.focus + move[:3, 3]
         self.points.move(self.id, moves)
@@ -297,7 +292,6 @@ class Segment:
             return found, None
         moves = self.dropped.together_with(moves)
         self.dropped.move(moves)
-        self.points.move_published(self.mapped_rows(), moves)
         return found, moves
 
 
