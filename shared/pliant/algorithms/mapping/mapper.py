@@ -440,7 +440,7 @@ class Mapper:
         # Now and then everything active is published, for those who came late.
         self._published_frames += 1
         snapshot = snapshot or self._published_frames % self._parameters.snapshot_frames == 0
-        # Between keyframes points are new; how they move is told with the next one.
+        # Between keyframes only new landmarks are published; moves follow with the next keyframe.
         self.atlas.note_changed(self.journal, everything=snapshot or self._keyframe_is_new)
         centre = np.zeros(3)
         if self.atlas.active is not None:
