@@ -17,7 +17,7 @@ class Process:
     """A service: its module has ``run(bus, ...)``.
 
     optional: topics that it reads besides where a service of the fleet publishes them.
-    observer: it reads every logged topic of the others, and nobody reads it.
+    observer: it reads every logged topic of the others, and has no readers.
     niceness: how much it gives way where processors are few; others do not wait for what it makes.
     finishing: what it does when the last frame is done, for people; "" where that is nothing.
     may_lag: it may be further behind than others with frames that bundle adjustment passes over.

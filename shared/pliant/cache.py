@@ -10,5 +10,5 @@ def cache_folder() -> Path:
     if own:
         return Path(own)
     home = os.path.expanduser("~")
-    home = "/" if home == "~" else home  # nobody knows it: who has none has the root's
+    home = "/" if home == "~" else home  # unknown: users without one have root's
     return Path(os.environ.get("XDG_CACHE_HOME") or Path(home, ".cache")) / "pliant"

@@ -1,7 +1,7 @@
-"""Where files lie that are not whole yet, beside those that they will replace.
+"""Folders for incomplete files, next to the files that they will replace.
 
-A folder of this kind belongs to the process that holds its lock.  One that nobody holds is of a
-process that was killed: the next one that writes there removes it.
+A folder of this kind belongs to the process that holds its lock.  One without
+a holder is of a killed process: the next writer removes it.
 """
 
 import errno
@@ -47,7 +47,7 @@ def _locked_folder(parent: Path) -> tuple[Path, int]:
         path = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
         try:
             lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        except FileNotFoundError:  # somebody took it for one that was left behind
+        except FileNotFoundError:  # another process took it for an abandoned one
             continue
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)

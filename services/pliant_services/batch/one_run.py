@@ -164,7 +164,7 @@ class OneRun:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(handle, signal.SIGKILL)
         for handle in services:
-            select.select([handle], [], [])  # nobody writes there any more
+            select.select([handle], [], [])  # no process writes there any more
             os.close(handle)
         self._process.wait()
 

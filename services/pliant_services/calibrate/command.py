@@ -272,7 +272,7 @@ def calibrate_without_board(
             output=Path(folder) / "run",
             overrides=["meshing.enabled=false", "recorder.images=false"],
         )
-        with contextlib.redirect_stdout(io.StringIO()):  # of results that nobody will find
+        with contextlib.redirect_stdout(io.StringIO()):  # of results in a temporary folder
             code = run_pipeline(request)
         if code == INTERRUPTED:
             raise KeyboardInterrupt

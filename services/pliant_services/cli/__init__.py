@@ -115,7 +115,7 @@ def run_and_exit(application: typer.Typer) -> None:
             code = _say(f"cannot write the output: {error.strerror}; free some space")
     if code >= INTERRUPTED:
         # All is closed, but a Zenoh session that was just being opened or closed leaves threads
-        # behind for which the interpreter would wait for ever.
+        # behind for which the interpreter would wait without end.
         os._exit(code)
     sys.exit(code)
 

@@ -45,7 +45,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
         keyframes = receive(bus, topics.KEYFRAME, Keyframe)
         for update, keyframe in join(updates, keyframes):
             mesher.take(update, keyframe, keyframe.images(), update.frame, keyframe.masks())
-            # Live: first all that has come is taken, so that nobody waits for the mesh.
+            # Live: first all that has come is taken, so that no service waits for the mesh.
             if not (is_live and bus.is_waiting(topics.KEYFRAME)):
                 changes = mesher.fuse(newest_only=is_live, timer=monitor.stage)
                 _publish(bus, keyframe, changes)

@@ -128,7 +128,7 @@ def run(bus: Bus, config: Config, monitor: Monitor) -> None:
 
 
 def _check(bus: Bus, config: Config) -> None:
-    """Raise ConfigError where the configuration needs what nobody of the fleet makes."""
+    """Raise ConfigError if the configuration needs a topic that no service publishes."""
     needs = {
         "surfels.depth_from=map": (config.surfels.depth_from == "map", topics.KEYFRAME),
         "surfels.prediction=tracks": (config.surfels.prediction == "tracks", topics.EXTREMA),
@@ -204,7 +204,7 @@ def _add(
             return frame, f"no surfels are created on the map: {found.problem}"
         state.ratio, state.segment = found.ratio, view.segment
         return state.tracker.add(image, found.depth), ""
-    # Nobody is left to compare with.  For the same map the last ratio holds, another starts anew.
+    # No surfels are left to compare with.  For the same map the last ratio holds.
     if view.segment != state.segment:
         state.ratio, state.segment = 1.0, view.segment
     T_world_camera = view.T_world_camera.copy()

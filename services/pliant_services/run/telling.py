@@ -14,7 +14,7 @@ def tell(output: Path, report: dict[str, Any]) -> None:
     from pliant.export.export import exports_in
     from pliant.results.verdict import summary
 
-    with suppress(BrokenPipeError):  # the results are on the disk, whoever reads of them
+    with suppress(BrokenPipeError):  # the results are on the disk, with or without a reader
         files = ", ".join(files_of(output, report))
         print(f"results in {output}/ ({_sizes(output)}): {files}, {_recording_in(output)}")
         print(f"open in a browser: {output / PAGE_NAME}")

@@ -5,7 +5,7 @@ import sys
 import threading
 from typing import Any
 
-_AGAIN_S = 0.01  # long enough to be out of the destructor, short enough that nobody waits for it
+_AGAIN_S = 0.01  # long enough to be out of the destructor, short enough not to delay the end
 _RAISED_BY = {KeyboardInterrupt: signal.SIGINT, SystemExit: signal.SIGTERM}
 
 
@@ -14,7 +14,7 @@ def deliver_swallowed_interruptions() -> None:
 
     Python runs the handler of a signal between any two instructions of the main thread.  In a
     destructor or in the callback of a weak reference, what the handler raises goes nowhere: Python
-    prints it and continues, and a command that should end would run for ever.
+    prints it and continues, and a command that should end would run on.
     """
     if threading.current_thread() is not threading.main_thread():
         return

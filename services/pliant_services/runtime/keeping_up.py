@@ -15,7 +15,7 @@ from pliant.messages import topics
 from pliant.messages.types import Image
 from pliant_services.processes import PROCESSES
 
-_INGEST = "ingest"  # its own work took so long: nobody was waited for
+_INGEST = "ingest"  # its own work took too long: no reader was waited for
 _MAPPING = "bundle_adjustment"
 _MAY_LAG = tuple(process.name for process in PROCESSES if process.may_lag)
 

@@ -137,11 +137,11 @@ class Fleet:
             declared.undeclare()
 
     def wait_for_viewer(self, timeout_s: float) -> bool:
-        """Wait until somebody looks on, or the time is over."""
+        """Wait until there is a viewer, or the time is over."""
         return self._relay.wait_for_viewer(timeout_s)
 
     def wait_for_last_viewer(self, timeout_s: float) -> bool:
-        """Wait until nobody looks on any more, or the time is over."""
+        """Wait until there is no viewer, or the time is over."""
         return self._relay.wait_for_last_viewer(timeout_s)
 
     @property
@@ -165,7 +165,7 @@ class Fleet:
             time.sleep(_POLL_S)
 
     def give_up(self) -> None:
-        """Start nobody again from now on."""
+        """Restart no service from now on."""
         self._gave_up = True
 
     def end_source(self) -> None:
@@ -224,7 +224,7 @@ class Fleet:
             self.raise_if_died()
             return over
         if all(c.process.poll() == 0 for c in self._children if BY_NAME[c.name].observer):
-            return over  # all is on the disk: whoever dies now is not missed
+            return over  # all is on the disk: a service that dies now has no effect
         for index, child in enumerate(self._children):
             if child.failed:
                 self._restart_or_raise(index, child)

@@ -39,7 +39,7 @@ class Sender:
         self._calibration = calibration_yaml(calibration)
 
     def source(self, frame: SourceFrame) -> SourceFrame:
-        """The frame that everybody is to work on."""
+        """The frame that all services process."""
         if self._how != "jpeg" or frame.dropped or frame.encoding == "jpeg":
             return frame
         try:

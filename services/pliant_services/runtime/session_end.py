@@ -65,7 +65,7 @@ def run_alone(name: str, config: Config, options: ServiceOptions, *, results: bo
 
 
 def _held(output: Path | None, *, results: bool) -> AbstractContextManager[object]:
-    """The folder that a recorder writes to, so that nobody replaces what is there."""
+    """The folder that a recorder writes to, so that no other process replaces its content."""
     if output is None:
         return nullcontext()
     return written(output.parent, force=True) if results else recorded_into(output.parent)

@@ -35,7 +35,7 @@ def make_certificates(
 
     Only the one named ROUTER proves a server, with these ``hosts``, the names and addresses by
     which it is reached; the others prove clients.  authority: the folder of the authority's own
-    key, beside the other unless it is given: whoever has that key is whoever they want to be, so it
+    key, beside the other unless it is given: its holder can pose as any service, so it
     is not where services look.  session: the only one in which they are good.  Keys are readable by
     their owner alone.  Raises PliantError without
     the package ``cryptography``, ResultError where a folder cannot be written or does not fit.

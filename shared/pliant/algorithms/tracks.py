@@ -66,7 +66,7 @@ class FrameExtrema(FrameTracks):
 
     @staticmethod
     def without_maxima(tracks: FrameTracks) -> "FrameExtrema":
-        """Tracks of a frame whose image nobody looks at."""
+        """Tracks of a frame without an image."""
         return FrameExtrema.of(tracks, np.zeros((0, 3), np.float32))
 
     @staticmethod

@@ -70,7 +70,7 @@ class Peers:
     failure: Exception | None = None
     """What a thread of the bus failed of."""
     strangers: dict[str, str] = field(default_factory=dict[str, str])
-    """What is said of those of another version that nobody here needs, by name: once."""
+    """What is said of those of another version that no service here needs, by name: once."""
     over: bool = False
     """Whether the recorder has said that everything is on its disk."""
     stays: bool = False

@@ -32,7 +32,7 @@ _NO_SHARED_MEMORY = "shm segment"
 """What Zenoh says where /dev/shm is full, or missing."""
 _NO_SOCKET = "no Unix socket available: every user of this machine can reach the services"
 _MAX_BYTES = max(topic.max_bytes for topic in TOPICS) + (1 << 20)
-"""Whoever announces more than our largest topic takes is cut off, before memory is taken for it."""
+"""A peer that announces more than our largest topic is cut off, before memory is allocated."""
 
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -198,7 +198,7 @@ class LocalRouter:
 
 
 def _clear_left(temporary: Path) -> None:
-    """Remove the folders of routers that were killed: nobody holds their locks, or listens."""
+    """Remove the folders of killed routers: their locks are free, or nothing listens."""
     for folder in temporary.glob(f"{_FOLDER}*"):
         with suppress(OSError):
             names = {path.name for path in folder.iterdir()}

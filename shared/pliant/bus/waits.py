@@ -1,6 +1,6 @@
 """How a service's thread waits for readers and for messages, and what it says of that.
 
-Nobody waits for ever: for a peer that is away no longer than our patience, and not at all once a
+Waits are limited: for a peer that is away no longer than our patience, and not at all once a
 thread of the bus has failed or the session is over.
 """
 

@@ -9,7 +9,7 @@ message is taken exactly once, in order, and memory is bounded.
 
 Who starts first does not matter: readers subscribe, then declare a liveliness token; a sender waits
 for the tokens of its required readers before its first message.  A peer that stays away for longer
-than our patience is named in an error, so that nothing waits for ever.
+than our patience is named in an error, so that every wait ends.
 
 With checkpoints a service that died continues where it was: ``restore`` puts it back to the newest
 checkpoint that its readers allow, senders send again what came after, and what it makes a second
@@ -135,7 +135,7 @@ class ZenohBus:
             on_tick=on_tick or (lambda: None),
             on_fault=on_fault or (lambda line: None),
         )
-        # Subscribed before announced: whoever sees the token may send at once.
+        # Subscribed before announced: a peer that sees the token may send at once.
         liveliness = self._session.liveliness()
         tokens, own = f"{shared.prefix}/ready/**", token_key(service, self._peers.incarnation)
         self._held: list[Any] = [  # they live as long as we do
@@ -345,7 +345,7 @@ class ZenohBus:
         if self._checkpoints is None:
             return None
         outputs = self._outputs.values()
-        if self._checkpoints.has_any():  # our readers have been here: they are not awaited for ever
+        if self._checkpoints.has_any():  # our readers have been here: the wait for them is limited
             with self._changed:
                 self._peers.expect((r for o in outputs for r in o.box.readers), time.monotonic())
         for output in outputs:

@@ -1,4 +1,4 @@
-"""Kernels that run the same code, whoever compiled them and whatever was loaded before.
+"""Kernels that run the same code, whatever process compiled them or was loaded before.
 
 Numba compiles the helpers of a kernel into the kernel's own object file once more, optimised
 together with it, and under the names that they have in theirs.  The linker takes equal names for

@@ -1,7 +1,7 @@
 """Where frames come from: one file per format of dataset, and the built-in sequences.
 
 ``open_source`` opens any of them; ``FORMATS`` is the list.  A source gives frames as they came and
-the calibration of its camera; ``Rectifier`` turns a frame into the image that everybody works on.
+the calibration of its camera; ``Rectifier`` turns a frame into the image that all services process.
 """
 
 from collections.abc import Callable

@@ -81,7 +81,7 @@ class Dataset(Protocol):
 
     @property
     def is_live(self) -> bool:
-        """Frames come whether somebody is ready or not."""
+        """Frames come whether a reader is ready or not."""
         ...
 
     @property

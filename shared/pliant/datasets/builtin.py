@@ -174,7 +174,7 @@ def _locked(path: Path) -> Generator[None]:
 
 def _render_beside(plan: _Plan, folder: Path, progress: Progress | None) -> None:
     """Render into a temporary folder next to ``folder``, then rename it: all or nothing."""
-    # Whoever holds the lock may clear away what a killed process left behind.
+    # The holder of the lock may remove files of a killed process.
     for leftover in folder.parent.glob(f".{folder.name}.*.partial"):
         shutil.rmtree(leftover, ignore_errors=True)
     partial = Path(

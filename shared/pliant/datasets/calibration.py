@@ -46,8 +46,7 @@ _MODELS: tuple[str, ...] = get_args(LensModel)
 SAID_SIGMA = 0.3
 """How far a field of view that somebody says may be wrong: standard deviation of log focal."""
 UNSAID_FOV_DEG, UNSAID_SIGMA = 60.0, 0.4
-"""What is taken along the longer side where nobody says anything: +-2 standard deviations are 29 to
-104 degrees."""
+"""Default along the longer side: +-2 standard deviations are 29 to 104 degrees."""
 _MAX_SIGMA = 1.0
 _MAX_UNITS = 65535  # of a 16-bit depth map
 _MAX_SIDE_PX = 32767  # what the fixed-point maps can address
@@ -121,7 +120,7 @@ def calibration_from_fov(
 ) -> Calibration:
     """A first guess: a pinhole camera with this horizontal field of view, looking straight ahead.
 
-    fov_deg: None where nobody says it: a lens sees as much, whichever way it is held.
+    fov_deg: None: the default, the same for upright and wide images.
     pixel_aspect: width over height of a pixel, which is fy over fx.
 
     Raises CalibrationError for a field of view that a pinhole camera cannot have.

@@ -40,7 +40,7 @@ def _open_device(index: int) -> Capture:
 
 
 class CameraDevice:
-    """A live camera; it ends when nobody reads any more, or with an error when it stops.
+    """A live camera; it ends when it is no longer read, or with an error when it stops.
 
     Frames are stamped when they arrive; no two stamps are the same.
     """

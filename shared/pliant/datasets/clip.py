@@ -53,7 +53,7 @@ class Clip:
         return crc
 
     def is_as_it_was(self) -> bool:
-        """Whether its name still leads to it, and nobody has written to it since it was opened."""
+        """Whether its name still leads to it, and it is unchanged since it was opened."""
         return file_version(self._path) == self._before
 
     def _blocks(self) -> Iterator[bytes]:

@@ -45,7 +45,7 @@ def decode(frame: SourceFrame) -> U8:
 
 
 class Rectifier:
-    """Turns frames of one camera into the rectified images that everybody works on."""
+    """Turns frames of one camera into the rectified images that all services process."""
 
     def __init__(self, calibration: Calibration) -> None:
         self._size = (calibration.width, calibration.height)
@@ -136,7 +136,7 @@ def _whole(frame: SourceFrame) -> bool:
     """Whether a file format's end marker is there.
 
     Decoders fill what an interrupted copy lacks with grey (which of them do depends on the
-    version), and a tracker would lose its points there without anybody knowing why.
+    version), and a tracker would lose its points there without a visible reason.
     """
     if frame.encoding == "jpeg":
         # A thumbnail inside has markers of its own: the end must follow the last scan.
@@ -153,7 +153,7 @@ def rectified(
     unmapped: bool = False,
     unplaced: bool = False,
 ) -> Image:
-    """The image that everybody works on: a pure function, so that a replay makes the same.
+    """The image that all services process: a pure function, so that a replay makes the same.
 
     unmapped, unplaced: as it was decided on and recorded.
     """

@@ -1,7 +1,7 @@
 """A camera of ROS 2 that is publishing: ``ros:localhost``, by rmw_zenoh's keys, without ROS.
 
 The source is the machine of rmw_zenoh's router, ``--topic`` chooses the images.  It is live, and
-ends when nobody publishes the images any more.
+ends when the images are no longer published.
 """
 
 import queue

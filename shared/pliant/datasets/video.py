@@ -2,8 +2,8 @@
 
 A file of the same name with the ending .yaml beside it is taken as its calibration.  Times are
 those of the container; where it has none, or they repeat, frames follow each other at its rate.
-A frame that does not decode is one without data, and those behind it come all the same.  What an
-edit list leaves out is decoded, as others hang on it, and passed over.
+A frame that does not decode is one without data, and those behind it come all the same.  Frames
+that an edit list excludes are decoded, because others depend on them, and skipped.
 Frames are published as they leave the decoder, as raw BGR pixels.
 """
 
@@ -129,8 +129,8 @@ def _is_there(pixels: U8 | None) -> bool:
 
 
 def shown_frames(stream: VideoStream | None, count: int | None, first_ns: int) -> int | None:
-    """How many frames come; first_ns: when the first that decodes does.  Those before it hang on
-    frames that a cut has taken away."""
+    """How many frames come; first_ns: when the first that decodes does.  Those before it
+    depend on frames that a cut has removed."""
     if stream is None or not stream.stamps_ns:
         return count
     first_ns += stream.origin_ns - _ROUNDED_NS

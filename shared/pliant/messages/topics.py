@@ -58,7 +58,7 @@ CLIP = Topic("camera/clip", ClipPiece, per_frame=False, compression="")
 IMAGE = Topic(
     "camera/image", Image, per_frame=True, logged=False, newest_wins=True, max_bytes=128 * _MIB
 )
-# Empty where nobody but the recorder would read it.
+# Empty if only the recorder would read it.
 DEPTH = Topic("camera/depth", Depth, per_frame=True, max_bytes=128 * _MIB, compression="")
 # The map of earlier sessions, before the first frame: nothing where a run begins without one.
 MAP_KNOWN = Topic("map/known", MapKeyframe, per_frame=False, max_bytes=64 * _MIB, kept_whole=True)

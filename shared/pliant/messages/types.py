@@ -23,7 +23,7 @@ BROKEN = "broken: "
 MASKED = "masked: none of it is used"
 """Why an image is missing all of which a mask covers."""
 PASSED_OVER = "passed over to keep up"
-"""Why a frame that has pixels has no pose as it comes: nobody maps it, and no tracks place it."""
+"""Why a frame that has pixels has no pose as it comes: it is not mapped, and no tracks place it."""
 WAITING_FOR_DEPTH = "waiting for depth"
 """Why a frame has no surfels yet."""
 WORLD_FRAME_ID = "world"
@@ -148,7 +148,7 @@ class Depth(Header):
 
 @dataclass(frozen=True, kw_only=True)
 class Image(Header):
-    """The rectified frame that everybody works on.
+    """The rectified frame that all services process.
 
     grey: (H, W).     colour: (H, W, 3) RGB, or (0, 0, 3) where the source has none.
     missing: "" or why there are no pixels ("dropped", "broken: ..."); both arrays are empty then.

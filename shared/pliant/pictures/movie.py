@@ -105,7 +105,7 @@ def _writer(partial: Path, path: Path, codec: str, fps: float, size: tuple[int, 
 def _call_webm(matroska: Path) -> None:
     """Make WebM of VP8 in Matroska: of that it is a part, and has its name in its header.
 
-    OpenCV writes WebM, too, with two lines on the terminal that nobody can silence.
+    OpenCV writes WebM, too, with two lines on the terminal that cannot be silenced.
     """
     with matroska.open("r+b") as file:
         at = file.read(64).index(_MATROSKA)

@@ -65,7 +65,7 @@ class RecordingWriter:
         except OSError as error:
             raise self._failed(error) from None
         try:
-            sync(path.parent)  # a file that nobody finds is none
+            sync(path.parent)  # a file must be findable after a power cut
             header = Header(profile="pliant", library=f"pliant {__version__}")
             self._put(layout.MAGIC, as_bytes(header))
             for name, content in metadata.items():

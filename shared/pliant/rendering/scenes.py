@@ -13,7 +13,7 @@ from pliant.rendering.solids import Kind, Material, Scene, Solid, Vector
 class BuiltinScene:
     """A scene, its path, and how many frames the path has at 30 frames per second.
 
-    colour: whether it is filmed in colour where nobody says.
+    colour: whether it is filmed in colour by default.
     """
 
     scene: Scene

@@ -122,8 +122,8 @@ def _switch(made: Path, output: Path) -> None:
 
 
 def replace_by(output: Path, made: Path) -> None:
-    """Replace a result by another one, whole, in a folder on the same file system that nobody
-    holds; who is killed has it done by the next one who takes the folder.  Raises ResultError."""
+    """Replace a result by another one, whole, in a folder on the same file system
+    without a holder; after a kill, the next holder completes it.  Raises ResultError."""
     try:
         sync_all(made)
         made.rename(output / _SWITCHING)

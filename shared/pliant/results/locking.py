@@ -91,7 +91,7 @@ class Held:
 
 
 def holder_of(output: Path) -> str | None:
-    """The number of the process that holds a folder, "" where it is unknown; None: nobody does."""
+    """The number of the process that holds a folder, "" if unknown; None: without a holder."""
     try:
         lock = os.open(output / LOCK_NAME, _OPENED)
     except OSError:

@@ -23,7 +23,7 @@ def grade(report: dict[str, Any]) -> int:
 
 
 def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
-    """The report in a few lines.  has_map: False where nobody was to make one, as in a replay."""
+    """The report in a few lines.  has_map: False if none was requested, as in a replay."""
     if report.get("profile") == "deformable":
         return [*surfel_summary(report), *_faults(report), _judged(report)]
     frames = counted(report["frames"], "frame")

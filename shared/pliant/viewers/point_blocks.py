@@ -49,7 +49,7 @@ class PointBlocks:
             self._doubtful[:] = False
 
     def draw_again(self) -> None:
-        """Whoever draws has none of the points."""
+        """The viewer has none of the points."""
         self._touch(np.flatnonzero(self._alive))
 
     def move(self, moves: MapMoves) -> None:

@@ -137,7 +137,7 @@ class RerunCanvas:
     def send(self) -> None:
         """Send what is left.
 
-        What a window did not take before it was closed goes: Rerun would wait for it for ever.
+        What a window did not take before it was closed goes: Rerun would wait for it without end.
         """
         while self.is_watched:
             try:

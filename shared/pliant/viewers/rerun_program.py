@@ -43,7 +43,7 @@ class RerunProgram:
         )
         try:
             self._wait_until_up(ports)
-        except BaseException:  # also Ctrl-C: nobody else would end it
+        except BaseException:  # also Ctrl-C: nothing else would end it
             self.close()
             raise
 
@@ -62,8 +62,8 @@ class RerunProgram:
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        # The server is its child, which nobody here can wait for: on a busy machine it may still
-        # take connections.
+        # The server is its child, for which this process cannot wait: on a busy machine it may
+        # still take connections.
         deadline = time.monotonic() + _GONE_S
         while any(listens(port) for port in self.ports) and time.monotonic() < deadline:
             time.sleep(_LOOK_S)

@@ -1,6 +1,6 @@
 """The mesh as blocks that change: what the mesher sends, and what it and its viewers hold.
 
-No kernels: whoever reads messages loads this.
+No kernels: readers of messages load this module.
 """
 
 from collections.abc import Iterator
@@ -110,7 +110,7 @@ class BlockMesh:
         return len(self._blocks)
 
     def changes(self, blocks: MeshBlocks) -> MeshBlocks:
-        """Those of the blocks that differ from what is held, for whoever holds the same."""
+        """Those of the blocks that differ from what is held, for a reader that holds the same."""
         starts, faces = _bounds(blocks.vertex_counts), _bounds(blocks.triangle_counts)
         differ = np.zeros(len(blocks.keys), np.bool_)
         for row, key in enumerate(pack(blocks.keys).tolist()):
