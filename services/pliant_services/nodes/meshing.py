@@ -96,6 +96,8 @@ def warm_up() -> None:
     volume.extract_all()
     keys = volume.remove(done.serial, found.depths, found.weights, colour, camera, pose)
     volume.extract(volume.affected(keys))
+    volume.integrate(found.depths, found.weights, colour, camera, pose)
+    volume.extract_finished()
     _warm_up_stereo(camera, points)
 
 

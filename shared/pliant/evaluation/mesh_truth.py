@@ -1,11 +1,13 @@
 """A mesh against true depth maps: how much it covers, how well, and its surface and normals."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32
+from pliant.algorithms.arrays import F32, F64, I32, BoolArray
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.meshing.mesh_blocks import no_rows
 from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.evaluation.criteria import Similarity
 from pliant.evaluation.nearest_points import nearest
@@ -22,11 +24,15 @@ _SPACING = 0.25
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh:
-    """points, normals: (V, 3) in the world of the estimate.    faces: (F, 3)."""
+    """points, normals: (V, 3) in the world of the estimate.    faces: (F, 3).
+
+    closed: rows of vertices that close holes: what they are corners of is measured apart, too.
+    """
 
     points: F32
     normals: F32
     faces: I32
+    closed: I32 = field(default_factory=no_rows)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +46,8 @@ class MeshTruth:
     normal_deg: median angle to the true normal, away from jumps in depth.
     diameter_m: diagonal of the box about the true surface.    precision, recall, f_score: at 1 %
     of it, against the true surface that the views see.
+    closed_covered, closed_median_error, closed_within: as above, with the scale that fits, of what
+    closes holes alone; 0 where none is closed.
     """
 
     views: int
@@ -55,6 +63,9 @@ class MeshTruth:
     precision: float
     recall: float
     f_score: float
+    closed_covered: float
+    closed_median_error: float
+    closed_within: float
 
 
 @dataclass
@@ -69,6 +80,7 @@ class MeshEvaluation:
     alignment: Similarity
     camera: PinholeCamera
     _ratios: list[F32] = field(default_factory=list[F32])
+    _closing: list[BoolArray] = field(default_factory=list[BoolArray])
     _angles: list[F32] = field(default_factory=list[F32])
     _surface: list[F64] = field(default_factory=list[F64])
     _floor: list[F64] = field(default_factory=list[F64])
@@ -84,6 +96,7 @@ class MeshEvaluation:
         both = known & (seen.depths > 0.0)
         depths = seen.depths * self.alignment.scale * view.inverse_depth
         self._ratios.append(depths[both].astype(np.float32))
+        self._closing.append(self._closes_holes[seen.triangles[both]])
         self._known += int(known.sum())
         normals = seen.interpolate(self.mesh.faces, self.mesh.normals) @ T_estimate[:3, :3]
         true, smooth = _true_normals(view)
@@ -101,6 +114,13 @@ class MeshEvaluation:
         for kept, T in ((self._surface, T_true), (self._floor, T_ours)):
             kept.append(thin_out(points @ T[:3, :3].T + T[:3, 3], spacing))
 
+    @cached_property
+    def _closes_holes(self) -> BoolArray:
+        """(F,) faces with a corner that closes a hole."""
+        marked = np.zeros(len(self.mesh.points), np.bool_)
+        marked[self.mesh.closed] = True
+        return np.asarray(marked[self.mesh.faces].any(axis=1), np.bool_)
+
     def result(self) -> MeshTruth:
         """The figures over all views."""
         nan = float("nan")
@@ -108,6 +128,7 @@ class MeshEvaluation:
         angles = np.concatenate([np.zeros(0, np.float32), *self._angles])
         scale = 1.0 / float(np.median(ratios)) if len(ratios) else nan
         errors, fitted = np.abs(ratios - 1.0), np.abs(ratios * scale - 1.0)
+        closing = fitted[np.concatenate([np.zeros(0, np.bool_), *self._closing])]
         surface, diameter = self._true_surface()
         precision, recall = self._surfaces(surface, SURFACE_LIMIT * diameter)
         both = precision + recall
@@ -125,6 +146,9 @@ class MeshEvaluation:
             precision=precision,
             recall=recall,
             f_score=2.0 * precision * recall / both if both > 0.0 else 0.0,
+            closed_covered=len(closing) / self._known if self._known else 0.0,
+            closed_median_error=float(np.median(closing)) if len(closing) else 0.0,
+            closed_within=float(np.mean(closing <= DEPTH_LIMIT)) if len(closing) else 0.0,
         )
 
     def columns(self) -> dict[str, SurfaceFigures]:
@@ -168,8 +192,12 @@ class MeshEvaluation:
 
 
 def format_mesh(truth: MeshTruth) -> str:
-    """Four lines, ready to print."""
+    """Four lines, ready to print, and one more where holes were closed."""
     t = truth
+    closed = (
+        f"\nclosed holes: {100 * t.closed_covered:.1f} % of the true depth; scaled to fit best: "
+        f"median {100 * t.closed_median_error:.2f} %, {100 * t.closed_within:.1f} % within 5 %"
+    )
     return (
         f"mesh in {t.views} keyframes: {100 * t.covered:.1f} % of the true depth covered, "
         f"{t.triangles} triangles\n"
@@ -179,6 +207,7 @@ def format_mesh(truth: MeshTruth) -> str:
         f"normals: median angle to ground truth {t.normal_deg:.1f} deg\n"
         f"surface within 1 % of the diameter ({t.diameter_m:.2f} m): F-score {t.f_score:.3f}, "
         f"precision {t.precision:.3f}, recall {t.recall:.3f}"
+        + (closed if t.closed_covered > 0.0 else "")
     )
 
 

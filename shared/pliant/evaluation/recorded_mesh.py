@@ -45,7 +45,9 @@ def mesh_against_truth(
             data = read_ply(result / name)
             if data.faces is None or data.normals is None:
                 raise ResultError(f"{result / name}: without faces or normals")
-            mesh = Mesh(points=data.points, normals=data.normals, faces=data.faces)
+            mesh = Mesh(
+                points=data.points, normals=data.normals, faces=data.faces, closed=data.closed
+            )
             measured = measure_mesh(mesh, run.history, run.stream.camera, truth, evaluation)
             found = measured.result()
             figures[key] = asdict(found)

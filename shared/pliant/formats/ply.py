@@ -30,16 +30,21 @@ _TYPES = {
 }
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 _LONGEST_HEADER = 65536
+_CLOSED = "closed"
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlyData:
-    """points: (N, 3).  colours: (N, 3) RGB.  normals: (N, 3).  faces: (F, 3) rows of points."""
+    """points: (N, 3).  colours: (N, 3) RGB.  normals: (N, 3).  faces: (F, 3) rows of points.
+
+    closed: rows of points that close holes, ascending; none where the file does not say.
+    """
 
     points: F32
     colours: U8 | None
     normals: F32 | None
     faces: I32 | None
+    closed: I32
 
 
 def write_ply(
@@ -49,6 +54,7 @@ def write_ply(
     *,
     normals: F32 | None = None,
     faces: I32 | None = None,
+    closed: I32 | None = None,
 ) -> None:
     """Write (N, 3) points; equal arrays give equal bytes.  See PlyData for the shapes.
 
@@ -60,6 +66,8 @@ def write_ply(
         fields += [("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4")]
     if colours is not None:
         fields += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    if closed is not None:
+        fields.append((_CLOSED, "u1"))
     rows = np.zeros(len(points), np.dtype(fields))
     named = (("points", points, "xyz"), ("normals", normals, ("nx", "ny", "nz")))
     for name, array, columns in (*named, ("colours", colours, ("red", "green", "blue"))):
@@ -71,6 +79,8 @@ def write_ply(
             raise ValueError(f"{name}: a value is not finite")
         for index, column in enumerate(columns):
             rows[column] = array[:, index]
+    if closed is not None:
+        rows[_CLOSED][closed] = 1
     names = {"<f4": "float", "u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
     header += [f"property {names[kind]} {name}" for name, kind in fields]
@@ -134,7 +144,15 @@ def _parse(data: bytes) -> PlyData:
         colours=_columns(rows, ("red", "green", "blue"), np.uint8),
         normals=_columns(rows, ("nx", "ny", "nz"), np.float32),
         faces=triangles,
+        closed=_marked(rows),
     )
+
+
+def _marked(rows: Any) -> I32:
+    """The rows whose points are marked."""
+    if _CLOSED not in (rows.dtype.names or ()):
+        return np.zeros(0, np.int32)
+    return np.flatnonzero(rows[_CLOSED]).astype(np.int32)
 
 
 def _parse_header(lines: list[str]) -> tuple[int, int | None, list[tuple[str, str]]]:

@@ -30,9 +30,9 @@ class FinalVolume:
     def __exit__(self, *_: object) -> None:
         self._empty()
 
-    def mesh(self) -> TriangleMesh:
-        """The whole surface; the volume is empty then."""
-        mesh = self.volume.extract_all()
+    def mesh(self, *, finish: bool = False) -> TriangleMesh:
+        """The whole surface; the volume is empty then.    finish: as of ``extract_finished``."""
+        mesh = self.volume.extract_finished() if finish else self.volume.extract_all()
         self._empty()
         return mesh
 

@@ -304,8 +304,14 @@ class Mesher:
             self.counts[f"final_{level}_mib"] = volume.memory_bytes / 2**20
             self.counts[f"final_{level}_file_mib"] = volume.file_bytes / 2**20
             with timer(f"final {level} meshing"):
-                mesh = volume.mesh()
+                finish = level == "fine" and self._finishes
+                mesh = volume.mesh(finish=finish)
             yield FinalMesh(segment, level, volume.volume.scale.voxel, fused, mesh)
+
+    @property
+    def _finishes(self) -> bool:
+        """The mesh of the points alone is the paper's."""
+        return self._parameters.finish and self._parameters.depth == "dense"
 
     def _dense(self, keyframes: list[int], timer: StageTimer) -> DenseDepths:
         """The dense depths of the keyframes of a segment; none with the points alone."""

@@ -36,6 +36,7 @@ def split(
             normals=mesh.normals[rows],
             colours=mesh.colours[rows],
             triangles=mesh.triangles[faces],
+            closed=mesh.closed[(mesh.closed >= rows.start) & (mesh.closed < rows.stop)],
         )
 
 
@@ -49,8 +50,9 @@ def joined(pieces: Sequence[MeshPiece]) -> TriangleMesh:
         normals=np.concatenate([p.normals for p in pieces]),
         colours=np.concatenate([p.colours for p in pieces]),
         triangles=np.concatenate([p.triangles for p in pieces]),
+        closed=np.concatenate([p.closed for p in pieces]),
     )
-    corners = mesh.triangles
-    if len(corners) and not 0 <= int(corners.min()) <= int(corners.max()) < len(mesh.positions):
-        raise MessageError("a mesh has a corner that is not a vertex")
+    for rows in (mesh.triangles, mesh.closed):
+        if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < len(mesh.positions):
+            raise MessageError("a mesh has a corner that is not a vertex")
     return mesh

@@ -4,14 +4,14 @@ A message that carries the result of an algorithm *is* that result plus a header
 sends what it computed and an algorithm takes what arrived, without copying fields about.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, TypeVar
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
-from pliant.algorithms.meshing.mesh_blocks import MeshBlocks
+from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, no_rows
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame
 from pliant.algorithms.tracks import FrameTracks
 
@@ -235,7 +235,8 @@ class MeshPiece(Header):
 
     level: "fine" or "coarse".    piece, pieces: this one's number from 0, and how many there are.
     keyframes: how many were fused.    positions, normals, colours: of the vertices, RGB.
-    triangles: rows of the vertices of all pieces.
+    triangles: rows of the vertices of all pieces.    closed: which of the vertices here, counted
+    over all pieces, no keyframe saw: with their triangles they close holes.
     """
 
     segment: int
@@ -248,6 +249,7 @@ class MeshPiece(Header):
     normals: Annotated[F32, Shape("V", 3)]
     colours: Annotated[U8, Shape("V", 3)]
     triangles: Annotated[I32, Shape("T", 3)]
+    closed: Annotated[I32, Shape("C")] = field(default_factory=no_rows)
 
 
 @dataclass(frozen=True, kw_only=True)

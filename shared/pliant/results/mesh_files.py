@@ -44,8 +44,11 @@ def write_meshes(
 
 
 def write_mesh(path: Path, mesh: TriangleMesh) -> None:
-    """A PLY file."""
-    write_ply(path, mesh.positions, mesh.colours, normals=mesh.normals, faces=mesh.triangles)
+    """A PLY file; vertices that close holes are marked where there are any."""
+    write_ply(
+        path, mesh.positions, mesh.colours, normals=mesh.normals, faces=mesh.triangles,
+        closed=mesh.closed if len(mesh.closed) else None,
+    )  # fmt: skip
 
 
 def write_pictures(folder: Path, mesh: TriangleMesh, T_world_camera: F64, suffix: str = "") -> None:

@@ -34,7 +34,7 @@ _PAD = SIDE + 3
 """Voxels of a block, one before and two behind it: what its cubes and their gradients read."""
 _END = np.float32(0.01)
 """Vertices keep this share of an edge from its ends, so that no triangle is without area."""
-_MAX_STEPS = 3.0
+MAX_STEPS = 3.0
 """A cut edge may change by so many voxels' worth of distance.  A true distance has one."""
 _VERTEX = 9
 """Values of a vertex: position, normal, colour."""
@@ -43,13 +43,14 @@ _VERTEX = 9
 class Tsdf(NamedTuple):
     """The sums of a volume's blocks, and their scale.
 
-    min_weight: voxels of less, in WEIGHT_UNITS, were not seen.
+    min_weight: voxels of less, in WEIGHT_UNITS, were not seen.    max_steps: see MAX_STEPS.
     """
 
     table: BlockTable
     sums: VoxelSums
     scale: Scale
     min_weight: int
+    max_steps: float = MAX_STEPS
 
 
 class CubeTable(NamedTuple):
@@ -157,7 +158,7 @@ def _best_cut(loop: tuple[int, ...]) -> tuple[int, tuple[tuple[int, int, int], .
 
 @kernel
 def _march(keys: I32, tsdf: Tsdf, cube: CubeTable) -> tuple[I32, I32, I32, F32, I32]:
-    max_jump = _MAX_STEPS * tsdf.scale.voxel / tsdf.scale.truncation
+    max_jump = tsdf.max_steps * tsdf.scale.voxel / tsdf.scale.truncation
     vertex_counts = np.zeros(len(keys), np.int32)
     triangle_counts = np.zeros(len(keys), np.int32)
     edges: Any = np.empty(4096, np.int32)

@@ -4,7 +4,7 @@ No kernels: readers of messages load this module.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Annotated
 
 import numpy as np
@@ -49,14 +49,23 @@ class MeshBlocks:
     triangles: Annotated[I32, Shape("T", 3)]
 
 
+def no_rows() -> I32:
+    """(0,) of none."""
+    return np.zeros(0, np.int32)
+
+
 @dataclass(frozen=True, kw_only=True)
 class TriangleMesh:
-    """A welded mesh.  Fields as in MeshBlocks; triangles are rows of the vertices here."""
+    """A welded mesh.  Fields as in MeshBlocks; triangles are rows of the vertices here.
+
+    closed: rows of vertices that no keyframe saw, ascending: with their triangles they close holes.
+    """
 
     positions: Annotated[F32, Shape("V", 3)]
     normals: Annotated[F32, Shape("V", 3)]
     colours: Annotated[U8, Shape("V", 3)]
     triangles: Annotated[I32, Shape("T", 3)]
+    closed: Annotated[I32, Shape("C")] = field(default_factory=no_rows)
 
     def of_triangles(self, rows: BoolArray | slice) -> "TriangleMesh":
         """Some of its triangles with the vertices that they use."""
@@ -66,6 +75,7 @@ class TriangleMesh:
             normals=self.normals[used],
             colours=self.colours[used],
             triangles=corners.reshape(-1, 3).astype(np.int32),
+            closed=np.flatnonzero(np.isin(used, self.closed)).astype(np.int32),
         )
 
 

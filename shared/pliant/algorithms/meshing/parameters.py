@@ -186,5 +186,10 @@ class MeshingParameters(Parameters):
             "landmarks, as in the live mesh."
         ),
     )
+    finish: bool = Field(
+        default=True,
+        description="Close small holes of mesh.ply, leave out its small pieces and smooth its "
+        "borders (with depth=dense).",
+    )
     surface: SurfaceParameters = SurfaceParameters()
     tsdf: TsdfParameters = TsdfParameters()

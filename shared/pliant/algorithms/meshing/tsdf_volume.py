@@ -1,6 +1,7 @@
 """A TSDF volume: depth maps in and out again exactly, blocks of mesh out."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,15 +9,17 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.meshing.marching_cubes import Tsdf, extract_blocks
+from pliant.algorithms.meshing.marching_cubes import MAX_STEPS, Tsdf, extract_blocks
 from pliant.algorithms.meshing.mesh_blocks import (
     BLOCK_BYTES,
+    SIDE,
     MeshBlocks,
     TriangleMesh,
     joined_blocks,
     sorted_keys,
     weld,
 )
+from pliant.algorithms.meshing.mesh_finish import MOST_STEPS, finished
 from pliant.algorithms.meshing.parameters import TsdfParameters
 from pliant.algorithms.meshing.tsdf_blocks import (
     BlockPool,
@@ -25,6 +28,7 @@ from pliant.algorithms.meshing.tsdf_blocks import (
     find_rows,
     with_neighbours,
 )
+from pliant.algorithms.meshing.tsdf_closing import CARRIED, carry_on, evidence_of
 from pliant.algorithms.meshing.tsdf_integrate import (
     WEIGHT_UNITS,
     PixelPlanes,
@@ -122,19 +126,39 @@ class TsdfVolume:
 
     def extract(self, keys: I32) -> MeshBlocks:
         """The surface of these blocks, ascending; those that are empty or gone have none."""
-        min_weight = max(1, round(self._parameters.min_weight * WEIGHT_UNITS))
-        blocks = self._blocks
-        return extract_blocks(
-            sorted_keys(keys), Tsdf(blocks.table, blocks.sums, self.scale, min_weight)
-        )
+        return extract_blocks(sorted_keys(keys), self._tsdf(MAX_STEPS))
 
-    def extract_all(self) -> TriangleMesh:
-        """The whole surface, welded across blocks."""
-        keys, parts = sorted_keys(self.keys), list[MeshBlocks]()
-        for first in range(0, len(keys), _AT_ONCE):
-            parts.append(self.extract(keys[first : first + _AT_ONCE]))
-            self._blocks.where.let_go()
+    def extract_all(self, max_steps: float = MAX_STEPS) -> TriangleMesh:
+        """The whole surface, welded across blocks.    max_steps: as of ``Tsdf``."""
+        parts = list[MeshBlocks]()
+        for keys in self._parts(sorted_keys(self.keys)):
+            parts.append(extract_blocks(keys, self._tsdf(max_steps)))
         return weld(joined_blocks(parts))
+
+    def extract_finished(self) -> TriangleMesh:
+        """The whole surface with small holes closed, without crumbs, and with smooth borders.
+
+        Voxels that were not seen are filled: afterwards the volume serves for nothing else.
+        """
+        tsdf = self._tsdf(MOST_STEPS)
+        steps = np.zeros((len(self.keys), SIDE, SIDE, SIDE), np.uint8)
+        for step in range(1, CARRIED + 1):
+            for keys in self._parts(self.keys):
+                carry_on(keys, tsdf, step, steps)
+        mesh = self.extract_all(MOST_STEPS)
+        evidence = evidence_of(mesh.positions, tsdf, steps)
+        self._blocks.where.let_go()
+        return finished(mesh, evidence, self.scale.voxel)
+
+    def _tsdf(self, max_steps: float) -> Tsdf:
+        min_weight = max(1, round(self._parameters.min_weight * WEIGHT_UNITS))
+        return Tsdf(self._blocks.table, self._blocks.sums, self.scale, min_weight, max_steps)
+
+    def _parts(self, keys: I32) -> Iterator[I32]:
+        """Some of the blocks after the others, so that few of those on disk are in memory."""
+        for first in range(0, len(keys), _AT_ONCE):
+            yield keys[first : first + _AT_ONCE]
+            self._blocks.where.let_go()
 
     def _add(
         self, sign: int, serial: int, pixels: PixelPlanes, colour: U8, T_world_camera: F64

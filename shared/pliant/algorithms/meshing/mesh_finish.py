@@ -1,0 +1,120 @@
+"""A mesh that can be shown: small holes closed, no crumbs or shreds, borders without teeth.
+
+What voxels say that were not seen, or whose sights disagree, is a guess: it stays where surface
+encloses it, and closes a hole.  From the border inwards it is peeled off, so that the surface ends
+where the keyframes' sight did.  Pieces of little area and little weight go.  Sizes are in voxels, a
+share of the scene's median depth.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, I32, BoolArray
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
+from pliant.algorithms.meshing.mesh_borders import smoothed_borders, without_teeth, zipped
+from pliant.algorithms.meshing.mesh_components import components
+from pliant.algorithms.meshing.mesh_topology import NONE, corner_before, split_fans, stars_of
+from pliant.algorithms.meshing.tsdf_closing import CARRIED, Evidence, is_guessed
+from pliant.compiler.kernel import kernel
+
+MOST_STEPS = 7.0
+"""As of ``Tsdf``: what a guess may have.  Between the truncations on both sides there are 8."""
+_SURE_STEPS = 5.0
+"""More are a guess.  MAX_STEPS, of the live mesh, lets no curtain hang behind the edges of things;
+here teeth are cut off and slits would stay."""
+_RINGS = 2 * CARRIED
+"""Triangles inwards that guesses are peeled off: they are carried on askew, too."""
+_CRUMB = 30.0
+"""Square voxels of certain surface that a piece has at least: one sight face on, of certain depth.
+Of uncertain surface it takes more."""
+_MAX_EDGE = 2.5
+"""Voxels: the longest edge that closes a notch."""
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """support: (V,) weights.    guessed: (V,)."""
+
+    mesh: TriangleMesh
+    support: F32
+    guessed: BoolArray
+
+    def kept(self, alive: BoolArray) -> "_Judged":
+        """Some of the triangles (T,)."""
+        used = np.unique(self.mesh.triangles[alive])
+        mesh = self.mesh.of_triangles(alive)
+        return _Judged(mesh, self.support[used], self.guessed[used])
+
+    def zipped(self, max_edge: float) -> "_Judged":
+        """With sharp notches closed; at most one border passes each vertex then."""
+        mesh = self.mesh
+        triangles, was = split_fans(len(mesh.positions), mesh.triangles)
+        positions, normals = mesh.positions[was], mesh.normals[was]
+        more = zipped(positions, normals, triangles, max_edge)
+        mesh = TriangleMesh(
+            positions=positions,
+            normals=normals,
+            colours=mesh.colours[was],
+            triangles=np.concatenate([triangles, more]),
+        )
+        return _Judged(mesh, self.support[was], self.guessed[was])
+
+
+def finished(mesh: TriangleMesh, evidence: Evidence, voxel: float) -> TriangleMesh:
+    """The mesh of a volume in which distances were carried on, with marks where it is guessed.
+
+    voxel: its side, in the unit of the mesh.
+    """
+    judged = _Judged(mesh, evidence.support, is_guessed(evidence, _SURE_STEPS))
+    judged = judged.kept(peeled(mesh.triangles, judged.guessed, _RINGS))
+    judged = judged.zipped(_MAX_EDGE * voxel)
+    judged = judged.kept(without_teeth(judged.mesh.positions, judged.mesh.triangles))
+    judged = judged.kept(_large_enough(judged, voxel))
+    judged = judged.zipped(_MAX_EDGE * voxel)
+    mesh = judged.mesh
+    return replace(
+        mesh,
+        positions=smoothed_borders(mesh.positions, mesh.normals, mesh.triangles),
+        closed=np.flatnonzero(judged.guessed).astype(np.int32),
+    )
+
+
+def _large_enough(judged: _Judged, voxel: float) -> BoolArray:
+    """(T,) triangles of pieces, connected by vertices, with enough area times weight up to 1."""
+    triangles = judged.mesh.triangles.astype(np.int64)
+    if not len(triangles):
+        return np.zeros(0, np.bool_)
+    count = len(judged.mesh.positions)
+    piece = components(count, triangles[:, :2].ravel(), triangles[:, 1:].ravel())[triangles[:, 0]]
+    corners = judged.mesh.positions[triangles].astype(np.float64) / voxel
+    turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    certain = np.minimum(judged.support[triangles].astype(np.float64).mean(axis=1), 1.0)
+    sizes = np.bincount(piece, 0.5 * np.linalg.norm(turned, axis=1) * certain)
+    return (sizes >= _CRUMB)[piece]
+
+
+@kernel
+def peeled(triangles: I32, guessed: BoolArray, rings: int) -> BoolArray:
+    """(T,) which triangles are left, without those with a guessed corner that meet the border; so
+    many times.  guessed: (V,)."""
+    stars = stars_of(len(guessed), triangles)
+    alive = np.ones(len(triangles), np.bool_)
+    ends = np.zeros(len(guessed), np.bool_)
+    for t in range(len(triangles)):
+        for k in range(3):
+            a, b = triangles[t, k], triangles[t, (k + 1) % 3]
+            if corner_before(b, a, triangles, stars, alive) == NONE:
+                ends[a], ends[b] = True, True
+    for _ in range(rings):
+        gone = np.zeros(len(triangles), np.bool_)
+        for t in range(len(triangles)):
+            a, b, c = triangles[t]
+            is_guess = guessed[a] or guessed[b] or guessed[c]
+            gone[t] = alive[t] and is_guess and (ends[a] or ends[b] or ends[c])
+        for t in range(len(triangles)):
+            if gone[t]:
+                alive[t] = False
+                for k in range(3):
+                    ends[triangles[t, k]] = True
+    return alive
