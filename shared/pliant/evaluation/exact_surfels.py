@@ -227,7 +227,9 @@ class ExactSurfels:
             where = np.where(alive[:, None], in_camera, rays * in_camera[:, 2:3])
         off = np.linalg.norm((where - exact_camera) / exact_camera[:, 2:3], axis=1)
         inside = listed & (surfels.state[row] != SurfelState.OUTSIDE)
-        self._pairs.zncc.append(surfels.zncc[row][inside].astype(np.float64))
+        # A recent template fits where it was taken: the ZNCC with that of birth is the test.
+        zncc = surfels.birth_zncc if len(surfels.birth_zncc) == len(surfels.ids) else surfels.zncc
+        self._pairs.zncc.append(zncc[row][inside].astype(np.float64))
         self._pairs.right.append((off < INLIER)[inside])
         self._pairs.visible.append(visible[inside])
         front = (where[:, 2] > 0.0) & (exact_camera[:, 2] > 0.0)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.commands.app import Overrides, app, show
+from benchmarks.commands.app import Overrides, Source, app, show
 
 
 @app.command()
@@ -73,6 +73,25 @@ def surfels(
         sources or [], tracks=tracks, tables=chosen, frames=frames, surfels=count, quick=quick
     )
     show(lines)
+
+
+@app.command()
+def tissue(
+    source: Source,
+    frames: Annotated[str, typer.Option(help="Frames to judge, from 0.")] = "50,100,150",
+    without: Annotated[
+        str,
+        typer.Option(help="Polygon u,v,u,v,... in the first frame: surfels in it do not count."),
+    ] = "",
+    overrides: Overrides = None,
+) -> None:
+    """Surfels on a video without depth, beside Lucas-Kanade: alive, right and wrong ones.
+
+    scripts/bench tissue path/to/folder --set patch_px=31
+    """
+    from benchmarks.tissue import measure
+
+    show(measure(source, frames, without, overrides or []))
 
 
 @app.command("how-pictures")

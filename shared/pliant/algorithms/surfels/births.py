@@ -51,7 +51,7 @@ _MAX_SLOPE = 4.0
 """Steepest surface: relative change of depth per unit of normalised coordinate."""
 _MAX_OFF_PLANE = 0.03
 """Pixels off a surfel's plane by more than this share of its depth are not part of its texture."""
-_MIN_TEMPLATE = 0.6
+MIN_TEMPLATE = 0.6
 """Minimum share of a patch inside the image and on the surfel's plane."""
 
 
@@ -89,7 +89,7 @@ def find_births(
     )
     poses = place(corners[:, :2], depth, camera, p)
     templates = [
-        make_templates(poses, each, p.highlight, _MIN_TEMPLATE, depth, _MAX_OFF_PLANE)
+        make_templates(poses, each, p.highlight, MIN_TEMPLATE, depth, _MAX_OFF_PLANE)
         for each in pyramid
     ]
     rows = np.flatnonzero(templates[0].usable)[: max(count, 0)]
@@ -181,36 +181,47 @@ def _fill(
     max_off_plane: float, templates: Templates, scratch: F32,
 ) -> None:  # fmt: skip
     h = np.empty(9)
-    side = wide.side - 2
     for s in range(len(poses)):
         if not homography(poses[s], level, h) or not sample_patch(h, level, wide, highlight):
             continue
         _leave_out_other_surfaces(h, level, wide, depth, max_off_plane)
-        images = templates.images[s]
-        count, total, squares = 0, 0.0, 0.0
-        for n in range(images.shape[1]):
-            k = first_inner(wide) + n
-            v = wide.values[k] if n % wide.side < side else np.float32(INVALID)
-            images[0, n] = v
-            if not v < _FAR:
-                continue
-            vu = np.float32(0.5) * (wide.values[k + 1] - wide.values[k - 1])
-            vv = np.float32(0.5) * (wide.values[k + wide.side] - wide.values[k - wide.side])
-            # Samples without derivatives are not part of the texture.
-            if abs(vu) < _FAR * 0.5 and abs(vv) < _FAR * 0.5:
-                images[1, n], images[2, n] = vu, vv
-            count, total, squares = count + 1, total + v, squares + v * v
-        if count < min_share * side * side:
+        fill_texture(s, wide, min_share, templates, scratch)
+
+
+@fast_kernel
+def fill_texture(s: int, wide: Grid, min_share: float, templates: Templates, scratch: F32) -> bool:
+    """Make one surfel's template of the samples of its grid; INVALID ones take no part.
+
+    Returns False where fewer than ``min_share`` of a patch are valid: nothing but the images is
+    written then.
+    """
+    side = wide.side - 2
+    images = templates.images[s]
+    count, total, squares = 0, 0.0, 0.0
+    for n in range(images.shape[1]):
+        k = first_inner(wide) + n
+        v = wide.values[k] if n % wide.side < side else np.float32(INVALID)
+        images[0, n], images[1, n], images[2, n] = v, np.float32(0.0), np.float32(0.0)
+        if not v < _FAR:
             continue
-        mean = float(total / count)
-        templates.means[s], templates.counts[s] = mean, count
-        # A sample that the template lacks is saturated in every frame.
-        for n in range(images.shape[1]):
-            if images[0, n] < _FAR:
-                images[0, n] -= np.float32(mean)
-        plain = Comparison(mean, 1.0, 0.0, 1.0, 0.0)
-        feature_matrix(images, wide, plain, scratch, templates.matrices[s])
-        templates.usable[s] = 1 if squares / count - mean * mean > _MIN_VARIANCE else 0
+        vu = np.float32(0.5) * (wide.values[k + 1] - wide.values[k - 1])
+        vv = np.float32(0.5) * (wide.values[k + wide.side] - wide.values[k - wide.side])
+        # Samples without derivatives are not part of the texture.
+        if abs(vu) < _FAR * 0.5 and abs(vv) < _FAR * 0.5:
+            images[1, n], images[2, n] = vu, vv
+        count, total, squares = count + 1, total + v, squares + v * v
+    if count < min_share * side * side:
+        return False
+    mean = float(total / count)
+    templates.means[s], templates.counts[s] = mean, count
+    # A sample that the template lacks is saturated in every frame.
+    for n in range(images.shape[1]):
+        if images[0, n] < _FAR:
+            images[0, n] -= np.float32(mean)
+    plain = Comparison(mean, 1.0, 0.0, 1.0, 0.0)
+    feature_matrix(images, wide, plain, scratch, templates.matrices[s])
+    templates.usable[s] = 1 if squares / count - mean * mean > _MIN_VARIANCE else 0
+    return True
 
 
 def select(templates: Templates, rows: I64) -> Templates:

@@ -23,6 +23,14 @@ def _none_tried() -> F64:
     return np.zeros((0, 3))
 
 
+def _no_zncc() -> F32:
+    return np.zeros(0, np.float32)
+
+
+def _none_confirmed() -> U8:
+    return np.zeros(0, np.uint8)
+
+
 @dataclass(frozen=True)
 class SurfelFrame:
     """N surfels in one frame, ordered by id.  No entry is ever NaN or infinite."""
@@ -47,6 +55,10 @@ class SurfelFrame:
     # (N, 3) metres, world: of the pose that zncc and visible speak of, kept or not; or (0, 3)
     # in recordings that were made before it was published.
     tried: Annotated[F64, Shape("T", 3)] = field(default_factory=_none_tried)
+    # (N,) ZNCC with the birth template, and 1 where the surfel was found by it; or (0,) in
+    # recordings that were made before they were published.
+    birth_zncc: Annotated[F32, Shape("B")] = field(default_factory=_no_zncc)
+    confirmed: Annotated[U8, Shape("B")] = field(default_factory=_none_confirmed)
 
     def __post_init__(self) -> None:
         check_arrays(self)

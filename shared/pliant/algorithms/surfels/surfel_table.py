@@ -37,7 +37,10 @@ def _none() -> list[Templates]:
 class SurfelTable:
     """N surfels, ordered by id.  Poses are in the world frame."""
 
-    templates: list[Templates] = field(default_factory=_none)  # one for each level
+    templates: list[Templates] = field(default_factory=_none)  # in use, one for each level
+    birth: list[Templates] = field(default_factory=_none)  # the same at birth
+    renewed: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))  # not that of birth
+    birth_zncc: F64 = field(default_factory=lambda: np.zeros(0))  # with the birth template
     poses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # last good ones
     rest: F64 = field(default_factory=lambda: np.zeros((0, 3)))  # X^0 of Eq. 20, world
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))  # root of its Sigma, metres
@@ -61,11 +64,13 @@ class SurfelTable:
         poses = move_poses(births.poses, T_world_camera)
         validations = new_validations(n)
         validations[:, [FRONT, INSIDE, VISIBLE, ZNCC]] = 1.0
-        self.templates = (
-            [join(a, b) for a, b in zip(self.templates, births.templates, strict=True)]
-            if self.templates
-            else births.templates
-        )
+        nothing = [select(each, np.zeros(0, np.int64)) for each in births.templates]
+        for name in ("templates", "birth"):
+            before = getattr(self, name) or nothing
+            pairs = zip(before, births.templates, strict=True)
+            setattr(self, name, [join(a, b) for a, b in pairs])
+        self.renewed = np.concatenate([self.renewed, np.zeros(n, np.bool_)])
+        self.birth_zncc = np.concatenate([self.birth_zncc, np.ones(n)])
         self.poses = np.concatenate([self.poses, poses])
         self.guesses = np.concatenate([self.guesses, poses])
         self.tried = np.concatenate([self.tried, poses[:, X : X + 3]])
@@ -85,7 +90,10 @@ class SurfelTable:
         """Drop all but some rows."""
         self.edges = keep_rows(self.edges, rows, len(self))
         self.templates = [select(each, rows) for each in self.templates]
+        self.birth = [select(each, rows) for each in self.birth]
         for name in (
+            "renewed",
+            "birth_zncc",
             "poses",
             "rest",
             "sigmas",
@@ -109,6 +117,11 @@ class SurfelTable:
     def tracked(self) -> BoolArray:
         """(N,) whether a surfel was tracked in the last frame."""
         return self.state == SurfelState.TRACKED
+
+    @property
+    def confirmed(self) -> BoolArray:
+        """(N,) whether a surfel was found by its birth template in the last frame."""
+        return self.tracked & ~self.renewed
 
 
 def frame_of(
@@ -140,6 +153,8 @@ def frame_of(
         age=(frame - table.born).astype(np.int32),
         born=table.born.copy(),
         tried=table.tried.copy(),
+        birth_zncc=_f32(table.birth_zncc),
+        confirmed=table.confirmed.astype(np.uint8),
     )
 
 
