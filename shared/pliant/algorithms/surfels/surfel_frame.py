@@ -55,8 +55,8 @@ class SurfelFrame:
     # (N, 3) metres, world: of the pose that zncc and visible speak of, kept or not; or (0, 3)
     # in recordings that were made before it was published.
     tried: Annotated[F64, Shape("T", 3)] = field(default_factory=_none_tried)
-    # (N,) ZNCC with the birth template, and 1 where the surfel was found by it; or (0,) in
-    # recordings that were made before they were published.
+    # (N,) ZNCC with the birth template; 1 where a surfel is tracked and that template is in use.
+    # Or (0,) in recordings that were made before they were published.
     birth_zncc: Annotated[F32, Shape("B")] = field(default_factory=_no_zncc)
     confirmed: Annotated[U8, Shape("B")] = field(default_factory=_none_confirmed)
 

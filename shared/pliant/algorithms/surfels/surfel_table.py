@@ -120,7 +120,7 @@ class SurfelTable:
 
     @property
     def confirmed(self) -> BoolArray:
-        """(N,) whether a surfel was found by its birth template in the last frame."""
+        """(N,) whether a surfel is tracked and its birth template is in use."""
         return self.tracked & ~self.renewed
 
 
