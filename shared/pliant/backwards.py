@@ -13,11 +13,11 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, I64
 from pliant.algorithms.image.masks import clearance_in, filled
-from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.self_calibration import widened
+from pliant.algorithms.slam.calibration.self_calibration import widened
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
+from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.config import Config
 from pliant.datasets.base import Dataset, SourceFrame

@@ -12,9 +12,9 @@ from typing import Any, Literal, TypeAlias, cast
 import yaml
 from pydantic import BaseModel, Field, ValidationError
 
-from pliant.algorithms.mapping.parameters import MappingParameters
 from pliant.algorithms.meshing.parameters import MeshingParameters
 from pliant.algorithms.parameters import Parameters
+from pliant.algorithms.slam.parameters import MappingParameters
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.errors import ConfigError, RecordingError

@@ -7,8 +7,8 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import matrix_to_pose, move_by_similarity, pose_to_matrix
-from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapDelta, MapMoves
+from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.trajectory import Trajectory
 
 MIN_INLIERS = 30

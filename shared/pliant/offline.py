@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pliant.algorithms.image.masks import clearance_in, filled
-from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import MapDelta
-from pliant.algorithms.mapping.calibration_bootstrap import mapper_for
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.known_places import KnownPlaces
-from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.slam.calibration_bootstrap import mapper_for
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.known_places import KnownPlaces
+from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
+from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.algorithms.tracks import FrameExtrema

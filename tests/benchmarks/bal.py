@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.bundle.problem import BundleProblem
 from pliant.algorithms.geometry import inverse, so3_exp
+from pliant.algorithms.slam.estimate.problem import BundleProblem
 from pliant.errors import DatasetError
 
 Indices = NDArray[Any]

@@ -6,9 +6,13 @@ import numpy as np
 
 from benchmarks.bal import load_bal, load_libmv
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.bundle.problem import BundleParameters, BundleProblem, shared_intrinsics
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_exp
+from pliant.algorithms.slam.estimate.problem import (
+    BundleParameters,
+    BundleProblem,
+    shared_intrinsics,
+)
 
 CAMERA = PinholeCamera(width=640, height=480, fx=600.0, fy=600.0, cx=319.5, cy=239.5)
 WINDOW = BundleParameters(kernel_sigma_px=2.0)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I32
-from pliant.algorithms.bundle.problem import BundleParameters, BundleProblem
 from pliant.algorithms.geometry import inverse, so3_log
+from pliant.algorithms.slam.estimate.problem import BundleParameters, BundleProblem
 from pliant.compiler.kernel import fast_kernel
 from pliant.errors import PliantError
 

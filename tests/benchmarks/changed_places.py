@@ -9,8 +9,8 @@ from benchmarks.deceiving_scenes import CAMERA, Film, Way, furniture, room_with
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.geometry import align_umeyama, inverse, so3_log, transform
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.tracking.maxima import maxima_of
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.config import Config

@@ -20,7 +20,7 @@ from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.triangulation import triangulate
+from pliant.algorithms.slam.estimate.triangulation import triangulate
 from pliant.export.export import export_result
 
 _CORNERS = 300

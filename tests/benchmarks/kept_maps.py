@@ -12,10 +12,10 @@ from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import align_umeyama, inverse, pose_to_matrix, so3_log, transform
-from pliant.algorithms.kept_keyframe import KeptKeyframe
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.localiser import Localiser
-from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.localiser import Localiser
+from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
+from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.config import Config
 from pliant.datasets import open_source

@@ -12,9 +12,9 @@ import numpy as np
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_exp
-from pliant.algorithms.mapping.final_adjustment import ObservationList, adjust_list
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.slam.adjust.final_adjustment import ObservationList, adjust_list
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.parameters import MappingParameters
 
 _CAMERA = PinholeCamera(width=640, height=480, fx=600.0, fy=600.0, cx=319.5, cy=239.5)
 

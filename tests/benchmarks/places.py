@@ -11,12 +11,12 @@ from benchmarks.table import markdown
 from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, pose_to_matrix, so3_log, transform
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.landmarks import MAPPED
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.relocalisation import Recognised
-from pliant.algorithms.places import describe
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.map.keyframe import Keyframe
+from pliant.algorithms.slam.map.landmarks import MAPPED
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.places.place_index import describe
+from pliant.algorithms.slam.places.relocalisation import Recognised
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.config import Config
 from pliant.datasets import open_source

@@ -15,10 +15,10 @@ import numpy as np
 from benchmarks.bundle_problems import Case, public_cases, synthetic_cases
 from benchmarks.ceres import CostCurve, solve_with_ceres
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.bundle.problem import BundleParameters, BundleProblem, BundleResult
-from pliant.algorithms.bundle.schur import solve_schur
-from pliant.algorithms.bundle.subspace import solve_subspace
 from pliant.algorithms.geometry import so3_exp
+from pliant.algorithms.slam.estimate.problem import BundleParameters, BundleProblem, BundleResult
+from pliant.algorithms.slam.estimate.schur import solve_schur
+from pliant.algorithms.slam.estimate.subspace import solve_subspace
 from pliant.errors import PliantError
 
 GOAL = 1.001

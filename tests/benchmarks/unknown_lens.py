@@ -9,9 +9,9 @@ import numpy as np
 from benchmarks.in_process import Mapped, run
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.rectification import distort
+from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, corrected_view
 from pliant.datasets import Calibration, open_source
 from pliant.datasets.calibration import calibration_from_fov
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.map_delta import LOST, TRACKING, MapDelta
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameTracks
 from pliant.datasets.source_spec import SourceSpec
 from pliant.exit_codes import DONE, INCOMPLETE

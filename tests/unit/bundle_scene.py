@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pliant.algorithms.bundle.problem import BundleParameters, BundleProblem
 from pliant.algorithms.geometry import inverse, so3_exp
+from pliant.algorithms.slam.estimate.problem import BundleParameters, BundleProblem
 
 F64 = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pliant.algorithms.absolute_pose import p3p, pose_by_ransac
 from pliant.algorithms.geometry import so3_exp
+from pliant.algorithms.slam.estimate.absolute_pose import p3p, pose_by_ransac
 
 
 def solutions(points, rays):

@@ -93,6 +93,28 @@ def test_imports_go_one_way() -> None:
     assert not breaches
 
 
+SLAM_LAYERS = (
+    *("estimate", "parameters", "keyframe_rule", "map", "calibration", "locate", "frame"),
+    *("adjust", "start", "places", "store"),
+)
+"""Of ``algorithms/slam``: each imports only those before it.  The flow is above them."""
+
+
+def test_packages_of_slam_import_those_below_them() -> None:
+    slam = LIBRARY / "algorithms" / "slam"
+    breaches: list[str] = []
+    for path in python_files(slam):
+        room = path.relative_to(slam).parts[0].removesuffix(".py")
+        if room not in SLAM_LAYERS:
+            continue  # the flow
+        below = SLAM_LAYERS[: SLAM_LAYERS.index(room) + 1]
+        for name in imports(path):
+            package = name.removeprefix("pliant.algorithms.slam.")
+            if package != name and package.split(".")[0] not in below:
+                breaches.append(f"{path.relative_to(slam)} imports {name}")
+    assert not breaches
+
+
 def test_algorithms_are_pure() -> None:
     breaches: list[str] = []
     for path in python_files(LIBRARY / "algorithms") + python_files(LIBRARY / "rendering"):
@@ -109,8 +131,8 @@ def test_algorithms_are_pure() -> None:
 
 def test_landmarks_alone_write_their_positions() -> None:
     writes = re.compile(r"points\.(xyz|spread)\[[^\n]*\] = ")
-    mapping = LIBRARY / "algorithms" / "mapping"
-    texts = {path.name: path.read_text(encoding="utf-8") for path in python_files(mapping)}
+    slam = LIBRARY / "algorithms" / "slam"
+    texts = {path.name: path.read_text(encoding="utf-8") for path in python_files(slam)}
     assert [name for name, text in texts.items() if writes.search(text)] == []
 
 

@@ -18,8 +18,8 @@ _ADJUSTMENT = """
 import hashlib
 import numpy
 from bundle_scene import make_scene
-from pliant.algorithms.bundle.problem import BundleParameters
-from pliant.algorithms.bundle.schur import solve_schur
+from pliant.algorithms.slam.estimate.problem import BundleParameters
+from pliant.algorithms.slam.estimate.schur import solve_schur
 problem = make_scene(cameras=40, points=300, noise_px=0.5, visible=0.4).problem
 result = solve_schur(problem, BundleParameters())
 print(hashlib.sha256(result.T_world_camera.tobytes()).hexdigest())

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from benchmarks.bal import load_bal, load_libmv
 
-from pliant.algorithms.bundle.problem import BundleParameters
-from pliant.algorithms.bundle.schur import solve_schur
+from pliant.algorithms.slam.estimate.problem import BundleParameters
+from pliant.algorithms.slam.estimate.schur import solve_schur
 from pliant.errors import DatasetError
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "bundle_adjustment"

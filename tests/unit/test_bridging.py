@@ -5,9 +5,9 @@ import numpy as np
 from test_tracking import follow, motion, render
 
 from pliant.algorithms.arrays import U8
-from pliant.algorithms.mapping.covisibility import collect_garbage
-from pliant.algorithms.mapping.landmarks import CANDIDATE, FREE, Landmarks
-from pliant.algorithms.mapping.track_links import UNLINKED, TrackLinks
+from pliant.algorithms.slam.map.covisibility import collect_garbage
+from pliant.algorithms.slam.map.landmarks import CANDIDATE, FREE, Landmarks
+from pliant.algorithms.slam.map.track_links import UNLINKED, TrackLinks
 from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.state import load_state, save_state
 

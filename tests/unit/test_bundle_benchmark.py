@@ -12,7 +12,7 @@ from benchmarks.solvers import (
     solve_with_scipy,
 )
 
-from pliant.algorithms.bundle.problem import BundleProblem
+from pliant.algorithms.slam.estimate.problem import BundleProblem
 
 
 def small_window(points: int) -> BundleProblem:
@@ -53,7 +53,7 @@ def test_ceres_projects_with_distortion_as_we_do():
     intrinsics[:, 4:] = (-0.05, 0.01)
     distorted = dataclasses.replace(problem, intrinsics=intrinsics)
     theirs = solve_with_ceres(distorted, WINDOW)
-    from pliant.algorithms.bundle.schur import solve_schur
+    from pliant.algorithms.slam.estimate.schur import solve_schur
 
     ours = solve_schur(distorted, WINDOW)
     assert theirs.costs[0] == pytest.approx(ours.initial_cost, rel=1e-9)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from bundle_scene import make_scene, numeric_jacobian, project
 
-from pliant.algorithms.bundle.calibration import SharedCalibration, ideal_pixels
-from pliant.algorithms.bundle.packed_layout import build_packed_layout
-from pliant.algorithms.bundle.problem import SHARED, BundleParameters, CalibrationUncertainty
-from pliant.algorithms.bundle.schur import SchurSystem, solve_schur, system_at
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.slam.estimate.calibration import SharedCalibration, ideal_pixels
+from pliant.algorithms.slam.estimate.packed_layout import build_packed_layout
+from pliant.algorithms.slam.estimate.problem import SHARED, BundleParameters, CalibrationUncertainty
+from pliant.algorithms.slam.estimate.schur import SchurSystem, solve_schur, system_at
 
 EXACT = BundleParameters(kernel_sigma_px=0.0, max_iterations=60, min_relative_decrease=1e-10)
 ROBUST = BundleParameters(kernel_sigma_px=1.0, max_iterations=60, min_relative_decrease=1e-7)

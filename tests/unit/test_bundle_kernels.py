@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from bundle_scene import cost, dense_normal_equations, make_scene, move, residuals
 
-from pliant.algorithms.bundle.dense_layout import BLOCK, build_layout
-from pliant.algorithms.bundle.problem import BundleParameters
-from pliant.algorithms.bundle.projection import limits_of, move_camera, solve_camera
-from pliant.algorithms.bundle.subspace import squared_residuals, total_cost
-from pliant.algorithms.bundle.subspace_kernels import linearise_camera, sweep_points
 from pliant.algorithms.geometry import inverse
+from pliant.algorithms.slam.estimate.dense_layout import BLOCK, build_layout
+from pliant.algorithms.slam.estimate.problem import BundleParameters
+from pliant.algorithms.slam.estimate.projection import limits_of, move_camera, solve_camera
+from pliant.algorithms.slam.estimate.subspace import squared_residuals, total_cost
+from pliant.algorithms.slam.estimate.subspace_kernels import linearise_camera, sweep_points
 
 LENSES = [(0.0, 0.0), (-0.2, 0.05)]
 LOWER = np.tril_indices(6)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from bundle_scene import make_scene, move, project
 
-from pliant.algorithms.bundle.problem import BundleParameters
-from pliant.algorithms.bundle.subspace import refine_pose, solve_subspace
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.slam.estimate.problem import BundleParameters
+from pliant.algorithms.slam.estimate.subspace import refine_pose, solve_subspace
 
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
 PARAMETERS = BundleParameters(kernel_sigma_px=2.0, min_relative_decrease=1e-8)

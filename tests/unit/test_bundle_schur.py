@@ -8,16 +8,16 @@ from bundle_scene import cost, dense_normal_equations, make_scene, residuals
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pliant.algorithms.bundle.dense_layout import BLOCK
-from pliant.algorithms.bundle.packed_layout import build_packed_layout
-from pliant.algorithms.bundle.problem import BundleParameters
-from pliant.algorithms.bundle.reduced import (
+from pliant.algorithms.slam.estimate.dense_layout import BLOCK
+from pliant.algorithms.slam.estimate.packed_layout import build_packed_layout
+from pliant.algorithms.slam.estimate.problem import BundleParameters
+from pliant.algorithms.slam.estimate.reduced import (
     find_pattern,
     solve_reduced,
     subtract_product3,
     subtract_product6,
 )
-from pliant.algorithms.bundle.schur import SchurSystem, solve_schur
+from pliant.algorithms.slam.estimate.schur import SchurSystem, solve_schur
 from pliant.compiler.kernel import fast_kernel
 
 LENSES = [(0.0, 0.0), (-0.2, 0.05)]

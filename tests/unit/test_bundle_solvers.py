@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from bundle_scene import cost, make_scene, residuals
 
-from pliant.algorithms.bundle.problem import BundleParameters, BundleProblem, BundleWindow
-from pliant.algorithms.bundle.schur import solve_schur
-from pliant.algorithms.bundle.subspace import solve_subspace
 from pliant.algorithms.geometry import so3_exp
+from pliant.algorithms.slam.estimate.problem import BundleParameters, BundleProblem, BundleWindow
+from pliant.algorithms.slam.estimate.schur import solve_schur
+from pliant.algorithms.slam.estimate.subspace import solve_subspace
 
 EXACT = BundleParameters(kernel_sigma_px=0.0, min_relative_decrease=1e-12)
 ROBUST = BundleParameters(kernel_sigma_px=2.0, min_relative_decrease=1e-9)

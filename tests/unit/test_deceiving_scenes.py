@@ -8,8 +8,8 @@ from test_recovery import dark, textures
 from test_relocalisation import Film
 from test_segment_merges import PARAMETERS, along, film
 
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.mapper import Mapper
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.tracks import FrameExtrema
 
 _END = 16.0

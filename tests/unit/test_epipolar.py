@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pliant.algorithms.epipolar import (
+from pliant.algorithms.geometry import hat, so3_exp, so3_log
+from pliant.algorithms.slam.estimate.epipolar import (
     decompose_essential,
     likely_pose,
     parallax,
@@ -13,7 +14,6 @@ from pliant.algorithms.epipolar import (
     rotation_between,
     two_view_depths,
 )
-from pliant.algorithms.geometry import hat, so3_exp, so3_log
 
 R_B_A = so3_exp(np.array([0.01, 0.1, -0.03]))
 T_B_A = np.array([0.4, -0.1, 0.2])

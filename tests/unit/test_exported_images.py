@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import corrected_view
-from pliant.algorithms.mapping.rolling_shutter import RolledFrame
+from pliant.algorithms.slam.calibration.corrected_view import corrected_view
+from pliant.algorithms.slam.calibration.rolling_shutter import RolledFrame
 from pliant.export.images import ShownView
 
 CAMERA = PinholeCamera(width=160, height=120, fx=100.0, fy=100.0, cx=79.5, cy=59.5)

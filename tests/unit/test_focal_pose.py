@@ -3,9 +3,9 @@
 import numpy as np
 from mapping_scene import CAMERA
 
-from pliant.algorithms.bundle.focal_pose import UNKNOWNS, linearise, refine_focal
-from pliant.algorithms.bundle.projection import move_cameras
 from pliant.algorithms.geometry import inverse, so3_exp
+from pliant.algorithms.slam.estimate.focal_pose import UNKNOWNS, linearise, refine_focal
+from pliant.algorithms.slam.estimate.projection import move_cameras
 
 CENTRE = (CAMERA.cx + 3.0, CAMERA.cy - 2.0)
 

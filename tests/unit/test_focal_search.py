@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from mapping_scene import CAMERA
 
-from pliant.algorithms.bundle.problem import (
+from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.slam.calibration.focal_search import best_along_focal
+from pliant.algorithms.slam.estimate.problem import (
     BundleParameters,
     BundleProblem,
     CalibrationUncertainty,
     shared_intrinsics,
 )
-from pliant.algorithms.bundle.schur import solve_schur
-from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.mapping.focal_search import best_along_focal
+from pliant.algorithms.slam.estimate.schur import solve_schur
 
 UNKNOWN = CalibrationUncertainty(focal=0.3, k1=0.0, k2=0.0, readout=0.0)
 ITERATIONS = BundleParameters(max_iterations=20)

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import matrix_to_pose, so3_exp
 from pliant.algorithms.rectification import rectified_camera
+from pliant.algorithms.slam.calibration.corrected_view import corrected_view
 from pliant.datasets.calibration import (
     Calibration,
     calibration_from_fov,

@@ -17,18 +17,18 @@ from pliant.algorithms.geometry import (
     transform,
 )
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping import global_adjustment
-from pliant.algorithms.mapping.final_adjustment import _spread_out, adjust_list
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.global_adjustment import find_moves
-from pliant.algorithms.mapping.landmarks import MAPPED
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import (
+from pliant.algorithms.slam import global_adjustment
+from pliant.algorithms.slam.adjust.final_adjustment import _spread_out, adjust_list
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.global_adjustment import find_moves
+from pliant.algorithms.slam.map.landmarks import MAPPED
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import (
     MappingParameters,
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.map_history import MapHistory
 from pliant.state import load_state, save_state

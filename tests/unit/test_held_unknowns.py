@@ -7,9 +7,9 @@ import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 from test_mapper import Published, trajectory_error
 
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters
 
 FRAMES = 60
 

@@ -8,12 +8,12 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 from test_global_adjustment import similarity
 from test_mapper import Published, run, trajectory_error
 
-from pliant.algorithms.bundle.projection import move_camera
 from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
 from pliant.algorithms.map_delta import LOST, TRACKING, MapMoves
-from pliant.algorithms.mapping.frame import Frame, IdealFrame
-from pliant.algorithms.mapping.frame_pose import localise
-from pliant.algorithms.mapping.inverse_depth import (
+from pliant.algorithms.slam.estimate.projection import move_camera
+from pliant.algorithms.slam.frame import Frame, IdealFrame
+from pliant.algorithms.slam.frame_pose import localise
+from pliant.algorithms.slam.locate.inverse_depth import (
     at_infinity,
     linearise,
     off_epipolar_line,
@@ -21,9 +21,9 @@ from pliant.algorithms.mapping.inverse_depth import (
     placed_candidates,
     refine_pose_spread,
 )
-from pliant.algorithms.mapping.landmarks import MAPPED
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.slam.map.landmarks import MAPPED
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters
 
 K = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
 

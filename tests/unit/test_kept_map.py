@@ -14,15 +14,15 @@ from test_relocalisation import Film, film, run
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.kept_keyframe import MAP_VERSION, KeptKeyframe
 from pliant.algorithms.map_delta import TRACKING, WAITING
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.kept_map import check, take_in
-from pliant.algorithms.mapping.landmarks import MAPPED, Landmarks
-from pliant.algorithms.mapping.localiser import Localiser
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.localiser import Localiser
+from pliant.algorithms.slam.map.kept_keyframe import MAP_VERSION, KeptKeyframe
+from pliant.algorithms.slam.map.landmarks import MAPPED, Landmarks
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters
+from pliant.algorithms.slam.store.kept_map import check, take_in
 from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 from pliant.errors import MapError
 from pliant.map_history import MapHistory

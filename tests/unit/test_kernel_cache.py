@@ -114,7 +114,7 @@ def test_sources_are_followed_through_imports() -> None:
     found = {str(path.relative_to(library)) for path in paths}
     assert {"algorithms/tracking/advance.py", "compiler/kernel.py"} <= found
     assert {"compiler/kernel_cache.py", "algorithms/image/patch_alignment.py"} <= found
-    assert not any(name.startswith("algorithms/bundle/") for name in found)
+    assert not any(name.startswith("algorithms/slam/") for name in found)
 
 
 def test_a_kernel_calls_the_helpers_in_its_own_object_file(tmp_path: Path) -> None:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.keyframe_rule import Overlap, is_due
-from pliant.algorithms.mapping.landmarks import MAPPED
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import KeyframeParameters, MappingParameters
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.keyframe_rule import Overlap, is_due
+from pliant.algorithms.slam.map.landmarks import MAPPED
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import KeyframeParameters, MappingParameters
 
 LIMITS = KeyframeParameters()
 

@@ -5,10 +5,10 @@ import pytest
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
 from pliant.algorithms.meshing.parameters import SurfaceParameters
+from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
 
 CAMERA = PinholeCamera(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 NOISE = 0.01

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 
-from pliant.algorithms.bundle.problem import CalibrationUncertainty
-from pliant.algorithms.corrected_view import moved_px
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.mapping.earlier_segments import EarlierSegments
-from pliant.algorithms.mapping.first_map import BufferedFrame
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.initialisation_buffer import InitialisationBuffer
-from pliant.algorithms.mapping.landmarks import MAPPED
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.rolling_shutter import FramePoses
-from pliant.algorithms.mapping.segment import see_by
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.slam.adjust.segment import see_by
+from pliant.algorithms.slam.calibration.corrected_view import moved_px
+from pliant.algorithms.slam.calibration.rolling_shutter import FramePoses
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.estimate.problem import CalibrationUncertainty
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.map.landmarks import MAPPED
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters
+from pliant.algorithms.slam.start.first_map import BufferedFrame
+from pliant.algorithms.slam.start.initialisation_buffer import InitialisationBuffer
+from pliant.algorithms.slam.store.earlier_segments import EarlierSegments
 
 GIVEN = CalibrationUncertainty()
 KNOWN = SelfCalibration.of(CAMERA, GIVEN)

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.mapping.active_map import ActiveMap
-from pliant.algorithms.mapping.final_adjustment import list_observations
-from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.landmarks import Landmarks
-from pliant.algorithms.mapping.observation_table import weigh
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.segment import Segment
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.slam.active_map import ActiveMap
+from pliant.algorithms.slam.adjust.final_adjustment import list_observations
+from pliant.algorithms.slam.adjust.segment import Segment
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.estimate.observation_table import weigh
+from pliant.algorithms.slam.estimate.problem import CalibrationUncertainty
+from pliant.algorithms.slam.map.keyframe import Keyframe
+from pliant.algorithms.slam.map.landmarks import Landmarks
+from pliant.algorithms.slam.parameters import MappingParameters
 
 CAMERA = PinholeCamera(width=640, height=480, fx=320.0, fy=320.0, cx=320.0, cy=240.0)
 """Its left border lies at -1 on the plane z = 1."""

@@ -1,7 +1,7 @@
 """How many observations make a point, by how many points a frame sees."""
 
-from pliant.algorithms.mapping.frame_pose import limits_of_points
-from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.slam.frame_pose import limits_of_points
+from pliant.algorithms.slam.parameters import MappingParameters
 
 
 def test_where_few_points_are_left_two_observations_make_one():

@@ -6,20 +6,20 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
 from test_mapper import Published, trajectory_error
 from test_recovery import picture, textures
 
-from pliant.algorithms.mapping import known_places
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.known_places import Comparisons, LoopCandidates
-from pliant.algorithms.mapping.landmarks import Landmarks
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import (
+from pliant.algorithms.slam import known_places
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.known_places import Comparisons, LoopCandidates
+from pliant.algorithms.slam.map.keyframe import Keyframe
+from pliant.algorithms.slam.map.landmarks import Landmarks
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import (
     MappingParameters,
     ReacquisitionParameters,
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.place_match import PlaceMatch
-from pliant.algorithms.mapping.relocalisation import Place
+from pliant.algorithms.slam.places.place_match import PlaceMatch
+from pliant.algorithms.slam.places.relocalisation import Place
 from pliant.state import load_state, save_state
 
 PARAMETERS = MappingParameters(window=WindowParameters(keyframes=3))

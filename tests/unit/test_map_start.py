@@ -9,14 +9,14 @@ from mapping_scene import INTERVAL_NS
 
 from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.epipolar import RelativePose
-from pliant.algorithms.mapping import start as start_of_a_map
-from pliant.algorithms.mapping.backfill import backfill
-from pliant.algorithms.mapping.first_map import BufferedFrame, Start
-from pliant.algorithms.mapping.focal_hypotheses import find_start_of
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.self_calibration import SelfCalibration, widened
-from pliant.algorithms.mapping.start import find_start, with_minimum_parallax
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration, widened
+from pliant.algorithms.slam.estimate.epipolar import RelativePose
+from pliant.algorithms.slam.parameters import MappingParameters
+from pliant.algorithms.slam.start import start as start_of_a_map
+from pliant.algorithms.slam.start.backfill import backfill
+from pliant.algorithms.slam.start.first_map import BufferedFrame, Start
+from pliant.algorithms.slam.start.focal_hypotheses import find_start_of
+from pliant.algorithms.slam.start.start import find_start, with_minimum_parallax
 
 CAMERA = PinholeCamera(fx=400.0, fy=400.0, cx=320.0, cy=240.0, width=640, height=480)
 

@@ -9,15 +9,15 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 from pliant.algorithms.arrays import check_arrays
 from pliant.algorithms.geometry import align_umeyama, move_by_similarity, pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
-from pliant.algorithms.mapping.calibration_bootstrap import BootstrapMapper
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import (
+from pliant.algorithms.slam.calibration_bootstrap import BootstrapMapper
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import (
     MappingParameters,
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.start import with_minimum_parallax
+from pliant.algorithms.slam.start.start import with_minimum_parallax
 from pliant.algorithms.tracks import FrameExtrema
 
 PARAMETERS = MappingParameters()

@@ -8,14 +8,21 @@ from hypothesis import strategies as st
 from mapping_scene import CAMERA, Scene, looking
 
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.mapping.covisibility import (
+from pliant.algorithms.slam.estimate.observation_table import (
+    count_in_view,
+    forget_outliers,
+    reprojection_errors,
+)
+from pliant.algorithms.slam.locate.localisation import locate, refine
+from pliant.algorithms.slam.locate.reacquisition import MaximaGrid, cut_patches, reacquire
+from pliant.algorithms.slam.map.covisibility import (
     marks_fewer,
     missing_rows,
     near_keyframes,
     rows_of,
 )
-from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.landmarks import (
+from pliant.algorithms.slam.map.keyframe import Keyframe
+from pliant.algorithms.slam.map.landmarks import (
     CANDIDATE,
     FREE,
     MAPPED,
@@ -23,18 +30,11 @@ from pliant.algorithms.mapping.landmarks import (
     PATCH_SIDE,
     Landmarks,
 )
-from pliant.algorithms.mapping.localisation import locate, refine
-from pliant.algorithms.mapping.observation_table import (
-    count_in_view,
-    forget_outliers,
-    reprojection_errors,
-)
-from pliant.algorithms.mapping.parameters import (
+from pliant.algorithms.slam.map.track_links import UNLINKED, TrackLinks
+from pliant.algorithms.slam.parameters import (
     LocalisationParameters,
     ReacquisitionParameters,
 )
-from pliant.algorithms.mapping.reacquisition import MaximaGrid, cut_patches, reacquire
-from pliant.algorithms.mapping.track_links import UNLINKED, TrackLinks
 
 
 def test_rows_are_reused_and_ids_never():

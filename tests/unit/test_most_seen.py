@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pliant.algorithms.mapping.final_adjustment import ObservationList
+from pliant.algorithms.slam.adjust.final_adjustment import ObservationList
 
 KEYFRAMES, POINTS = 12, 3000
 

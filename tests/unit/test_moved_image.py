@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 from mapping_scene import CAMERA
 
-from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.image.moved_image import MovedImage, moved_image
-from pliant.algorithms.mapping.frame import Frame, IdealFrame
-from pliant.algorithms.mapping.rolling_shutter import RolledFrame
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
+from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
+from pliant.algorithms.slam.calibration.rolling_shutter import RolledFrame
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.frame import Frame, IdealFrame
 from pliant.algorithms.tracks import FrameExtrema
 
 WIDTH, HEIGHT = 640, 480

@@ -5,15 +5,15 @@ import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 
 from pliant.algorithms.geometry import align_umeyama, inverse, pose_to_matrix, transform
-from pliant.algorithms.mapping import ordinary_frames
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.landmarks import CANDIDATE, Landmarks
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.ordinary_frames import OrdinaryFrames, refined_poses
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.start import with_minimum_parallax
+from pliant.algorithms.slam.adjust import ordinary_frames
+from pliant.algorithms.slam.adjust.ordinary_frames import OrdinaryFrames, refined_poses
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.map.keyframe import Keyframe
+from pliant.algorithms.slam.map.landmarks import CANDIDATE, Landmarks
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters
+from pliant.algorithms.slam.start.start import with_minimum_parallax
 from pliant.map_history import MapHistory
 
 PARAMETERS = MappingParameters()

@@ -6,7 +6,7 @@ import pytest
 from mapping_scene import CAMERA
 
 from pliant.algorithms.arrays import U8
-from pliant.algorithms.places import (
+from pliant.algorithms.slam.places.place_index import (
     Features,
     PlaceIndex,
     describe,

@@ -8,10 +8,10 @@ import pytest
 from mapping_scene import looking
 
 from pliant.algorithms.geometry import move_by_similarity, transform
-from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.landmarks import Landmarks
-from pliant.algorithms.mapping.point_patches import look_alike
-from pliant.algorithms.mapping.reacquisition import cut_patches
+from pliant.algorithms.slam.locate.point_patches import look_alike
+from pliant.algorithms.slam.locate.reacquisition import cut_patches
+from pliant.algorithms.slam.map.keyframe import Keyframe
+from pliant.algorithms.slam.map.landmarks import Landmarks
 
 COUNT, SIDE, FOCAL_PX = 40, 400, 400.0
 MIN_ZNCC = 0.8

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from pliant.algorithms.bundle.pose_graph import (
+from pliant.algorithms.geometry import matrix_to_pose, similarity_to_matrix, so3_exp
+from pliant.algorithms.slam.estimate.pose_graph import (
     Edges,
     jacobians,
     optimise_pose_graph,
     residuals,
     step_by,
 )
-from pliant.algorithms.geometry import matrix_to_pose, similarity_to_matrix, so3_exp
 
 
 def similarity(omega, t, log_scale=0.0):

@@ -11,10 +11,10 @@ from test_mapper import Published, trajectory_error
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.map_delta import LOST, TRACKING
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.localisation import Motion, search_radius_px
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters, RecoveryParameters
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.locate.localisation import Motion, search_radius_px
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters, RecoveryParameters
 from pliant.algorithms.tracks import FrameExtrema
 
 _SIDE = 13

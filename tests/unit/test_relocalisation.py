@@ -10,12 +10,12 @@ from test_recovery import dark, picture, textures
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.map_delta import LOST, TRACKING, MapMoves
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.global_adjustment import held
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters, WholeMapParameters
-from pliant.algorithms.mapping.place_match import PlaceMatch, match_places
-from pliant.algorithms.mapping.relocalisation import Place
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.global_adjustment import held
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters, WholeMapParameters
+from pliant.algorithms.slam.places.place_match import PlaceMatch, match_places
+from pliant.algorithms.slam.places.relocalisation import Place
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.state import load_state, save_state
 

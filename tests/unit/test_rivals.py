@@ -7,15 +7,16 @@ import pytest
 from mapping_scene import CAMERA, looking
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.mapping import known_places, relocalisation
-from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.known_places import KnownPlaces
-from pliant.algorithms.mapping.landmarks import Landmarks
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.relocalisation import Place, Recognised, relocalise
-from pliant.algorithms.mapping.segment import Segment
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.places import Features
+from pliant.algorithms.slam import known_places
+from pliant.algorithms.slam.adjust.segment import Segment
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.known_places import KnownPlaces
+from pliant.algorithms.slam.map.keyframe import Keyframe
+from pliant.algorithms.slam.map.landmarks import Landmarks
+from pliant.algorithms.slam.parameters import MappingParameters
+from pliant.algorithms.slam.places import relocalisation
+from pliant.algorithms.slam.places.place_index import Features
+from pliant.algorithms.slam.places.relocalisation import Place, Recognised, relocalise
 
 PARAMETERS = MappingParameters()
 NOTHING = Features(points_px=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), "u1"))

@@ -5,19 +5,19 @@ import numpy as np
 import pytest
 from mapping_scene import INTERVAL_NS, Scene, looking
 
-from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.geometry import align_umeyama, inverse, so3_exp
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.localisation import Motion
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.rolling_shutter import FramePoses, RolledFrame, readout_flow
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.start import with_minimum_parallax
+from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
+from pliant.algorithms.slam.calibration.rolling_shutter import FramePoses, RolledFrame, readout_flow
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.estimate.problem import CalibrationUncertainty
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.locate.localisation import Motion
+from pliant.algorithms.slam.map.keyframe import Keyframe
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters
+from pliant.algorithms.slam.start.start import with_minimum_parallax
 from pliant.map_history import MapHistory
 
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)

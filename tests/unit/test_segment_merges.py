@@ -12,15 +12,15 @@ from test_recovery import dark, picture, textures
 
 from pliant.algorithms.geometry import align_umeyama, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.global_adjustment import held
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import (
+from pliant.algorithms.slam.adjust.segment import Moved
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.global_adjustment import held
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import (
     MappingParameters,
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.segment import Moved
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.map_history import MapHistory
 from pliant.messages import topics

@@ -7,14 +7,15 @@ import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 from test_mapper import Published, trajectory_error
 
-from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.map_delta import TRACKING, WAITING
-from pliant.algorithms.mapping import calibration_bootstrap, start
-from pliant.algorithms.mapping.calibration_bootstrap import BootstrapMapper, mapper_for
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.self_calibration import widened
+from pliant.algorithms.slam import calibration_bootstrap
+from pliant.algorithms.slam.calibration.self_calibration import widened
+from pliant.algorithms.slam.calibration_bootstrap import BootstrapMapper, mapper_for
+from pliant.algorithms.slam.estimate.problem import CalibrationUncertainty
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters
+from pliant.algorithms.slam.start import start
 
 PARAMETERS = MappingParameters()
 GUESS_SIGMA = 0.3

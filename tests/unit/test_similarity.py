@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.geometry import so3_exp
-from pliant.algorithms.mapping.similarity import (
+from pliant.algorithms.slam.places.similarity import (
     Pairs,
     closed_form,
     moved,

@@ -10,21 +10,21 @@ from test_loops import drifted, drifted_once, recognised, there_and_back, world
 from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING, MapMoves
-from pliant.algorithms.mapping import sparsification
-from pliant.algorithms.mapping.atlas import Atlas
-from pliant.algorithms.mapping.earlier_segments import EarlierSegments
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.landmarks import FREE, MAPPED, Landmarks
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import (
+from pliant.algorithms.slam.adjust.segment import DroppedKeyframes, Segment
+from pliant.algorithms.slam.atlas import Atlas
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.map.keyframe import Keyframe
+from pliant.algorithms.slam.map.landmarks import FREE, MAPPED, Landmarks
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import (
     MappingParameters,
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.mapping.segment import DroppedKeyframes, Segment
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.sparsification import observations_of, sparsify
+from pliant.algorithms.slam.store import sparsification
+from pliant.algorithms.slam.store.earlier_segments import EarlierSegments
+from pliant.algorithms.slam.store.sparsification import observations_of, sparsify
 from pliant.state import load_state, save_state
 
 __all__ = ["drifted", "drifted_once", "world"]  # fixtures

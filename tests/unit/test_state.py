@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from pliant import __version__
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters
 from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.datasets import open_source

@@ -8,10 +8,10 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 from test_mapper import run, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters, SupportParameters
-from pliant.algorithms.mapping.pose_quality import support_of, why_doubtful
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.locate.pose_quality import support_of, why_doubtful
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters, SupportParameters
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.map_history import FramePose, MapHistory
 from pliant.messages.types import PASSED_OVER

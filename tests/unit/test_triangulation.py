@@ -4,7 +4,7 @@ import numpy as np
 from mapping_scene import CAMERA, Scene, looking, sideways
 
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.triangulation import spread_of_rays, triangulate
+from pliant.algorithms.slam.estimate.triangulation import spread_of_rays, triangulate
 
 
 def table(noise_px=0.0, count=300):

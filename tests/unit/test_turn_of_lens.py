@@ -6,11 +6,11 @@ import pytest
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
-from pliant.algorithms.mapping.first_map import BufferedFrame
-from pliant.algorithms.mapping.focal_hypotheses import find_start_of
-from pliant.algorithms.mapping.parameters import MappingParameters
-from pliant.algorithms.mapping.self_calibration import SelfCalibration, widened
-from pliant.algorithms.turn_of_lens import turn_of_lens
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration, widened
+from pliant.algorithms.slam.calibration.turn_of_lens import turn_of_lens
+from pliant.algorithms.slam.parameters import MappingParameters
+from pliant.algorithms.slam.start.first_map import BufferedFrame
+from pliant.algorithms.slam.start.focal_hypotheses import find_start_of
 
 GUESSED = PinholeCamera(fx=554.0, fy=554.0, cx=319.5, cy=239.5, width=640, height=480)
 INTERVAL_NS = 33_000_000

@@ -7,11 +7,11 @@ import pytest
 from bundle_scene import make_scene, numeric_jacobian, project
 from test_bundle_calibration import EXACT, FREE, calibration_jacobian, with_flow
 
-from pliant.algorithms.bundle.calibration import SharedCalibration
-from pliant.algorithms.bundle.packed_layout import build_packed_layout
-from pliant.algorithms.bundle.problem import SHARED, CalibrationUncertainty
-from pliant.algorithms.bundle.schur import SchurSystem, solve_schur
-from pliant.algorithms.bundle.varying_focal import FocalWalk, VaryingFocal
+from pliant.algorithms.slam.estimate.calibration import SharedCalibration
+from pliant.algorithms.slam.estimate.packed_layout import build_packed_layout
+from pliant.algorithms.slam.estimate.problem import SHARED, CalibrationUncertainty
+from pliant.algorithms.slam.estimate.schur import SchurSystem, solve_schur
+from pliant.algorithms.slam.estimate.varying_focal import FocalWalk, VaryingFocal
 
 DAMPING = 1e-3
 

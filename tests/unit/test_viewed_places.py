@@ -9,9 +9,9 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import matrix_to_pose
 from pliant.algorithms.map_delta import TRACKING, MapDelta, MapMoves
-from pliant.algorithms.mapping.journal import Journal, Outcome
-from pliant.algorithms.mapping.keyframe import Keyframe
-from pliant.algorithms.mapping.landmarks import Landmarks
+from pliant.algorithms.slam.journal import Journal, Outcome
+from pliant.algorithms.slam.map.keyframe import Keyframe
+from pliant.algorithms.slam.map.landmarks import Landmarks
 from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.types import Header, MapUpdate

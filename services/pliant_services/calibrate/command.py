@@ -24,9 +24,9 @@ from pliant.algorithms.board_calibration import (
     calibrate,
     choose_views,
 )
-from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.image.sharpness import LONGEST_SIDE_PX, resized, sharpness
+from pliant.algorithms.slam.estimate.problem import CalibrationUncertainty
 from pliant.config import IngestParameters
 from pliant.datasets import BrokenFrame, Dataset, decode, open_source
 from pliant.datasets.calibration import UNSAID_FOV_DEG, Calibration, calibration_yaml

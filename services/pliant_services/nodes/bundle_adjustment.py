@@ -22,29 +22,29 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
-from pliant.algorithms.absolute_pose import pose_by_ransac
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.image.masks import filled
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
-from pliant.algorithms.mapping.calibration_bootstrap import BootstrapMapper, mapper_for
-from pliant.algorithms.mapping.frame import Frame
-from pliant.algorithms.mapping.global_adjustment import (
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.calibration_bootstrap import BootstrapMapper, mapper_for
+from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.global_adjustment import (
     AdjustmentJob,
     AdjustmentResult,
     GlobalAdjustment,
     find_moves,
 )
-from pliant.algorithms.mapping.keyframe import Keyframe as KeyframeOfMap
-from pliant.algorithms.mapping.landmarks import Landmarks
-from pliant.algorithms.mapping.localiser import Localiser
-from pliant.algorithms.mapping.loops import Loop
-from pliant.algorithms.mapping.mapper import Mapper
-from pliant.algorithms.mapping.parameters import MappingParameters, WindowParameters
-from pliant.algorithms.mapping.self_calibration import SelfCalibration
-from pliant.algorithms.mapping.similarity import Pairs, similarity_by_ransac
-from pliant.algorithms.mapping.sparsification import sparsify
-from pliant.algorithms.places import PlaceIndex, describe, match
+from pliant.algorithms.slam.localiser import Localiser
+from pliant.algorithms.slam.map.keyframe import Keyframe as KeyframeOfMap
+from pliant.algorithms.slam.map.landmarks import Landmarks
+from pliant.algorithms.slam.mapper import Mapper
+from pliant.algorithms.slam.parameters import MappingParameters, WindowParameters
+from pliant.algorithms.slam.places.loops import Loop
+from pliant.algorithms.slam.places.place_index import PlaceIndex, describe, match
+from pliant.algorithms.slam.places.similarity import Pairs, similarity_by_ransac
+from pliant.algorithms.slam.store.sparsification import sparsify
 from pliant.algorithms.tracking.maxima import maxima_of
 from pliant.algorithms.tracking.parameters import TrackingParameters
 from pliant.algorithms.tracks import FrameExtrema

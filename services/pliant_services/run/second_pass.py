@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.image.exposure import FLAWS
-from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.backwards import Reached, Stretch, final_update, lost_stretches, reach_back
 from pliant.config import Config, load_config
 from pliant.datasets import open_source

@@ -8,7 +8,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.masks import clearance_in, filled
-from pliant.algorithms.mapping.localiser import Localiser
+from pliant.algorithms.slam.localiser import Localiser
 from pliant.algorithms.tracking.maxima import maxima_of
 from pliant.api.images import calibration_of, source_frame
 from pliant.config import load_config

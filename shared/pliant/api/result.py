@@ -14,8 +14,8 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I64, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.slam.calibration.corrected_view import corrected_view
 from pliant.api.mapped import Mapped
 from pliant.api.open3d_types import Mesh
 from pliant.datasets.calibration import Calibration, calibration_from_yaml

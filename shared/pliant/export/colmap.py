@@ -11,7 +11,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.mapping.reacquisition import MaximaGrid
+from pliant.algorithms.slam.locate.reacquisition import MaximaGrid
 from pliant.export.crop import Box
 from pliant.export.images import camera_of, make_folder
 from pliant.export.posed_images import (

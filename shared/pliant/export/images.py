@@ -10,9 +10,9 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, U8, U16, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import CorrectedView, corrected_view
 from pliant.algorithms.image.masks import mask_image, unpacked
-from pliant.algorithms.mapping.rolling_shutter import RolledFrame
+from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, corrected_view
+from pliant.algorithms.slam.calibration.rolling_shutter import RolledFrame
 from pliant.datasets.base import BrokenFrame
 from pliant.datasets.calibration import (
     Calibration,

@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, U8, BoolArray
-from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.duplicate_views import SHARPER
 from pliant.algorithms.image.masks import mask_image
 from pliant.algorithms.image.sharpness import sharpness
-from pliant.algorithms.mapping.rolling_shutter import RolledFrame, motion_between
+from pliant.algorithms.slam.calibration.corrected_view import corrected_view
+from pliant.algorithms.slam.calibration.rolling_shutter import RolledFrame, motion_between
 from pliant.errors import ResultError
 from pliant.export.images import (
     RectifiedImage,

@@ -7,8 +7,8 @@ import numpy as np
 
 from pliant.algorithms.arrays import U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import CorrectedView
 from pliant.algorithms.image.masks import unpacked
+from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
 
 
 @lru_cache(maxsize=4)

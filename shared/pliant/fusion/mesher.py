@@ -15,7 +15,6 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import corrected_view, parts_of
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
@@ -23,6 +22,7 @@ from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, TriangleMesh
 from pliant.algorithms.meshing.parameters import MeshingParameters
 from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.meshing.tsdf_volume import VolumeFullError
+from pliant.algorithms.slam.calibration.corrected_view import corrected_view, parts_of
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.fusion.dense_depth import DenseDepths
 from pliant.fusion.final_volume import FinalVolume

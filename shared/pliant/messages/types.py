@@ -9,9 +9,9 @@ from typing import Annotated, Any, TypeVar
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.kept_keyframe import KeptKeyframe
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, no_rows
+from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame
 from pliant.algorithms.tracks import FrameTracks
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pliant.algorithms.kept_keyframe import MAP_VERSION
+from pliant.algorithms.slam.map.kept_keyframe import MAP_VERSION
 from pliant.errors import MapError, MessageError, RecordingError
 from pliant.files import put_in_place
 from pliant.messages import codec
@@ -74,7 +74,7 @@ class MapFile:
         """The keyframes, oldest first.  Raises MapError for a file that is damaged or cut off,
         and for a map in which no place could be recognised."""
         # It loads kernels, and services that only look for their map need none.
-        from pliant.algorithms.mapping.kept_map import check
+        from pliant.algorithms.slam.store.kept_map import check
 
         last, places = -1, 0
         closed = False

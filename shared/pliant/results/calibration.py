@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.bundle.problem import CalibrationUncertainty
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import corrected_view, parts_of
 from pliant.algorithms.geometry import pose_to_matrix, so3_log
+from pliant.algorithms.slam.calibration.corrected_view import corrected_view, parts_of
+from pliant.algorithms.slam.estimate.problem import CalibrationUncertainty
 from pliant.datasets.calibration import Calibration, calibration_from_yaml
 from pliant.datasets.working_size import at_size
 from pliant.errors import CalibrationError

@@ -6,10 +6,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from pliant.algorithms.corrected_view import parts_of
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.exposure import FLAWS
 from pliant.algorithms.map_density import count_distinct, well_observed
+from pliant.algorithms.slam.calibration.corrected_view import parts_of
 from pliant.messages.types import DROPPED, MASKED
 from pliant.results.calibration import (
     calibration_doubt,

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
-from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.image.masks import mask_image, unpacked
 from pliant.algorithms.image.sharpness import sharpness
@@ -21,6 +20,7 @@ from pliant.algorithms.meshing.texturing import (
     patches,
 )
 from pliant.algorithms.meshing.view_exposure import ExposureSamples
+from pliant.algorithms.slam.calibration.corrected_view import corrected_view
 from pliant.formats.textured import TexturedMesh
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Keyframe

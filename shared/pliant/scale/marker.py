@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64
-from pliant.algorithms.triangulation import triangulate
+from pliant.algorithms.slam.estimate.triangulation import triangulate
 from pliant.errors import ResultError
 from pliant.export.images import camera_of, rectified_images
 from pliant.export.posed_images import IdealCamera

@@ -11,9 +11,9 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.corrected_view import corrected_view
 from pliant.algorithms.geometry import matrix_to_pose, move_by_similarity, pose_to_matrix
 from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.slam.calibration.corrected_view import corrected_view
 from pliant.datasets.base import BrokenFrame, SourceFrame
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.own_recording import recorded_frame

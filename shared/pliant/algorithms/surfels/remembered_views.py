@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pliant.algorithms.absolute_pose import pose_by_ransac
 from pliant.algorithms.arrays import F32, F64, I64, BoolArray
-from pliant.algorithms.bundle.problem import BundleParameters
-from pliant.algorithms.bundle.subspace import refine_pose
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.places import Features, PlaceIndex, match, repeated_share
+from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac
+from pliant.algorithms.slam.estimate.problem import BundleParameters
+from pliant.algorithms.slam.estimate.subspace import refine_pose
+from pliant.algorithms.slam.places.place_index import Features, PlaceIndex, match, repeated_share
 from pliant.algorithms.surfels.deformation_models import move_poses
 from pliant.algorithms.surfels.patch_sampling import A, B, F, X
 from pliant.algorithms.surfels.surfel_table import SurfelTable

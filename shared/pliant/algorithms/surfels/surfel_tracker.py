@@ -5,7 +5,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
-from pliant.algorithms.places import Features, describe
+from pliant.algorithms.slam.places.place_index import Features, describe
 from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.surfels import validation
 from pliant.algorithms.surfels.births import find_births

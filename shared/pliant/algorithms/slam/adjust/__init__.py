@@ -1,0 +1,1 @@
+"""Adjustment of a window, a segment and ordinary frames."""

@@ -1,0 +1,1 @@
+"""The calibration of the camera, as the images tell it."""

@@ -1,0 +1,1 @@
+"""Solvers of poses, points and calibrations: arrays in, arrays out."""

@@ -1,0 +1,104 @@
+"""The focal length and pose of one frame with fixed points, if zoom or focus change it.
+
+The image of a frame is that of the calibrated camera, magnified by e^d about a centre c:
+
+    p = c + e^d (pi(X') - c),     X' = exp(theta) X + rho,     pi: the pinhole projection.
+
+With (x, y) = X'/Z' on the plane z = 1 and F = e^d diag(fx, fy) the Jacobian by (rho, theta, d) is
+
+    F (1/Z'  0   -x/Z'  -x y       1 + x^2  -y)      d p / d d = p - c.
+      (0   1/Z'  -y/Z'  -(1 + y^2)  x y       x)
+
+Gauss-Newton with Geman-McClure weights ``1 / (1 + r^2 / sigma^2)^2``, from a wide kernel to a
+narrow one, and a prior d ~ N(0, deviation^2) at residuals of 1 px: without parallax or depth that
+differs across the image a magnification looks like a forward motion.
+"""
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse
+from pliant.algorithms.slam.estimate.projection import move_camera
+from pliant.compiler.kernel import kernel
+
+_SIGMAS_PX = (8.0, 8.0, 2.0, 2.0)
+_MIN_DEPTH = 1e-6
+_MOST = 250
+"""Points are thinned evenly to at most twice as many, which is sufficient."""
+
+_MEDIAN_OF_TWO = 1.386
+"""The median of chi-square with two degrees of freedom."""
+
+UNKNOWNS = 7
+
+
+def refine_focal(
+    T_world_camera: F64,
+    points_world: F64,
+    points_px: F32,
+    camera: PinholeCamera,
+    centre: tuple[float, float],
+    deviation: float,
+) -> tuple[float, float]:
+    """Return the log magnification d of a frame, and its standard deviation by the residuals,
+    scaled to all points.
+
+    T_world_camera: (4, 4) to start from.  points_world: (N, 3).  points_px: (N, 2).  deviation:
+    standard deviation of d.
+    """
+    every = max(1, len(points_px) // _MOST)
+    world, px = points_world[::every], points_px[::every].astype(np.float64)
+    lens = np.array([*camera.intrinsics, *centre])
+    T_camera_world = inverse(T_world_camera)
+    motion = np.concatenate([T_camera_world[:3, :3].ravel(), T_camera_world[:3, 3]])
+    d, normal, squared = 0.0, np.eye(UNKNOWNS), np.zeros(0)
+    for sigma in _SIGMAS_PX:
+        residuals, J = linearise(motion, d, world, px, lens)
+        squared = (residuals**2).sum(axis=1)
+        weights = 1.0 / (1.0 + squared / sigma**2) ** 2
+        weighted = (weights[:, None, None] * J).reshape(-1, UNKNOWNS)
+        normal = weighted.T @ J.reshape(-1, UNKNOWNS)
+        g = weighted.T @ residuals.reshape(-1)
+        normal[6, 6] += deviation**-2
+        g[6] -= d * deviation**-2
+        normal[np.diag_indices(6)] *= 1.0 + 1e-9
+        normal[np.diag_indices(6)] += 1e-9
+        step = np.linalg.solve(normal, g)
+        move_camera(motion, step[:6], motion)
+        d += float(step[6])
+    variance = np.median(squared) / _MEDIAN_OF_TWO if len(squared) else np.inf
+    return d, float(np.sqrt(variance / every * np.linalg.inv(normal)[6, 6]))
+
+
+@kernel
+def linearise(
+    motion: F64, d: float, points_world: F64, points_px: F64, lens: F64
+) -> tuple[F64, F64]:
+    """Residuals ``points_px - p`` (n, 2) and the Jacobian (n, 2, 7) of p, of points in front.
+
+    motion: (12,) R_camera_world by rows, then t_camera_world.   lens: fx, fy, cx, cy and c.
+    """
+    N = len(points_world)
+    residuals, J = np.empty((N, 2)), np.zeros((N, 2, UNKNOWNS))
+    magnified, n = np.exp(d), 0
+    for i in range(N):
+        X = np.empty(3)
+        for k in range(3):
+            X[k] = motion[9 + k]
+            for m in range(3):
+                X[k] += motion[3 * k + m] * points_world[i, m]
+        if X[2] <= _MIN_DEPTH:
+            continue
+        x, y, iz = X[0] / X[2], X[1] / X[2], 1.0 / X[2]
+        f, g = magnified * lens[0], magnified * lens[1]
+        J[n, 0, 0], J[n, 0, 2], J[n, 0, 3] = f * iz, -f * x * iz, -f * x * y
+        J[n, 0, 4], J[n, 0, 5] = f * (1.0 + x * x), -f * y
+        J[n, 1, 1], J[n, 1, 2], J[n, 1, 3] = g * iz, -g * y * iz, -g * (1.0 + y * y)
+        J[n, 1, 4], J[n, 1, 5] = g * x * y, g * x
+        J[n, 0, 6] = f * x + magnified * (lens[2] - lens[4])
+        J[n, 1, 6] = g * y + magnified * (lens[3] - lens[5])
+        residuals[n, 0] = points_px[i, 0] - lens[4] - J[n, 0, 6]
+        residuals[n, 1] = points_px[i, 1] - lens[5] - J[n, 1, 6]
+        n += 1
+    return residuals[:n], J[:n]

@@ -1,0 +1,280 @@
+"""The pose of a frame in the map.
+
+It is estimated from the tracks of landmarks, refined by reacquired landmarks, and adjusted together
+with the window (VITAMIN-E section 3.2, Eq. 6).
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
+from pliant.algorithms.slam.active_map import ActiveMap
+from pliant.algorithms.slam.estimate.observation_table import reprojection_errors
+from pliant.algorithms.slam.frame import IdealFrame, PlacedFrame
+from pliant.algorithms.slam.locate.inverse_depth import (
+    Spread,
+    off_epipolar_line,
+    placed_candidates,
+    spread_of,
+)
+from pliant.algorithms.slam.locate.localisation import (
+    Localisation,
+    Motion,
+    locate,
+    recover,
+    refine,
+    verify_pose,
+)
+from pliant.algorithms.slam.locate.pose_quality import support_of
+from pliant.algorithms.slam.locate.reacquisition import reacquire
+from pliant.algorithms.slam.map.keyframe import Observations
+from pliant.algorithms.slam.map.landmarks import MAPPED
+from pliant.algorithms.slam.map.track_links import UNLINKED
+from pliant.algorithms.slam.parameters import MappingParameters, PointParameters
+from pliant.algorithms.tracks import FrameTracks
+
+_AGREEING = 0.5
+"""Minimum share of the inlying landmarks that still fit once candidates help; with fewer, the
+landmarks are on a moving object.
+"""
+
+_OF_CANDIDATE = 0.5
+"""Inliers that a fitting candidate counts as: any depth will do, so it constrains one coordinate of
+its pixel, not two.
+"""
+
+_OFF = 2.0
+"""In errors of an inlier: a track farther from its epipolar line contradicts a pose."""
+
+_TELLING = 500
+"""Minimum tracks that decide whether a camera stands still."""
+
+_FEW, _FIRM = 0.05, 0.2
+"""Minimum shares of the last frame's tracks that fit a pose: after a cut, 0.3 to 2 % fit by chance,
+and 9 % where the views overlap; the fastest rotations with blur leave 11 to 20 %.
+"""
+
+
+class Located(NamedTuple):
+    """T_world_camera of a frame.   is_firm: it has so many tracks that the view was not cut."""
+
+    T_world_camera: F64
+    is_firm: bool
+
+
+def localise(
+    active: ActiveMap, motion: Motion, frame: IdealFrame, generator: np.random.Generator
+) -> Located | None:
+    """Return a frame's pose from the tracks of landmarks, or by searching landmarks in the image;
+    None if both fail.
+
+    Few tracks are no evidence by themselves: after a cut, those that continue on some extremum have
+    all moved alike, as if by a camera.
+    """
+    points, parameters, tracks = active.points, active.parameters, frame.tracks
+    predictions = motion.predictions(frame.stamp_ns)
+    active.candidates_agree = True
+    candidates = active.helping_candidates()
+    linked = np.concatenate([active.linked(MAPPED), candidates])
+    limits = parameters.localisation
+    if len(linked) >= limits.min_inliers:
+        rows, points_px = active.links.rows[linked], tracks.points_px[linked]
+        if frame.calibration.readout:
+            rolled = active.segment.rolled(frame.calibration, motion.velocity())
+            depths = active.segment.inverse_depths(rows, predictions[0])
+            points_px = points_px - rolled.shifts(points_px, depths)
+        located = _by_tracks(active, predictions, rows, points_px, candidates, generator)
+        inliers = int(located.inliers.sum())
+        of_points = int(located.inliers[: len(linked) - len(candidates)].sum())
+        if of_points + _OF_CANDIDATE * (inliers - of_points) >= limits.min_inliers:
+            # Candidates that help in one frame and not in the next were not lost in between.
+            helped = len(candidates) and active.candidates_agree
+            before = motion.tracked if helped else motion.to_points
+            if not frame.has_image or inliers >= _FEW * before:
+                return Located(located.T_world_camera, inliers >= _FIRM * before)
+            proved = verify_pose(
+                located.T_world_camera, active.nearby(), points, tracks.maxima, frame.image,
+                active.camera, parameters, parameters.recovery.min_agreement,
+            )  # fmt: skip
+            if proved is not None:
+                return Located(proved.T_world_camera, True)
+    if not frame.has_image:
+        return None
+    recovered = recover(
+        motion, frame.stamp_ns, active.nearby(), points, tracks.maxima, frame.image, active.camera,
+        parameters, generator,
+    )  # fmt: skip
+    return None if recovered is None else Located(recovered, True)
+
+
+def _by_tracks(
+    active: ActiveMap,
+    predictions: list[F64],
+    rows: I32,
+    points_px: F32,
+    candidates: I64,
+    generator: np.random.Generator,
+) -> Localisation:
+    """Return the pose that fits the tracks: landmarks come first and decide."""
+    limits, mapped = active.parameters.localisation, len(rows) - len(candidates)
+
+    def located(count: int, spread: Spread | None) -> Localisation:
+        return locate(
+            predictions, active.points.xyz[rows[:count]], points_px[:count], active.camera, limits,
+            generator, spread,
+        )  # fmt: skip
+
+    together = located(len(rows), _spread(active, rows, candidates))
+    still = together.inliers[:mapped].sum()
+    if len(candidates) and mapped >= limits.min_inliers and still < _AGREEING * mapped:
+        alone = located(mapped, None)
+        fitting = alone.inliers.sum()
+        if fitting >= limits.min_inliers and still < _AGREEING * fitting:
+            active.candidates_agree = False
+            return alone
+    return together
+
+
+def to_global_shutter(
+    active: ActiveMap, motion: Motion, frame: IdealFrame, T_world_camera: F64
+) -> IdealFrame:
+    """Return the frame at this pose with a global shutter.  motion: before it."""
+    if not frame.calibration.readout:
+        return frame
+    velocity = motion.velocity_at(frame.number, T_world_camera)
+    rolled = active.segment.rolled(frame.calibration, velocity)
+    depths = active.segment.inverse_depths(active.links.rows, T_world_camera)
+    return frame.to_global_shutter(rolled, depths)
+
+
+def reacquire_points(active: ActiveMap, frame: IdealFrame, T_world_camera: F64) -> PlacedFrame:
+    """Find landmarks without a track among the maxima, and refine the pose with them."""
+    placed = PlacedFrame(frame=frame, T_world_camera=T_world_camera)
+    points, parameters, tracks = active.points, active.parameters, frame.tracks
+    if not parameters.reacquisition.enabled:
+        return placed
+    reacquired = reacquire(
+        T_world_camera, active.missing(frame.number), points, tracks.maxima,
+        frame.given.extrema.maxima, frame.given.grey, active.camera, parameters.reacquisition,
+    )  # fmt: skip
+    found = active.take_over(reacquired, tracks)
+    if frame.rolled is not None:
+        depths = active.segment.inverse_depths(found.rows, T_world_camera)
+        points_px, rolled_px = frame.rolled.found(found.points_px, depths)
+        found = Observations(rows=found.rows, points_px=points_px, rolled_px=rolled_px)
+    placed = refine_by_all(active, replace(placed, found=found))
+    linked = active.linked(MAPPED)
+    points.kappas[active.links.rows[linked]] = tracks.kappas[linked]
+    return placed
+
+
+def refine_by_all(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
+    """Refine the pose by its tracks and the landmarks found without one."""
+    candidates = active.helping_candidates()
+    rows, points_px = active.observed(placed, candidates)
+    located = refine(
+        placed.T_world_camera, active.points.xyz[rows], points_px, active.camera,
+        active.parameters.localisation, near=True, spread=_spread(active, rows, candidates),
+    )  # fmt: skip
+    return replace(placed, T_world_camera=located.T_world_camera)
+
+
+def adjust(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFrame:
+    """Adjust the window and this frame (Eq. 6).  motion: before it."""
+    judge_tracks(active, placed)
+    active.see(placed)
+    if active.parameters.window.sweeps > 0 and not len(active.helping_candidates()):
+        placed = replace(placed, T_world_camera=active.window.sweep_current(active.parameters))
+    return supported(active, motion, placed)
+
+
+def judge_tracks(active: ActiveMap, placed: PlacedFrame) -> None:
+    """Unlink tracks from landmarks that they miss repeatedly."""
+    linked, errors = _track_errors(active, placed)
+    active.judge_tracks(linked, errors)
+
+
+def _track_errors(active: ActiveMap, placed: PlacedFrame) -> tuple[I64, F32]:
+    """Indices of the tracks of landmarks, and their reprojection errors in px."""
+    linked = active.linked(MAPPED)
+    xyz = active.points.xyz[active.links.rows[linked]]
+    points_px = placed.frame.tracks.points_px[linked]
+    return linked, reprojection_errors(placed.T_world_camera, xyz, points_px, active.camera)
+
+
+def supported(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedFrame:
+    """Return the frame with the quality of its pose.  motion: before it."""
+    T_world_camera, tracks = placed.T_world_camera, placed.frame.tracks
+    rows, points_px = active.observed(placed, active.helping_candidates())
+    errors = reprojection_errors(T_world_camera, active.points.xyz[rows], points_px, active.camera)
+    inliers = errors < active.parameters.localisation.inlier_px
+    telling = _settled(active, motion, tracks)
+    telling[_contradicting(active, T_world_camera, tracks.points_px)] = True
+    tracked = len(rows) - len(placed.found.rows)
+    support = support_of(points_px, inliers, tracked, tracks.points_px[telling], active.camera)
+    return replace(placed, support=support)
+
+
+def tracks_to_points(active: ActiveMap, placed: PlacedFrame) -> int:
+    """Number of tracks that lead to landmarks at their predicted position."""
+    _, errors = _track_errors(active, placed)
+    return int(np.count_nonzero(errors < active.parameters.localisation.inlier_px))
+
+
+def _settled(active: ActiveMap, motion: Motion, tracks: FrameTracks) -> BoolArray:
+    """Which tracks (N,) had enough time and keyframes to become landmarks."""
+    points, parameters = active.points, active.parameters
+    rows = active.links.rows
+    newest = active.keyframes[-1].id
+    seen_by = np.where(rows != UNLINKED, newest + 1 - points.first_keyframe[rows], 0)
+    old = tracks.ages * motion.interval_s() >= parameters.support.settled_s
+    return old & (seen_by >= parameters.point.min_observations)
+
+
+def _contradicting(active: ActiveMap, T_world_camera: F64, points_px: F32) -> I64:
+    """Indices of the tracks of candidates that no depth makes consistent with the pose."""
+    points = active.points
+    candidates = placed_candidates(points, active.links.rows)
+    rows = active.links.rows[candidates]
+    off = off_epipolar_line(
+        T_world_camera, points.xyz[rows], points.spread[rows], points_px[candidates], active.camera
+    )
+    return candidates[off > _OFF * active.parameters.localisation.inlier_px]
+
+
+def check_pure_rotation(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
+    """Whether the camera has only rotated since the last keyframe, with its pose in that case."""
+    if active.segment.resumes:
+        return placed  # its previous pose is unknown
+    points, parameters = active.points, active.parameters
+    candidates = placed_candidates(points, active.links.rows)
+    rows, points_px = active.observed(placed, candidates)
+    T_standing = placed.T_world_camera
+    for every in (max(1, len(rows) // _TELLING), 1):  # a few tracks reveal most motions
+        some = np.arange(0, len(rows), every)
+        located = refine(
+            placed.T_world_camera, points.xyz[rows[some]], points_px[some], active.camera,
+            parameters.localisation, near=True,
+            spread=spread_of(points, rows[some], active.keyframes[-1]),
+        )  # fmt: skip
+        if not located.is_pure_rotation:
+            return placed
+        T_standing = located.T_world_camera
+    return replace(placed, T_world_camera=T_standing, is_pure_rotation=True)
+
+
+def _spread(active: ActiveMap, rows: I32, candidates: I64) -> Spread | None:
+    return spread_of(active.points, rows, active.keyframes[-1]) if len(candidates) else None
+
+
+def limits_of_points(inliers: int, parameters: MappingParameters) -> PointParameters:
+    """Return the limits for new landmarks.
+
+    In a frame with fewer landmarks than a start needs, two observations are enough: its few tracks
+    may not survive to a third, and then the map ends.
+    """
+    if inliers >= parameters.start.min_points:
+        return parameters.point
+    return parameters.point.model_copy(update={"min_observations": 2})

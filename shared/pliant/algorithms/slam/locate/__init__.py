@@ -1,0 +1,1 @@
+"""The pose of one frame in the map."""

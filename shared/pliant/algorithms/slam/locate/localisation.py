@@ -1,0 +1,333 @@
+"""The pose of a frame from visible landmarks, and without tracks after a loss.
+
+A camera that is covered, blurred or dark for a moment keeps moving.  The longer that takes, the
+farther it may be from any prediction, so landmarks are searched in a radius that grows with the
+time since the last pose.  Of the many maxima in it a landmark takes the one whose patch fits best.
+P3P and RANSAC find the pose on which the good ones agree, and all landmarks found at their
+projection must verify it.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
+from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.geometry import inverse, move_by_similarity, so3_exp, so3_log
+from pliant.algorithms.slam.calibration.rolling_shutter import motion_between
+from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac, truncated_cost
+from pliant.algorithms.slam.estimate.problem import BundleParameters
+from pliant.algorithms.slam.estimate.subspace import refine_pose
+from pliant.algorithms.slam.locate.inverse_depth import Spread, refine_pose_spread
+from pliant.algorithms.slam.locate.reacquisition import MaximaGrid, match_widely, reacquire
+from pliant.algorithms.slam.map.landmarks import Landmarks
+from pliant.algorithms.slam.parameters import (
+    LocalisationParameters,
+    MappingParameters,
+    RecoveryParameters,
+)
+
+_COARSE_SIGMAS = 4.0
+"""The kernel is first this many times wider, so that a poor prediction still converges."""
+
+_PREDICTION_GATE_PX = 20.0
+
+_SPEEDING_UP = 0.5
+"""Share of its last acceleration that a prediction keeps: all of it amplifies noise."""
+
+NEAR = 0.3
+"""Share of the radius that is searched first: usually sufficient, with far fewer false matches."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Localisation:
+    """T_world_camera of a frame, and which of the points (N,) support it.
+
+    is_pure_rotation: no translation is significant, see ``Spread``.
+    """
+
+    T_world_camera: F64
+    inliers: BoolArray
+    is_pure_rotation: bool = False
+
+
+def locate(
+    predictions: list[F64],
+    points_world: F64,
+    points_px: F32,
+    camera: PinholeCamera,
+    parameters: LocalisationParameters,
+    generator: np.random.Generator,
+    spread: Spread | None = None,
+) -> Localisation:
+    """Return the pose on which most points agree, from the best prediction or by P3P and RANSAC.
+
+    predictions: poses (4, 4) to start from, at least one.   points_world: (N, 3).  points_px: (N,
+    2).  spread: of provisional points, see ``inverse_depth``; None: all are certain. The caller
+    decides whether the inliers suffice.
+    """
+    points_n = camera.normalise(points_px.astype(np.float64))
+    gate = _PREDICTION_GATE_PX / camera.fx
+    costs = [_cost(T_world_camera, points_world, points_n, gate) for T_world_camera in predictions]
+    start = predictions[int(np.argmin(costs))]
+    best = refine(start, points_world, points_px, camera, parameters, spread=spread)
+    if best.inliers.sum() < parameters.min_predicted_share * len(points_px):
+        found = pose_by_ransac(
+            points_world,
+            points_n,
+            generator,
+            gate=parameters.ransac_gate_px / camera.fx,
+            samples=parameters.ransac_samples,
+        )
+        if found is not None:
+            other = refine(found[0], points_world, points_px, camera, parameters, spread=spread)
+            if other.inliers.sum() > best.inliers.sum():
+                best = other
+    return best
+
+
+def refine(
+    T_world_camera: F64,
+    points_world: F64,
+    points_px: F32,
+    camera: PinholeCamera,
+    parameters: LocalisationParameters,
+    *,
+    near: bool = False,
+    spread: Spread | None = None,
+) -> Localisation:
+    """Refine a pose robustly, from a wide kernel to a narrow one; near: narrow immediately.
+
+    spread: of provisional points, see ``inverse_depth``; None: all are certain.
+    """
+    inliers, is_pure_rotation = np.zeros(len(points_px), np.bool_), False
+    for widening in (1.0,) if near else (_COARSE_SIGMAS, 1.0):
+        if spread is not None:
+            T_world_camera, squared, is_pure_rotation = refine_pose_spread(
+                T_world_camera, points_world, spread.vectors, points_px, camera,
+                standing=spread.standing,
+                kernel_sigma_px=widening * parameters.kernel_sigma_px,
+            )  # fmt: skip
+            inliers = squared < parameters.inlier_px**2
+            continue
+        bundle = BundleParameters(kernel_sigma_px=widening * parameters.kernel_sigma_px)
+        T_world_camera, inliers, _ = refine_pose(
+            T_world_camera, points_world, points_px, camera, bundle, inlier_px=parameters.inlier_px
+        )
+    return Localisation(
+        T_world_camera=T_world_camera, inliers=inliers, is_pure_rotation=is_pure_rotation
+    )
+
+
+def _cost(T_world_camera: F64, points_world: F64, points_n: F64, gate: float) -> float:
+    T = inverse(T_world_camera)
+    return truncated_cost(
+        np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), points_world, points_n,
+        gate,
+    )  # fmt: skip
+
+
+class VerifiedPose(NamedTuple):
+    """A pose, and the rows of the landmarks that verify it."""
+
+    T_world_camera: F64
+    rows: I32
+
+
+@dataclass(kw_only=True)
+class Motion:
+    """The last motion of the camera: T_world_camera (4, 4) of two frames, the newer one last.
+
+    tracked: tracked landmarks and helping candidates that support the newer one, as far as known.
+    to_points: tracks that lead from it to landmarks alone.
+    unmapped_s: from the last mapped frame to the newer one.
+    """
+
+    frames: tuple[int, int]
+    stamps_ns: tuple[int, int]
+    poses: tuple[F64, F64]
+    tracked: int = 0
+    to_points: int = 0
+    unmapped_s: float = 0.0
+
+    @staticmethod
+    def at(frame: int, stamp_ns: int, T_world_camera: F64) -> "Motion":
+        """Return the motion of a camera with one known pose."""
+        twice = (T_world_camera, T_world_camera)
+        return Motion(frames=(frame, frame), stamps_ns=(stamp_ns, stamp_ns), poses=twice)
+
+    def then(
+        self,
+        frame: int,
+        stamp_ns: int,
+        T_world_camera: F64,
+        tracked: int = 0,
+        to_points: int = 0,
+    ) -> "Motion":
+        """Return the motion after one more pose."""
+        return Motion(
+            frames=(self.frames[1], frame),
+            stamps_ns=(self.stamps_ns[1], stamp_ns),
+            poses=(self.poses[1], T_world_camera),
+            tracked=tracked,
+            to_points=to_points,
+        )
+
+    def then_unmapped(
+        self, frame: int, stamp_ns: int, T_world_camera: F64, tracked: int, to_points: int
+    ) -> "Motion":
+        """Return the motion after one more pose, of an unmapped frame."""
+        after = self.then(frame, stamp_ns, T_world_camera, tracked, to_points)
+        return replace(after, unmapped_s=self.unmapped_s + self.lost_s(stamp_ns))
+
+    def moved(self, S: F64) -> "Motion":
+        """Return the motion after the world has moved by a similarity (4, 4)."""
+        before, last = (move_by_similarity(S, pose) for pose in self.poses)
+        return replace(self, poses=(before, last))
+
+    def velocity(self) -> F64:
+        """(6,) between the two frames, as of ``FramePoses.motions``."""
+        frames = max(1, self.frames[1] - self.frames[0])
+        return motion_between(*self.poses, self.poses[1]) / frames
+
+    def velocity_at(self, frame: int, T_world_camera: F64) -> F64:
+        """(6,) at a later frame with this pose."""
+        between = self.then(frame, 0, T_world_camera).velocity()
+        if self.frames[0] == self.frames[1]:
+            return between
+        # The velocity between the frames has changed since.
+        share = (frame - self.frames[1]) / (frame - self.frames[0])
+        return between + _SPEEDING_UP * share * (between - self.velocity())
+
+    def interval_s(self) -> float:
+        """Seconds between the two."""
+        return 1e-9 * (self.stamps_ns[1] - self.stamps_ns[0])
+
+    def lost_s(self, stamp_ns: int) -> float:
+        """Seconds since the last pose."""
+        return 1e-9 * (stamp_ns - self.stamps_ns[1])
+
+    def predictions(self, stamp_ns: int) -> list[F64]:
+        """Predict T_world_camera by constant velocity, and for a camera that has stopped."""
+        before, last = self.poses
+        elapsed = self.stamps_ns[1] - self.stamps_ns[0]
+        if elapsed <= 0:
+            return [last]
+        share = (stamp_ns - self.stamps_ns[1]) / elapsed
+        step = inverse(before) @ last
+        moved = np.eye(4)
+        moved[:3, :3] = so3_exp(share * so3_log(step[:3, :3]))
+        moved[:3, 3] = share * step[:3, 3]
+        return [last @ moved, last]
+
+
+def search_radius_px(lost_s: float, camera: PinholeCamera, parameters: RecoveryParameters) -> float:
+    """Search radius around a prediction, px, this long after the last pose."""
+    grown = parameters.radius_share + parameters.growth_share_per_s * lost_s
+    return camera.width * min(grown, parameters.max_radius_share)
+
+
+def recover(
+    motion: Motion,
+    stamp_ns: int,
+    rows: I32,
+    points: Landmarks,
+    maxima: F32,
+    grey: U8,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    generator: np.random.Generator,
+) -> F64 | None:
+    """Return T_world_camera of a frame without tracks, or None if the image does not verify a pose.
+
+    motion: before.   stamp_ns: of the frame.   rows: of landmarks that may be in view.   maxima:
+    (M, 3) of the frame.   grey: (H, W).
+    """
+    predictions = motion.predictions(stamp_ns)
+    radius_px = search_radius_px(motion.lost_s(stamp_ns), camera, parameters.recovery)
+    for radius in (NEAR * radius_px, radius_px):
+        grid = MaximaGrid.build(maxima, camera.width, camera.height, radius)
+        for prediction in predictions:
+            proved = search_near(
+                prediction, rows, points, grid, grey, radius, camera, parameters, generator
+            )
+            if proved is not None and are_enough(len(proved.rows), parameters):
+                return proved.T_world_camera
+    return None
+
+
+def are_enough(points: int, parameters: MappingParameters) -> bool:
+    """Whether this many verified landmarks, or corners, place a camera without tracks.
+
+    A few dozen also agree on a pose a step aside, if the scene repeats there.  No map starts with
+    so few, and none continues by them.
+    """
+    return points >= parameters.start.min_points
+
+
+def search_near(
+    T_world_camera: F64,
+    rows: I32,
+    points: Landmarks,
+    grid: MaximaGrid,
+    grey: U8,
+    radius_px: float,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    generator: np.random.Generator,
+) -> VerifiedPose | None:
+    """Search landmarks around their projection in a pose, and return the pose that they verify.
+
+    rows: of the landmarks.   grid: the maxima of the image, for this radius.
+    """
+    own = parameters.recovery
+    limits = parameters.localisation.model_copy(update={"ransac_samples": own.ransac_samples})
+    found, points_px = match_widely(
+        T_world_camera, rows, points, grid, grey, camera, radius_px, own.points,
+        parameters.reacquisition.min_zncc,
+    )  # fmt: skip
+    if len(found) < own.min_agreeing:
+        return None
+    located = locate([T_world_camera], points.xyz[found], points_px, camera, limits, generator)
+    if located.inliers.sum() < own.min_agreeing:
+        return None
+    return verify_pose(
+        located.T_world_camera, rows, points, grid.maxima, grey, camera, parameters,
+        own.min_agreement,
+    )  # fmt: skip
+
+
+def verify_pose(
+    T_world_camera: F64,
+    rows: I32,
+    points: Landmarks,
+    maxima: F32,
+    grey: U8,
+    camera: PinholeCamera,
+    parameters: MappingParameters,
+    min_agreement: float,
+) -> VerifiedPose | None:
+    """Refine a pose by all landmarks found at their projection; None if too few support it.
+
+    min_agreement: minimum share of the found landmarks that support it, see ``RecoveryParameters``.
+    A wrong pose finds landmarks too: wherever a maximum is near and its patch looks alike.
+    """
+    found = reacquire(
+        T_world_camera, rows, points, maxima, maxima, grey, camera, parameters.reacquisition
+    )
+    if len(found.rows) < parameters.localisation.min_inliers:
+        return None
+    located = refine(
+        T_world_camera, points.xyz[found.rows], found.points_px, camera, parameters.localisation,
+        near=True,
+    )  # fmt: skip
+    inliers = int(located.inliers.sum())
+    enough = max(
+        parameters.localisation.min_inliers,
+        parameters.recovery.min_support_share * len(found.visible),
+        min_agreement * len(found.rows),
+    )
+    if inliers < enough:
+        return None
+    return VerifiedPose(located.T_world_camera, found.rows[located.inliers])

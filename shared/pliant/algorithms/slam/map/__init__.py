@@ -1,0 +1,1 @@
+"""What a map consists of: landmarks, keyframes, links."""

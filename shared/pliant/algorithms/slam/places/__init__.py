@@ -1,0 +1,1 @@
+"""Place recognition, loop closure and relocalisation."""

@@ -1,0 +1,1 @@
+"""Maps that are kept: earlier segments and earlier sessions."""
