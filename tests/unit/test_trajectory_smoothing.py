@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pliant.algorithms import trajectory_smoothing as smoothing
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.geometry import inverse, so3_exp
+from pliant.algorithms.slam.estimate import trajectory_smoothing as smoothing
 
 FRAMES = 120
 STAMPS_NS = np.arange(FRAMES, dtype=np.int64) * 33_333_333
