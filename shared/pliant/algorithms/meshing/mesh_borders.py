@@ -1,11 +1,10 @@
-"""Borders of a mesh that are straight where the surface ends, instead of saw-toothed.
+"""Smooth borders of a mesh instead of saw-toothed ones.
 
-Marching cubes ends where voxels were not seen: in teeth of a voxel, shreds as wide as one, and
-slits.  Corners of the surface that are sharp are cut off, and again what is sharp then: so teeth
-and shreds go.  Corners of the gap that are sharp are closed by a triangle, and again: so notches
-go, and slits are zipped up from their ends.  Neither spreads along a border that is straight or
-round.  At last the border is smoothed along the surface (Taubin 1995): low frequencies keep their
-amplitude, so nothing shrinks.
+Marching cubes ends at unobserved voxels, with teeth, shreds and slits one voxel wide.  Sharp
+corners of the surface are cut off repeatedly, which removes teeth and shreds.  Sharp corners of
+gaps are closed by triangles repeatedly, which removes notches and closes slits from their ends.
+Neither spreads along a straight or round border.  Then the border is smoothed along the surface
+(Taubin 1995): low frequencies keep their amplitude, so nothing shrinks.
 """
 
 import math
@@ -26,19 +25,19 @@ from pliant.algorithms.meshing.tsdf_blocks import EMPTY, grown, slot_of
 from pliant.compiler.kernel import kernel
 
 _TOOTH = math.radians(80.0)
-"""Less than a right angle: of a right-angled corner as many would be left, and all cut off."""
+"""Less than a right angle: cutting a right-angled corner leaves new ones, without end."""
 _NOTCH = math.radians(100.0)
-"""More than one: a triangle closes it, and leaves two obtuse ones."""
+"""More than a right angle: a triangle closes it and leaves two obtuse corners."""
 _MIN_COSINE = 0.5
-"""Between the normal of a closing triangle and those of its corners."""
+"""Minimum, between the normal of a closing triangle and those of its corners."""
 _SHRINK, _GROW, _ROUNDS = 0.5, -0.53, 60
-"""Taubin's lambda, mu and number of steps: what is shorter than ten vertices goes."""
+"""Taubin's lambda, mu and number of steps: they remove wavelengths below ten vertices."""
 _HALVINGS = 4
-"""Of a vertex' way, before it stays where it was."""
+"""Halvings of a vertex' motion before the vertex is left in place."""
 
 
 def without_teeth(positions: F32, triangles: I32) -> BoolArray:
-    """(T,) which triangles are left without the sharp corners of the surface.
+    """(T,) triangles that are kept, without the sharp corners of the surface.
 
     positions: (V, 3).
     """
@@ -58,7 +57,7 @@ def zipped(positions: F32, normals: F32, triangles: I32, max_edge: float) -> I32
 def smoothed_borders(positions: F32, normals: F32, triangles: I32) -> F32:
     """(V, 3) positions, those on the border smoothed along it.
 
-    A vertex moves at right angles to its normal, and less where a triangle would turn over.
+    A vertex moves perpendicular to its normal, and less if a triangle would turn over.
     """
     border = border_of(len(positions), triangles)
     rows = np.flatnonzero((border.after != NONE) & (border.before != NONE))
@@ -153,7 +152,7 @@ def _cut_off(positions: F32, triangles: I32, stars: Stars, sharp: float) -> Bool
 
 @kernel
 def _fits(positions: F32, normals: F32, a: Any, b: Any, c: Any) -> bool:
-    """Whether a triangle lies as the surface does at its corners."""
+    """Whether a triangle's normal is close to those of the surface at its corners."""
     e0 = float(positions[b, 0]) - float(positions[a, 0])
     e1 = float(positions[b, 1]) - float(positions[a, 1])
     e2 = float(positions[b, 2]) - float(positions[a, 2])

@@ -1,9 +1,9 @@
-"""A mesh that can be shown: small holes closed, no crumbs or shreds, borders without teeth.
+"""Finishing of the mesh: small holes closed, crumbs and shreds removed, borders smoothed.
 
-What voxels say that were not seen, or whose sights disagree, is a guess: it stays where surface
-encloses it, and closes a hole.  From the border inwards it is peeled off, so that the surface ends
-where the keyframes' sight did.  Pieces of little area and little weight go.  Sizes are in voxels, a
-share of the scene's median depth.
+Surface from unobserved voxels, or from inconsistent observations, is a guess.  It is kept where
+observed surface encloses it, and closes a hole.  Along the border it is removed, so that the mesh
+ends where the observations do.  Components of little area and weight are removed.  Lengths are in
+voxels, a share of the scene's median depth.
 """
 
 from dataclasses import dataclass, replace
@@ -19,17 +19,21 @@ from pliant.algorithms.meshing.tsdf_closing import CARRIED, Evidence, is_guessed
 from pliant.compiler.kernel import kernel
 
 MOST_STEPS = 7.0
-"""As of ``Tsdf``: what a guess may have.  Between the truncations on both sides there are 8."""
+"""As of ``Tsdf``: maximum for a guess.  The two truncations are 8 steps apart."""
 _SURE_STEPS = 5.0
-"""More are a guess.  MAX_STEPS, of the live mesh, lets no curtain hang behind the edges of things;
-here teeth are cut off and slits would stay."""
+"""Above it a vertex is a guess.  MAX_STEPS of the live mesh is lower, against curtains behind depth
+discontinuities; here they are cut off as teeth, and a lower limit would leave slits.
+"""
 _RINGS = 2 * CARRIED
-"""Triangles inwards that guesses are peeled off: they are carried on askew, too."""
+"""Rings of triangles from the border in which guesses are removed.  Twice the extrapolated voxels,
+because extrapolation is diagonal as well.
+"""
 _CRUMB = 30.0
-"""Square voxels of certain surface that a piece has at least: one sight face on, of certain depth.
-Of uncertain surface it takes more."""
+"""Minimum area of a component in square voxels, times its weight: one frontal observation with
+certain depth has weight 1.
+"""
 _MAX_EDGE = 2.5
-"""Voxels: the longest edge that closes a notch."""
+"""Maximum edge, in voxels, of a triangle that closes a notch."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +45,13 @@ class _Judged:
     guessed: BoolArray
 
     def kept(self, alive: BoolArray) -> "_Judged":
-        """Some of the triangles (T,)."""
+        """Select triangles (T,)."""
         used = np.unique(self.mesh.triangles[alive])
         mesh = self.mesh.of_triangles(alive)
         return _Judged(mesh, self.support[used], self.guessed[used])
 
     def zipped(self, max_edge: float) -> "_Judged":
-        """With sharp notches closed; at most one border passes each vertex then."""
+        """Close sharp notches.  At most one border then passes each vertex."""
         mesh = self.mesh
         triangles, was = split_fans(len(mesh.positions), mesh.triangles)
         positions, normals = mesh.positions[was], mesh.normals[was]
@@ -62,7 +66,7 @@ class _Judged:
 
 
 def finished(mesh: TriangleMesh, evidence: Evidence, voxel: float) -> TriangleMesh:
-    """The mesh of a volume in which distances were carried on, with marks where it is guessed.
+    """Return the finished mesh of a volume with extrapolated distances, with its guesses marked.
 
     voxel: its side, in the unit of the mesh.
     """
@@ -81,7 +85,7 @@ def finished(mesh: TriangleMesh, evidence: Evidence, voxel: float) -> TriangleMe
 
 
 def _large_enough(judged: _Judged, voxel: float) -> BoolArray:
-    """(T,) triangles of pieces, connected by vertices, with enough area times weight up to 1."""
+    """(T,) triangles of components with sufficient area times weight, which is at most 1."""
     triangles = judged.mesh.triangles.astype(np.int64)
     if not len(triangles):
         return np.zeros(0, np.bool_)
@@ -96,8 +100,10 @@ def _large_enough(judged: _Judged, voxel: float) -> BoolArray:
 
 @kernel
 def peeled(triangles: I32, guessed: BoolArray, rings: int) -> BoolArray:
-    """(T,) which triangles are left, without those with a guessed corner that meet the border; so
-    many times.  guessed: (V,)."""
+    """(T,) triangles that are kept: those with a guessed vertex are removed at the border.
+
+    guessed: (V,).   rings: how often.
+    """
     stars = stars_of(len(guessed), triangles)
     alive = np.ones(len(triangles), np.bool_)
     ends = np.zeros(len(guessed), np.bool_)

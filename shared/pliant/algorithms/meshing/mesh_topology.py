@@ -1,8 +1,8 @@
-"""Which triangles meet at a vertex, and where a mesh ends.
+"""The triangles at each vertex, and the borders of a mesh.
 
-Edges are directed as the triangles turn: two triangles at one edge run along it in opposite
-directions.  An edge without its opposite is one of the border, which so runs anticlockwise around
-a piece of surface and clockwise around a hole, seen from outside.
+Edges have the orientation of their triangle, so two triangles share an edge in opposite directions.
+An edge without its opposite belongs to the border.  Seen from outside, the border runs
+anticlockwise around a component and clockwise around a hole.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -34,7 +34,7 @@ class Border(NamedTuple):
 
 @kernel
 def stars_of(count: int, triangles: I32) -> Stars:
-    """Of ``count`` vertices."""
+    """Return the corners at each of ``count`` vertices."""
     starts = np.zeros(count + 1, np.int64)
     for t in range(len(triangles)):
         for k in range(3):
@@ -53,7 +53,7 @@ def stars_of(count: int, triangles: I32) -> Stars:
 
 @kernel
 def corner_before(a: Any, b: Any, triangles: I32, stars: Stars, alive: BoolArray) -> int:
-    """The corner at a of the living triangle that runs from a to b; NONE: there is none."""
+    """Return the corner at a of the kept triangle with the edge a to b, or NONE."""
     for at in range(stars.starts[a], stars.starts[a + 1]):
         t, k = stars.corners[at] // 3, stars.corners[at] % 3
         if alive[t] and triangles[t, (k + 1) % 3] == b:
@@ -63,7 +63,7 @@ def corner_before(a: Any, b: Any, triangles: I32, stars: Stars, alive: BoolArray
 
 @kernel
 def border_of(count: int, triangles: I32) -> Border:
-    """Of a mesh in which at most one border passes each vertex: see ``split_fans``."""
+    """Return the border of a mesh with at most one border at each vertex: see ``split_fans``."""
     stars = stars_of(count, triangles)
     alive = np.ones(len(triangles), np.bool_)
     after, before = np.full(count, NONE, np.int32), np.full(count, NONE, np.int32)
@@ -77,10 +77,10 @@ def border_of(count: int, triangles: I32) -> Border:
 
 @kernel
 def split_fans(count: int, triangles: I32) -> tuple[I32, I32]:
-    """Part the fans of triangles that meet in a vertex of the border and nowhere else.
+    """Split a vertex of the border that separate fans of triangles share.
 
-    Returns the (T, 3) triangles, and (V',) of each vertex the one that it was; the first ``count``
-    are as before.
+    Returns the (T, 3) triangles, and (V',) the original of each vertex; the first ``count`` are
+    unchanged.
     """
     stars = stars_of(count, triangles)
     alive = np.ones(len(triangles), np.bool_)
@@ -93,7 +93,7 @@ def split_fans(count: int, triangles: I32) -> tuple[I32, I32]:
             t, k = corner // 3, corner % 3
             if corner_before(triangles[t, (k + 1) % 3], v, triangles, stars, alive) != NONE:
                 continue
-            # The border leaves v here; the fan is walked to where it comes in.
+            # The border leaves v here: follow the fan to the other end.
             fans += 1
             if fans == 1:
                 continue

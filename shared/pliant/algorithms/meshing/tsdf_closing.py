@@ -1,9 +1,9 @@
-"""A truncated signed distance carried on a few voxels into unseen ones, to close small holes.
+"""Extrapolation of a truncated signed distance by a few voxels, to close small holes.
 
-Near a surface that is smooth the distance is linear.  So where a voxel was not seen and in a
-direction the next two were, it would have 2 d(1) - d(2); the mean over the directions counts.
-(Davis, Marschner, Garr and Levoy 2002 spread the distance itself, which bends the surface.)  What
-is carried on beyond the outer border of the surface is cut off again by ``mesh_finish``.
+Near a smooth surface the distance is linear.  So an unobserved voxel, with the next two observed
+in some direction, has 2 d(1) - d(2); the mean over such directions is used.  (Davis, Marschner,
+Garr and Levoy 2002 diffuse the distance itself, which bends the surface.)  ``mesh_finish`` removes
+the extrapolated surface beyond the outer border.
 """
 
 import math
@@ -19,21 +19,21 @@ from pliant.algorithms.meshing.tsdf_integrate import DISTANCE_UNITS, WEIGHT_UNIT
 from pliant.compiler.kernel import kernel
 
 CARRIED = 3
-"""Steps of one voxel: a hole of twice as many is closed."""
+"""Number of steps of one voxel: holes of twice this width are closed."""
 _PAD = 2
-"""Voxels around a block: a direction reads two."""
+"""Voxels around a block: each direction reads two."""
 _WIDE = SIDE + 2 * _PAD
 _LEAST_DIRECTIONS = 3
-"""Fewer are no surface."""
+"""Minimum directions for an extrapolated voxel."""
 _STEEPEST = 1.5
-"""Times as fast as a distance may change between two voxels, and it still is one."""
+"""Maximum change of the distance between two voxels, relative to that of a true distance."""
 
 
 class Evidence(NamedTuple):
-    """What speaks for the vertices of a mesh.
+    """The evidence for the vertices of a mesh.
 
-    support: weight, of both voxels of its edge the lesser, 0 where one was not seen.
-    steps: voxels' worth of distance by which the edge changes; a true distance has one.
+    support: the smaller weight of the two voxels of its edge; 0 if one was not observed.
+    steps: change of the distance along the edge, in voxels; that of a true distance is one.
     """
 
     support: Annotated[F32, Shape("V")]
@@ -42,11 +42,11 @@ class Evidence(NamedTuple):
 
 @kernel
 def carry_on(keys: I32, tsdf: Tsdf, step: int, filled: U8) -> None:
-    """Fill unseen voxels of the blocks (N, 3) beside seen ones; sums change.
+    """Fill unobserved voxels of the blocks (N, 3) beside observed ones; changes the sums.
 
-    filled: (B, SIDE, SIDE, SIDE) of all blocks, by which step each voxel was, from 1 on; 0: it was
-    not.  A step reads seen voxels and those of the steps before.  A filled voxel has the
-    least weight that counts as seen.
+    filled: (B, SIDE, SIDE, SIDE) of all blocks: the step, from 1, that filled each voxel; 0: none.
+    A step reads observed voxels and those of earlier steps.  A filled voxel gets the minimum weight
+    of an observed one.
     """
     sums, min_weight = tsdf.sums, tsdf.min_weight
     near = np.empty((3, 3, 3), np.int32)
@@ -70,9 +70,9 @@ def carry_on(keys: I32, tsdf: Tsdf, step: int, filled: U8) -> None:
 
 @kernel
 def _gather(near: I32, sums: VoxelSums, min_weight: int, step: int, filled: U8, field: F32) -> bool:
-    """Distances in truncations, 2 where they are one or more, NaN where nothing is known.
+    """Distances in truncations; 2 from one truncation on, NaN if unobserved.
 
-    Returns whether the block has a voxel to be filled, and some near it have a distance.
+    Returns whether the block has a voxel to fill, and distances near it.
     """
     lacks, has = False, False
     for z in range(_WIDE):
@@ -143,7 +143,7 @@ def _fill(
 
 
 def evidence_of(positions: F32, tsdf: Tsdf, filled: U8) -> Evidence:
-    """Of the vertices (V, 3) of a mesh as marching cubes makes it.    filled: see ``carry_on``."""
+    """Of the vertices (V, 3) of a mesh made by marching cubes.    filled: see ``carry_on``."""
     support, steps = _evidence(positions, tsdf, filled)
     return Evidence(support, steps)
 
@@ -155,7 +155,7 @@ def _evidence(positions: F32, tsdf: Tsdf, filled: U8) -> tuple[F32, F32]:
     voxel = tsdf.scale.voxel
     at = np.empty((2, 3), np.int64)
     for v in range(len(positions)):
-        # Off the lattice along one axis alone: there are the ends of its edge.
+        # A vertex is off the lattice along one axis only, that of its edge.
         axis, furthest = 0, -1.0
         for k in range(3):
             place = float(positions[v, k]) / voxel
@@ -185,5 +185,5 @@ def _evidence(positions: F32, tsdf: Tsdf, filled: U8) -> tuple[F32, F32]:
 
 
 def is_guessed(evidence: Evidence, most_steps: float) -> BoolArray:
-    """(V,) vertices between voxels that were not seen, or whose sights differ by more steps."""
+    """(V,) vertices beside unobserved voxels, or with a change of more than ``most_steps``."""
     return (evidence.support <= 0.0) | (evidence.steps > most_steps)

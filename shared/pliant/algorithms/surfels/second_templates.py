@@ -1,11 +1,11 @@
 """A second, recent template of each surfel, guarded by that of its birth (not in the paper).
 
-DSDT keeps the texture of Eq. 5 for good.  Wet tissue changes its highlights when it tilts, so its
-texture soon looks otherwise in place.  A surfel whose ZNCC falls is therefore compared with the
-frame in which it was last found.  Such templates drift, so the birth template is tried again:
+DSDT never changes the texture of Eq. 5.  Highlights on wet tissue change as it tilts, so the
+texture of a surfel changes in place.  A surfel whose ZNCC falls therefore gets a template of the
+current frame.  Such templates drift, so the birth template is aligned again:
 
-- in every frame from the present position, tied to the neighbours as in ``relocate``;
-- in turns from where confirmed neighbours have carried the surfel, also if it is missing.
+- in every frame from the current position, tied to the neighbours as in ``relocate``;
+- every few frames from the position predicted by confirmed neighbours, also if it is missing.
 
 Where the birth template fits, it is in use again and the surfel is confirmed: its drift is gone.
 """
@@ -102,11 +102,11 @@ def restore(rows: I64, birth: list[Templates], used: list[Templates]) -> None:
 def carried_by_neighbours(
     wanted: BoolArray, confirmed: BoolArray, born: I32, rest: F64, points: F64
 ) -> tuple[I64, F64]:
-    """Rows of those wanted that have confirmed neighbours, and where these have carried them.
+    """Return the wanted rows with confirmed neighbours, and the positions that these predict.
 
     born: (N,) frame of birth: only surfels of one batch have been at ``rest`` together.  rest,
-    points: (N, 3) positions at birth and now, world.  The displacement of the nearest is fitted by
-    an affine one, of the least norm where they lie in a plane.
+    points: (N, 3) positions at birth and now, world.  The displacements of the nearest are fitted
+    by an affine one, with minimum norm if they lie in a plane.
     """
     found: list[int] = []
     moves: list[F64] = []

@@ -14,8 +14,6 @@ from pliant.algorithms.surfels.deformation_models import MODELS, move_poses
 from pliant.algorithms.surfels.graph_alignment import COARSE_STEPS, STEPS, align_graph, relocate
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import (
-    BIAS,
-    GAIN,
     Level,
     X,
     make_pyramid,
@@ -23,12 +21,6 @@ from pliant.algorithms.surfels.patch_sampling import (
 )
 from pliant.algorithms.surfels.prediction import start_at, targets
 from pliant.algorithms.surfels.remembered_views import FoundBack, RememberedViews
-from pliant.algorithms.surfels.second_templates import (
-    birth_bias,
-    carried_by_neighbours,
-    renew,
-    restore,
-)
 from pliant.algorithms.surfels.surfel_alignment import (
     OMEGA_E,
     Equilibrium,
@@ -41,20 +33,8 @@ from pliant.algorithms.surfels.surfel_alignment import (
 )
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.algorithms.surfels.surfel_table import SurfelTable, frame_of
-from pliant.algorithms.surfels.validation import new_validations
+from pliant.algorithms.surfels.template_update import RELOCATED_ZNCC, TemplateUpdate
 
-_RELOCATED_ZNCC = 0.9
-"""Minimum ZNCC of a recovered surfel, higher than that of a tracked one: repeated attempts may
-match by chance.
-"""
-_RENEWED_ZNCC, _RENEWED_VISIBLE = 0.93, 0.8
-"""A template is renewed below this ZNCC, where at least this share of the patch is visible."""
-_GUARD_ZNCC = 0.5
-_CONFIRMED_PATCH, _SOUGHT_PATCH = 0.2, 0.3
-"""Shares of a patch's side: how far its birth template may move a surfel, from where it was found
-and from where its neighbours say it is."""
-_SOUGHT_LEVELS, _TURNS = 2, 5
-"""Levels, the finest, at which a surfel is sought there, and in how many frames each once."""
 _TOGETHER_LEVELS = {False: 2, True: 1}
 """Levels, the finest, at which surfels with neighbours move as one: before a static camera, and
 before a moving one, where more takes twice as long and the camera is hardly better."""
@@ -133,7 +113,7 @@ class SurfelTracker:
         with timer("views"):
             seen = self._look_back(image, pyramid, before, was_lost=was_lost)
         with timer("templates"):
-            self._settle_templates(pyramid)
+            self._update_templates(pyramid)
         if depth is not None:
             with timer("births"):
                 self._give_birth(pyramid, _checked_depth(depth, self._camera))
@@ -340,7 +320,7 @@ class SurfelTracker:
             relocate(poses, rows, table.edges, matcher, p.strain)
             validation.validate_all(poses, rows, matcher, found)
             torn = torn & ~passed
-        wanted = np.where(table.missing > 0, max(p.min_zncc, _RELOCATED_ZNCC), p.min_zncc)
+        wanted = np.where(table.missing > 0, max(p.min_zncc, RELOCATED_ZNCC), p.min_zncc)
         state = np.full(len(table), SurfelState.TRACKED, np.uint8)
         state[found[:, validation.ZNCC] < wanted] = SurfelState.OUTLIER
         state[found[:, validation.VISIBLE] < p.min_visible] = SurfelState.OCCLUDED
@@ -363,82 +343,6 @@ class SurfelTracker:
         if p.neighbours and not self._lost:
             carried = ~good & np.isfinite(world).all(axis=1)
             table.guesses[carried] = world[carried]
-
-    def _settle_templates(self, pyramid: list[Level]) -> None:
-        """Confirm surfels by their birth templates, and renew those in use (second_templates)."""
-        table, p, n = self._table, self._parameters, len(self._table)
-        if self._lost or not n:
-            return
-        T_camera_world = inverse(self._T_world_camera)
-        poses = move_poses(table.poses, T_camera_world)
-        poses[:, BIAS] = birth_bias(poses, table.templates[0].means)
-        poses[:, BIAS] -= table.birth[0].means * (1.0 - poses[:, GAIN])
-        matcher, found = self._birth_matcher(0, pyramid), new_validations(n)
-        # At the place where it was found, and then where the birth template leads from there.
-        rows = (table.tracked & table.renewed).astype(np.uint8)
-        table.birth_zncc = table.validations[:, validation.ZNCC].copy()
-        table.birth_zncc[table.renewed] = 0.0
-        validation.validate_all(poses, rows, matcher, found)
-        table.birth_zncc[rows > 0] = found[rows > 0, validation.ZNCC]
-        before = found[:, [validation.U, validation.V]]
-        relocate(poses, rows, table.edges, matcher, p.strain)
-        validation.validate_all(poses, rows, matcher, found)
-        self._confirm(rows > 0, poses, found, before, p.min_zncc, _CONFIRMED_PATCH * p.patch_px)
-        table.state[table.tracked & table.renewed & (table.birth_zncc < _GUARD_ZNCC)] = (
-            SurfelState.OUTLIER
-        )
-        # In turns, so that every frame costs the same.
-        wanted = ~table.confirmed & (table.ids % _TURNS == self._frame % _TURNS)
-        turn, points = carried_by_neighbours(
-            wanted, table.confirmed, table.born, table.rest, table.poses[:, X : X + 3]
-        )
-        if len(turn):
-            poses[turn, X : X + 3] = transform(T_camera_world, points)
-            rows = np.zeros(n, np.uint8)
-            rows[turn] = 1
-            validation.validate_all(poses, rows, matcher, found)
-            before = found[:, [validation.U, validation.V]]
-            for number in range(min(_SOUGHT_LEVELS, len(pyramid)) - 1, -1, -1):
-                align_all(poses, rows, no_equilibrium(n), self._birth_matcher(number, pyramid))
-            validation.validate_all(poses, rows, matcher, found)
-            least = max(p.min_zncc, _RELOCATED_ZNCC)
-            self._confirm(rows > 0, poses, found, before, least, _SOUGHT_PATCH * p.patch_px)
-        self._renew(pyramid, T_camera_world)
-
-    def _confirm(
-        self, wanted: BoolArray, poses: F64, found: F64, before: F64, least: float, most_px: float
-    ) -> None:
-        """Put birth templates in use where they fit, within a distance of where they should be."""
-        table, p = self._table, self._parameters
-        step = np.linalg.norm(found[:, [validation.U, validation.V]] - before, axis=1)
-        good = wanted & (found[:, validation.ZNCC] >= least) & (step <= most_px)
-        good &= (found[:, validation.VISIBLE] >= p.min_visible) & np.isfinite(poses).all(axis=1)
-        good &= (found[:, validation.INSIDE] >= p.min_visible) & (found[:, validation.FRONT] > 0.0)
-        rows = np.flatnonzero(good)
-        restore(rows, table.birth, table.templates)
-        table.renewed[rows], table.missing[rows] = False, 0.0
-        table.state[rows], table.validations[rows] = SurfelState.TRACKED, found[rows]
-        table.birth_zncc[rows] = found[rows, validation.ZNCC]
-        table.poses[rows] = move_poses(poses[rows], self._T_world_camera)
-        table.guesses[rows] = table.poses[rows]
-        table.tried[rows] = table.poses[rows, X : X + 3]
-
-    def _renew(self, pyramid: list[Level], T_camera_world: F64) -> None:
-        table, found = self._table, self._table.validations
-        rows = np.flatnonzero(
-            table.tracked
-            & (found[:, validation.ZNCC] < _RENEWED_ZNCC)
-            & (found[:, validation.VISIBLE] >= _RENEWED_VISIBLE)
-            & (found[:, validation.INSIDE] >= 1.0)
-        )
-        poses = move_poses(table.poses, T_camera_world)
-        renew(poses, rows, pyramid, self._parameters.highlight, table.birth, table.templates)
-        table.poses[rows, BIAS] = table.guesses[rows, BIAS] = poses[rows, BIAS]
-        table.renewed[rows] = True
-
-    def _birth_matcher(self, number: int, pyramid: list[Level]) -> Matcher:
-        matcher = self._matcher(number, pyramid[number])
-        return matcher._replace(templates=self._table.birth[number])
 
     def _give_birth(self, pyramid: list[Level], depth: F64) -> None:
         table, p, camera = self._table, self._parameters, self._camera
@@ -465,6 +369,17 @@ class SurfelTracker:
         rows = (table.born == self._frame).astype(np.uint8)
         poses = move_poses(table.poses, inverse(self._T_world_camera))
         validation.validate_all(poses, rows, self._matcher(0, pyramid[0]), table.validations)
+
+    def _update_templates(self, pyramid: list[Level]) -> None:
+        if self._lost or not len(self._table):
+            return
+        matchers = [
+            self._matcher(number, level)._replace(templates=self._table.birth[number])
+            for number, level in enumerate(pyramid)
+        ]
+        TemplateUpdate(self._table, self._parameters, pyramid, matchers, self._T_world_camera).run(
+            self._frame
+        )
 
     def _matcher(self, number: int, level: Level) -> Matcher:
         """number: of the level, 0 being that of full size, -1 the coarsest."""
