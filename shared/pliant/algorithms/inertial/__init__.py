@@ -1,0 +1,1 @@
+"""Inertial and satellite measurements, and what they say about a finished trajectory."""
