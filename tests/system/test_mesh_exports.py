@@ -70,6 +70,13 @@ def test_small_pieces_are_left_out(result: Path, tmp_path: Path) -> None:
         export_result(result, "tum", tmp_path / "poses.txt", clean=True)
 
 
+def test_closed_holes_are_left_out(result: Path) -> None:
+    recording = Recording(result / "recording.mcap")
+    whole, observed = (textured_mesh(recording, 10**7, observed=each) for each in (False, True))
+    assert len(read_ply(result / "mesh.ply").closed)
+    assert 0.5 * len(whole.triangles) < len(observed.triangles) < len(whole.triangles)
+
+
 def test_a_solid_is_closed(result: Path, tmp_path: Path) -> None:
     try:
         import_module("open3d")

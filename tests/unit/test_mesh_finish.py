@@ -39,6 +39,22 @@ def area(positions: F32, triangles: I32) -> float:
     return float(0.5 * np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, 2].sum())
 
 
+def test_observed_surface_is_without_the_triangles_of_closed_vertices() -> None:
+    positions, normals, triangles = sheet(np.ones((1, 3), np.bool_))
+    colours = np.arange(24, dtype=np.uint8).reshape(8, 3)
+    mesh = TriangleMesh(
+        positions=positions, normals=normals, colours=colours, triangles=triangles,
+        closed=np.array([3], np.int32),
+    )  # fmt: skip
+    observed = mesh.observed()
+    left = positions[triangles][~(triangles == 3).any(axis=1)]
+    assert 0 < len(left) < len(triangles)
+    np.testing.assert_array_equal(observed.positions[observed.triangles], left)
+    assert len(observed.closed) == 0
+    assert not (observed.colours == colours[3]).all(axis=1).any()
+    np.testing.assert_array_equal(observed.observed().triangles, observed.triangles)
+
+
 def test_the_border_runs_anticlockwise_and_a_holes_clockwise() -> None:
     cells = np.ones((3, 3), np.bool_)
     cells[1, 1] = False

@@ -37,6 +37,9 @@ def export(
             "--clean", help="glb, obj: remove pieces below 1 % of the area of the largest."
         ),
     ] = False,
+    observed: Annotated[
+        bool, typer.Option("--observed", help="glb, obj: leave out the surface that closes holes.")
+    ] = False,
     crop: Annotated[
         str | None,
         typer.Option(
@@ -74,7 +77,7 @@ def export(
 
     written = export_result(
         result, to, output, force=force, every=every, triangles=triangles, clean=clean,
-        crop=None if crop is None else _box(crop),
+        observed=observed, crop=None if crop is None else _box(crop),
         progress=partial(tell_progress, f"{to}: image"),
     )  # fmt: skip
     typer.echo(str(written))

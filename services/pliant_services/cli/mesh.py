@@ -21,6 +21,9 @@ def mesh(
     clean: Annotated[
         bool, typer.Option("--clean", help="Remove pieces below 1 % of the area of the largest.")
     ] = False,
+    observed: Annotated[
+        bool, typer.Option("--observed", help="Leave out the surface that closes holes.")
+    ] = False,
     watertight: Annotated[
         bool,
         typer.Option(
@@ -58,6 +61,7 @@ def mesh(
         force=force or when_over,
         overrides=overrides or [],
         clean=clean,
+        observed=observed,
         close=watertight,
     ):
         typer.echo(line)

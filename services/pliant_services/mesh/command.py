@@ -1,13 +1,14 @@
 """Behind ``pliant mesh``: the final meshes of a recording, made again without a new recording."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.mesh_components import cleaned
 from pliant.config import Config, recorded_config
 from pliant.errors import RecordingError
@@ -76,11 +77,12 @@ def mesh_recording(recording: Path, config: Config) -> Meshing:
 
 def run_mesh(
     recording: Path, *, output: Path | None, force: bool, overrides: Sequence[str],
-    clean: bool = False, close: bool = False,
+    clean: bool = False, observed: bool = False, close: bool = False,
 ) -> Iterator[str]:  # fmt: skip
     """Mesh, write the files, and say what came of it.  Raises PliantError.
 
-    clean: leave out small pieces.    close: write a watertight mesh, too.
+    clean: leave out small pieces.    observed: leave out closed holes.    close: write a watertight
+    mesh, too.
     """
     if close:
         load_open3d()  # said before the work
@@ -90,8 +92,10 @@ def run_mesh(
     with written(output, force=force):
         found = mesh_recording(recording, config)
         yield from dict.fromkeys(found.notes)
+        if observed:
+            found.pieces = list(_changed(found.pieces, TriangleMesh.observed))
         if clean:
-            found.pieces = list(without_small_pieces(found.pieces))
+            found.pieces = list(_changed(found.pieces, cleaned))
         write_all(output, found, folded_map(recording))
         report = {
             "mesh": mesh_report(found.pieces),
@@ -124,12 +128,14 @@ def _beside(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}_mesh")
 
 
-def without_small_pieces(pieces: Sequence[MeshPiece]) -> Iterator[MeshPiece]:
-    """The meshes, cleaned."""
+def _changed(
+    pieces: Sequence[MeshPiece], change: Callable[[TriangleMesh], TriangleMesh]
+) -> Iterator[MeshPiece]:
+    """The meshes, each changed."""
     for some in meshes_of(pieces).values():
         first = some[0]
         yield from split(
-            first, cleaned(joined(some)), segment=first.segment, level=first.level,
+            first, change(joined(some)), segment=first.segment, level=first.level,
             voxel_size=first.voxel_size, keyframes=first.keyframes,
         )  # fmt: skip
 

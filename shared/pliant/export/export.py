@@ -77,19 +77,23 @@ class RecordedFrame:
 def export_result(
     result: Path, to: str, output: Path | None, *, force: bool = False,
     every: int | None = None, triangles: int | None = None, clean: bool = False,
-    crop: Box | None = None, progress: Progress | None = None,
+    observed: bool = False, crop: Box | None = None, progress: Progress | None = None,
 ) -> Path:  # fmt: skip
     """Write one export of a result folder or a recording and return where.
 
     every: of surfaces, which frames.    triangles: most of a textured mesh.
-    clean: leave out its small pieces.    crop: only the surface or the points in this box.
+    clean: leave out its small pieces.    observed: leave out its closed holes.
+    crop: only the surface or the points in this box.
     progress: called with the number of images read, and of how many.
 
     Raises ResultError for an unknown kind, and for an existing output unless ``force``.
     """
     if to not in EXPORTS:
         raise ResultError(f"--to {to}: choose {', '.join(EXPORTS)}")
-    options = {"every": every, "triangles": triangles, "clean": clean or None, "crop": crop}
+    options = {
+        "every": every, "triangles": triangles, "clean": clean or None,
+        "observed": observed or None, "crop": crop,
+    }  # fmt: skip
     given = {name: value for name, value in options.items() if value is not None}
     for option in given:
         if to not in OPTIONS[option]:

@@ -39,6 +39,7 @@ OPTIONS = {
     "every": ("surface",),
     "triangles": ("glb", "obj"),
     "clean": ("glb", "obj"),
+    "observed": ("glb", "obj"),
     "crop": ("glb", "obj", "watertight", "ply", "splat"),
 }
 """Which kinds have an option."""

@@ -21,28 +21,31 @@ _TEXELS = 2048
 
 def glb(
     recording: Recording, path: Path, folder: Path | None, triangles: int = TRIANGLES,
-    clean: bool = False, crop: Box | None = None,
+    clean: bool = False, observed: bool = False, crop: Box | None = None,
 ) -> None:  # fmt: skip
     """Binary glTF with the texture inside."""
-    write_glb(path, textured_mesh(recording, triangles, clean=clean, crop=crop))
+    mesh = textured_mesh(recording, triangles, clean=clean, observed=observed, crop=crop)
+    write_glb(path, mesh)
 
 
 def obj(
     recording: Recording, path: Path, folder: Path | None, triangles: int = TRIANGLES,
-    clean: bool = False, crop: Box | None = None,
+    clean: bool = False, observed: bool = False, crop: Box | None = None,
 ) -> None:  # fmt: skip
     """A folder with ``mesh.obj``, ``mesh.mtl`` and ``mesh.png``."""
-    mesh = textured_mesh(recording, triangles, clean=clean, crop=crop)
+    mesh = textured_mesh(recording, triangles, clean=clean, observed=observed, crop=crop)
     make_folder(path)
     write_obj(path, mesh)
 
 
 def textured_mesh(
-    recording: Recording, triangles: int, *, clean: bool = False, crop: Box | None = None
-) -> TexturedMesh:
+    recording: Recording, triangles: int, *, clean: bool = False, observed: bool = False,
+    crop: Box | None = None,
+) -> TexturedMesh:  # fmt: skip
     """The fine mesh of the longest segment, of at most so many triangles.
 
-    clean: without small pieces.    crop: only what lies in this box.
+    clean: without small pieces.    observed: without closed holes.    crop: only what lies in this
+    box.
 
     Raises ResultError where there is none.
     """
@@ -52,6 +55,6 @@ def textured_mesh(
     fine = mesh_of(pieces, segment)
     if run.stream is None or fine is None or not len(fine.triangles):
         raise ResultError(f"{recording.path}: has no mesh: run its source again")
-    fine = cropped_mesh(fine, crop)
+    fine = cropped_mesh(fine.observed() if observed else fine, crop)
     fine = cleaned(fine) if clean else fine
     return textured(fine, recording, run, run.stream, segment, triangles=triangles, texels=_TEXELS)

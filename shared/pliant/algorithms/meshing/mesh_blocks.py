@@ -78,6 +78,10 @@ class TriangleMesh:
             closed=np.flatnonzero(np.isin(used, self.closed)).astype(np.int32),
         )
 
+    def observed(self) -> "TriangleMesh":
+        """Without the triangles that close holes: those with a vertex that no keyframe saw."""
+        return self.of_triangles(~np.any(np.isin(self.triangles, self.closed), axis=1))
+
 
 def pack(keys: I32) -> I64:
     """(N,) numbers in the order of the (N, 3) keys (by x, then y, then z)."""
