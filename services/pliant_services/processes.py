@@ -44,6 +44,8 @@ PROCESSES: tuple[Process, ...] = (
         outputs=(
             topics.STREAM,
             topics.CLIP,
+            topics.IMU,
+            topics.GPS,
             topics.MAP_KNOWN,
             topics.SOURCE,
             topics.IMAGE,

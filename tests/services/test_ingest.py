@@ -12,14 +12,19 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.image.masks import packed, unpacked
+from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, IngestParameters
 from pliant.datasets.base import SourceFrame, encoding_of
 from pliant.datasets.calibration import Calibration
+from pliant.datasets.measured.base import Measurements
 from pliant.errors import DatasetError, SourceLostError
-from pliant.messages import topics
+from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import MASKED, CameraStream, Depth, Header, Image, SourceImage
+from pliant.recording.measured import fixes_of, imu_of
+from pliant.recording.reader import Recording
+from pliant.recording.writer import RecordingWriter
 from pliant_services.nodes import ingest
 from pliant_services.runtime.host import stop_on_signal
 from pliant_services.runtime.monitor import SilentMonitor
@@ -290,6 +295,46 @@ def test_a_source_that_fails_in_mid_run_keeps_what_came_before(mode: str) -> Non
         ingest.run(bus, config, monitor, dataset, lambda: False)
     assert len(images_of(bus)) == 3
     assert "plugged in" in monitor.note
+
+
+def test_other_sensors_come_before_the_first_frame_and_are_recorded(tmp_path: Path) -> None:
+    stamps = 5_000_000 * np.arange(10_000) - 123  # before the first image, too
+    imu = ImuSamples(
+        stamps_ns=stamps,
+        gyro_rad_s=np.random.default_rng(0).normal(size=(10_000, 3)),
+        accel_m_s2=np.random.default_rng(1).normal(size=(10_000, 3)),
+    )
+    fixes = GpsFixes(
+        stamps_ns=stamps[:3],
+        latitude_deg=np.array([47.0, 47.1, 47.2]),
+        longitude_deg=np.array([8.0, 8.1, 8.2]),
+        altitude_m=np.array([400.0, 401.0, 402.0]),
+        sigma_m=np.full((3, 3), np.nan),
+    )
+    bus = ReplayBus({})
+    ingest.run(
+        *(bus, Config(), Counters(), FakeDataset([png(0)]), lambda: False),
+        measured=Measurements(imu=imu, gps=fixes),
+    )
+    order = list(bus.outputs)
+    assert max(map(order.index, (topics.IMU, topics.GPS))) < order.index(topics.SOURCE)
+    with RecordingWriter(tmp_path / "recording.mcap", {}) as file:
+        for topic, messages in bus.outputs.items():
+            for number, message in enumerate(messages):
+                data = codec.encode(message)
+                assert len(data) < topic.max_bytes
+                file.write(topic, data, sequence=number, log_time_ns=1, publish_time_ns=0)
+    recording = Recording(tmp_path / "recording.mcap")
+    for name, value in vars(imu_of(recording)).items():
+        np.testing.assert_array_equal(value, getattr(imu, name))
+    for name, value in vars(fixes_of(recording)).items():
+        np.testing.assert_array_equal(value, getattr(fixes, name))
+
+
+def test_without_other_sensors_nothing_more_is_sent() -> None:
+    _, _, bus = run(FakeDataset([png(0)]))
+    assert not bus.outputs.get(topics.IMU)
+    assert not bus.outputs.get(topics.GPS)
 
 
 @pytest.mark.parametrize("mode", ["lossless", "live"])

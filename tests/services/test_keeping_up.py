@@ -154,7 +154,8 @@ def test_tracking_goes_on_while_bundle_adjustment_stands_still(
 
     def send() -> None:
         outputs: dict[Topic, Sequence[str]] = dict.fromkeys(images, FLEET[1:])
-        outputs |= {topics.CLIP: (), topics.MAP_KNOWN: (), topics.SOURCE: (), topics.DEPTH: ()}
+        unread = (topics.CLIP, topics.IMU, topics.GPS, topics.MAP_KNOWN, topics.SOURCE)
+        outputs |= dict.fromkeys((*unread, topics.DEPTH), ())
         try:
             with bus_of(endpoint, "ingest", config, outputs=outputs) as bus:
                 ingest.run(bus, config, SilentMonitor(), Camera(frames, due), lambda: False)

@@ -99,6 +99,20 @@ def run(
     topic: Annotated[
         str, _source(help="Image topic, for an MCAP file, bag or ros:HOST with several.")
     ] = "",
+    imu: Annotated[
+        str,
+        _source(
+            help="File of inertial samples, or their topic in a bag [those that come with the "
+            "source]."
+        ),
+    ] = "",
+    gps: Annotated[
+        str,
+        _source(
+            help="File of satellite fixes, or their topic in a bag [those that come with the "
+            "source]."
+        ),
+    ] = "",
     max_size: Annotated[
         int | None,
         _source(
@@ -217,7 +231,15 @@ def run(
     localising = ["bundle_adjustment.only_localise=true", "meshing.enabled=false"]
     sets += localising if localise else []
     sets += [] if images else ["recorder.images=false"]
-    spec = SourceSpec(location=source, calibration=calibration, fov_deg=fov, topic=topic, mask=mask)
+    spec = SourceSpec(
+        location=source,
+        calibration=calibration,
+        fov_deg=fov,
+        topic=topic,
+        mask=mask,
+        imu=imu,
+        gps=gps,
+    )
     request = RunRequest(
         source=spec,
         profile=profile,

@@ -40,6 +40,8 @@ def service(
         Path | None, typer.Option("--map", help="ingest: map of earlier sessions to extend.")
     ] = None,
     topic: Annotated[str, typer.Option(help="ingest: image topic, for a file with several.")] = "",
+    imu: Annotated[str, typer.Option(help="ingest: inertial samples, as in `pliant run`.")] = "",
+    gps: Annotated[str, typer.Option(help="ingest: satellite fixes, as in `pliant run`.")] = "",
     output: Annotated[Path | None, typer.Option(help="recorder: the MCAP file to write.")] = None,
     metadata: Annotated[
         Path | None, typer.Option(help="recorder: JSON of metadata records to keep.")
@@ -95,6 +97,7 @@ def service(
     arguments: dict[str, Any] = {}
     if name == "ingest":
         from pliant.datasets import open_source
+        from pliant.datasets.measured.found import measurements_of
         from pliant.datasets.source_spec import SourceSpec
         from pliant.recording.map_file import MapFile
 
@@ -107,13 +110,20 @@ def service(
             SourceSpec.parse(source)
             if described
             else SourceSpec(
-                location=source, calibration=calibration, fov_deg=fov, topic=topic, mask=mask
+                location=source,
+                calibration=calibration,
+                fov_deg=fov,
+                topic=topic,
+                mask=mask,
+                imu=imu,
+                gps=gps,
             )
         )
         arguments["dataset"] = open_source(
             with_depth(spec, names, config),
             config.ingest,
         )
+        arguments["measured"] = measurements_of(spec, arguments["dataset"])
         arguments["known"] = None if known is None else MapFile(known)
     elif name == "recorder":
         if output is None:

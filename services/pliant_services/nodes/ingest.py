@@ -3,6 +3,8 @@
 in   an image folder, a video, a camera, a built-in sequence
 out  camera/stream   once: the camera
      camera/clip     before the first frame: the file of a video, where that is smaller than frames
+     imu/samples     before the first frame: the inertial samples of the source, where it has any
+     gps/fixes       before the first frame: its satellite fixes, where it has any
      map/known       before the first frame: the keyframes of a map of earlier sessions
      camera/source   every frame: its bytes as they came
      camera/image    every frame: rectified; empty where it was dropped or does not decode; over a
@@ -21,6 +23,7 @@ from pliant.config import Config
 from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.calibration import calibration_yaml
 from pliant.datasets.clip import Clip, clip_of
+from pliant.datasets.measured.base import NOTHING, Measurements
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.datasets.static_mask import static_counters
 from pliant.datasets.working_size import SmallerImages
@@ -35,6 +38,7 @@ from pliant.messages.types import (
     SourceImage,
 )
 from pliant.recording.map_file import MapFile
+from pliant.recording.measured import gps_pieces, imu_pieces
 from pliant_services.runtime.keeping_up import (
     Drops,
     MappingPace,
@@ -52,10 +56,11 @@ def run(
     dataset: Dataset,
     stopping: Callable[[], bool],
     known: MapFile | None = None,
+    measured: Measurements = NOTHING,
 ) -> None:
     """Publish until the source ends or ``stopping()``.
 
-    known: a map of earlier sessions.
+    known: a map of earlier sessions.   measured: what other sensors of the source measured.
     Raises SourceLostError where the source fails after its first frame; what came before is sent.
     """
     live = plays_live(dataset, config)
@@ -70,6 +75,12 @@ def run(
         for piece in clip.pieces() if clip is not None else ():
             bus.publish(topics.CLIP, piece)
         bus.end(topics.CLIP)
+        for samples in imu_pieces(measured.imu):
+            bus.publish(topics.IMU, samples)
+        bus.end(topics.IMU)
+        for fixes in gps_pieces(measured.gps):
+            bus.publish(topics.GPS, fixes)
+        bus.end(topics.GPS)
         for keyframe in known.keyframes() if known is not None else ():
             bus.publish(topics.MAP_KNOWN, keyframe)
         bus.end(topics.MAP_KNOWN)

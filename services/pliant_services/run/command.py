@@ -14,6 +14,7 @@ from pliant.datasets.base import is_builtin
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.calibration_files import file_and_camera
 from pliant.datasets.calibration_formats import UNDERSTOOD
+from pliant.datasets.measured.found import measurements_of
 from pliant.datasets.rectifier import Rectifier
 from pliant.errors import CalibrationError, DatasetError, PliantError, ResultError
 from pliant.exit_codes import INTERRUPTED
@@ -79,6 +80,7 @@ def run_pipeline(request: RunRequest) -> int:
         read.append(known.path)
     # What the configuration says is taken over before anything goes: it may be of this folder.
     read += [source.mask] if source.mask is not None else []
+    read += [Path(name) for name in (source.imu, source.gps) if name and os.path.exists(name)]
     read += [file_and_camera(source.calibration)[0]] if source.calibration is not None else []
     keep_apart(output, read)
     if request.save is not None:
@@ -128,7 +130,7 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
     if request.force and not dataset.is_live:
         next(iter(dataset), None)  # what has no first frame costs no earlier result
     progress = Progress(dataset.frame_count)
-    for note in notes_on(dataset):
+    for note in (*notes_on(dataset), *measurements_of(request.source, dataset).notes):
         progress.say(note)
     if spec.calibration is None and spec.fov_deg is None:
         _say_guess(dataset.calibration, profile, progress)

@@ -20,9 +20,10 @@ from pliant.datasets.base import (
 from pliant.datasets.calibration import Calibration, calibration_from_yaml, calibration_yaml
 from pliant.datasets.calibration_files import read_calibration
 from pliant.datasets.camera_device import CameraDevice, camera_index
-from pliant.datasets.euroc import is_euroc, open_euroc
+from pliant.datasets.euroc import euroc_sensors, is_euroc, open_euroc
 from pliant.datasets.excerpt import Excerpt, Frames, is_all
 from pliant.datasets.folder import (
+    folder_sensors,
     is_bare_folder,
     is_listed_folder,
     open_bare_folder,
@@ -33,7 +34,13 @@ from pliant.datasets.images import SUFFIXES
 from pliant.datasets.kitti import is_kitti, open_kitti
 from pliant.datasets.masks import Masked
 from pliant.datasets.mcap_file import is_mcap, open_mcap
-from pliant.datasets.own_recording import is_own_recording, open_own_recording
+from pliant.datasets.measured.base import NOTHING, Measurements
+from pliant.datasets.measured.readers import video_sensors
+from pliant.datasets.own_recording import (
+    is_own_recording,
+    open_own_recording,
+    recorded_sensors,
+)
 from pliant.datasets.rectifier import Rectifier, decode
 from pliant.datasets.ros_bag import is_ros_bag, open_ros_bag
 from pliant.datasets.source_spec import SourceSpec
@@ -68,6 +75,10 @@ __all__ = [
 ]
 
 
+def _no_sensors(_spec: SourceSpec) -> Measurements:
+    return NOTHING
+
+
 @dataclass(frozen=True)
 class SourceFormat:
     """One kind of source.
@@ -75,6 +86,7 @@ class SourceFormat:
     recognises: whether a source is of this kind.
     open: opens it; raises DatasetError and CalibrationError.
     sized: its images have their working size already.
+    sensors: what its other sensors measured, on the clock of its images; raises PliantError.
     """
 
     recognises: Callable[[str], bool]
@@ -82,6 +94,7 @@ class SourceFormat:
     has_topics: bool = False
     has_depth: bool = False
     sized: bool = False
+    sensors: Callable[[SourceSpec], Measurements] = _no_sensors
 
 
 def _open_builtin(spec: SourceSpec) -> Dataset:
@@ -108,6 +121,12 @@ def _open_ros(spec: SourceSpec) -> Dataset:
     return open_ros(spec)
 
 
+def _builtin_sensors(spec: SourceSpec) -> Measurements:
+    from pliant.datasets.builtin import builtin_folder
+
+    return folder_sensors(spec.at(builtin_folder(spec.location)))
+
+
 def _open_video(spec: SourceSpec) -> Dataset:
     path = Path(spec.location)
     if path.suffix.lower() in (*SUFFIXES, ".txt", ".csv", ".yaml"):
@@ -116,17 +135,26 @@ def _open_video(spec: SourceSpec) -> Dataset:
 
 
 FORMATS: dict[str, SourceFormat] = {
-    "built-in": SourceFormat(is_builtin, _open_builtin, has_depth=True),
+    "built-in": SourceFormat(is_builtin, _open_builtin, has_depth=True, sensors=_builtin_sensors),
     "camera": SourceFormat(_is_camera, _open_camera),
     "ros": SourceFormat(_is_ros, _open_ros, has_topics=True),
-    "recording": SourceFormat(is_own_recording, open_own_recording, has_depth=True, sized=True),
+    "recording": SourceFormat(
+        *(is_own_recording, open_own_recording),
+        has_depth=True,
+        sized=True,
+        sensors=recorded_sensors,
+    ),
     "mcap": SourceFormat(is_mcap, open_mcap, has_topics=True),
     "ros-bag": SourceFormat(is_ros_bag, open_ros_bag, has_topics=True),
-    "video": SourceFormat(lambda source: Path(source).is_file(), _open_video),
-    "euroc": SourceFormat(is_euroc, open_euroc),
+    "video": SourceFormat(
+        lambda source: Path(source).is_file(), _open_video, sensors=video_sensors
+    ),
+    "euroc": SourceFormat(is_euroc, open_euroc, sensors=euroc_sensors),
     "kitti": SourceFormat(is_kitti, open_kitti),
     "tum-rgbd": SourceFormat(is_tum_rgbd, open_tum_rgbd, has_depth=True),
-    "folder": SourceFormat(is_listed_folder, open_listed_folder, has_depth=True),
+    "folder": SourceFormat(
+        is_listed_folder, open_listed_folder, has_depth=True, sensors=folder_sensors
+    ),
     "images": SourceFormat(is_bare_folder, open_bare_folder),
 }
 """Every kind of source that is ours."""

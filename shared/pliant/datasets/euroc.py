@@ -3,6 +3,7 @@
     SEQUENCE/mav0/cam0/data.csv       "nanoseconds,file" a line; seconds are recognised
     SEQUENCE/mav0/cam0/data/*.png
     SEQUENCE/mav0/cam0/sensor.yaml    the calibration (or --calibration FILE, e.g. Kalibr's)
+    SEQUENCE/mav0/imu0/data.csv       optional: inertial samples
     SEQUENCE/mav0/state_groundtruth_estimate0/data.csv
 
 The source is SEQUENCE, SEQUENCE/mav0 or SEQUENCE/mav0/cam0 (or another camera's folder).
@@ -18,6 +19,8 @@ from pliant.datasets.images import (
     existing,
     image_size,
 )
+from pliant.datasets.measured.base import NOTHING, Measurements
+from pliant.datasets.measured.csv_log import read_csv
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 
@@ -47,6 +50,13 @@ def open_euroc(spec: SourceSpec) -> Dataset:
             camera.parent / "mocap0" / "data.csv",
         ),
     )
+
+
+def euroc_sensors(spec: SourceSpec) -> Measurements:
+    """The inertial samples beside a camera.  Raises DatasetError."""
+    camera = _camera_folder(Path(spec.location))
+    file = None if camera is None else existing(camera.resolve().parent / "imu0" / "data.csv")
+    return NOTHING if file is None else read_csv(file)
 
 
 def _camera_folder(folder: Path) -> Path | None:

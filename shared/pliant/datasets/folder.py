@@ -5,6 +5,7 @@
     FOLDER/images/...       the files that rgb.txt names, anywhere inside
     FOLDER/groundtruth.txt  optional: true poses, TUM format
     FOLDER/depth.txt        optional: depth maps, listed like the images; see pliant.datasets.depth
+    FOLDER/imu.csv          optional: inertial samples; see pliant.datasets.measured.csv_log
     FOLDER/right.txt        optional: right images of a stereo pair; see pliant.datasets.stereo
 
 or ``associations.txt`` ("seconds file seconds file") instead of rgb.txt, or a bare folder of images
@@ -29,12 +30,15 @@ from pliant.datasets.images import (
     existing,
     image_size,
 )
+from pliant.datasets.measured.base import NOTHING, Measurements
+from pliant.datasets.measured.csv_log import read_csv
 from pliant.datasets.named_times import times_in_names
 from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.times import rate
 
 LIST_NAME = "rgb.txt"
 CALIBRATION_NAME = "calib.yaml"
+IMU_NAME = "imu.csv"
 GROUND_TRUTH_NAME = "groundtruth.txt"
 DEFAULT_FPS = 30.0
 
@@ -72,6 +76,12 @@ def open_listed_folder(spec: SourceSpec, *, name: str = "") -> Dataset:
         ground_truth_path=existing(folder / GROUND_TRUTH_NAME),
         notes=listed.notes,
     )
+
+
+def folder_sensors(spec: SourceSpec) -> Measurements:
+    """The inertial samples in a folder.  Raises DatasetError."""
+    file = existing(Path(spec.location) / IMU_NAME)
+    return NOTHING if file is None else read_csv(file)
 
 
 def is_bare_folder(source: str) -> bool:

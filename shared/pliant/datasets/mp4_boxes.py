@@ -1,6 +1,7 @@
-"""The video tracks of an MP4 or QuickTime file: its boxes, as ISO/IEC 14496-12 says.
+"""The tracks of an MP4 or QuickTime file: its boxes, as ISO/IEC 14496-12 says.
 
-Read are the sizes, which tracks are pictures, the times of the samples, and the edit lists.  With
+Read are the sizes, which tracks are pictures, the times of the samples, and the edit lists; of a
+track of metadata also where the samples are.  With
 an edit list a file keeps more samples than it shows (a lossless trim).  FFmpeg passes over some of
 these, and then it is unknown how many frames should come.  So where an edit list leaves something
 out it is hidden, all samples are decoded, and the source passes over what is not shown.
@@ -21,6 +22,8 @@ _SIZED = (b"avc1", b"hvc1")
 """Descriptions of H.264 and HEVC whose parameters are not among the samples."""
 _MOST_BOXES = 100_000
 _MOST_EDITS = 1_000
+_MOST_PLACES = 1_000_000
+"""Samples of a track of metadata: of one a second, for eleven days."""
 _MOST_TABLE_BYTES = 1 << 28
 _NS = 10**9
 
@@ -79,6 +82,45 @@ def video_streams(file: BinaryIO, size: int) -> Container:
     return Container(streams=tuple(streams), patches=tuple(patches))
 
 
+class Sample(NamedTuple):
+    """A sample of a track: where its bytes are, and from when to when it lasts.
+
+    Times begin with the first picture that the file shows.
+    """
+
+    offset: int
+    size: int
+    begin_ns: int
+    end_ns: int
+
+
+def metadata_samples(file: BinaryIO, size: int, kind: bytes) -> list[Sample]:
+    """The samples of the first track of a kind of metadata, in order.  Raises OSError."""
+    moov = next((box for box in _boxes(file, 0, size) if box.kind == b"moov"), None)
+    if moov is None:
+        return []
+    tracks = [_Track(file, box) for box in _boxes(file, moov.start, moov.end, b"trak")]
+    track = next((each for each in tracks if each.kind() == kind), None)
+    if track is None:
+        return []
+    time_scale = _time_scale(file, moov, b"mvhd")
+    picture = next((each for each in tracks if each.is_video()), None)
+    first_ns = 0
+    if picture is not None and not picture.shown_ns(time_scale):
+        first_ns = int(min(picture.stamps_ns(), default=0))
+    shown = track.shown_ns(time_scale)
+    origin_ns = first_ns + (shown[0][0] if shown else 0)
+    begin = track.stamps_ns()
+    places = track.places(size)[: len(begin)]
+    begin = begin[: len(places)] - origin_ns
+    steps = np.diff(begin, append=begin[-1:] + _NS)
+    steps[-1:] = steps[-2:-1] if len(steps) > 1 else steps
+    return [
+        Sample(*place, start, start + step)
+        for place, start, step in zip(places, begin.tolist(), steps.tolist(), strict=True)
+    ]
+
+
 class _Track:
     """A ``trak`` box."""
 
@@ -99,6 +141,46 @@ class _Track:
 
     def is_video(self) -> bool:
         return self._body(b"mdia", b"hdlr")[8:12] == b"vide" and bool(self._entry())
+
+    def kind(self) -> bytes:
+        """The format of its samples."""
+        return self._entry()[4:8]
+
+    def places(self, file_size: int) -> list[tuple[int, int]]:
+        """(offset, size) of its samples that are in the file, up to the first that is not, or
+        until all have as many bytes as the file."""
+        data = self._body(b"mdia", b"minf", b"stbl", b"stsz", limit=_MOST_TABLE_BYTES)
+        fixed, count = int.from_bytes(data[4:8]), self.samples()
+        count = min(count, file_size) if fixed else min(count, max(0, len(data) - 12) // 4)
+        count = min(count, _MOST_PLACES)
+        sizes = [fixed] * count if fixed else np.frombuffer(data[12:], ">u4", count).tolist()
+        found, left = list[tuple[int, int]](), file_size
+        for offset, samples in self._chunks():
+            for _ in range(samples):
+                if len(found) == count or offset + sizes[len(found)] > file_size or left < 0:
+                    return found
+                found.append((offset, sizes[len(found)]))
+                offset += found[-1][1]
+                left -= found[-1][1]
+        return found
+
+    def _chunks(self) -> Iterator[tuple[int, int]]:
+        """(offset, number of samples) of its chunks."""
+        at = (b"mdia", b"minf", b"stbl")
+        for kind, width in ((b"stco", 4), (b"co64", 8)):
+            data = self._body(*at, kind, limit=_MOST_TABLE_BYTES)
+            if not data:
+                continue
+            count = min(int.from_bytes(data[4:8]), max(0, len(data) - 8) // width)
+            offsets = np.frombuffer(data[8:], f">u{width}", count).tolist()
+            runs = self._body(*at, b"stsc", limit=_MOST_TABLE_BYTES)
+            most = min(int.from_bytes(runs[4:8]), max(0, len(runs) - 8) // 12)
+            table = np.frombuffer(runs[8:], ">u4", 3 * most).reshape(-1, 3).tolist()
+            row, samples = 0, 0
+            for number, offset in enumerate(offsets, start=1):
+                while row < len(table) and table[row][0] <= number:
+                    samples, row = table[row][1], row + 1
+                yield offset, samples
 
     def is_enabled(self) -> bool:
         return bool(self._flags & 1)
@@ -132,11 +214,11 @@ class _Track:
         count = min(self.samples(), sum(max(0, each) for each, _ in steps.tolist()))
         if not scale or not count or count * 8 > _MOST_TABLE_BYTES:
             return np.zeros(0, np.int64)
-        ticks = np.cumsum(np.repeat(steps[:, 1], np.maximum(steps[:, 0], 0)))[:count]
+        ticks = np.cumsum(_of_runs(steps, count))
         ticks = np.concatenate(([0], ticks[:-1]))
         later = self._runs(b"ctts")
         if int(np.maximum(later[:, 0], 0).sum()) >= count:
-            ticks = ticks + np.repeat(later[:, 1], np.maximum(later[:, 0], 0))[:count]
+            ticks = ticks + _of_runs(later, count)
         return ticks // scale * _NS + ticks % scale * _NS // scale
 
     def shown_ns(self, movie_scale: int) -> tuple[tuple[int, int], ...]:
@@ -177,6 +259,13 @@ def _inside(stamps_ns: I64, shown_ns: tuple[tuple[int, int], ...]) -> BoolArray:
     for start, end in shown_ns:
         inside |= (stamps_ns >= start) & (stamps_ns < end)
     return inside
+
+
+def _of_runs(runs: I64, count: int) -> I64:
+    """The first values of runs (N, 2), which may claim to be far longer."""
+    lengths = np.minimum(np.maximum(runs[:, 0], 0), count)
+    before = np.minimum(np.cumsum(lengths) - lengths, count)
+    return np.repeat(runs[:, 1], np.minimum(lengths, count - before))
 
 
 def _time_scale(file: BinaryIO, parent: _Box, kind: bytes) -> int:

@@ -13,11 +13,13 @@ from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.calibration import calibration_from_yaml
 from pliant.datasets.images import choose_calibration
 from pliant.datasets.mcap_file import is_mcap
+from pliant.datasets.measured.base import Measurements
 from pliant.datasets.recorded_images import RecordedImages
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Depth, SourceImage
+from pliant.recording.measured import fixes_of, imu_of
 from pliant.recording.parts import parts_of
 from pliant.recording.reader import Recording
 
@@ -37,6 +39,12 @@ def is_own_recording(source: str) -> bool:
 def open_own_recording(spec: SourceSpec) -> Dataset:
     """The frames of a recording.  Raises DatasetError, CalibrationError and RecordingError."""
     return RecordedFrames(Path(spec.location), spec)
+
+
+def recorded_sensors(spec: SourceSpec) -> Measurements:
+    """What a recording has of other sensors.  Raises RecordingError and MessageError."""
+    recording = Recording(Path(spec.location))
+    return Measurements(imu=imu_of(recording), gps=fixes_of(recording))
 
 
 class RecordedFrames:

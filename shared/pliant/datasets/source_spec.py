@@ -19,6 +19,8 @@ class SourceSpec(BaseModel):
     topic: the images of a file that has several; "" if it has one.
     mask: an image, or a folder of them, that masks parts of frames: see ``masks``.
     depth: the depth maps that frames bring along; a source without any is refused then.
+    imu, gps: a file of inertial samples or of satellite fixes, or their topic in a file that has
+    topics; "": those that the source brings along.
 
     Raises CalibrationError for a calibration and a field of view together.
     """
@@ -31,6 +33,8 @@ class SourceSpec(BaseModel):
     topic: str = ""
     mask: Path | None = None
     depth: Literal["none", "first", "all"] = "none"
+    imu: str = ""
+    gps: str = ""
 
     @model_validator(mode="after")
     def _one_camera(self) -> Self:

@@ -40,13 +40,18 @@ def nanoseconds(value: Decimal, unit: str, where: str) -> int:
     return int((value * UNITS[unit]).to_integral_value())
 
 
-def likely_unit(values: Sequence[Decimal], known: str = "") -> str:
-    """The unit of a list of times.  known: that which the file should have."""
+def likely_unit(
+    values: Sequence[Decimal], known: str = "", *, usual_step_s: float = _USUAL_STEP_S
+) -> str:
+    """The unit of a list of times.  known: that which the file should have.
+
+    usual_step_s: between two of them.
+    """
     step = median_step(values)
 
     def unlikely(unit: str) -> float:
         scale = UNITS[unit] / 1e9
-        off = abs(math.log10(step * scale / _USUAL_STEP_S)) if step > 0.0 else 0.0
+        off = abs(math.log10(step * scale / usual_step_s)) if step > 0.0 else 0.0
         return off - _IS_KNOWN * (unit == known) - _IS_A_DATE * is_date(values, unit)
 
     return min(UNITS, key=unlikely)

@@ -7,8 +7,10 @@ from pliant.messages.types import (
     ClipPiece,
     Depth,
     Extrema,
+    GpsPiece,
     Header,
     Image,
+    ImuPiece,
     Keyframe,
     MapKeyframe,
     MapUpdate,
@@ -60,6 +62,9 @@ IMAGE = Topic(
 )
 # Empty if only the recorder would read it.
 DEPTH = Topic("camera/depth", Depth, per_frame=True, max_bytes=128 * _MIB, compression="")
+# All that the source's other sensors measured, before the first frame: nothing where it has none.
+IMU = Topic("imu/samples", ImuPiece, per_frame=False, max_bytes=_MIB)
+GPS = Topic("gps/fixes", GpsPiece, per_frame=False, max_bytes=_MIB)
 # The map of earlier sessions, before the first frame: nothing where a run begins without one.
 MAP_KNOWN = Topic("map/known", MapKeyframe, per_frame=False, max_bytes=64 * _MIB, kept_whole=True)
 EXTREMA = Topic("tracks/extrema", Extrema, per_frame=True, viewed=2)
@@ -87,8 +92,8 @@ def status(service: str) -> Topic:
 
 
 TOPICS = (
-    STREAM, CLIP, SOURCE, IMAGE, DEPTH, MAP_KNOWN, EXTREMA, MAP_UPDATE, MAP_FINAL, KEYFRAME,
-    KEYFRAME_FINAL, MAP_KEPT, MESH_BLOCKS, MESH_FINAL, SURFELS, STREAM_END,
+    STREAM, CLIP, SOURCE, IMAGE, DEPTH, IMU, GPS, MAP_KNOWN, EXTREMA, MAP_UPDATE, MAP_FINAL,
+    KEYFRAME, KEYFRAME_FINAL, MAP_KEPT, MESH_BLOCKS, MESH_FINAL, SURFELS, STREAM_END,
 )  # fmt: skip
 WITH_PIXELS = (IMAGE, SOURCE)
 """Those that are made smaller for a link between machines."""

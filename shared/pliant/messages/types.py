@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar
 
 from pliant.algorithms.arrays import F32, F64, I32, U8, Shape
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.inertial.samples import GpsFixes, ImuSamples
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.meshing.mesh_blocks import MeshBlocks, no_rows
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
@@ -16,6 +17,8 @@ from pliant.algorithms.surfels.surfel_frame import SurfelFrame
 from pliant.algorithms.tracks import FrameTracks
 
 CAMERA_FRAME_ID = "camera"
+IMU_FRAME_ID = "imu"
+GPS_FRAME_ID = "earth"
 DROPPED = "dropped"
 """Why an image is missing that live mode left out."""
 BROKEN = "broken: "
@@ -144,6 +147,22 @@ class Depth(Header):
     """
 
     data: bytes = b""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuPiece(Header, ImuSamples):
+    """The next inertial samples of the source.  frame: number of this piece, from 0.
+
+    stamp_ns: 0; samples may be older than the first image.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class GpsPiece(Header, GpsFixes):
+    """The next satellite fixes of the source.  frame: number of this piece, from 0.
+
+    stamp_ns: 0; fixes may be older than the first image.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)

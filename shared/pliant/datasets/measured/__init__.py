@@ -1,0 +1,1 @@
+"""What other sensors of a source measured: inertial samples and satellite fixes."""
