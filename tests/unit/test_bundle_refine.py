@@ -7,8 +7,9 @@ import pytest
 from bundle_scene import make_scene, move, project
 
 from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.estimate.problem import BundleParameters
-from pliant.algorithms.slam.estimate.subspace import refine_pose, solve_subspace
+from pliant.algorithms.slam.estimate.subspace import solve_subspace
 
 CAMERA = PinholeCamera(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
 PARAMETERS = BundleParameters(kernel_sigma_px=2.0, min_relative_decrease=1e-8)
@@ -26,7 +27,8 @@ def test_pose_is_found_among_outliers():
     px[wrong] += rng.uniform(-80.0, 80.0, (int(wrong.sum()), 2)).astype(np.float32)
     px[5] = np.nan
     start = move(scene.T_world_camera[3], np.array([0.02, -0.01, 0.03, 0.004, -0.003, 0.002]))
-    T, inliers, H = refine_pose(start, scene.points_world, px, CAMERA, PARAMETERS, iterations=30)
+    seen = Correspondences(scene.points_world, px)
+    T, inliers, H, _ = refine_pose(start, seen, CAMERA, PARAMETERS, iterations=30)
     np.testing.assert_allclose(T, scene.T_world_camera[3], atol=1e-4)
     assert inliers.shape == (400,)
     assert not inliers[5]
@@ -39,10 +41,10 @@ def test_pose_is_found_among_outliers():
 def test_pose_hessian_is_the_curvature_of_the_cost():
     scene = make_scene(points=200)
     px = observe(scene, 2)
-    T, _, H = refine_pose(
-        scene.T_world_camera[2], scene.points_world, px.astype(np.float32), CAMERA,
-        BundleParameters(kernel_sigma_px=0.0),
-    )  # fmt: skip
+    seen = Correspondences(scene.points_world, px.astype(np.float32))
+    T, _, H, _ = refine_pose(
+        scene.T_world_camera[2], seen, CAMERA, BundleParameters(kernel_sigma_px=0.0)
+    )
     J = np.stack(
         [
             (
@@ -65,7 +67,7 @@ def test_pose_without_observations_stays():
         (scene.points_world, np.full((10, 2), np.nan, np.float32)),
         (scene.points_world * (1.0, 1.0, -1.0), observe(scene, 3).astype(np.float32)),
     ):
-        T, inliers, _ = refine_pose(start, points, px, CAMERA, PARAMETERS)
+        T, inliers, *_ = refine_pose(start, Correspondences(points, px), CAMERA, PARAMETERS)
         assert np.array_equal(T, start)
         assert not inliers.any()
 

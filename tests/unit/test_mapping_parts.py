@@ -13,6 +13,7 @@ from pliant.algorithms.slam.estimate.observation_table import (
     forget_outliers,
     reprojection_errors,
 )
+from pliant.algorithms.slam.estimate.pose import Correspondences
 from pliant.algorithms.slam.locate.localisation import locate, refine
 from pliant.algorithms.slam.locate.reacquisition import MaximaGrid, cut_patches, reacquire
 from pliant.algorithms.slam.map.covisibility import (
@@ -288,7 +289,7 @@ def localisation_case(outliers):
 def test_a_near_prediction_suffices():
     T, points, px = localisation_case(0.3)
     near = T @ looking((0.03, 0.0, 0.0), (0.0, 0.01, 0.0))
-    found = refine(near, points, px, CAMERA, LocalisationParameters())
+    found = refine(near, Correspondences(points, px), CAMERA, LocalisationParameters())
     np.testing.assert_allclose(found.T_world_camera, T, atol=1e-4)
     assert found.inliers.sum() >= 0.69 * len(px)
 
@@ -297,7 +298,7 @@ def test_a_hopeless_prediction_is_mended_by_ransac():
     T, points, px = localisation_case(0.4)
     far = T @ looking((2.0, 1.0, -1.0), (0.0, 0.8, 0.0))
     generator = np.random.default_rng(0)
-    found = locate([far], points, px, CAMERA, LocalisationParameters(), generator)
+    found = locate([far], Correspondences(points, px), CAMERA, LocalisationParameters(), generator)
     np.testing.assert_allclose(found.T_world_camera, T, atol=1e-3)
 
 
@@ -305,7 +306,8 @@ def test_refined_rotations_stay_rotations():
     T, points, px = localisation_case(0.0)
     skewed = T.copy()
     skewed[:3, :3] *= 1.001
-    R = refine(skewed, points, px, CAMERA, LocalisationParameters()).T_world_camera[:3, :3]
+    found = refine(skewed, Correspondences(points, px), CAMERA, LocalisationParameters())
+    R = found.T_world_camera[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.slam.active_map import ActiveMap
 from pliant.algorithms.slam.estimate.observation_table import reprojection_errors
+from pliant.algorithms.slam.estimate.pose import Correspondences
 from pliant.algorithms.slam.frame import IdealFrame, PlacedFrame
 from pliant.algorithms.slam.locate.inverse_depth import (
-    Spread,
     off_epipolar_line,
     placed_candidates,
     spread_of,
@@ -120,16 +120,13 @@ def _by_tracks(
     """Return the pose that fits the tracks: landmarks come first and decide."""
     limits, mapped = active.parameters.localisation, len(rows) - len(candidates)
 
-    def located(count: int, spread: Spread | None) -> Localisation:
-        return locate(
-            predictions, active.points.xyz[rows[:count]], points_px[:count], active.camera, limits,
-            generator, spread,
-        )  # fmt: skip
+    def located(seen: Correspondences) -> Localisation:
+        return locate(predictions, seen, active.camera, limits, generator)
 
-    together = located(len(rows), _spread(active, rows, candidates))
+    together = located(_correspondences(active, rows, points_px, len(candidates)))
     still = together.inliers[:mapped].sum()
     if len(candidates) and mapped >= limits.min_inliers and still < _AGREEING * mapped:
-        alone = located(mapped, None)
+        alone = located(_correspondences(active, rows[:mapped], points_px[:mapped], 0))
         fitting = alone.inliers.sum()
         if fitting >= limits.min_inliers and still < _AGREEING * fitting:
             active.candidates_agree = False
@@ -174,10 +171,9 @@ def refine_by_all(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     """Refine the pose by its tracks and the landmarks found without one."""
     candidates = active.helping_candidates()
     rows, points_px = active.observed(placed, candidates)
-    located = refine(
-        placed.T_world_camera, active.points.xyz[rows], points_px, active.camera,
-        active.parameters.localisation, near=True, spread=_spread(active, rows, candidates),
-    )  # fmt: skip
+    seen = _correspondences(active, rows, points_px, len(candidates))
+    limits = active.parameters.localisation
+    located = refine(placed.T_world_camera, seen, active.camera, limits, near=True)
     return replace(placed, T_world_camera=located.T_world_camera)
 
 
@@ -254,19 +250,22 @@ def check_pure_rotation(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     T_standing = placed.T_world_camera
     for every in (max(1, len(rows) // _TELLING), 1):  # a few tracks reveal most motions
         some = np.arange(0, len(rows), every)
+        seen = _correspondences(active, rows[some], points_px[some], len(rows))
         located = refine(
-            placed.T_world_camera, points.xyz[rows[some]], points_px[some], active.camera,
-            parameters.localisation, near=True,
-            spread=spread_of(points, rows[some], active.keyframes[-1]),
-        )  # fmt: skip
+            placed.T_world_camera, seen, active.camera, parameters.localisation, near=True
+        )
         if not located.is_pure_rotation:
             return placed
         T_standing = located.T_world_camera
     return replace(placed, T_world_camera=T_standing, is_pure_rotation=True)
 
 
-def _spread(active: ActiveMap, rows: I32, candidates: I64) -> Spread | None:
-    return spread_of(active.points, rows, active.keyframes[-1]) if len(candidates) else None
+def _correspondences(
+    active: ActiveMap, rows: I32, points_px: F32, candidates: int
+) -> Correspondences:
+    """Rows (N,) at points_px (N, 2).   candidates: how many of the rows are provisional."""
+    spread = spread_of(active.points, rows, active.keyframes[-1]) if candidates else None
+    return Correspondences(active.points.xyz[rows], points_px, spread=spread)
 
 
 def limits_of_points(inliers: int, parameters: MappingParameters) -> PointParameters:

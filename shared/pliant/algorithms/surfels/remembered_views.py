@@ -16,8 +16,8 @@ from pliant.algorithms.arrays import F32, F64, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac
+from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.estimate.problem import BundleParameters
-from pliant.algorithms.slam.estimate.subspace import refine_pose
 from pliant.algorithms.slam.places.place_index import Features, PlaceIndex, match, repeated_share
 from pliant.algorithms.surfels.deformation_models import move_poses
 from pliant.algorithms.surfels.patch_sampling import A, B, F, X
@@ -188,11 +188,11 @@ def _motions(
         if found is None or found[1].sum() < _AGREEING:
             break
         agree = left[found[1]]
-        T_world_camera, inliers, _ = refine_pose(
-            found[0], points[agree], seen.points_px[corners[agree]], camera, loose,
+        refined = refine_pose(
+            found[0], Correspondences(points[agree], seen.points_px[corners[agree]]), camera, loose,
             inlier_px=gate_px,
         )  # fmt: skip
-        T_camera_world, agree = inverse(T_world_camera), agree[inliers]
+        T_camera_world, agree = inverse(refined.T_world_camera), agree[refined.inliers]
         left = left[~found[1]]
         if len(agree) < _AGREEING:
             break

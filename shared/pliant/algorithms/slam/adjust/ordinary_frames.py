@@ -19,7 +19,7 @@ from pliant.algorithms.slam.calibration.rolling_shutter import FramePoses
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.estimate.focal_pose import refine_focal
 from pliant.algorithms.slam.estimate.observation_table import weigh
-from pliant.algorithms.slam.estimate.subspace import refine_pose
+from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.estimate.trajectory_smoothing import smooth_trajectory
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import MAPPED, MAPPED_SHARE, Landmarks
@@ -57,7 +57,7 @@ class EarlierPose:
 
 @dataclass(frozen=True, kw_only=True)
 class RefinedPose(EarlierPose):
-    """information: (6, 6) of the pose, as ``refine_pose`` returns it."""
+    """information: (6, 6) of the pose, as of a ``PoseEstimate``."""
 
     information: F64
 
@@ -175,16 +175,15 @@ def refined_poses(
             change, _ = refine_focal(start, xyz, points_px, camera, centre, RATE)
             factors = np.full(len(points_px), change)
             points_px = moved_px(points_px, seen_by.view, seen_by.view, factors)
-        T_world_camera, fits, information = refine_pose(
-            start, xyz, points_px, camera, parameters.bundle, inlier_px=limits.inlier_px,
-            weights=weigh(points_px, camera, seen_by.k_sigmas(parameters.calibration)),
-        )  # fmt: skip
-        inliers = int(np.count_nonzero(fits))
-        if inliers >= max(limits.min_inliers, limits.min_predicted_share * len(fits)):
+        weights = weigh(points_px, camera, seen_by.k_sigmas(parameters.calibration))
+        seen = Correspondences(xyz, points_px, weights)
+        found = refine_pose(start, seen, camera, parameters.bundle, inlier_px=limits.inlier_px)
+        inliers = int(np.count_nonzero(found.inliers))
+        if inliers >= max(limits.min_inliers, limits.min_predicted_share * len(xyz)):
             placed.append(
                 RefinedPose(
-                    frame=each.frame, keyframe=keyframe, T_world_camera=T_world_camera,
-                    inliers=inliers, information=information,
+                    frame=each.frame, keyframe=keyframe, T_world_camera=found.T_world_camera,
+                    inliers=inliers, information=found.information,
                 )
             )  # fmt: skip
     return placed
@@ -210,15 +209,15 @@ def smoothed_poses(
             continue
         here = points.state[keyframe.rows] == MAPPED
         points_px = keyframe.points_px[here]
-        _, fits, information = refine_pose(
-            keyframe.T_world_camera, points.xyz[keyframe.rows[here]], points_px,
+        weights = weigh(points_px, seen_by.view.camera, seen_by.k_sigmas(parameters.calibration))
+        found = refine_pose(
+            keyframe.T_world_camera,
+            Correspondences(points.xyz[keyframe.rows[here]], points_px, weights),
             seen_by.view.camera, parameters.bundle, inlier_px=parameters.localisation.inlier_px,
-            iterations=1, weights=weigh(
-                points_px, seen_by.view.camera, seen_by.k_sigmas(parameters.calibration)
-            ),
+            iterations=1,
         )  # fmt: skip
-        inliers = int(np.count_nonzero(fits))
-        path.refine(keyframe.frame, keyframe, keyframe.T_world_camera, inliers, information)
+        inliers = int(np.count_nonzero(found.inliers))
+        path.refine(keyframe.frame, keyframe, keyframe.T_world_camera, inliers, found.information)
     frames, T_world_camera, information = path.frames_on(keyframes)
     if not frames:
         return []

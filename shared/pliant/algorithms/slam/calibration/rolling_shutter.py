@@ -85,7 +85,7 @@ class FramePoses:
         self, frame: int, keyframe: Keyframe, T_world_camera: F64, inliers: int, information: F64
     ) -> None:
         """Replace the pose of a frame with this reference keyframe.   information: (6, 6) of the
-        pose, as ``refine_pose`` returns it.
+        pose, as of a ``PoseEstimate``.
         """
         if self.has(frame, keyframe):
             self.add(frame, keyframe, T_world_camera, inliers)

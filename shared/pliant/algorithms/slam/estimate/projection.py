@@ -185,6 +185,41 @@ def observe(
     return x, y, iz, m00, (m01,), m11, g00 * du + g10 * dv, g01 * du + g11 * dv, cost
 
 
+@fast_kernel(inline=True)  # a call in a loop keeps LLVM from vectorising it
+def observe_uncertain(
+    one: _Number,
+    T: _Camera,
+    K: _Camera,
+    point: _Point,
+    spread: _Point,
+    shared: Any,
+    seen: Seen,
+    limits: Limits,
+) -> Any:
+    """As ``observe``, without distortion, of a point whose depth is uncertain (``inverse_depth``).
+
+    The point is at ``point + shared spread``.  Returns in addition (a, b), the derivative of (x, y)
+    by shared, r^T W r, and whether it is in front: M and e contain W.
+    """
+    x0, y0, z0 = spread
+    X, Y, Z = point[0] + shared * x0, point[1] + shared * y0, point[2] + shared * z0
+    x, y, iz, front, du, dv = residual(one, T, K, (), (X, Y, Z), seen.u, seen.v, limits)
+    mz = T[6] * x0 + T[7] * y0 + T[8] * z0
+    a = (T[0] * x0 + T[1] * y0 + T[2] * z0 - x * mz) * iz
+    b = (T[3] * x0 + T[4] * y0 + T[5] * z0 - y * mz) * iz
+    eu, ev = K[0] * a, K[1] * b
+    across = ev * du - eu * dv
+    share = one / (one + eu * eu + ev * ev)
+    s = (du * du + dv * dv + across * across) * share
+    k = one / (one + s * limits.inverse_sigma2)
+    cost = seen.w * (s * k if front else limits.behind)
+    weight = (seen.w if front else one - one) * k * k * share
+    gx, gy = weight * K[0], weight * K[1]
+    m00, m11 = gx * K[0] * (one + ev * ev), gy * K[1] * (one + eu * eu)
+    e0, e1 = gx * (du + ev * across), gy * (dv - eu * across)
+    return x, y, iz, m00, (-gx * K[1] * eu * ev,), m11, e0, e1, cost, a, b, s, front
+
+
 @fast_kernel
 def apply_metric(m00: Any, m01: Any, m11: Any, a: Any, b: Any) -> Any:
     """M (a, b) for the symmetric M."""
@@ -262,16 +297,16 @@ def solve_point(one: _Number, V: Triangle, g: _Point, smallest: _Number) -> _Poi
 
 
 @kernel
-def solve_camera(normal: F64, damping: float, step: F64) -> bool:
+def solve_camera(H: F64, g: F64, damping: float, step: F64) -> bool:
     """Solve ``(H + damping diag(H)) step = g``; False, and step 0, where there is no solution.
 
-    normal: (>= 27,) lower triangle of H by rows, then g.
+    H: (>= 21,) its lower triangle by rows.   g, step: (>= 6,).
     """
     L = np.empty((6, 6))
     at = 0
     for r in range(6):
         for c in range(r + 1):
-            total = normal[at] * (1.0 + damping) if r == c else normal[at]
+            total = H[at] * (1.0 + damping) if r == c else H[at]
             diagonal = total
             for k in range(c):
                 total -= L[r, k] * L[c, k]
@@ -284,7 +319,7 @@ def solve_camera(normal: F64, damping: float, step: F64) -> bool:
                 L[r, c] = total / L[c, c]
             at += 1
     for r in range(6):
-        total = normal[21 + r]
+        total = g[r]
         for k in range(r):
             total -= L[r, k] * step[k]
         step[r] = total / L[r, r]

@@ -17,6 +17,7 @@ from pliant.algorithms.slam.estimate.projection import (
     motion_of,
     move_camera,
     observe,
+    observe_uncertain,
     pinhole_of,
     point_rows,
     residual,
@@ -149,15 +150,41 @@ def sweep_points(
 
 
 @fast_kernel
+def _depths(spread: Any, lo: int, hi: int) -> Any:
+    if len(spread) == 0:
+        return ()
+    each = spread[0]
+    return each[0, lo:hi], each[1, lo:hi], each[2, lo:hi]
+
+
+@fast_kernel(inline=True)
+def _observe(
+    T: Any, K: Any, lens: Any, point: Any, seen: Seen, limits: Limits, depths: Any, i: int,
+    shared: Any,
+) -> Any:  # fmt: skip
+    if len(depths) == 0:
+        x, y, iz, m00, m01, m11, e0, e1, cost = observe(ONE, T, K, lens, point, seen, limits)
+        return x, y, iz, m00, m01, m11, e0, e1, cost, ZERO, ZERO
+    depth = (depths[0][i], depths[1][i], depths[2][i])
+    return observe_uncertain(ONE, T, K, point, depth, shared, seen, limits)[:11]
+
+
+@fast_kernel
 def linearise_camera(
     m: int,
     cameras: Cameras,
     points: F32,
     table: Table,
     limits: Limits,
+    spread: Any,
+    shared: Any,
     out: F64,
 ) -> None:
-    """Write (28,) of camera m: H (lower triangle by rows), negative gradient, cost (Eq. 11)."""
+    """Write (36,) of camera m: H (lower triangle by rows), negative gradient, cost (Eq. 11).
+
+    Of seven unknowns: ``move_camera``'s step, and shared, which moves the points by spread:
+    ((3, P),) of their depths, see ``inverse_depth``; () where all are certain.
+    """
     T, K, lens = motion_of(cameras, m), pinhole_of(cameras, m), lens_of(cameras, m)
     out[:] = 0.0
     b = 0
@@ -171,13 +198,15 @@ def linearise_camera(
         hi = b * BLOCK
         X, Y, Z = points[0, lo:hi], points[1, lo:hi], points[2, lo:hi]
         um, vm, wm = table.u[m, lo:hi], table.v[m, lo:hi], table.w[m, lo:hi]
+        depths = _depths(spread, lo, hi)
         total = ZERO
         h00 = h10 = h11 = h20 = h21 = h22 = h30 = h31 = h32 = h33 = ZERO
         h40 = h41 = h42 = h43 = h44 = h50 = h51 = h52 = h53 = h54 = h55 = ZERO
-        g0 = g1 = g2 = g3 = g4 = g5 = ZERO
+        h60 = h61 = h62 = h63 = h64 = h65 = h66 = ZERO
+        g0 = g1 = g2 = g3 = g4 = g5 = g6 = ZERO
         for i in range(hi - lo):
-            x, y, iz, m00, m01, m11, e0, e1, cost = observe(
-                ONE, T, K, lens, (X[i], Y[i], Z[i]), Seen(um[i], vm[i], wm[i]), limits
+            x, y, iz, m00, m01, m11, e0, e1, cost, a6, b6 = _observe(
+                T, K, lens, (X[i], Y[i], Z[i]), Seen(um[i], vm[i], wm[i]), limits, depths, i, shared
             )
             total += cost
             a2, b2 = -x * iz, -y * iz
@@ -215,11 +244,22 @@ def linearise_camera(
             g3 += e0 * a3 + e1 * b3
             g4 += e0 * a4 + e1 * b4
             g5 += e0 * a5 + e1 * b5
+            if len(depths) != 0:
+                p6, q6 = apply_metric(m00, m01, m11, a6, b6)
+                h60 += p6 * iz
+                h61 += q6 * iz
+                h62 += p6 * a2 + q6 * b2
+                h63 += p6 * a3 + q6 * b3
+                h64 += p6 * a4 + q6 * b4
+                h65 += p6 * a5 + q6 * b5
+                h66 += p6 * a6 + q6 * b6
+                g6 += e0 * a6 + e1 * b6
         sums = (
             h00, h10, h11, h20, h21, h22, h30, h31, h32, h33, h40, h41, h42, h43, h44,
-            h50, h51, h52, h53, h54, h55, g0, g1, g2, g3, g4, g5, total,
+            h50, h51, h52, h53, h54, h55, h60, h61, h62, h63, h64, h65, h66,
+            g0, g1, g2, g3, g4, g5, g6, total,
         )  # fmt: skip
-        for r in range(28):
+        for r in range(36):
             out[r] += sums[r]
 
 
@@ -258,7 +298,7 @@ def sweep_cameras(
     exact (M, 12) is the float64 master of the cameras' motion; both are moved in place.  A camera
     moves only if that lowers its own cost.  Returns the decrease of the cost.
     """
-    normal = np.empty(28)
+    normal = np.empty(36)
     step = np.empty(6)
     moved = np.empty(12)
     trial = np.empty(12, np.float32)
@@ -266,58 +306,16 @@ def sweep_cameras(
     for m in range(exact.shape[0]):
         if not free[m]:
             continue
-        linearise_camera(m, cameras, points, table, limits, normal)
-        if not solve_camera(normal, damping, step):
+        linearise_camera(m, cameras, points, table, limits, (), ZERO, normal)
+        if not solve_camera(normal, normal[28:], damping, step):
             continue
         move_camera(exact[m], step, moved)
         for k in range(12):
             trial[k] = np.float32(moved[k])
         cost = camera_cost(trial, m, cameras, points, table, limits)
-        if cost < normal[27]:
-            decrease += 0.5 * (normal[27] - cost)
+        if cost < normal[35]:
+            decrease += 0.5 * (normal[35] - cost)
             for k in range(12):
                 exact[m, k] = moved[k]
                 cameras.motion[m, k] = trial[k]
     return decrease
-
-
-@kernel
-def iterate_pose(
-    camera: F64,
-    cameras: Cameras,
-    points: F32,
-    table: Table,
-    limits: Limits,
-    damping: float,
-    min_relative_decrease: float,
-    iterations: int,
-    normal: F64,
-) -> int:
-    """Levenberg-Marquardt on the motion of one camera (12,), moved in place.
-
-    cameras: that one, whose motion is overwritten.     normal: (28,) at its end.
-    Returns the number of evaluations.
-    """
-    trial = camera.copy()
-    step = np.zeros(6)
-    fresh = np.empty(28)
-    lowest = np.inf
-    m = len(cameras.motion) - 1  # for a literal 0 numba compiles what is called once more
-    for iteration in range(iterations + 1):
-        for k in range(12):
-            cameras.motion[m, k] = np.float32(trial[k])
-        linearise_camera(m, cameras, points, table, limits, fresh)
-        if fresh[27] <= lowest:
-            small = lowest - fresh[27] <= min_relative_decrease * fresh[27]
-            lowest = fresh[27]
-            camera[:] = trial
-            normal[:] = fresh
-            damping = max(damping * 0.1, 1e-9)
-            if small:
-                return iteration + 1
-        else:
-            damping *= 10.0
-        if iteration == iterations or not solve_camera(normal, damping, step):
-            return iteration + 1
-        move_camera(camera, step, trial)
-    return iterations + 1

@@ -21,18 +21,22 @@ across the ray's epipolar line and along it only as far as the depth is known.  
 has spread 0 and W = I.
 
 What is not mapped may all be nearer or farther than what is, so that depths err together, too: a
-frame sees candidates at X + g spread, with one g ~ N(0, 1) that is found with its pose.  Thousands
+frame sees candidates at X + s spread, with one s ~ N(0, 1) that is found with its pose.  Thousands
 that err alike would outweigh the points that tell how far the camera went.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse
-from pliant.algorithms.slam.estimate.projection import move_camera, solve_camera
+from pliant.algorithms.slam.estimate.pose import (
+    Correspondences,
+    PoseEstimate,
+    Spread,
+    refine_pose,
+)
+from pliant.algorithms.slam.estimate.problem import BundleParameters
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import CANDIDATE, MAPPED, MAPPED_SHARE, Landmarks
 from pliant.algorithms.slam.map.track_links import UNLINKED
@@ -53,20 +57,8 @@ _ANY_DEPTH = 10.0
 _ENDLESS = 1e6
 """Distance, in medians of the map, at which no camera in it can tell a point from a direction."""
 
-_NEAREST = -1.8
-"""Least g: at -2 what no other keyframe has seen would be at the camera."""
-
 _STEPS = 3
-_ITERATIONS = 10
 _MIN_DEPTH = 1e-6
-
-
-@dataclass(frozen=True, kw_only=True)
-class Spread:
-    """vectors: (N, 3) how uncertain points are.   standing: (3,) where the camera stood last."""
-
-    vectors: F64
-    standing: F64
 
 
 def spread_of(points: Landmarks, rows: I32, last: Keyframe) -> Spread:
@@ -231,150 +223,24 @@ def _off_lines(T: F64, X: F64, spread: F64, px: F32, K: F64, off: F64) -> None:
             off[n] = np.sqrt(max(du * du + dv * dv - share * along * along, 0.0))
 
 
-def refine_pose_spread(
+def refine_moving_or_standing(
     T_world_camera: F64,
-    points_world: F64,
-    spread: F64,
-    points_px: F32,
-    camera: PinholeCamera,
-    *,
-    kernel_sigma_px: float,
+    seen: Correspondences,
     standing: F64,
-) -> tuple[F64, F64, bool]:
-    """Robust Levenberg-Marquardt on one pose and g: the least ``sum rho(r^T W r) + g^2``, rho
-    Geman-McClure's.
+    camera: PinholeCamera,
+    parameters: BundleParameters,
+    inlier_px: float,
+) -> tuple[PoseEstimate, bool]:
+    """Refine a pose (4, 4) with points of uncertain depth.  Returns whether the camera stands.
 
-    points_world, spread: (N, 3), see the module.   points_px: (N, 2).   standing: (3,) where the
-    camera is unless it is told to have moved: over a view of some 60 degrees a translation and a
-    turn differ so little that errors which tracks have in common, small as they are, look like one.
-    Returns the pose, (N,) ``r^T W r``, px^2, inf behind the camera, and whether it stands.
+    It is at ``standing`` (3,) unless the points tell that it has moved: over a view of some 60
+    degrees a translation and a rotation differ so little that errors which tracks have in common,
+    small as they are, look like one.
     """
-    K = camera.intrinsics
-    sigma2, squared = kernel_sigma_px**2, np.empty((2, len(points_px)))
     still = T_world_camera.copy()
     still[:3, 3] = standing
-    moved, turned = _twelve(T_world_camera), _twelve(still)
-    free = _iterate(moved, points_world, spread, points_px, K, sigma2, False, squared[0])
-    held = _iterate(turned, points_world, spread, points_px, K, sigma2, True, squared[1])
-    turns = held - free <= _COMMON_PX**2 * len(points_px)
-    pose = turned if turns else moved
-    # Predictions extrapolate: rounding must not grow.
-    U, _, Vt = np.linalg.svd(pose[:9].reshape(3, 3))
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = U @ Vt, pose[9:]
-    return inverse(T), squared[int(turns)], bool(turns)
-
-
-def _twelve(T_world_camera: F64) -> F64:
-    T_camera_world = inverse(T_world_camera)
-    return np.concatenate([T_camera_world[:3, :3].reshape(-1), T_camera_world[:3, 3]])
-
-
-@kernel
-def _iterate(
-    pose: F64, X: F64, spread: F64, px: F32, K: F64, sigma2: float, turn_only: bool, squared: F64
-) -> float:
-    """Moves the pose (12,) to the least cost, which it returns; turn_only: its centre stays."""
-    trial, step, normal, fresh = pose.copy(), np.zeros(6), np.zeros(36), np.zeros(36)
-    common, trial_common, damping, lowest = 0.0, 0.0, 1e-4, np.inf
-    for _ in range(_ITERATIONS):
-        linearise(trial, trial_common, X, spread, px, K, sigma2, squared, fresh)
-        if turn_only:
-            for r in range(7):
-                for c in range(min(r + 1, 3)):
-                    fresh[r * (r + 1) // 2 + c] = 1.0 if r == c else 0.0
-            fresh[28:31] = 0.0
-        if fresh[35] <= lowest:
-            small = lowest - fresh[35] <= 1e-5 * fresh[35]
-            lowest = fresh[35]
-            pose[:] = trial
-            common = trial_common
-            normal[:] = fresh
-            damping = max(0.1 * damping, 1e-9)
-            if small:
-                break
-        else:
-            damping *= 10.0
-        if not solve_camera(_of_pose(normal), damping, step):
-            break
-        move_camera(pose, step, trial)
-        rest = normal[34]
-        for r in range(6):
-            rest -= normal[21 + r] * step[r]
-        trial_common = max(common + rest / normal[27], _NEAREST)
-    linearise(pose, common, X, spread, px, K, sigma2, squared, fresh)
-    return fresh[35]
-
-
-@kernel
-def _of_pose(normal: F64) -> F64:
-    """(27,) as of ``solve_camera``, of ``linearise``'s equations with g eliminated."""
-    reduced = np.empty(27)
-    at = 0
-    for r in range(6):
-        share = normal[21 + r] / normal[27]
-        for c in range(r + 1):
-            reduced[at] = normal[at] - share * normal[21 + c]
-            at += 1
-        reduced[21 + r] = normal[28 + r] - share * normal[34]
-    return reduced
-
-
-@kernel
-def linearise(
-    pose: F64,
-    common: float,
-    X: F64,
-    spread: F64,
-    px: F32,
-    K: F64,
-    sigma2: float,
-    squared: F64,
-    normal: F64,
-) -> None:
-    """Write (36,): H (lower triangle by rows), negative gradient, cost, W and weight held.
-
-    pose: (12,) T_camera_world; the step is ``move_camera``'s, and then that of g.   common: g.
-    squared: (N,) written, r^T W r.
-    """
-    normal[:] = 0.0
-    J, P = np.empty((2, 7)), np.empty(3)
-    for n in range(X.shape[0]):
-        for k in range(3):
-            P[k] = X[n, k] + common * spread[n, k]
-        z = pose[6] * P[0] + pose[7] * P[1] + pose[8] * P[2] + pose[11]
-        if z < _MIN_DEPTH:
-            squared[n] = np.inf
-            normal[35] += sigma2
-            continue
-        x = (pose[0] * P[0] + pose[1] * P[1] + pose[2] * P[2] + pose[9]) / z
-        y = (pose[3] * P[0] + pose[4] * P[1] + pose[5] * P[2] + pose[10]) / z
-        mx = pose[0] * spread[n, 0] + pose[1] * spread[n, 1] + pose[2] * spread[n, 2]
-        my = pose[3] * spread[n, 0] + pose[4] * spread[n, 1] + pose[5] * spread[n, 2]
-        mz = pose[6] * spread[n, 0] + pose[7] * spread[n, 1] + pose[8] * spread[n, 2]
-        eu, ev = K[0] * (mx - x * mz) / z, K[1] * (my - y * mz) / z
-        share = 1.0 / (1.0 + eu * eu + ev * ev)
-        w00, w01, w11 = 1.0 - eu * eu * share, -eu * ev * share, 1.0 - ev * ev * share
-        du, dv = px[n, 0] - K[0] * x - K[2], px[n, 1] - K[1] * y - K[3]
-        wu, wv = w00 * du + w01 * dv, w01 * du + w11 * dv
-        s = du * wu + dv * wv
-        weight = 1.0 / (1.0 + s / sigma2)
-        squared[n] = s
-        normal[35] += s * weight
-        weight *= weight
-        J[0, 0], J[0, 1], J[0, 2] = K[0] / z, 0.0, -K[0] * x / z
-        J[0, 3], J[0, 4], J[0, 5] = -K[0] * x * y, K[0] * (1.0 + x * x), -K[0] * y
-        J[1, 0], J[1, 1], J[1, 2] = 0.0, K[1] / z, -K[1] * y / z
-        J[1, 3], J[1, 4], J[1, 5] = -K[1] * (1.0 + y * y), K[1] * x * y, K[1] * x
-        J[0, 6], J[1, 6] = eu, ev
-        at = 0
-        for r in range(7):
-            a = weight * (w00 * J[0, r] + w01 * J[1, r])
-            b = weight * (w01 * J[0, r] + w11 * J[1, r])
-            for c in range(r + 1):
-                normal[at] += a * J[0, c] + b * J[1, c]
-                at += 1
-            normal[28 + r] += weight * (J[0, r] * wu + J[1, r] * wv)
-    normal[27] += 1.0
-    normal[34] -= common
-    normal[35] += common * common
+    fixed = seen._replace(prior=seen.prior.with_fixed_centre())
+    moved = refine_pose(T_world_camera, seen, camera, parameters, inlier_px=inlier_px)
+    rotated = refine_pose(still, fixed, camera, parameters, inlier_px=inlier_px)
+    stands = rotated.cost - moved.cost <= _COMMON_PX**2 * len(seen.points_px)
+    return rotated if stands else moved, stands

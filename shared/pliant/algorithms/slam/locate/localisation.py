@@ -17,9 +17,9 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, move_by_similarity, so3_exp, so3_log
 from pliant.algorithms.slam.calibration.rolling_shutter import motion_between
 from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac, truncated_cost
+from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.estimate.problem import BundleParameters
-from pliant.algorithms.slam.estimate.subspace import refine_pose
-from pliant.algorithms.slam.locate.inverse_depth import Spread, refine_pose_spread
+from pliant.algorithms.slam.locate.inverse_depth import refine_moving_or_standing
 from pliant.algorithms.slam.locate.reacquisition import MaximaGrid, match_widely, reacquire
 from pliant.algorithms.slam.map.landmarks import Landmarks
 from pliant.algorithms.slam.parameters import (
@@ -54,25 +54,22 @@ class Localisation:
 
 def locate(
     predictions: list[F64],
-    points_world: F64,
-    points_px: F32,
+    seen: Correspondences,
     camera: PinholeCamera,
     parameters: LocalisationParameters,
     generator: np.random.Generator,
-    spread: Spread | None = None,
 ) -> Localisation:
     """Return the pose on which most points agree, from the best prediction or by P3P and RANSAC.
 
-    predictions: poses (4, 4) to start from, at least one.   points_world: (N, 3).  points_px: (N,
-    2).  spread: of provisional points, see ``inverse_depth``; None: all are certain. The caller
-    decides whether the inliers suffice.
+    predictions: poses (4, 4) to start from, at least one.   The caller decides whether the inliers
+    suffice.
     """
-    points_n = camera.normalise(points_px.astype(np.float64))
+    points_world, points_n = seen.points_world, camera.normalise(seen.points_px.astype(np.float64))
     gate = _PREDICTION_GATE_PX / camera.fx
     costs = [_cost(T_world_camera, points_world, points_n, gate) for T_world_camera in predictions]
     start = predictions[int(np.argmin(costs))]
-    best = refine(start, points_world, points_px, camera, parameters, spread=spread)
-    if best.inliers.sum() < parameters.min_predicted_share * len(points_px):
+    best = refine(start, seen, camera, parameters)
+    if best.inliers.sum() < parameters.min_predicted_share * len(points_n):
         found = pose_by_ransac(
             points_world,
             points_n,
@@ -81,7 +78,7 @@ def locate(
             samples=parameters.ransac_samples,
         )
         if found is not None:
-            other = refine(found[0], points_world, points_px, camera, parameters, spread=spread)
+            other = refine(found[0], seen, camera, parameters)
             if other.inliers.sum() > best.inliers.sum():
                 best = other
     return best
@@ -89,32 +86,24 @@ def locate(
 
 def refine(
     T_world_camera: F64,
-    points_world: F64,
-    points_px: F32,
+    seen: Correspondences,
     camera: PinholeCamera,
     parameters: LocalisationParameters,
     *,
     near: bool = False,
-    spread: Spread | None = None,
 ) -> Localisation:
-    """Refine a pose robustly, from a wide kernel to a narrow one; near: narrow immediately.
-
-    spread: of provisional points, see ``inverse_depth``; None: all are certain.
-    """
-    inliers, is_pure_rotation = np.zeros(len(points_px), np.bool_), False
+    """Refine a pose robustly, from a wide kernel to a narrow one; near: narrow immediately."""
+    is_pure_rotation, limit_px = False, parameters.inlier_px
+    inliers = np.zeros(len(seen.points_px), np.bool_)
     for widening in (1.0,) if near else (_COARSE_SIGMAS, 1.0):
-        if spread is not None:
-            T_world_camera, squared, is_pure_rotation = refine_pose_spread(
-                T_world_camera, points_world, spread.vectors, points_px, camera,
-                standing=spread.standing,
-                kernel_sigma_px=widening * parameters.kernel_sigma_px,
-            )  # fmt: skip
-            inliers = squared < parameters.inlier_px**2
-            continue
         bundle = BundleParameters(kernel_sigma_px=widening * parameters.kernel_sigma_px)
-        T_world_camera, inliers, _ = refine_pose(
-            T_world_camera, points_world, points_px, camera, bundle, inlier_px=parameters.inlier_px
-        )
+        if seen.spread is None:
+            found = refine_pose(T_world_camera, seen, camera, bundle, inlier_px=limit_px)
+        else:
+            found, is_pure_rotation = refine_moving_or_standing(
+                T_world_camera, seen, seen.spread.standing, camera, bundle, limit_px
+            )
+        T_world_camera, inliers = found.T_world_camera, found.inliers
     return Localisation(
         T_world_camera=T_world_camera, inliers=inliers, is_pure_rotation=is_pure_rotation
     )
@@ -289,7 +278,8 @@ def search_near(
     )  # fmt: skip
     if len(found) < own.min_agreeing:
         return None
-    located = locate([T_world_camera], points.xyz[found], points_px, camera, limits, generator)
+    seen = Correspondences(points.xyz[found], points_px)
+    located = locate([T_world_camera], seen, camera, limits, generator)
     if located.inliers.sum() < own.min_agreeing:
         return None
     return verify_pose(
@@ -318,10 +308,8 @@ def verify_pose(
     )
     if len(found.rows) < parameters.localisation.min_inliers:
         return None
-    located = refine(
-        T_world_camera, points.xyz[found.rows], found.points_px, camera, parameters.localisation,
-        near=True,
-    )  # fmt: skip
+    seen = Correspondences(points.xyz[found.rows], found.points_px)
+    located = refine(T_world_camera, seen, camera, parameters.localisation, near=True)
     inliers = int(located.inliers.sum())
     enough = max(
         parameters.localisation.min_inliers,

@@ -18,6 +18,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
 from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac
+from pliant.algorithms.slam.estimate.pose import Correspondences
 from pliant.algorithms.slam.locate.localisation import (
     NEAR,
     are_enough,
@@ -292,9 +293,9 @@ def _propose(
         if found is None or found[1].sum() < own.min_agreeing:
             return
         agree = found[1]
-        T_world_camera = refine(found[0], xyz, points_px, camera, limits).T_world_camera
+        located = refine(found[0], Correspondences(xyz, points_px), camera, limits)
         yield _Proposed(
-            T_world_camera, place, pairs[agree, 0], points_px[agree], xyz[agree],
+            located.T_world_camera, place, pairs[agree, 0], points_px[agree], xyz[agree],
             agree.sum() / alike,
         )  # fmt: skip
         pairs = pairs[~agree]

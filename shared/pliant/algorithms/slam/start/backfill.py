@@ -11,6 +11,7 @@ import numpy as np
 from pliant.algorithms.arrays import F64, I64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.slam.estimate.pose import Correspondences
 from pliant.algorithms.slam.estimate.triangulation import triangulate
 from pliant.algorithms.slam.keyframe_rule import Overlap, is_due
 from pliant.algorithms.slam.locate.localisation import refine
@@ -49,7 +50,8 @@ def backfill(
         _, i, j = np.intersect1d(frame.ids, known[0], assume_unique=True, return_indices=True)
         if len(i) < limits.min_inliers:
             break
-        located = refine(T_world_camera, known[1][j], frame.points_px[i], camera, limits)
+        seen = Correspondences(known[1][j], frame.points_px[i])
+        located = refine(T_world_camera, seen, camera, limits)
         if located.inliers.sum() < limits.min_inliers:
             break
         placed.append((frame, located.T_world_camera))

@@ -15,6 +15,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.slam.adjust.ordinary_frames import EarlierPose
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.slam.estimate.epipolar import rotation_between
+from pliant.algorithms.slam.estimate.pose import Correspondences
 from pliant.algorithms.slam.frame import Frame, IdealFrame
 from pliant.algorithms.slam.locate.localisation import refine
 from pliant.algorithms.slam.map.keyframe import Keyframe
@@ -161,5 +162,6 @@ def _place(
     _, i, j = np.intersect1d(frame.ids, ids, assume_unique=True, return_indices=True)
     if len(i) < parameters.min_inliers:
         return T_world_camera, 0
-    located = refine(T_world_camera, points_world[j], frame.points_px[i], camera, parameters)
+    seen = Correspondences(points_world[j], frame.points_px[i])
+    located = refine(T_world_camera, seen, camera, parameters)
     return located.T_world_camera, int(located.inliers.sum())

@@ -24,6 +24,7 @@ from pliant.algorithms.slam.estimate.epipolar import (
     rotation_between,
     two_view_depths,
 )
+from pliant.algorithms.slam.estimate.pose import Correspondences
 from pliant.algorithms.slam.estimate.problem import CalibrationUncertainty
 from pliant.algorithms.slam.estimate.triangulation import triangulate
 from pliant.algorithms.slam.locate.localisation import refine
@@ -339,7 +340,7 @@ def _reconstruct(
         if len(i) < start.min_points:
             return f"too few tracks last through the start: {len(i)} of {start.min_points}"
         located = refine(
-            T_world_camera[k - 1], points[j], chosen[k].points_px[i], camera,
+            T_world_camera[k - 1], Correspondences(points[j], chosen[k].points_px[i]), camera,
             parameters.localisation,
         )  # fmt: skip
         T_world_camera[k] = located.T_world_camera
