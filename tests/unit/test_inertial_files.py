@@ -176,5 +176,5 @@ def test_a_named_file_replaces_them_or_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").write_text("")
     with pytest.raises(DatasetError, match="not a kind of file that is understood"):
         found_of(folder, imu=str(tmp_path / "a.xyz"))
-    with pytest.raises(DatasetError, match="--gps"):
+    with pytest.raises(DatasetError, match="no columns of latitude"):
         found_of(folder, gps=str(own))

@@ -33,7 +33,7 @@ from pliant.datasets.image_kinds import foreign_files
 from pliant.datasets.images import SUFFIXES
 from pliant.datasets.kitti import is_kitti, open_kitti
 from pliant.datasets.masks import Masked
-from pliant.datasets.mcap_file import is_mcap, open_mcap
+from pliant.datasets.mcap_file import is_mcap, mcap_sensors, open_mcap
 from pliant.datasets.measured.base import NOTHING, Measurements
 from pliant.datasets.measured.readers import video_sensors
 from pliant.datasets.own_recording import (
@@ -42,7 +42,7 @@ from pliant.datasets.own_recording import (
     recorded_sensors,
 )
 from pliant.datasets.rectifier import Rectifier, decode
-from pliant.datasets.ros_bag import is_ros_bag, open_ros_bag
+from pliant.datasets.ros_bag import bag_sensors, is_ros_bag, open_ros_bag
 from pliant.datasets.source_spec import SourceSpec
 from pliant.datasets.static_mask import StaticallyMasked
 from pliant.datasets.tum_rgbd import is_tum_rgbd, open_tum_rgbd
@@ -144,8 +144,8 @@ FORMATS: dict[str, SourceFormat] = {
         sized=True,
         sensors=recorded_sensors,
     ),
-    "mcap": SourceFormat(is_mcap, open_mcap, has_topics=True),
-    "ros-bag": SourceFormat(is_ros_bag, open_ros_bag, has_topics=True),
+    "mcap": SourceFormat(is_mcap, open_mcap, has_topics=True, sensors=mcap_sensors),
+    "ros-bag": SourceFormat(is_ros_bag, open_ros_bag, has_topics=True, sensors=bag_sensors),
     "video": SourceFormat(
         lambda source: Path(source).is_file(), _open_video, sensors=video_sensors
     ),

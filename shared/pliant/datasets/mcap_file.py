@@ -22,6 +22,8 @@ from pliant.datasets.image_messages import (
     RecordedImage,
     plain_type,
 )
+from pliant.datasets.measured.base import Measurements
+from pliant.datasets.measured.message_topics import FIX_TYPES, IMU_TYPES, sensors_of
 from pliant.datasets.message_files import (
     MessageImages,
     MessageTopic,
@@ -50,6 +52,11 @@ def is_mcap(source: str) -> bool:
 def open_mcap(spec: SourceSpec) -> Dataset:
     """The images of an MCAP file.  Raises DatasetError and CalibrationError."""
     return MessageImages(_Mcap(Path(spec.location)), spec)
+
+
+def mcap_sensors(spec: SourceSpec) -> Measurements:
+    """The other sensors of an MCAP file.  Raises DatasetError."""
+    return sensors_of(_Mcap(Path(spec.location)), spec)
 
 
 class _Mcap:
@@ -106,7 +113,10 @@ class _OpenMcap:
 
 def _decoder(path: Path, schema: Schema | None, encoding: str) -> _Decoder:
     assert schema is not None
-    assert plain_type(schema.name) in (*IMAGE_TYPES, *CALIBRATION_TYPES)
+    assert plain_type(schema.name) in (
+        *(*IMAGE_TYPES, *CALIBRATION_TYPES),
+        *(*IMU_TYPES, *FIX_TYPES),
+    )
     if encoding in ("cdr", "ros1"):
         return _ros_decoder(path, schema, encoding)
     if encoding == "protobuf":

@@ -13,6 +13,8 @@ from typing import Any
 
 from pliant.datasets.base import Dataset
 from pliant.datasets.image_messages import RecordedImage, plain_type
+from pliant.datasets.measured.base import Measurements
+from pliant.datasets.measured.message_topics import sensors_of
 from pliant.datasets.message_files import (
     MessageImages,
     MessageTopic,
@@ -35,6 +37,11 @@ def is_ros_bag(source: str) -> bool:
 def open_ros_bag(spec: SourceSpec) -> Dataset:
     """The images of a bag.  Raises DatasetError and CalibrationError."""
     return MessageImages(_Bag(Path(spec.location)), spec)
+
+
+def bag_sensors(spec: SourceSpec) -> Measurements:
+    """The other sensors of a bag.  Raises DatasetError."""
+    return sensors_of(_Bag(Path(spec.location)), spec)
 
 
 class _Bag:

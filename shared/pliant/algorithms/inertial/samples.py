@@ -41,7 +41,8 @@ class GpsFixes:
     stamps_ns: strictly ascending.
     latitude_deg, longitude_deg: WGS84.
     altitude_m: above the ellipsoid, or above the mean sea level where a source has only that.
-    sigma_m: standard deviations east, north and up; NaN where the source does not say.
+    sigma_m: standard deviations east, north and up; NaN where the source does not say, infinite up
+    where it has no altitude.
     """
 
     stamps_ns: Annotated[I64, Shape("N")]

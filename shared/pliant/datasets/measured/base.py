@@ -48,8 +48,11 @@ class Measurements:
 
     def and_those_of(self, other: "Measurements") -> "Measurements":
         """These, and of sensors that are missing here those of another."""
-        imu = self if len(self.imu.stamps_ns) else other
-        gps = self if len(self.gps.stamps_ns) else other
+        imu, gps = self, self
+        if not len(self.imu.stamps_ns):
+            imu = replace(other, imu_notes=(*self.imu_notes, *other.imu_notes))
+        if not len(self.gps.stamps_ns):
+            gps = replace(other, gps_notes=(*self.gps_notes, *other.gps_notes))
         return replace(imu, gps=gps.gps, gps_notes=gps.gps_notes)
 
     def later(self, ns: int) -> "Measurements":
@@ -117,18 +120,23 @@ def imu_measurements(
 def gps_measurements(fixes: Series, where: str, *, unreadable: int = 0) -> Measurements:
     """Fixes of rows: latitude and longitude in degrees, altitude, and sigma east, north and up in
     metres, NaN where unknown.   where: what they are from.   unreadable: rows missing already.
+
+    An unknown altitude is 0, with an infinite sigma.
     """
-    ordered = fixes.in_order(needed=3)
+    ordered = fixes.in_order(needed=2)
     latitude, longitude = ordered.values[:, 0], ordered.values[:, 1]
     rows = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0)
     rows &= (latitude != 0.0) | (longitude != 0.0)  # what receivers write without a fix
     values = ordered.values[rows]
+    flat = ~np.isfinite(values[:, 2])
+    sigma = np.where(values[:, 3:] > 0.0, values[:, 3:], np.nan)
+    sigma[flat, 2] = np.inf
     found = GpsFixes(
         stamps_ns=ordered.stamps_ns[rows],
         latitude_deg=values[:, 0].copy(),
         longitude_deg=values[:, 1].copy(),
-        altitude_m=values[:, 2].copy(),
-        sigma_m=np.where(values[:, 3:] > 0.0, values[:, 3:], np.nan),
+        altitude_m=np.where(flat, 0.0, values[:, 2]),
+        sigma_m=sigma,
     )
     wrong = len(fixes) + unreadable - len(found.stamps_ns)
     told = f"{where}: satellite fixes: {len(found.stamps_ns)}"

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64
+from pliant.algorithms.arrays import F64, I64
 from pliant.datasets.measured.base import (
     STANDARD_GRAVITY_M_S2,
     Measurements,
@@ -50,6 +50,7 @@ _TIME_UNITS = {
 _GYRO = re.compile(r"w|w[_ ].*|g|gyr.*|omega.*|.*angular_?vel.*|.*rotation_?rate.*|.*gyro.*")
 _ACCEL = re.compile(r"a|a[_ ].*|acc.*|.*linear_acceleration.*|.*accelero.*|.*specific_force.*")
 _WITHOUT_GRAVITY = re.compile(r"user|linear_?acc(?!eleration)|gravity|linear acc|motion")
+_ANY = re.compile(r".*")
 _APPLE = re.compile(r"accelerometeracceleration")
 """Of loggers that write CoreMotion's numbers: in g, and -1 upwards at rest."""
 
@@ -75,10 +76,9 @@ def read_csv(file: Path) -> Measurements:
     if not times:
         raise DatasetError(f"{file}: no line has a time, three angular velocities and three "
                            "accelerations")  # fmt: skip
-    stamps = stamps_of(times, columns.time_unit, file)
     table = np.array(values).reshape(-1, 6)
     accel, note = in_m_s2(table[:, 3:], columns.accel_factor, file)
-    gyro = Series(np.array(stamps, np.int64), table[:, :3] * columns.gyro_factor)
+    gyro = Series(_ns(times, columns.time_unit, file), table[:, :3] * columns.gyro_factor)
     return imu_measurements(
         gyro,
         Series(gyro.stamps_ns, accel),
@@ -88,16 +88,42 @@ def read_csv(file: Path) -> Measurements:
     )
 
 
+def text_lines(file: Path) -> list[str]:
+    """The lines of a text file that are not empty.  Raises DatasetError."""
+    try:
+        text = file.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot be read: {error.strerror}") from None
+    return [line for line in text.splitlines() if line.strip()]
+
+
+def read_sensor(file: Path, *, gyro: bool) -> tuple[Series, float | None, int]:
+    """Columns x, y and z of the table of one sensor; what they are multiplied by for SI units
+    (None: unknown); and how many lines are unreadable.   gyro: or accelerometer.
+
+    Raises DatasetError.
+    """
+    header, rows = table_of(file)
+    found, (time, unit) = _triple(header, _ANY), time_column(header)
+    if found is None or time < 0:
+        raise DatasetError(f"{file}: no columns of time, x, y and z in its header")
+    times, values, unreadable = numbers(rows, time, found[0])
+    if not times:
+        raise DatasetError(f"{file}: no line has a time, x, y and z")
+    factor = gyro_factor(found[1]) if gyro else accel_factor(found[1], header[found[0][0]])
+    return Series(_ns(times, unit, file), np.array(values).reshape(-1, 3)), factor, unreadable
+
+
+def _ns(times: Sequence[Decimal], unit: str, file: Path) -> I64:
+    return np.array(stamps_of(times, unit, file), np.int64)
+
+
 def table_of(file: Path) -> tuple[list[str], list[list[str]]]:
     """(names of the columns, fields of the lines); a table without a header is in ASL format.
 
     Raises DatasetError.
     """
-    try:
-        lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read: {error.strerror}") from None
-    lines = [line for line in lines if line.strip()]
+    lines = text_lines(file)
     first = lines[0] if lines else ""
     split = next((each for each in ";\t," if first.count(each) >= 3), None)
     if not re.search("[a-zA-Z]", first):
@@ -127,17 +153,19 @@ def numbers(
     return times, values, unreadable
 
 
-def stamps_of(times: Sequence[Decimal], known: str, file: Path) -> list[int]:
+def stamps_of(
+    times: Sequence[Decimal], known: str, file: Path, *, usual_step_s: float = _STEP_S
+) -> list[int]:
     """Nanoseconds of times; those before zero count from the earliest.  Raises DatasetError."""
     earliest = min(times)
     if earliest < 0:
         times = [each - earliest for each in times]
-    unit = likely_unit(times[:_LOOKED_AT], known, usual_step_s=_STEP_S)
+    unit = likely_unit(times[:_LOOKED_AT], known, usual_step_s=usual_step_s)
     longest = (1 << 62) / UNITS[unit]
     return [nanoseconds(min(each, Decimal(longest)), unit, str(file)) for each in times]
 
 
-def in_m_s2(accel: F64, factor: float | None, file: Path) -> tuple[F64, str]:
+def in_m_s2(accel: F64, factor: float | None, where: Path | str) -> tuple[F64, str]:
     """Accelerations (N, 3) in m/s^2, and a note.  factor: that of their unit; None: unknown.
 
     At rest an accelerometer measures gravity, and a camera that is held by hand, by a car or by a
@@ -148,10 +176,10 @@ def in_m_s2(accel: F64, factor: float | None, file: Path) -> tuple[F64, str]:
     note = ""
     if factor is None:
         factor = STANDARD_GRAVITY_M_S2 if 0.5 <= median <= 2.0 else 1.0
-        note = f"{file.name}: accelerations are taken as g, not m/s^2" if factor != 1.0 else ""
+        note = f"{where}: accelerations are taken as g, not m/s^2" if factor != 1.0 else ""
     if median * abs(factor) < 0.5 * STANDARD_GRAVITY_M_S2:
         raise DatasetError(
-            f"{file}: its accelerations are without gravity (median {median * abs(factor):.2g} "
+            f"{where}: its accelerations are without gravity (median {median * abs(factor):.2g} "
             "m/s^2), which the estimate of the scale needs: record the raw accelerometer"
         )
     return accel * factor, note
@@ -173,15 +201,19 @@ def _columns(header: Sequence[str], file: Path) -> _Columns:
         )
     assert gyro is not None
     assert accel is not None
-    degrees = "deg" in gyro[1] or "°" in gyro[1] or "dps" in gyro[1]
     return _Columns(
         time=time,
         time_unit=unit,
         gyro=gyro[0],
         accel=accel[0],
-        gyro_factor=radians(1.0) if degrees else 1.0,
+        gyro_factor=gyro_factor(gyro[1]),
         accel_factor=accel_factor(accel[1], header[accel[0][0]]),
     )
+
+
+def gyro_factor(unit: str) -> float:
+    """What angular velocities of a unit are multiplied by for rad/s."""
+    return radians(1.0) if re.search("deg|°|dps", unit) else 1.0
 
 
 def accel_factor(unit: str, name: str) -> float | None:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from pliant.algorithms.arrays import I64
 from pliant.datasets import formats
 from pliant.datasets.base import Dataset
 from pliant.datasets.measured.base import Measurements
@@ -28,34 +29,36 @@ def measurements_of(spec: SourceSpec, dataset: Dataset) -> Measurements:
         raise DatasetError(f"{spec.location}: is live: leave out --imu and --gps")
     found = Measurements()
     try:
-        found = kind.sensors(spec)
+        found = kind.sensors(spec.model_copy(update=dict.fromkeys(files, "")))
     except PliantError as error:
-        if any(named.values()):
+        if set(files) != {key for key, name in named.items() if name}:  # a topic was named
             raise
         found = Measurements(imu_notes=(str(error),))
     if "imu" in files:
         imu = read_named(Path(spec.imu), IMU_READERS, "--imu")
-        if not len(imu.imu.stamps_ns):
-            raise DatasetError(f"--imu {spec.imu}: has no inertial samples")
-        found = _on_clock(imu.without_gps(), dataset).and_those_of(found.without_imu())
+        found = imu.without_gps().and_those_of(found.without_imu())
     if "gps" in files:
         gps = read_named(Path(spec.gps), GPS_READERS, "--gps")
-        if not len(gps.gps.stamps_ns):
-            raise DatasetError(f"--gps {spec.gps}: has no satellite fixes")
-        found = _on_clock(gps.without_imu(), dataset).and_those_of(found.without_gps())
-    return found
+        found = gps.without_imu().and_those_of(found.without_gps())
+    if spec.imu and not len(found.imu.stamps_ns):
+        raise DatasetError(f"--imu {spec.imu}: has no inertial samples")
+    if spec.gps and not len(found.gps.stamps_ns):
+        raise DatasetError(f"--gps {spec.gps}: has no satellite fixes")
+    gps = _on_clock(found.without_imu(), found.gps.stamps_ns, dataset)
+    return _on_clock(found.without_gps(), found.imu.stamps_ns, dataset).and_those_of(gps)
 
 
-def _on_clock(found: Measurements, dataset: Dataset) -> Measurements:
-    """On the clock of the images; of a file with another clock, the first sample is at the first
-    image."""
+def _on_clock(found: Measurements, stamps_ns: I64, dataset: Dataset) -> Measurements:
+    """Samples of one sensor on the clock of the images.
+
+    Of another clock, the first sample is at the first image.
+    """
     origin = dataset
     while (inner := getattr(origin, "source", None)) is not None:
         origin = inner
-    stamps = found.imu.stamps_ns if len(found.imu.stamps_ns) else found.gps.stamps_ns
-    frame = next(iter(origin), None)
-    if frame is None or not len(stamps):
+    image = next(iter(origin), None) if len(stamps_ns) else None
+    if image is None:
         return found
-    first, last = int(stamps[0]), int(stamps[-1])
-    near = first - _NEAR_NS <= frame.stamp_ns <= last + _NEAR_NS
-    return found if near else found.later(frame.stamp_ns - first)
+    first, last = int(stamps_ns[0]), int(stamps_ns[-1])
+    near = first - _NEAR_NS <= image.stamp_ns <= last + _NEAR_NS
+    return found if near else found.later(image.stamp_ns - first)

@@ -1,0 +1,126 @@
+"""Inertial samples and satellite fixes in files of messages: bags and MCAP files.
+
+Samples: sensor_msgs Imu.   Fixes: sensor_msgs NavSatFix, foxglove LocationFix.
+Times are those of the headers, as of the images.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from pliant.datasets.image_messages import FOREIGN, capture_time
+from pliant.datasets.measured.base import (
+    Measurements,
+    Series,
+    gps_measurements,
+    imu_measurements,
+)
+from pliant.datasets.measured.csv_log import in_m_s2
+from pliant.datasets.message_files import MessageFile, MessageTopic, OpenMessages
+from pliant.datasets.source_spec import SourceSpec
+from pliant.errors import DatasetError
+
+IMU_TYPES = ("sensor_msgs/Imu",)
+FIX_TYPES = ("sensor_msgs/NavSatFix", "foxglove/LocationFix")
+_NO_FIX = -1
+
+
+def sensors_of(file: MessageFile, spec: SourceSpec) -> Measurements:
+    """What the topics of sensors have that are named, or the only ones of their kind.
+
+    Raises DatasetError where a topic is named that is not there, or the choice is not clear.
+    """
+    with file.open() as opened:
+        imu = _chosen(opened, IMU_TYPES, spec.imu, file, "inertial samples", "--imu")
+        fixes = _chosen(opened, FIX_TYPES, spec.gps, file, "satellite fixes", "--gps")
+        found = Measurements()
+        if imu:
+            found = found.and_those_of(_imu(opened, imu, file))
+        if len(fixes) == 1:
+            series, unreadable = _read(opened, fixes[0], _fix, 6)
+            where = f"{file.path.name}: {fixes[0].name}"
+            found = found.and_those_of(gps_measurements(series, where, unreadable=unreadable))
+    return found
+
+
+def _chosen(
+    opened: OpenMessages,
+    kinds: Sequence[str],
+    named: str,
+    file: MessageFile,
+    what: str,
+    option: str,
+) -> list[MessageTopic]:
+    """The one topic; or the gyro's and the accelerometer's, which some cameras publish apart."""
+    there = sorted(
+        (topic for topic in opened.topics if topic.kind in kinds and topic.count != 0),
+        key=lambda topic: topic.name,
+    )
+    listed = ", ".join(topic.name for topic in there) or "none"
+    if named:
+        found = [topic for topic in there if topic.name.strip("/") == named.strip("/")]
+        if not found:
+            raise DatasetError(
+                f"{option} {named}: neither a file nor a topic with {what} of {file.path}; its "
+                f"topics with {what}: {listed}"
+            )
+        return found
+    apart = [[t for t in there if re.search(word, t.name)] for word in ("accel", "gyro")]
+    if len(there) == 2 and all(len(each) == 1 for each in apart) and apart[0] != apart[1]:
+        return [apart[1][0], apart[0][0]]
+    if len(there) > 1:
+        raise DatasetError(
+            f"{file.path.name}: several topics with {what}; choose one with {option}: {listed}"
+        )
+    return there
+
+
+def _imu(opened: OpenMessages, topics: Sequence[MessageTopic], file: MessageFile) -> Measurements:
+    """Of the topic of both sensors, or of the gyro's and the accelerometer's."""
+    where = f"{file.path.name}: {' and '.join(topic.name for topic in topics)}"
+    gyro, unreadable = _read(opened, topics[0], _gyro_and_accel, 6)
+    accel, more = (gyro, 0) if len(topics) == 1 else _read(opened, topics[1], _gyro_and_accel, 6)
+    accelerations, note = in_m_s2(accel.values[:, 3:], None, where)
+    return imu_measurements(
+        Series(gyro.stamps_ns, gyro.values[:, :3]),
+        Series(accel.stamps_ns, accelerations),
+        where,
+        unreadable=unreadable + more,
+        notes=[note] if note else [],
+    )
+
+
+def _read(
+    opened: OpenMessages, topic: MessageTopic, values_of: Callable[[Any], list[float]], width: int
+) -> tuple[Series, int]:
+    """The values of a topic, and how many messages have none."""
+    stamps, values, unreadable = list[int](), list[list[float]](), 0
+    for each in opened.messages(topic):
+        try:
+            stamp, row = capture_time(each), values_of(each.message)
+        except FOREIGN:  # also those that are damaged
+            unreadable += 1
+            continue
+        stamps.append(min(max(stamp, 0), (1 << 63) - 1))
+        values.append(row)
+    return Series(
+        np.array(stamps, np.int64), np.array(values, float).reshape(-1, width)
+    ), unreadable
+
+
+def _gyro_and_accel(message: Any) -> list[float]:
+    vectors = (message.angular_velocity, message.linear_acceleration)
+    return [float(getattr(vector, axis)) for vector in vectors for axis in "xyz"]
+
+
+def _fix(message: Any) -> list[float]:
+    """Latitude, longitude, altitude, and sigmas east, north and up."""
+    status = getattr(getattr(message, "status", None), "status", 0)
+    position = [float(message.latitude), float(message.longitude), float(message.altitude)]
+    if int(status) <= _NO_FIX:
+        position = [float("nan")] * 3
+    variances = [float(message.position_covariance[row]) for row in (0, 4, 8)]
+    known = int(message.position_covariance_type) > 0
+    return [*position, *(v**0.5 if known and v > 0.0 else float("nan") for v in variances)]
