@@ -27,16 +27,16 @@ from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.image.masks import filled
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.calibration_bootstrap import BootstrapMapper, mapper_for
+from pliant.algorithms.slam.calibration_bootstrap import mapper_for
 from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac
 from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.frame_mapper import FrameMapper
 from pliant.algorithms.slam.global_adjustment import (
     AdjustmentJob,
     AdjustmentResult,
     GlobalAdjustment,
     find_moves,
 )
-from pliant.algorithms.slam.localiser import Localiser
 from pliant.algorithms.slam.map.keyframe import Keyframe as KeyframeOfMap
 from pliant.algorithms.slam.map.landmarks import Landmarks
 from pliant.algorithms.slam.mapper import Mapper
@@ -75,7 +75,7 @@ _JPEG_QUALITY = 95
 def run(bus: Bus, config: Config, monitor: Monitor) -> None:
     """Map until the tracks end."""
 
-    def start() -> tuple[Header, Mapper | BootstrapMapper | Localiser, dict[int, _Kept]]:
+    def start() -> tuple[Header, FrameMapper, dict[int, _Kept]]:
         stream = receive_one(bus, topics.STREAM, CameraStream)
         known: list[MapKeyframe] = []
         if bus.reads(topics.MAP_KNOWN):

@@ -15,6 +15,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDelta
 from pliant.algorithms.slam.calibration.self_calibration import is_guess, widened
 from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.frame_mapper import FrameMapper
 from pliant.algorithms.slam.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.journal import Journal, Outcome
 from pliant.algorithms.slam.localiser import Localiser
@@ -43,7 +44,7 @@ class _Taken(NamedTuple):
 
 
 class BootstrapMapper:
-    """A mapper that waits for its calibration, with the interface of ``Mapper``.
+    """A ``FrameMapper`` that waits for its calibration.
 
     mapper: the trial, or the final one.    taken: during the trial, the newest frames.
     """
@@ -156,7 +157,7 @@ def mapper_for(
     seed: int,
     focal_sigma: float = 0.0,
     known: Sequence[KeptKeyframe] = (),
-) -> Mapper | BootstrapMapper | Localiser:
+) -> FrameMapper:
     """Return the mapper for a camera, depending on how certain its calibration is: see ``widened``.
 
     known: a loaded map; if it is of the same camera, its calibration is used.

@@ -39,7 +39,7 @@ _LOOK_SHIFT = 0.05
 
 
 class Localiser:
-    """Has the interface of ``Mapper``.
+    """A ``FrameMapper`` that never extends its map.
 
     A pure function of camera, map, parameters, seed and the frames in their order.
     """

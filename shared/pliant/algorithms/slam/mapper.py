@@ -63,7 +63,7 @@ lapses.
 
 
 class Mapper:
-    """Builds the map and localises every frame in it.
+    """A ``FrameMapper`` that builds the map and localises every frame in it.
 
     A pure function of camera, parameters, seed and the frames in their order.
     """

@@ -1,0 +1,65 @@
+"""What maps or localises the frames of a source: one interface for the three that do."""
+
+from collections.abc import Iterable
+from typing import Protocol
+
+from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.global_adjustment import GlobalAdjustment
+from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
+from pliant.algorithms.stages import StageTimer, no_stages
+
+
+class FrameMapper(Protocol):
+    """``Mapper``, ``BootstrapMapper`` of an unknown camera, or ``Localiser`` in a loaded map.
+
+    Every frame goes to one of ``process``, ``only_localise`` and ``skip``, in their order.  The
+    object is its state: a checkpoint stores it.
+    """
+
+    def process(self, frame: Frame, timer: StageTimer = no_stages) -> MapDelta:
+        """Localise a frame, extend the map, and return what readers need."""
+        ...
+
+    def only_localise(self, frame: Frame, otherwise: str) -> MapDelta:
+        """Localise a frame by its tracks, when there is no time to map it.
+
+        otherwise: the reason that a frame without a pose is published with.
+        """
+        ...
+
+    def skip(self, frame: int, reason: str = ...) -> MapDelta:
+        """Skip a frame without pixels or without time: it gets no pose."""
+        ...
+
+    def finish(self, timer: StageTimer = no_stages) -> MapDelta:
+        """Return the last corrections, after the last frame."""
+        ...
+
+    def publish_keyframes(self) -> KeyframeDelta:
+        """Return the keyframe changes after a frame, or after ``finish``."""
+        ...
+
+    def kept(self) -> Iterable[KeptKeyframe]:
+        """Return the map as it is to be kept, after ``finish``."""
+        ...
+
+    @property
+    def global_adjustment(self) -> GlobalAdjustment:
+        """Global bundle adjustment: its job, for a thread, and where the result goes."""
+        ...
+
+    @property
+    def waiting_frames(self) -> list[int]:
+        """Numbers of the frames from which a map may still start."""
+        ...
+
+    @property
+    def point_count(self) -> int:
+        """Number of landmarks."""
+        ...
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Counts for the summary of a run."""
+        ...
