@@ -17,6 +17,7 @@ from pliant.algorithms.slam.frame_focal import shows_at_once
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import MappingParameters
+from pliant.results.run import Run
 
 FRAMES = 60
 CENTRE = np.array([CAMERA.cx, CAMERA.cy])
@@ -85,6 +86,31 @@ def test_the_magnification_of_one_frame_shows_only_what_is_large_and_certain():
     assert shows_at_once(-0.03, 0.0003)
     assert not shows_at_once(0.03, 0.001)
     assert not shows_at_once(0.015, 0.0001)
+
+
+@pytest.mark.parametrize(("second", "changes"), [(0.03, True), (-0.03, False), (0.001, False)])
+def test_a_change_shows_in_two_frames_in_a_row(second, changes, monkeypatch):
+    found = [0.03, second]
+    magnification = lambda *_: (found.pop(0) if found else 0.0, 0.0003)  # noqa: E731
+    monkeypatch.setattr(frame_focal, "refine_focal", magnification)
+    mapper = Mapper(CAMERA, MappingParameters(), 0, None)
+    frames = Scene.box(death=0.02).frames(sideways(FRAMES))
+    for frame, tracks in enumerate(frames):
+        mapper.process(Frame(frame, frame * INTERVAL_NS, tracks))
+        if not found:
+            break
+    assert mapper.calibration.changes == changes
+
+
+def test_a_change_that_is_none_is_withdrawn_from_the_report(control):
+    run_of_clip, empty = Run(), control[1]
+    ids = np.arange(3)
+    changed = replace(empty, focal_keyframes=ids, log_focals=np.array([0.0, 0.02, 0.04]))
+    run_of_clip.take_calibration(changed)
+    run_of_clip.take_calibration(empty)
+    assert run_of_clip.focal_range is not None
+    run_of_clip.take_calibration(replace(changed, log_focals=np.zeros(3)))
+    assert run_of_clip.focal_range is None
 
 
 def test_frames_between_keyframes_change_as_between_them():

@@ -93,7 +93,7 @@ class MapDelta:
         nothing was estimated.
     calibration_sigmas: standard deviation of each of these, at residuals of 1 px.
     focal_keyframes, log_focals: keyframes whose focal length is e^log_focal times that of the
-        corrected calibration: of clips in which it changes.
+        corrected calibration: of all of a clip in which it changes, and 0 if it turns out not to.
     snapshot: every keyframe and point of the active window is in it, changed or not.
     """
 

@@ -80,14 +80,15 @@ class Run:
         if update.calibration_correction:
             self.corrections[update.segment] = update.calibration_correction
             self.calibration_sigmas = update.calibration_sigmas
-        focal = zip(update.focal_keyframes.tolist(), update.log_focals.tolist(), strict=True)
-        self.log_focals |= dict(focal)
+        if len(update.focal_keyframes):  # of all keyframes: zeros where an earlier change was none
+            focal = zip(update.focal_keyframes.tolist(), update.log_focals.tolist(), strict=True)
+            self.log_focals = dict(focal)
 
     @property
     def focal_range(self) -> tuple[float, float] | None:
         """The least and the greatest focal length, in units of the calibration that was found, but
         for a twentieth of the keyframes at each end; None where it does not change."""
-        if not self.log_focals:
+        if not any(self.log_focals.values()):
             return None
         low, high = np.exp(np.percentile([*self.log_focals.values()], (5.0, 95.0))).tolist()
         return low, high

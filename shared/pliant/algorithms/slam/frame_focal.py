@@ -1,9 +1,10 @@
 """The focal length of each frame, if it changes during a clip (see ``changing_focal``).
 
-A frame that is magnified relative to the map by far more than one step of the camera explains shows
-the change immediately, long before an adjustment of all keyframes would be due.  From then on each
-frame gets the focal length that fits its tracks, with a random walk from that of the frame before
-as its prior.
+Two consecutive frames that are magnified relative to the map, both in the same direction and by far
+more than one step of the camera explains, show the change long before an adjustment of all
+keyframes would be due.  One frame is not enough: a rolling shutter magnifies and reduces the frames
+of a shaking hand in turn.  After a change is found, each frame gets the focal length that fits its
+tracks, with a random walk from that of the frame before as its prior.
 """
 
 from dataclasses import replace
@@ -56,7 +57,10 @@ def refocused(
         predicted, active.points.xyz[rows], points_px, active.camera, (given.cx, given.cy),
         RATE * np.sqrt(max(motion.lost_s(stamp_ns), _LEAST_GAP_S)) if changes else SPREAD,
     )  # fmt: skip
-    if not changes and not shows_at_once(change, sigma):
+    certain = change if shows_at_once(change, sigma) else 0.0
+    lasts = certain * active.magnification > 0.0
+    active.magnification = certain
+    if not changes and not lasts:
         return calibration
     active.seen_by = replace(calibration, changes=True, log_focal=calibration.log_focal + change)
     return active.seen_by

@@ -96,6 +96,7 @@ class Mapper:
         self._keyframe_is_new = False
         self._recognised: int | None = None  # the keyframe, until this frame becomes one
         self._published_frames = 0
+        self._focals_published = False
 
     @property
     def calibration(self) -> SelfCalibration:
@@ -450,7 +451,8 @@ class Mapper:
     def publish(self, outcome: Outcome) -> MapDelta:
         """Return the changes since the last call.   outcome: of the last frame."""
         delta = self.calibration.published_with(self.journal.publish(outcome))
-        if outcome.snapshot and self.calibration.changes:
+        if outcome.snapshot and (self.calibration.changes or self._focals_published):
+            self._focals_published = self.calibration.changes  # else they are withdrawn
             made = [k for segment, _ in self.atlas.everything() for k in segment.keyframes]
             delta = replace(
                 delta,
