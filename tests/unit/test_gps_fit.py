@@ -144,6 +144,9 @@ def test_straight_path_needs_gravity() -> None:
     alone = fit_to_fixes(stamps, in_map(enu), fixes)
     assert isinstance(alone, GpsRefusal)
     assert "too straight" in alone.reason
+    scale = fit_to_fixes(stamps, in_map(enu), fixes, oriented=False)
+    assert isinstance(scale, GpsFit)
+    assert scale.metres_per_unit == pytest.approx(SCALE, rel=0.03)
     found = fitted(stamps, in_map(enu), fixes, up_in_map())
     assert found.metres_per_unit == pytest.approx(SCALE, rel=0.03)
     assert found.R_enu_world @ up_in_map() == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)

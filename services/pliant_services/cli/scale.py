@@ -42,6 +42,9 @@ def scale(
             help="Source of the run, if it has depth maps or a stereo pair.",
         ),
     ] = None,
+    gps: Annotated[
+        bool, typer.Option("--gps", help="Satellite fixes that came with the source of the run.")
+    ] = False,
 ) -> None:
     """Make a result metric: its files, its later exports, and runs that extend its map.
 
@@ -52,9 +55,11 @@ def scale(
     pliant scale results/desk --points 0.12,0.05,1.3 0.48,0.06,1.31 0.60
 
     pliant scale results/desk --depth path/to/desk
+
+    pliant scale results/flight --gps
     """
     from pliant.scale.command import Known, scale_result
 
     a_b = None if points is None else (_point(points[0]), _point(points[1]), points[2])
-    for line in scale_result(result, Known(points=a_b, marker=marker, depth=depth)):
+    for line in scale_result(result, Known(points=a_b, marker=marker, depth=depth, gps=gps)):
         typer.echo(line)

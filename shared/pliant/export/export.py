@@ -17,6 +17,7 @@ from pliant.export.images import camera_of, images, rectified_images
 from pliant.export.kinds import KINDS, OF_STILL_SCENES, OPTIONS
 from pliant.export.models import foxglove, ply, rerun, solid
 from pliant.export.nerfstudio import nerfstudio
+from pliant.export.on_earth import geojson, gpx
 from pliant.export.overview import (
     FPS,
     FRAMES,
@@ -305,6 +306,8 @@ _WRITERS: dict[str, Export] = {
     "tum": _poses(write_tum),
     "kitti": _poses(write_kitti),
     "euroc": _poses(write_euroc),
+    "gpx": gpx,
+    "geojson": geojson,
     "ply": ply,
     "colmap": colmap,
     "nerfstudio": nerfstudio,
@@ -321,5 +324,5 @@ _WRITERS: dict[str, Export] = {
 }
 EXPORTS = {kind: (name, _WRITERS[kind]) for kind, name in KINDS.items()}
 """Kind of export: its default name, and who writes it."""
-_NAMED = ("foxglove", "rerun", "ply", "glb", "watertight")
+_NAMED = ("foxglove", "rerun", "gpx", "geojson", "ply", "glb", "watertight")
 """Kinds that other programs know by the ending; trajectories are text under any."""

@@ -6,6 +6,8 @@ KINDS = {
     "tum": "trajectory_tum.txt",
     "kitti": "trajectory_kitti.txt",
     "euroc": "trajectory_euroc.csv",
+    "gpx": "track.gpx",
+    "geojson": "track.geojson",
     "ply": "points_longest.ply",
     "colmap": "colmap",
     "nerfstudio": "nerfstudio",
@@ -23,6 +25,8 @@ KINDS = {
 """Kind of export: its default name."""
 
 OF_STILL_SCENES = (
+    "gpx",
+    "geojson",
     "ply",
     "colmap",
     "nerfstudio",

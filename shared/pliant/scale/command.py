@@ -12,6 +12,7 @@ from pliant.results.known_scale import MetricRecording, Scale
 from pliant.results.run import Run, read_run
 from pliant.results.surfels import has_surfels
 from pliant.results.write import write_rigid_results
+from pliant.scale.gps import from_gps
 from pliant.scale.lengths import from_depth, from_points
 from pliant.scale.marker import from_marker
 
@@ -24,12 +25,13 @@ class Known:
     """A known length in the scene: one of these.
 
     points: two points of the map, and the metres between them.   marker: side of the markers.
-    depth: a source with depth maps.
+    depth: a source with depth maps.   gps: the satellite fixes of the run's source.
     """
 
     points: tuple[Sequence[float], Sequence[float], float] | None = None
     marker: float | None = None
     depth: str | None = None
+    gps: bool = False
 
 
 def scale_result(result: Path, known: Known) -> Iterator[str]:
@@ -39,8 +41,8 @@ def scale_result(result: Path, known: Known) -> Iterator[str]:
     An earlier scale is replaced.  Raises PliantError, and then has written nothing.
     """
     given = [each for each in (known.points, known.marker, known.depth) if each is not None]
-    if len(given) != 1:
-        raise ResultError("no known length given: pass one of --points, --marker, --depth")
+    if len(given) + known.gps != 1:
+        raise ResultError("no known length given: pass one of --points, --marker, --depth, --gps")
     settle_killed(result)
     if not parts.exists(result / RECORDING_NAME):
         raise ResultError(f"{result}: not a result folder with a recording")
@@ -70,5 +72,7 @@ def _measure(recording: MetricRecording, run: Run, known: Known) -> Scale:
         return from_points(run, *known.points)
     if known.marker is not None:
         return from_marker(recording, run, known.marker)
+    if known.gps:
+        return from_gps(recording, run)
     assert known.depth is not None
     return from_depth(recording, run, known.depth)

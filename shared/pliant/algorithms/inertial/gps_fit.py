@@ -79,6 +79,14 @@ class GpsFit:
     fixes: int
     agreeing: int
 
+    @property
+    def S_enu_world(self) -> F64:
+        """(4, 4): the similarity as a matrix."""
+        S = np.eye(4)
+        S[:3, :3] = self.metres_per_unit * self.R_enu_world
+        S[:3, 3] = self.p_enu_world
+        return S
+
 
 @dataclass(frozen=True)
 class GpsRefusal:
@@ -126,12 +134,18 @@ class Problem:
 
 
 def fit_to_fixes(
-    stamps_ns: I64, positions: F64, fixes: GpsFixes, up_world: F64 | None = None
+    stamps_ns: I64,
+    positions: F64,
+    fixes: GpsFixes,
+    up_world: F64 | None = None,
+    *,
+    oriented: bool = True,
 ) -> GpsFit | GpsRefusal:
     """Fit a trajectory to fixes.
 
     stamps_ns, positions: (N,), (N, 3) of the camera, of one segment of the map.
     up_world: (3,) direction against gravity in the map, where it is known.
+    oriented: refuse an uncertain orientation, which the scale does not need.
     """
     if len(stamps_ns) < 2 or not len(fixes.stamps_ns):
         return GpsRefusal("there are no fixes during the trajectory")
@@ -170,26 +184,27 @@ def fit_to_fixes(
         fixes=len(off),
         agreeing=int(agreeing.sum()),
     )
-    return _judged(fit, scale * _extent(problem.positions), with_gravity=up_world is not None)
+    why = _fault(fit, scale * _extent(problem.positions))
+    if not why and oriented and fit.turn_sigma_rad > _MOST_TURN_SIGMA_RAD:
+        what = "short" if up_world is not None else "straight"
+        turn = np.degrees(fit.turn_sigma_rad)
+        why = f"the trajectory is too {what}: its orientation is uncertain by {turn:.0f} degrees"
+    return GpsRefusal(why) if why else fit
 
 
-def _judged(fit: GpsFit, extent_m: float, *, with_gravity: bool) -> GpsFit | GpsRefusal:
-    """The fit, or why it is not to be believed."""
+def _fault(fit: GpsFit, extent_m: float) -> str:
+    """Why the scale is not to be believed; "" if it is."""
     if fit.agreeing < _LEAST_AGREEING * fit.fixes:
-        return GpsRefusal(
+        return (
             f"only {fit.agreeing} of {fit.fixes} fixes agree with the trajectory (error "
             f"{fit.error_m:.1f} m)"
         )
     if fit.scale_sigma > _MOST_SCALE_SIGMA:
-        return GpsRefusal(
+        return (
             f"the trajectory of {extent_m:.0f} m is too short for fixes with an error of "
             f"{fit.error_m:.1f} m: the scale is uncertain by {fit.scale_sigma:.0%}"
         )
-    if fit.turn_sigma_rad > _MOST_TURN_SIGMA_RAD:
-        turn = f"{np.degrees(fit.turn_sigma_rad):.0f} degrees"
-        why = "the trajectory is too short" if with_gravity else "the trajectory is too straight"
-        return GpsRefusal(f"{why}: its orientation is uncertain by {turn}")
-    return fit
+    return ""
 
 
 def _extent(positions: F64) -> float:
@@ -301,7 +316,7 @@ def _step(problem: Problem, state: State) -> tuple[F64, F64, F64]:
     # The offset's prior, in units of the fixes' errors as all else here.
     H[-1, -1] += (factor / _OFFSET_SIGMA_S) ** 2
     b[-1] += (factor / _OFFSET_SIGMA_S) ** 2 * state.tau
-    H += _VAGUE * np.eye(len(H))
+    H[np.diag_indices(len(H))] += _VAGUE
     covariance = np.linalg.inv(H) * factor * factor * _correlation(r * weights[:, None])
     return -np.linalg.solve(H, b), covariance, lengths
 

@@ -1,0 +1,137 @@
+"""A recording with satellite fixes: its scale, and its track on the Earth."""
+
+import dataclasses
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from pliant.algorithms.arrays import F64
+from pliant.algorithms.geometry import so3_exp
+from pliant.algorithms.inertial.geodesy import EnuOrigin, enu_of, geodetic_of_enu
+from pliant.algorithms.inertial.samples import GpsFixes
+from pliant.algorithms.map_delta import TRACKING
+from pliant.algorithms.tracks import FrameTracks
+from pliant.bus.replay_bus import ReplayBus
+from pliant.config import Config
+from pliant.datasets.measured.fix_files import read_gpx
+from pliant.errors import ResultError
+from pliant.export.export import export_result
+from pliant.messages import topics
+from pliant.messages.types import CameraStream, Extrema, Header, MapUpdate
+from pliant.recording.measured import gps_pieces
+from pliant.results.known_scale import MetricRecording
+from pliant.results.run import read_run
+from pliant.scale.gps import from_gps
+from pliant_services.nodes import recorder
+
+EMPTY = Extrema.of(Header(frame=0, stamp_ns=0, frame_id=""), FrameTracks.empty())
+FRAMES, STEP_NS, BEGIN_NS = 400, 10**8, 1_700_000_000 * 10**9
+ORIGIN = EnuOrigin(latitude_deg=-33.9, longitude_deg=151.2, altitude_m=58.0)
+SCALE, TURN = 3.0, so3_exp(np.array([0.4, 0.2, -1.0]))
+
+
+def path() -> tuple[F64, F64]:
+    """Stamps of the frames, and true positions east, north and up."""
+    times = 1e-9 * STEP_NS * np.arange(FRAMES)
+    turns = [30 * np.sin(0.2 * times), 20 * np.cos(0.3 * times), 5 * np.sin(0.4 * times)]
+    return BEGIN_NS + STEP_NS * np.arange(FRAMES), np.stack(turns, axis=1)
+
+
+def fixes_on(stamps: F64, enu: F64) -> GpsFixes:
+    latitude, longitude, altitude = geodetic_of_enu(enu[::5], ORIGIN)
+    return GpsFixes(
+        stamps_ns=stamps[::5], latitude_deg=latitude, longitude_deg=longitude,
+        altitude_m=altitude, sigma_m=np.full((len(latitude), 3), np.nan),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def placed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result folder of a run whose source had fixes."""
+    folder = tmp_path_factory.mktemp("placed")
+    stamps, enu = path()
+    record(folder, list(gps_pieces(fixes_on(stamps, enu))))
+    return folder
+
+
+def record(folder: Path, fixes: list[Header]) -> None:
+    stamps, enu = path()
+    camera = "model: pinhole\nwidth: 160\nheight: 120\nfx: 100\nfy: 100\ncx: 79.5\ncy: 59.5\n"
+    stream = CameraStream(
+        frame=0, stamp_ns=0, frame_id="", source="", mode="lossless", frames=FRAMES,
+        calibration=camera, width=160, height=120, fx=100.0, fy=100.0, cx=79.5, cy=59.5,
+    )  # fmt: skip
+    poses = np.zeros((FRAMES, 7))
+    poses[:, :3], poses[:, 6] = enu @ TURN / SCALE, 1.0
+    frames, none = np.arange(FRAMES), np.zeros(FRAMES, np.int32)
+    final = MapUpdate(
+        frame=FRAMES - 1, stamp_ns=int(stamps[-1]), frame_id="", state=TRACKING, reason="",
+        segment=0, inliers=400, pose_frames=frames, pose_segments=none, pose_keyframes=frames,
+        poses_keyframe_camera=np.tile(np.eye(7)[6], (FRAMES, 1)), pose_inliers=none + 400,
+        keyframe_ids=frames, keyframe_frames=frames, keyframe_segments=none, keyframe_poses=poses,
+        point_ids=np.zeros(0, np.int64), point_segments=none[:0], points_world=np.zeros((0, 3)),
+        point_colours=np.zeros((0, 3), np.uint8), point_keyframes=none[:0],
+        point_parallax_rad=np.zeros(0, np.float32), point_sigmas=np.zeros(0, np.float32),
+        removed_point_ids=np.zeros(0, np.int64), point_hosts=np.zeros(0, np.int64),
+    )  # fmt: skip
+    tracks = [
+        dataclasses.replace(EMPTY, frame=frame, stamp_ns=int(stamp))
+        for frame, stamp in enumerate(stamps)
+    ]
+    nothing = {n: value[:0] for n, value in vars(final).items() if isinstance(value, np.ndarray)}
+    updates = [
+        dataclasses.replace(final, **nothing, frame=frame, stamp_ns=int(stamp))
+        for frame, stamp in enumerate(stamps)
+    ]
+    told: dict[topics.Topic, list[Header]] = {
+        topics.STREAM: [stream], topics.GPS: fixes, topics.EXTREMA: list(tracks),
+        topics.MAP_UPDATE: updates,
+        topics.MAP_FINAL: [final],
+    }  # fmt: skip
+    recorder.run(
+        ReplayBus({t: m for t, m in told.items() if m}), Config(), folder / "recording.mcap", {}
+    )
+
+
+def test_scale_by_fixes(placed: Path) -> None:
+    recording = MetricRecording(placed / "recording.mcap")
+    found = from_gps(recording, read_run(recording.path))
+    assert found.metres_per_unit == pytest.approx(SCALE, rel=1e-4)
+    assert found.sigma < 1e-3
+    assert "satellite fixes, error 0.0 m" in found.source
+
+
+def test_gpx_is_where_the_camera_was(placed: Path) -> None:
+    file = export_result(placed, "gpx", None)
+    found = read_gpx(file).gps
+    stamps, enu = path()
+    assert found.stamps_ns.tolist() == stamps.tolist()
+    there = enu_of(found.latitude_deg, found.longitude_deg, found.altitude_m, ORIGIN)
+    assert there == pytest.approx(enu, abs=0.01)
+    assert ElementTree.parse(file).getroot().tag.endswith("gpx")
+
+
+def test_geojson_says_where_the_map_lies(placed: Path) -> None:
+    feature = json.loads(export_result(placed, "geojson", None).read_text())
+    assert feature["geometry"]["type"] == "LineString"
+    longitude, latitude, altitude = np.array(feature["geometry"]["coordinates"]).T
+    _, enu = path()
+    assert enu_of(latitude, longitude, altitude, ORIGIN) == pytest.approx(enu, abs=0.01)
+    told = feature["properties"]
+    S = np.array(told["S_enu_world"])
+    origin = EnuOrigin(**dict(zip(vars(ORIGIN), told["enu_origin"], strict=True)))
+    ours = (enu @ TURN / SCALE) @ S[:3, :3].T + S[:3, 3]
+    back = enu_of(*geodetic_of_enu(ours, origin), ORIGIN)
+    assert back == pytest.approx(enu, abs=0.01)
+    assert told["coordinateProperties"]["times"][0] == 1_700_000_000.0
+
+
+@pytest.mark.parametrize("kind", ["gpx", "geojson"])
+def test_without_fixes_there_is_no_track(tmp_path: Path, kind: str) -> None:
+    record(tmp_path, [])
+    with pytest.raises(ResultError, match="had no satellite fixes"):
+        export_result(tmp_path, kind, None)
+    assert not (tmp_path / f"track.{kind}").exists()
