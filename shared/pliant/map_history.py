@@ -211,7 +211,7 @@ class MapHistory(CurrentMap):
     def __init__(self) -> None:
         super().__init__()
         self.stamps_ns: dict[int, int] = {}
-        self.causal: dict[int, tuple[int, F64]] = {}
+        self.online: dict[int, tuple[int, F64]] = {}
         """Segment and T_world_camera of each frame as estimated at frame time, without later
         changes of the segment."""
         self.frames: dict[int, FramePose] = {}
@@ -243,7 +243,7 @@ class MapHistory(CurrentMap):
         self.states[frame] = (delta.state, delta.reason)
         known = self.frames.get(frame)
         if known is not None and known.inliers >= MIN_INLIERS:
-            self.causal[frame] = (known.segment, matrix_to_pose(self._world(known)))
+            self.online[frame] = (known.segment, matrix_to_pose(self._world(known)))
 
     def _scale(self, moves: MapMoves) -> None:
         """Distances of frames to their keyframes scale as the whole map moves."""

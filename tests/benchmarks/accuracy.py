@@ -37,11 +37,11 @@ def measure(
         for seed, folder in enumerate(folders):
             _run(source, folder, seed, overrides)
         reports = [json.loads((folder / "report.json").read_text()) for folder in folders]
-        ate, share, causal = "-", "-", "-"
+        ate, share, online = "-", "-", "-"
         if truth is not None and reports[0]["segments"]:
             evaluations = [evaluate_result(folder, groundtruth=truth) for folder in folders]
-            final, early = summarise(evaluations), summarise(evaluations, kind="causal")
-            ate, causal = _spread(final.ate_m), _spread(early.ate_m)
+            final, early = summarise(evaluations), summarise(evaluations, kind="online")
+            ate, online = _spread(final.ate_m), _spread(early.ate_m)
             percent = evaluations[0].final.ate_percent_of_path
             share = "-" if percent is None else f"{percent:.3f} %"
         report = reports[0]
@@ -50,7 +50,7 @@ def measure(
                 Path(source).name,
                 ate,
                 share,
-                causal,
+                online,
                 f"{100.0 * report['success_rate']:.1f} %"
                 + ("" if report["segments"] else f" ({report['last_reason']})"),
                 f"{report['median_tracks_per_frame']:.0f}",

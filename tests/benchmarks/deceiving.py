@@ -108,7 +108,7 @@ class _Session:
         after = [frame for frame in self.truth if frame > night]
         wrong = {
             each
-            for poses in (self.history.causal, final)
+            for poses in (self.history.online, final)
             for each in wrong_poses(poses, self.truth, apart_m)
         }
         assert isinstance(self.mapper.atlas.places, _Watched)

@@ -117,7 +117,7 @@ def _fly(flight: Flight, overrides: Sequence[str]) -> tuple[list[str], float | N
     segments = {pose[0] for pose in history.final().values()}
     cells: list[str] = []
     found = []
-    for poses in (history.final(), history.causal):
+    for poses in (history.final(), history.online):
         chosen = {frame: pose for frame, pose in poses.items() if pose[0] == longest}
         found.append(evaluate_trajectory(history.trajectory(chosen), truth))
         ate = found[-1].ate_m

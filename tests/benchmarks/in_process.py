@@ -26,13 +26,13 @@ _HEADER = ("sequence", "seed", "ATE, final", "ATE, online", "frames with a pose"
 class Mapped:
     """What a run came to.
 
-    final, causal: its longest segment against the true poses.   share: of the frames with a pose in
+    final, online: its longest segment against the true poses.   share: of the frames with a pose in
     it.   tracks, inliers: medians over the frames.   correction, sigmas: of the calibration, as of
     ``MapDelta``; empty where nothing was told.
     """
 
     final: TrajectoryEvaluation
-    causal: TrajectoryEvaluation
+    online: TrajectoryEvaluation
     share: float
     tracks: float
     inliers: float
@@ -53,7 +53,7 @@ class Mapped:
     @property
     def both(self) -> str:
         """The final error, and the online one."""
-        return f"{self.ate} / {shown_ate(self.causal)}"
+        return f"{self.ate} / {shown_ate(self.online)}"
 
 
 def run(
@@ -82,7 +82,7 @@ def run(
     longest, final = history.longest_segment(), history.final()
     return Mapped(
         final=evaluate_trajectory(history.trajectory_in(longest, final), truth, frames=len(counts)),
-        causal=evaluate_trajectory(history.trajectory_in(longest, history.causal), truth),
+        online=evaluate_trajectory(history.trajectory_in(longest, history.online), truth),
         share=sum(segment == longest for segment, _ in final.values()) / len(counts),
         tracks=tracks,
         inliers=inliers,
@@ -110,7 +110,7 @@ def measure(
         lens = replace(given, fx=aspect * focal * given.fx, fy=focal * given.fy, cx=cx)
         for seed in seeds:
             found = run(dataset, [*overrides, f"seed={seed}"], calibration=lens)
-            ates = shown_ate(found.final), shown_ate(found.causal)
+            ates = shown_ate(found.final), shown_ate(found.online)
             share = f"{100.0 * found.share:.1f} %"
             yield markdown_row([Path(source).name, str(seed), *ates, share])
 

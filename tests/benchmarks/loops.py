@@ -33,7 +33,7 @@ def measure(sources: list[str], config: Config) -> Iterator[str]:
             path, end = path_m(came), end_error_m(came)
             cells = (
                 *(Path(name).name, f"{path:.0f} m", "on" if places else "off"),
-                *(metres(came.ate_m(came.final)), metres(came.ate_m(came.causal))),
+                *(metres(came.ate_m(came.final)), metres(came.ate_m(came.online))),
                 *(metres(end), f"{100.0 * end / path:.4f} %", _told(came.compared)),
                 *(str(came.same_places), str(came.segments), came.share, f"{came.cpu_ms:.0f} ms"),
             )

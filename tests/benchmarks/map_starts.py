@@ -58,7 +58,7 @@ def _errors(
     if tracked <= following:
         return None  # what is over so soon tells of the end of the source
     longest = history.longest_segment()
-    poses = (history.final(), history.causal)
+    poses = (history.final(), history.online)
     found = [evaluate_trajectory(history.trajectory_in(longest, each), truth) for each in poses]
     times = history.trajectory_in(longest, poses[0]).stamps_ns
     among = (truth.stamps_ns >= times[0]) & (truth.stamps_ns <= times[-1])

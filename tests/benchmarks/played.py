@@ -44,14 +44,14 @@ class _NoPlaces(KnownPlaces):
 class Played:
     """What came of it; everything by number of the image that was shown.
 
-    final: (7,) poses of the segment that has most of them in the end.   causal: likewise, as they
+    final: (7,) poses of the segment that has most of them in the end.   online: likewise, as they
     were known when the image had come.   truth: (3,) positions.   lit: images that were not dark.
     joined: when segments became one.   same_places: pairs of keyframes that were found to show one
     place.   compared: what came of comparing keyframes, see ``Comparisons``.   cpu_ms: an image.
     """
 
     final: dict[int, F64]
-    causal: dict[int, F64]
+    online: dict[int, F64]
     truth: dict[int, F64]
     lit: int
     segments: int
@@ -138,7 +138,7 @@ class Reel:
         shown = enumerate(order)
         return Played(
             final=_longest(final),
-            causal=_longest(history.causal),
+            online=_longest(history.online),
             truth={n: self._truth[source] for n, source in shown if source in self._truth},
             lit=sum(source != DARK for source in order),
             segments=len({segment for segment, _ in final.values()}),

@@ -255,7 +255,7 @@ def report_row(frames: Dataset, config: Config) -> tuple[str, ...]:
     longest, ates = history.longest_segment(), list[str]()
     shares = list[float | None]()
     poses: dict[int, tuple[int, F64]]
-    for poses in (final, history.causal):
+    for poses in (final, history.online):
         found = evaluate_trajectory(history.trajectory_in(longest, poses), truth)
         ates.append("-" if found.ate_m is None else metres(found.ate_m.rmse))
         shares.append(found.ate_percent_of_path)

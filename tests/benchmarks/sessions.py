@@ -62,7 +62,7 @@ def kidnappings(sources: list[str], config: Config) -> Iterator[str]:
             came = reel.play(order)
             until = frames_until_found(came, arrivals)
             waited = [len(a) if n is None else n for n, a in zip(until, arrivals, strict=True)]
-            errors = [came.errors_m(poses) for poses in (came.final, came.causal)]
+            errors = [came.errors_m(poses) for poses in (came.final, came.online)]
             cells = (
                 *(Path(name).name, how, str(len(arrivals)), str(len(until) - until.count(None))),
                 *(f"{np.median(waited):g}", str(max(waited)), str(came.segments), came.share),
@@ -90,7 +90,7 @@ def kidnapped(reel: Reel, dark_s: float, times: int) -> tuple[list[int], list[ra
 
 def frames_until_found(came: Played, arrivals: list[range]) -> list[int | None]:
     """After each kidnapping, 1: at once.   None: never in its stretch."""
-    first = [next((n for n in seen if n in came.causal), None) for seen in arrivals]
+    first = [next((n for n in seen if n in came.online), None) for seen in arrivals]
     return [None if n is None else n - seen[0] + 1 for n, seen in zip(first, arrivals, strict=True)]
 
 

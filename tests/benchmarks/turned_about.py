@@ -73,8 +73,8 @@ def measure(
                     ]
                 )  # fmt: skip
     if found:
-        final, causal = 100.0 * np.exp(np.log(found).mean(axis=0))
-        yield f"geometric means of {len(found)}: final {final:.3f} %, online {causal:.3f} %"
+        final, online = 100.0 * np.exp(np.log(found).mean(axis=0))
+        yield f"geometric means of {len(found)}: final {final:.3f} %, online {online:.3f} %"
 
 
 def _drive(
@@ -89,7 +89,7 @@ def _drive(
         pipeline.take(replace(seen, index=index, number=-1, stamp_ns=stamp_ns))
     pipeline.finish()
     final, longest = history.final(), history.longest_segment()
-    found = [history.trajectory_in(longest, each) for each in (final, history.causal)]
+    found = [history.trajectory_in(longest, each) for each in (final, history.online)]
     errors = [share_of(spread_of(true), evaluate_trajectory(each, true)) for each in found]
     segments = {segment for segment, _ in final.values()}
     return len(found[0]), len(segments), (errors[0], errors[1])

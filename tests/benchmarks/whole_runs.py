@@ -30,7 +30,7 @@ from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.launcher import Fleet
 
 SERVICES = PROFILES["points"]
-FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
+FILES = ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "points.ply")
 
 
 def losses(source: str, runs: int) -> Iterator[str]:

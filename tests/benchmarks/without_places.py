@@ -37,12 +37,12 @@ def measure(
         for title, order in orders.items():
             played = {on: reel.play(order, places=on) for on in (True, False)}
             final = played[True].final.keys() & played[False].final.keys()
-            causal = played[True].causal.keys() & played[False].causal.keys()
+            online = played[True].online.keys() & played[False].online.keys()
             for on, came in played.items():
                 cells = (
                     *(Path(name).name + title, "on" if on else "off"),
                     *(metres(came.ate_m(came.final)), metres(came.ate_m(came.final, final))),
-                    *(metres(came.ate_m(came.causal)), metres(came.ate_m(came.causal, causal))),
+                    *(metres(came.ate_m(came.online)), metres(came.ate_m(came.online, online))),
                     *(came.share, str(came.segments), f"{came.cpu_ms:.0f} ms"),
                 )
                 yield markdown_row(cells)

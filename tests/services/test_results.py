@@ -80,7 +80,7 @@ def result(tmp_path: Path) -> Path:
 
 
 def test_the_longest_segment_has_the_plain_names(result: Path) -> None:
-    for name in ("trajectory", "trajectory_causal", "keyframes"):
+    for name in ("trajectory", "trajectory_online", "keyframes"):
         longest, other = (read_tum(result / f"{name}{s}.txt") for s in ("", "_segment_0"))
         assert longest.positions[:, 0].tolist() == list(range(SHORT, SHORT + LONG))
         assert other.positions[:, 0].tolist() == list(range(SHORT))

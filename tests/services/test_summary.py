@@ -118,7 +118,7 @@ def test_the_last_line_says_what_the_run_is_worth(tmp_path: Path) -> None:
     assert (report["verdict"], report["doubtful_frames"]) == ("bad", [])
 
 
-def test_what_a_map_cannot_tell_is_left_out_and_what_it_gave_up_is_told() -> None:
+def test_what_a_map_cannot_tell_is_left_out_and_what_it_dropped_is_reported() -> None:
     report: dict[str, Any] = {
         **dict.fromkeys(("frames", "frames_with_pose", "keyframes", "points"), 60),
         **dict.fromkeys(("ended_early", "verdict", "verdict_reason"), ""),
@@ -135,7 +135,7 @@ def test_what_a_map_cannot_tell_is_left_out_and_what_it_gave_up_is_told() -> Non
     report["median_inliers_per_frame"] = 700.0
     assert "median per frame: 900 tracks, 700 mapped inliers" in summary(report)
     assert not any("kept_observations" in line for line in summary(report))
-    counted = {"given_up_keyframes": 1.0, "given_up_points": 5200.0}
+    counted = {"dropped_keyframes": 1.0, "dropped_points": 5200.0}
     report["counters"] = {"bundle_adjustment": counted}
     told = "kept_observations: 1 keyframe and 5200 points dropped, but kept in the results"
     assert any(line.endswith(told) for line in summary(report))

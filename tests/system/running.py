@@ -31,7 +31,7 @@ not.  A command that forgot to fix its arithmetic would not be seen otherwise.""
 UP = "services are up"
 NO_MESH = ("--set", "meshing.enabled=false")
 """For tests of what does not end in a mesh: a process and a third of a run's work less."""
-FILES = ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "points.ply")
+FILES = ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "points.ply")
 """Of a run's results, those that depend on nothing but its input."""
 
 

@@ -40,8 +40,8 @@ def test_a_result_is_what_its_files_hold(result: pliant.Result) -> None:
     kept = read_tum(result.path / "trajectory.txt")
     np.testing.assert_array_equal(result.trajectory.stamps_ns, kept.stamps_ns)
     np.testing.assert_allclose(result.trajectory.positions, kept.positions, atol=1e-6)
-    causal = read_tum(result.path / "trajectory_causal.txt")
-    np.testing.assert_allclose(result.causal_trajectory.positions, causal.positions, atol=1e-6)
+    online = read_tum(result.path / "trajectory_online.txt")
+    np.testing.assert_allclose(result.online_trajectory.positions, online.positions, atol=1e-6)
     cloud = read_ply(result.path / "points.ply")
     np.testing.assert_allclose(result.points, cloud.points, atol=1e-5)
     np.testing.assert_array_equal(result.colours, cloud.colours)
@@ -100,11 +100,11 @@ def test_following_a_source_gives_the_numbers_of_the_processes(
     slam = followed[-1].slam
     np.testing.assert_array_equal(slam.trajectory.T_world_camera, result.trajectory.T_world_camera)
     np.testing.assert_array_equal(slam.points, result.points)
-    causal = result.causal_trajectory
+    online = result.online_trajectory
     told = [frame for frame in followed if frame.T_world_camera is not None]
-    assert [frame.stamp_ns for frame in told] == causal.stamps_ns.tolist()
+    assert [frame.stamp_ns for frame in told] == online.stamps_ns.tolist()
     poses = np.array([frame.T_world_camera for frame in told])
-    np.testing.assert_allclose(poses, causal.T_world_camera, atol=1e-12)
+    np.testing.assert_allclose(poses, online.T_world_camera, atol=1e-12)
 
 
 def test_a_run_takes_what_the_command_takes() -> None:
@@ -129,7 +129,7 @@ def test_a_run_tells_each_pose_as_it_is_known(tmp_path: Path) -> None:
     assert [frame for frame, _ in told] == list(range(part.report["frames"]))
     assert part.report["frames"] < 20
     poses = [T for _, T in told if T is not None]
-    np.testing.assert_allclose(np.array(poses), part.causal_trajectory.T_world_camera, atol=1e-7)
+    np.testing.assert_allclose(np.array(poses), part.online_trajectory.T_world_camera, atol=1e-7)
     assert 0 < len(poses) < len(told)  # a map begins once the camera has moved
     found = list[object]()
     within = pliant.run(
@@ -139,7 +139,7 @@ def test_a_run_tells_each_pose_as_it_is_known(tmp_path: Path) -> None:
     )  # fmt: skip
     located = np.array([T for T in found if T is not None])
     assert len(located) > 3
-    np.testing.assert_allclose(located, within.causal_trajectory.T_world_camera, atol=1e-7)
+    np.testing.assert_allclose(located, within.online_trajectory.T_world_camera, atol=1e-7)
 
 
 def test_a_callback_that_raises_ends_the_run(tmp_path: Path) -> None:

@@ -161,9 +161,9 @@ def test_the_truth_adds_the_error_over_time(result: pliant.Result, tmp_path: Pat
     assert said[0] == said[1]
     head, section, rest = said[0].split("<!-- against the truth -->")
     assert before == f"{head}{'<!-- against the truth -->' * 2}{rest}"
-    final, causal = re.findall(r'<polyline [^>]*points="([^"]+)"', section)
+    final, online = re.findall(r'<polyline [^>]*points="([^"]+)"', section)
     assert len(final.split()) == len(result.trajectory)
-    assert len(causal.split()) == len(result.causal_trajectory)
+    assert len(online.split()) == len(result.online_trajectory)
     (rmse,) = re.findall(r"final \(blue\): RMSE ([^;]+);", section)
     assert re.search(rf"ATE RMSE +{re.escape(rmse)} ", done.stdout)
 

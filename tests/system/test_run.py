@@ -45,7 +45,7 @@ def test_a_run_leaves_everything_a_user_opens(result: Path) -> None:
     assert report["complete"]
     assert report["frames"] == report["frames_with_pose"] > 10
     assert report["points"] > 100
-    for name in ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt", "config.yaml"):
+    for name in ("trajectory.txt", "trajectory_online.txt", "keyframes.txt", "config.yaml"):
         assert (result / name).stat().st_size > 0
     assert (result / "points.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
     assert len(np.loadtxt(result / "trajectory.txt")) == report["frames"]

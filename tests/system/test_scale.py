@@ -43,7 +43,7 @@ def doubled(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_file_is_in_metres(tiny_run: Path, doubled: Path) -> None:
-    for name in ("trajectory.txt", "trajectory_causal.txt", "keyframes.txt"):
+    for name in ("trajectory.txt", "trajectory_online.txt", "keyframes.txt"):
         before, after = read_tum(tiny_run / name), read_tum(doubled / name)
         np.testing.assert_allclose(after.positions, 2.0 * before.positions, atol=2e-6)
         turned = after.T_world_camera[:, :3, :3] - before.T_world_camera[:, :3, :3]

@@ -145,7 +145,7 @@ def test_a_session_without_a_launcher_writes_its_results_and_ends_its_router(
         assert {path.name for path in tmp_path.iterdir()} == {
             *("recording.mcap", "config.yaml", "report.json", "points.ply", "keyframes.txt"),
             *("calibration.yaml", "map.pliant", "report.html"),
-            *("trajectory.txt", "trajectory_causal.txt", "state"),
+            *("trajectory.txt", "trajectory_online.txt", "state"),
         }
         written.append((tmp_path / "trajectory.txt").read_bytes() + output.read_bytes())
     assert "40 frames" not in "".join(said)

@@ -168,4 +168,4 @@ def test_idioms_are_found_as_whole_words() -> None:
     assert faults("a pose is told as doubtful")
     assert faults("compared with others,\nbeside\nCOLMAP")
     assert not faults("ground truth causally; they cannot be told apart")
-    assert not faults(prose("`trajectory_causal.txt` and [this](places.md#what-is-seen)"))
+    assert not faults(prose("`causal.txt` and [this](places.md#what-is-seen)"))

@@ -218,7 +218,7 @@ def test_a_camera_that_stands_still_has_no_accuracy() -> None:
 def result_folder(path: Path, estimate: Trajectory, report: object) -> Path:
     path.mkdir()
     write_tum(path / "trajectory.txt", estimate)
-    write_tum(path / "trajectory_causal.txt", estimate.select(np.arange(5, len(estimate))))
+    write_tum(path / "trajectory_online.txt", estimate.select(np.arange(5, len(estimate))))
     (path / "report.json").write_text(json.dumps(report))
     return path
 
@@ -235,12 +235,12 @@ def test_only_the_longest_segment_counts(tmp_path: Path) -> None:
     longest = moved(truth, scale=2.0).select(np.arange(6, 100))
     report = {"frames": 100, "initialisation_retries": 1, "segments": segments(6, 94)}
     evaluation = evaluate_result(result_folder(tmp_path / "r", longest, report), groundtruth=truth)
-    final, causal = evaluation.final, evaluation.causal
+    final, online = evaluation.final, evaluation.online
     assert (final.localised, final.other_segments, final.segments) == (94, 6, 2)
     assert final.ate_m is not None
     assert final.ate_m.rmse < 1e-6
-    assert causal is not None
-    assert (causal.localised, causal.other_segments) == (89, 6)
+    assert online is not None
+    assert (online.localised, online.other_segments) == (89, 6)
     assert final.times_s[0] == 0.0
     assert evaluation.initialisation_retries == 1
     text = format_evaluation(evaluation)
@@ -318,7 +318,7 @@ def test_summary_json_and_plot(tmp_path: Path) -> None:
     write_json(tmp_path / "e.json", evaluation_to_json(runs[1]))
     data = json.loads((tmp_path / "e.json").read_text())
     assert data["final"]["ate_m"]["rmse"] == values[0]
-    assert len(data["causal"]["errors_m"]) == 95
+    assert len(data["online"]["errors_m"]) == 95
     with pytest.raises(ResultError, match="no runs"):
         summarise([])
     pytest.importorskip("matplotlib")

@@ -331,7 +331,7 @@ def test_a_wrong_lens_is_taken_over(mistaken, monkeypatch):
     monkeypatch.setattr(SelfCalibration, "is_refuted", lambda *_: False)
     other, _, without = fold(GROWING, camera=WRONG, poses=turning())
     assert other.calibration.view.camera == WRONG
-    assert causal_error(history) < 0.5 * causal_error(without)
+    assert online_error(history) < 0.5 * online_error(without)
     assert error_of(mapper.atlas.active, turning()) < 0.5 * error_of(other.atlas.active, turning())
 
 
@@ -366,10 +366,10 @@ def test_where_the_answer_was_found_changes_nothing(mistaken, how):
             np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
 
 
-def causal_error(history):
+def online_error(history):
     """Sim(3) RMSE of the poses of the last frames as they were known at once."""
-    last = [frame for frame in history.causal if frame >= FRAMES - 30]
+    last = [frame for frame in history.online if frame >= FRAMES - 30]
     true = np.array(turning())[last, :3, 3]
-    at = np.array([history.causal[frame][1][:3] for frame in last])
+    at = np.array([history.online[frame][1][:3] for frame in last])
     scale, R, t = align_umeyama(at, true, with_scale=True)
     return np.sqrt(((scale * at @ R.T + t - true) ** 2).sum(axis=1).mean())

@@ -52,7 +52,7 @@ def test_tracks_that_noise_ends_need_one_only_once_the_camera_has_moved(interval
         overlap = Overlap(share, 1.0, flow, 4.0 * interval_s, interval_s)
         return is_due(overlap, LIMITS)
 
-    still, moved = 0.9 * LIMITS.telling_flow_px, 1.1 * LIMITS.telling_flow_px
+    still, moved = 0.9 * LIMITS.moved_flow_px, 1.1 * LIMITS.moved_flow_px
     assert not due(0.5, still)
     assert due(0.5, moved)
     assert due(0.3, still)

@@ -16,5 +16,5 @@ def test_a_kidnapped_camera_is_found_at_once_and_where_it_is(dark_s: float) -> N
     came = reel.play(order)
     assert all(until is not None and until <= 5 for until in frames_until_found(came, arrivals))
     assert came.segments == 1
-    for poses in (came.final, came.causal):
+    for poses in (came.final, came.online):
         assert came.errors_m(poses).max() < 0.05

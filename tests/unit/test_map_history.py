@@ -72,7 +72,7 @@ def points(delta: MapDelta, ids: list[int], value: float) -> MapDelta:
     )
 
 
-def test_a_moved_keyframe_moves_its_frames_and_not_their_causal_poses() -> None:
+def test_a_moved_keyframe_moves_its_frames_and_not_their_online_poses() -> None:
     step = np.array([1.0, 0, 0, 0, 0, 0, 1])
     history = MapHistory()
     history.apply(keyframe(posed(0, IDENTITY), IDENTITY), frame=0, stamp_ns=100)
@@ -84,9 +84,9 @@ def test_a_moved_keyframe_moves_its_frames_and_not_their_causal_poses() -> None:
     final = history.trajectory(history.final())
     assert final.stamps_ns.tolist() == [100, 200]
     np.testing.assert_allclose(final.positions, [[0, 0, 5], [0, 1, 5]], atol=1e-12)
-    causal = history.trajectory(history.causal)
-    np.testing.assert_allclose(causal.positions, [[0, 0, 0], [1, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(pose_to_matrix(causal.poses[1]), causal.T_world_camera[1])
+    online = history.trajectory(history.online)
+    np.testing.assert_allclose(online.positions, [[0, 0, 0], [1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(pose_to_matrix(online.poses[1]), online.T_world_camera[1])
 
 
 def test_a_pose_without_support_does_not_count() -> None:
@@ -94,7 +94,7 @@ def test_a_pose_without_support_does_not_count() -> None:
     history.apply(keyframe(posed(0, IDENTITY), IDENTITY), frame=0, stamp_ns=0)
     history.apply(posed(1, IDENTITY, inliers=29), frame=1, stamp_ns=1)
     assert list(history.final()) == [0]
-    assert list(history.causal) == [0]
+    assert list(history.online) == [0]
 
 
 def test_the_longest_segment_has_the_most_supported_frames() -> None:

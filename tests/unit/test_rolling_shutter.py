@@ -217,7 +217,7 @@ class Shaken:
         return mapper, history, tracks, keyframes
 
     def error(self, history, poses):
-        """Sim(3) RMSE of the causal or final poses."""
+        """Sim(3) RMSE of the online or final poses."""
         at = history.trajectory(poses).T_world_camera[:, :3, 3]
         true = np.array(self.poses)[sorted(poses), :3, 3]
         scale, R, t = align_umeyama(at, true, with_scale=True)
@@ -251,7 +251,7 @@ def test_the_readout_is_found_and_straightens_the_map(rolling, straight):
     _, _, best, _, _ = straight
     bent, without, _, _ = shaken.mapped(prior=0.0)
     assert shaken.error(history, final) < 0.5 * shaken.error(without, finished(bent, without))
-    assert shaken.error(best, best.causal) < shaken.error(history, final)
+    assert shaken.error(best, best.online) < shaken.error(history, final)
     assert mapper.calibration.readout == pytest.approx(0.6, abs=0.02)
 
 
@@ -264,8 +264,8 @@ def finished(mapper, history):
 def test_frames_with_a_known_readout_are_as_good_as_if_taken_at_once(known, straight):
     shaken, _, history, _, _ = known
     _, _, best, _, _ = straight
-    reached = shaken.error(history, history.causal)
-    assert reached < 2.0 * shaken.error(best, best.causal)  # unknown it would be 13 times
+    reached = shaken.error(history, history.online)
+    assert reached < 2.0 * shaken.error(best, best.online)  # unknown it would be 13 times
 
 
 def test_published_is_what_was_seen(known):

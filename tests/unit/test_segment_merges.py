@@ -141,11 +141,11 @@ def test_what_both_have_seen_is_mapped_once(two):
     assert len(made.history.points()) < 1.25 * _COUNT
 
 
-def test_causal_poses_stay_as_they_were_known(two):
+def test_online_poses_stay_as_they_were_known(two):
     shots, _, made = two
     (at,) = made.joined
     dark_at = next(k for k, (tracks, _) in enumerate(shots) if not len(tracks.ids))
-    for frame, (segment, _) in made.history.causal.items():
+    for frame, (segment, _) in made.history.online.items():
         assert segment == (1 if dark_at < frame < at else 0)
 
 

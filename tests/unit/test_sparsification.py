@@ -178,7 +178,7 @@ def test_two_segments_that_become_one_have_not_been_adjusted_as_one() -> None:
     assert goes_on.adjusted == -1
 
 
-def test_what_a_segment_without_room_had_is_given_up_with_it() -> None:
+def test_a_segment_without_room_is_dropped_with_what_it_had_dropped() -> None:
     left = segment([list(range(10 * k, 10 * k + 25)) for k in range(30)])
     atlas = Atlas(SelfCalibration(CAMERA, np.zeros(7), np.zeros((7, 7))), MappingParameters())
     atlas.points = left.points
@@ -189,10 +189,10 @@ def test_what_a_segment_without_room_had_is_given_up_with_it() -> None:
     no_room = WindowParameters(kept_observations=1000).model_copy(update={"kept_observations": 20})
     atlas._earlier.share_room(left.points, no_room)
     assert atlas.everything() == []
-    assert atlas.dropped == {"given_up_keyframes": 31, "given_up_points": 315}
+    assert atlas.dropped == {"dropped_keyframes": 31, "dropped_points": 315}
 
 
-def test_what_has_been_given_up_moves_as_what_is_near_it() -> None:
+def test_dropped_keyframes_move_with_their_neighbourhood() -> None:
     """In time, or in what it saw; also where that was given up later."""
     here = DroppedKeyframes()
     for ids, hosts in (([4, 7], [0, 0]), ([2, 8], [2, 4]), ([5], [5])):
@@ -237,7 +237,7 @@ def test_the_map_keeps_its_size_where_the_camera_comes_back():
     assert most < 1.6 * room.kept_observations
     assert max(rows[len(rows) // 2 :]) <= 1.1 * max(rows[: len(rows) // 2])
     assert mapper.point_count == len(published.points)
-    counts = {"given_up_keyframes": len(kept.dropped), "given_up_points": kept.points.culled}
+    counts = {"dropped_keyframes": len(kept.dropped), "dropped_points": kept.points.culled}
     assert counts.items() <= mapper.counters.items()
     again = load_state(save_state(mapper)).atlas.active.segment
     np.testing.assert_array_equal(again.dropped.centres, kept.dropped.centres)
@@ -298,7 +298,7 @@ def test_beyond_its_room_the_map_is_adjusted_as_before(whole, room, least):
     assert trajectory_error(published, poses)[0] < 2.5 * map_error(all_of_it, poses)
 
 
-def test_a_loop_is_closed_in_a_map_that_has_given_up_some(drifted):
+def test_a_loop_is_closed_in_a_map_with_dropped_keyframes(drifted):
     """Frames that hang on what is no more gain from it, too."""
     scene, _, mapper, published = drifted
     active = mapper.atlas.active
@@ -313,7 +313,7 @@ def test_a_loop_is_closed_in_a_map_that_has_given_up_some(drifted):
     assert trajectory_error(published.apply(last), there_and_back())[0] < 3e-3
 
 
-def test_a_loop_to_what_was_given_up_is_one_to_its_host(drifted):
+def test_a_loop_to_a_dropped_keyframe_is_one_to_its_host(drifted):
     scene, _, mapper, _ = drifted
     active, loop = mapper.atlas.active, recognised(scene, mapper)
     sparsify(active.segment, 12_000, limits(1000, 200), active.links.rows, whole=6)

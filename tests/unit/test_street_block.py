@@ -51,7 +51,7 @@ def test_the_end_error_is_what_the_way_has_left():
     mine[200:] += (0.0, 0.02, 0.0)
     poses = {k: np.append(at, (0.0, 0.0, 0.0, 1.0)) for k, at in enumerate(mine * (1.0, 1.0, -1.0))}
     came = Played(
-        final=poses, causal=poses, truth=dict(enumerate(true)), lit=300, segments=1, joined=[],
+        final=poses, online=poses, truth=dict(enumerate(true)), lit=300, segments=1, joined=[],
         same_places=0, compared={}, cpu_ms=0.0,
     )  # fmt: skip
     assert loops.end_error_m(came) == pytest.approx(0.04, rel=1e-6)

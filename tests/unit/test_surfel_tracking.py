@@ -216,13 +216,13 @@ def test_lost_surfels_make_room_for_new_ones(
 
 
 @pytest.mark.parametrize(
-    ("fps", "lost_in", "given_up_in"), [(5, 3, 28), (30, 16, 166), (60, 32, 331)]
+    ("fps", "lost_in", "dropped_in"), [(5, 3, 28), (30, 16, 166), (60, 32, 331)]
 )
-def test_surfels_are_lost_and_given_up_after_seconds_of_the_stream(
+def test_surfels_are_lost_and_dropped_after_seconds_of_the_stream(
     board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
     fps: int,
     lost_in: int,
-    given_up_in: int,
+    dropped_in: int,
 ) -> None:
     frames, camera, _ = board
     tracker = SurfelTracker(SMALL.model_copy(update={"max_surfels": 30, "levels": 1}))
@@ -231,10 +231,10 @@ def test_surfels_are_lost_and_given_up_after_seconds_of_the_stream(
     covered[:, : WIDTH // 2] = 128
     under = first.ids[first.points_px[:, 0] < WIDTH // 2 - 15]
     assert len(under) > 5
-    for number in range(1, given_up_in + 1):
+    for number in range(1, dropped_in + 1):
         result = tracker.track(covered, 1.0 / fps, depth=frames[0].depth_m)
         there = np.isin(result.ids, under)
-        assert there.sum() == (0 if number == given_up_in else len(under))
+        assert there.sum() == (0 if number == dropped_in else len(under))
         assert (result.state[there] == SurfelState.LOST).all() == (number >= lost_in)
 
 

@@ -42,6 +42,7 @@ from pliant.results.locking import Held
 from pliant_services.nodes.ingest import plays_live
 from pliant_services.processes import BY_NAME, deformable_fleet, with_depth
 from pliant_services.profiles import PROFILES
+from pliant_services.run.final_summary import print_summary
 from pliant_services.run.progress import Progress
 from pliant_services.run.request import RunRequest
 from pliant_services.run.resume import (
@@ -52,7 +53,6 @@ from pliant_services.run.resume import (
     resumed_map,
 )
 from pliant_services.run.spectators import Viewer, check_viewer, has_viewer
-from pliant_services.run.telling import tell
 from pliant_services.runtime import kernels as warm_up
 from pliant_services.runtime.announced import announced
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError
@@ -318,7 +318,7 @@ def _finish(
         if isinstance(error, ResultError):
             raise ResultError(f"{error}: {again}") from None
         raise
-    tell(output, report)
+    print_summary(output, report)
     if failure is not None:
         raise failure
     return INTERRUPTED if interrupted else grade(report)

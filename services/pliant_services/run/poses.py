@@ -3,7 +3,7 @@
     pose FRAME SECONDS tx ty tz qx qy qz qw        T_world_camera
     pose FRAME SECONDS                             it has none, or none yet
 
-The file trajectory_causal.txt has the same poses in the end.  A slow reader delays nothing but the
+The file trajectory_online.txt has the same poses in the end.  A slow reader delays nothing but the
 end of the run, which waits until all are printed.
 """
 
@@ -77,5 +77,5 @@ def _pose(message: MapUpdate | Surfels, history: MapHistory) -> F64 | None:
         return None if lost else matrix_to_pose(message.T_world_camera)
     with suppress(KeyError):  # its keyframe was in an update that did not come
         history.apply(message, frame=message.frame, stamp_ns=message.stamp_ns)
-    found = history.causal.get(message.frame)
+    found = history.online.get(message.frame)
     return None if found is None else found[1]

@@ -46,8 +46,8 @@ from pliant.staging import staging
 from pliant.wording import counted
 from pliant_services.processes import BY_NAME
 from pliant_services.replay.services import SECOND_PASS, affected, copied, record
+from pliant_services.run.final_summary import print_summary
 from pliant_services.run.request import RunRequest
-from pliant_services.run.telling import tell
 
 _VERDICTS = (GOOD, DOUBTFUL, BAD)
 _MESHING = BY_NAME["meshing"]
@@ -87,7 +87,7 @@ def second_pass(output: Path, request: RunRequest, code: int) -> int:
                 return code
             replace_by(output, made)
         _say(f"{_posed(second)}, in the first pass {_posed(first)}")
-        tell(output, second)
+        print_summary(output, second)
     except KeyboardInterrupt:
         _say("stopped: the result of the first pass is kept")
         return INTERRUPTED

@@ -25,7 +25,7 @@ def evaluate(
     """Compare a trajectory with ground truth, after an alignment with scale::
 
         evaluation = pliant.evaluate("results/clip", "sequence/groundtruth.txt")
-        evaluation.final.ate_m.rmse, evaluation.final.success_rate, evaluation.causal
+        evaluation.final.ate_m.rmse, evaluation.final.success_rate, evaluation.online
         evaluation.better  # an offset of the times with which ground truth fits far better, or None
 
     result: of a run, its folder, a trajectory file or a ``Trajectory``.    groundtruth: a file that
@@ -48,7 +48,7 @@ def evaluate(
             groundtruth=str(groundtruth) if isinstance(groundtruth, str | Path) else "given poses",
             initialisation_retries=None,
             final=evaluate_trajectory(moved, truth, frames=frames),
-            causal=None,
+            online=None,
             offset_s=1e-9 * by_ns,
             better=better_offset(moved, truth),
         )

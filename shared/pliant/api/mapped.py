@@ -26,9 +26,9 @@ class Mapped(ABC):
         return self.history.trajectory_in(self.history.longest_segment(), self.history.final())
 
     @property
-    def causal_trajectory(self) -> Trajectory:
+    def online_trajectory(self) -> Trajectory:
         """Each pose as it was known when its frame was done."""
-        return self.history.trajectory_in(self.history.longest_segment(), self.history.causal)
+        return self.history.trajectory_in(self.history.longest_segment(), self.history.online)
 
     @property
     def points(self) -> PointArray:

@@ -69,7 +69,7 @@ def run(
     ``["tracking.max_tracks=5000"]``.    quiet: print nothing.
 
     on_frame: called in this thread with each frame's number and its pose (4, 4), as it is known
-    then (``result.causal_trajectory``), or None: ``on_frame(12, T_world_camera)``.  The run does
+    then (``result.online_trajectory``), or None: ``on_frame(12, T_world_camera)``.  The run does
     not wait for it, but its end does; ``pliant.follow`` gives each frame with its image and tracks.
 
     ``result.report["verdict"]`` says whether it went well.  Raises ResultError with what the

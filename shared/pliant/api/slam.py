@@ -112,7 +112,7 @@ class Slam(Mapped):
         self._next = SourceFrame(
             index=source.index + 1, stamp_ns=source.stamp_ns, encoding="", data=b""
         )
-        known = self._history.causal.get(source.index)
+        known = self._history.online.get(source.index)
         image = frame.image
         return Tracked(
             number=image.frame,

@@ -3,23 +3,23 @@
 from html import escape
 
 from pliant.evaluation.presentation import metres
-from pliant.evaluation.run_evaluation import SHOWN, Evaluation
+from pliant.evaluation.run_evaluation import Evaluation
 from pliant.results.page.chart import BLUE, ORANGE, Line, chart
 
 
 def error_over_time(evaluation: Evaluation) -> str:
     """HTML: the distance to the true position, final and online; "" where nothing was aligned."""
-    parts = [part for part in (evaluation.final, evaluation.causal) if part and len(part.errors_m)]
+    parts = [part for part in (evaluation.final, evaluation.online) if part and len(part.errors_m)]
     if not parts:
         return ""
-    colours = {"final": ("blue", BLUE), "causal": ("orange", ORANGE)}
+    colours = {"final": ("blue", BLUE), "online": ("orange", ORANGE)}
     last = max(float(part.times_s[-1]) for part in parts)
     largest = max(float(part.errors_m.max()) for part in parts)
     lines = [
         Line(part.times_s.tolist(), part.errors_m.tolist(), colours[part.kind][1]) for part in parts
     ]
     told = "; ".join(
-        f"{SHOWN[part.kind]} ({colours[part.kind][0]}): "
+        f"{part.kind} ({colours[part.kind][0]}): "
         + (f"RMSE {metres(part.ate_m.rmse)}" if part.ate_m else escape(part.reason))
         for part in parts
     )

@@ -72,7 +72,7 @@ def run_evaluation(request: EvaluationRequest) -> Iterator[str]:
         if evaluation.better is not None:
             yield _proposal(evaluation, evaluation.better)
     if len(evaluations) > 1:
-        summaries = [summarise(evaluations, kind=kind) for kind in ("final", "causal")]
+        summaries = [summarise(evaluations, kind=kind) for kind in ("final", "online")]
         for summary in summaries:
             yield format_summary(summary)
         figures = {summary.kind: summary_to_json(summary) for summary in summaries}

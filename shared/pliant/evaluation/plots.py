@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from pliant.errors import ResultError
-from pliant.evaluation.run_evaluation import SHOWN, Evaluation
+from pliant.evaluation.run_evaluation import Evaluation
 
-_COLOURS = {"final": "#1668b8", "causal": "#e0751a"}
+_COLOURS = {"final": "#1668b8", "online": "#e0751a"}
 
 
 def plot_errors(path: Path, evaluation: Evaluation, *, title: str | None = None) -> None:
@@ -22,7 +22,7 @@ def plot_errors(path: Path, evaluation: Evaluation, *, title: str | None = None)
         raise ResultError(
             "the plot needs matplotlib, which is not installed: pip install pliant[plot]"
         ) from None
-    parts = [part for part in (evaluation.causal, evaluation.final) if part and len(part.errors_m)]
+    parts = [part for part in (evaluation.online, evaluation.final) if part and len(part.errors_m)]
     if not parts:
         raise ResultError(f"{evaluation.result}: no error over time, {evaluation.final.reason}")
     largest = max(float(part.errors_m.max()) for part in parts)
@@ -34,7 +34,7 @@ def plot_errors(path: Path, evaluation: Evaluation, *, title: str | None = None)
     FigureCanvasAgg(figure)
     axes: Any = figure.add_subplot()
     for part in parts:
-        label = SHOWN[part.kind]
+        label = part.kind
         if part.ate_m is not None:
             label += f", RMSE {part.ate_m.rmse * factor:.3g} {unit}"
         colour = _COLOURS[part.kind]

@@ -10,7 +10,7 @@ import numpy as np
 
 from pliant.errors import ResultError
 from pliant.evaluation.criteria import ErrorStatistics, RelativeErrors
-from pliant.evaluation.run_evaluation import SHOWN, Evaluation, TrajectoryEvaluation
+from pliant.evaluation.run_evaluation import Evaluation, TrajectoryEvaluation
 from pliant.formats.text import write_bytes
 
 ALIGNMENT = "Sim(3) aligned (the scale of a single camera is unknown)"
@@ -53,7 +53,7 @@ class Summary:
 
 
 def summarise(evaluations: Sequence[Evaluation], *, kind: str = "final") -> Summary:
-    """Mean and deviation of each criterion over runs.  kind: "final" or "causal".
+    """Mean and deviation of each criterion over runs.  kind: "final" or "online".
 
     Raises ResultError when there are no runs, or when one of them has no online trajectory.
     """
@@ -61,7 +61,7 @@ def summarise(evaluations: Sequence[Evaluation], *, kind: str = "final") -> Summ
         raise ResultError("no runs to summarise")
     parts: list[TrajectoryEvaluation] = []
     for evaluation in evaluations:
-        part = evaluation.final if kind == "final" else evaluation.causal
+        part = evaluation.final if kind == "final" else evaluation.online
         if part is None:
             raise ResultError(f"{evaluation.result}: has no online trajectory")
         parts.append(part)
@@ -152,9 +152,9 @@ def table(rows: Sequence[Sequence[str]]) -> str:
 
 def format_evaluation(evaluation: Evaluation) -> str:
     """A table of one run, ready to print."""
-    parts = [evaluation.final] + ([evaluation.causal] if evaluation.causal else [])
+    parts = [evaluation.final] + ([evaluation.online] if evaluation.online else [])
     columns = [_rows(part) for part in parts]
-    rows = [[ALIGNMENT.split(" (")[0], *(SHOWN[part.kind] for part in parts)]]
+    rows = [[ALIGNMENT.split(" (")[0], *(part.kind for part in parts)]]
     rows += [[label, *cells] for label, *cells in zip(_LABELS, *columns, strict=True)]
     retries = evaluation.initialisation_retries
     lines = [
@@ -165,7 +165,7 @@ def format_evaluation(evaluation: Evaluation) -> str:
         "",
         f"initialisation retries: {'-' if retries is None else retries}",
     ]
-    lines += [f"{SHOWN[part.kind]}: no accuracy, {part.reason}" for part in parts if part.reason]
+    lines += [f"{part.kind}: no accuracy, {part.reason}" for part in parts if part.reason]
     final = evaluation.final
     if final.partly_compared:
         lines.append(
@@ -187,7 +187,7 @@ def format_summary(summary: Summary) -> str:
         return "-" if value is None else f"{show(value.mean)} ± {show(value.deviation)}{suffix}"
 
     rows = [
-        ["over " + str(summary.runs) + " runs", SHOWN[summary.kind]],
+        ["over " + str(summary.runs) + " runs", summary.kind],
         ["failures", str(summary.failures)],
         ["localised", cell(summary.success_rate, lambda x: f"{100 * x:.1f}", " %")],
         ["ATE RMSE", cell(summary.ate_m, metres)],
@@ -246,7 +246,7 @@ def evaluation_to_json(evaluation: Evaluation) -> dict[str, Any]:
         "better_offset": None if evaluation.better is None else asdict(evaluation.better),
         "initialisation_retries": evaluation.initialisation_retries,
         "final": _trajectory_json(evaluation.final),
-        "causal": _trajectory_json(evaluation.causal),
+        "online": _trajectory_json(evaluation.online),
     }
 
 

@@ -38,10 +38,7 @@ MAX_SHARE = 0.5
 """With an error above this share of the spread of the true positions it may be, too."""
 
 FINAL_NAME = "trajectory.txt"
-CAUSAL_NAME = "trajectory_causal.txt"
-
-SHOWN = {"final": "final", "causal": "online"}
-"""The kinds of trajectories as people read them."""
+ONLINE_NAME = "trajectory_online.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +49,7 @@ class TrajectoryEvaluation:
     evaluated (it is what trajectory.txt holds), and the frames of those that were never joined to
     it count as not localised.  Online poses stay in the segment of their time.
 
-    kind: "final" (after all corrections) or "causal" (each pose as known when its frame was done).
+    kind: "final" (after all corrections) or "online" (each pose as known when its frame was done).
     frames: of the whole sequence; None if unknown, without a success rate.
     localised: frames with a pose in the longest segment.      other_segments: poses left out.
     success: True, False, or None (unknown).     reason: why there is no accuracy, else "".
@@ -124,7 +121,7 @@ class Evaluation:
     groundtruth: str
     initialisation_retries: int | None
     final: TrajectoryEvaluation
-    causal: TrajectoryEvaluation | None
+    online: TrajectoryEvaluation | None
     better: TimeOffset | None = None
     offset_s: float = 0.0
 
@@ -243,7 +240,7 @@ def evaluate_result(
 ) -> Evaluation:
     """Evaluate a result folder (or one trajectory file) against a ground truth.
 
-    result: a folder with trajectory.txt, and where it has them trajectory_causal.txt and
+    result: a folder with trajectory.txt, and where it has them trajectory_online.txt and
         report.json; or a trajectory file of any known format.
     groundtruth: a trajectory, a file of any known format, or a folder with groundtruth.txt.
         times: the times of a KITTI ground truth.
@@ -269,7 +266,7 @@ def evaluate_result(
             groundtruth=true_name,
             initialisation_retries=None,
             final=final,
-            causal=None,
+            online=None,
             better=better_offset(estimate, truth),
             offset_s=1e-9 * by_ns,
         )
@@ -279,7 +276,7 @@ def evaluate_result(
     estimate = shifted(estimate, by_ns)
     others = _other_segments(estimate, report, result / FINAL_NAME)
     evaluations: dict[str, TrajectoryEvaluation] = {}
-    for kind, path in (("final", result / FINAL_NAME), ("causal", result / CAUSAL_NAME)):
+    for kind, path in (("final", result / FINAL_NAME), ("online", result / ONLINE_NAME)):
         if path.exists():
             evaluations[kind] = evaluate_trajectory(
                 estimate if kind == "final" else shifted(read_tum(path, allow_empty=True), by_ns),
@@ -295,7 +292,7 @@ def evaluate_result(
         groundtruth=true_name,
         initialisation_retries=report.initialisation_retries,
         final=evaluations["final"],
-        causal=evaluations.get("causal"),
+        online=evaluations.get("online"),
         better=better_offset(estimate, truth),
         offset_s=1e-9 * by_ns,
     )

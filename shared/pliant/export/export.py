@@ -215,7 +215,7 @@ def _picture(recording: Recording, path: Path, folder: Path | None) -> None:
     """One frame with its tracks, where images were recorded, the points and the mesh."""
     run, stream, what = _made(recording)
     has_images = next(recording.messages(topics.SOURCE), None) is not None
-    wanted = (_telling_frame(run, what),)
+    wanted = (_informative_frame(run, what),)
     frames = _shown_frames(recording, stream, wanted) if has_images else iter(())
     write_image(path, still_picture(frames, stream.camera, what))
 
@@ -230,7 +230,7 @@ def _overview(recording: Recording, path: Path, folder: Path | None) -> None:
     write_animation(path, list(overview_pictures(frames, layout, what)), fps=FPS, quality=_QUALITY)
 
 
-def _telling_frame(run: Run, what: Made) -> int:
+def _informative_frame(run: Run, what: Made) -> int:
     """Of the frames that the map explains well, the one that looks at the middle of it."""
     final, longest = run.history.final(), run.history.longest_segment()
     frames = [frame for frame, (segment, _) in sorted(final.items()) if segment == longest]

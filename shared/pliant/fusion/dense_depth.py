@@ -47,7 +47,7 @@ class _Taken:
 
 @dataclass(frozen=True)
 class _Swept:
-    """around: the keyframes beside it, the most telling first."""
+    """around: the keyframes beside it, the most informative first."""
 
     keyframe: int
     around: list[int]

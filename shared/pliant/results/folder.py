@@ -40,7 +40,7 @@ TRAJECTORY_NAME = "trajectory.txt"
 SURFELS_NAME = "surfels.npz"
 _RIGID_FILES = (
     TRAJECTORY_NAME,
-    "trajectory_causal.txt",
+    "trajectory_online.txt",
     "keyframes.txt",
     "points.ply",
     CALIBRATION_NAME,

@@ -39,8 +39,8 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
     reasons = {frame: reason for frame, (_, reason) in sorted(history.states.items()) if reason}
     # That a frame is broken says nothing about why there is no map, unless all of them are.
     silent = {*run.missing, *run.passed_over}
-    telling = [reason for frame, reason in reasons.items() if frame not in silent]
-    telling = telling or list(reasons.values())
+    shown = [reason for frame, reason in reasons.items() if frame not in silent]
+    shown = shown or list(reasons.values())
     doubtful = doubtful_frames(history)
     passed_over = [frame for frame in run.passed_over if frame not in final]
     missing = [*run.missing.values()]
@@ -70,7 +70,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "success_rate": len(final) / frames if frames else 0.0,
         "initialisation_retries": max(0, len(segments) - 1),
         "segments": segments,
-        "last_reason": last_reason(telling),
+        "last_reason": last_reason(shown),
         "frames_without_pixels": {str(f): why for f, why in sorted(run.missing.items())},
         "frames_passed_over": passed_over,
         "keyframes": len(history.keyframe_poses()),
@@ -80,7 +80,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "calibration_correction": _correction(run),
         "calibration_verdict": calibration_verdict(run, final),
         "median_tracks_per_frame": _median(run.tracks.values()),
-        "median_inliers_per_frame": _median(run.inliers[f] for f in history.causal),
+        "median_inliers_per_frame": _median(run.inliers[f] for f in history.online),
         "mesh": mesh_report(run.mesh),
         **process_figures(run, frames),
         "tracks_per_frame": [run.tracks[f] for f in sorted(run.tracks)],
@@ -176,7 +176,7 @@ def _known_map(run: Run, final: dict[int, Any]) -> dict[str, Any] | None:
     if not run.known_segments:
         return None
     came = sorted(run.history.states)
-    as_it_came = [f for f, (of, _) in run.history.causal.items() if of in run.known_segments]
+    as_it_came = [f for f, (of, _) in run.history.online.items() if of in run.known_segments]
     return {
         "keyframes": sum(k.frame < 0 for k in run.history.keyframes.values()),
         "frames_in_it": sum(segment in run.known_segments for segment, _ in final.values()),

@@ -37,7 +37,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         f"median per frame: {report['median_tracks_per_frame']:.0f} tracks, {_mapped(report)}",
     ]
     lines += _told_of_map(report)
-    lines += _given_up(report.get("counters", {}).get("bundle_adjustment", {}))
+    lines += _dropped_parts(report.get("counters", {}).get("bundle_adjustment", {}))
     lines += [
         f"{mesh['level']} mesh: {mesh['triangles']} triangles "
         f"from {counted(mesh['keyframes'], 'keyframe')}"
@@ -84,11 +84,11 @@ def _told_of_map(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def _given_up(counters: Mapping[str, float]) -> list[str]:
+def _dropped_parts(counters: Mapping[str, float]) -> list[str]:
     """What a map had no more room for."""
-    if "given_up_points" not in counters:
+    if "dropped_points" not in counters:
         return []
-    keyframes, points = (int(counters[f"given_up_{name}"]) for name in ("keyframes", "points"))
+    keyframes, points = (int(counters[f"dropped_{name}"]) for name in ("keyframes", "points"))
     return [
         (
             "the map is larger than bundle_adjustment.window.kept_observations: "

@@ -77,7 +77,7 @@ def _write_files(folder: Path, run: Run, final: dict[int, Any], report: dict[str
     history = run.history
     trajectories = {
         "trajectory": final,
-        "trajectory_causal": history.causal,
+        "trajectory_online": history.online,
         "keyframes": history.keyframe_poses(),
     }
     longest = history.longest_segment()

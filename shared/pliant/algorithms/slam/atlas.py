@@ -98,7 +98,7 @@ class Atlas:
         """Counts of dropped keyframes and landmarks; empty if nothing was dropped."""
         keyframes = self._earlier.dropped_keyframes
         keyframes += sum(len(segment.dropped) for segment, _ in self.everything())
-        counts = {"given_up_keyframes": keyframes, "given_up_points": self.points.culled}
+        counts = {"dropped_keyframes": keyframes, "dropped_points": self.points.culled}
         return counts if self.points.culled or keyframes else {}
 
     def begin(

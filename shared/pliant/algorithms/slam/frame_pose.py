@@ -48,7 +48,7 @@ its pixel, not two.
 _OFF = 2.0
 """In errors of an inlier: a track farther from its epipolar line contradicts a pose."""
 
-_TELLING = 500
+_DECIDING = 500
 """Minimum tracks that decide whether a camera stands still."""
 
 _FEW, _FIRM = 0.05, 0.2
@@ -206,10 +206,10 @@ def supported(active: ActiveMap, motion: Motion, placed: PlacedFrame) -> PlacedF
     rows, points_px = active.observed(placed, active.helping_candidates())
     errors = reprojection_errors(T_world_camera, active.points.xyz[rows], points_px, active.camera)
     inliers = errors < active.parameters.localisation.inlier_px
-    telling = _settled(active, motion, tracks)
-    telling[_contradicting(active, T_world_camera, tracks.points_px)] = True
+    settled = _settled(active, motion, tracks)
+    settled[_contradicting(active, T_world_camera, tracks.points_px)] = True
     tracked = len(rows) - len(placed.found.rows)
-    support = support_of(points_px, inliers, tracked, tracks.points_px[telling], active.camera)
+    support = support_of(points_px, inliers, tracked, tracks.points_px[settled], active.camera)
     return replace(placed, support=support)
 
 
@@ -248,7 +248,7 @@ def check_pure_rotation(active: ActiveMap, placed: PlacedFrame) -> PlacedFrame:
     candidates = placed_candidates(points, active.links.rows)
     rows, points_px = active.observed(placed, candidates)
     T_standing = placed.T_world_camera
-    for every in (max(1, len(rows) // _TELLING), 1):  # a few tracks reveal most motions
+    for every in (max(1, len(rows) // _DECIDING), 1):  # a few tracks reveal most motions
         some = np.arange(0, len(rows), every)
         seen = _correspondences(active, rows[some], points_px[some], len(rows))
         located = refine(

@@ -41,7 +41,7 @@ def is_due(overlap: Overlap, limits: KeyframeParameters) -> bool:
     if overlap.age_s > limits.max_s and overlap.flow > limits.min_flow_px:
         return True
     until_next = 1.0 + overlap.interval_s / overlap.age_s
-    if overlap.flow > limits.telling_flow_px:
+    if overlap.flow > limits.moved_flow_px:
         return overlap.share**until_next < limits.min_shared_share
     return (
         overlap.in_view**until_next < limits.min_shared_share

@@ -194,7 +194,7 @@ class KeyframeParameters(Parameters):
             "only below it"
         ),
     )
-    telling_flow_px: float = Field(
+    moved_flow_px: float = Field(
         default=8.0,
         gt=0.0,
         description=(

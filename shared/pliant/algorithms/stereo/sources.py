@@ -38,7 +38,7 @@ class Viewpoints:
 
 
 def choose_sources(views: Viewpoints, row: int, points_world: F64, count: int) -> I64:
-    """Rows of at most ``count`` keyframes, the most telling first.
+    """Rows of at most ``count`` keyframes, the most informative first.
 
     points_world: (P, 3) some of what keyframe ``row`` sees.  Each that is taken lowers those which
     see the points from much the same side.

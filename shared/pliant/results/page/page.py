@@ -40,7 +40,7 @@ def put_truth_in(path: Path, section: str) -> None:
 
 _FILES = {
     "trajectory.txt": "camera poses after all corrections (TUM)",
-    "trajectory_causal.txt": "online poses, as estimated at frame time",
+    "trajectory_online.txt": "online poses, as estimated at frame time",
     "keyframes.txt": "poses of the keyframes",
     "points.ply": "the point cloud",
     "mesh.ply": "the surface, fine",

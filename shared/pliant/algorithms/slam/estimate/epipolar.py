@@ -20,7 +20,7 @@ _CONFIDENCE = 0.9999
 _SAMPLES = 300
 """Enough for 50 % outliers; with more of them nothing good can start."""
 
-_TELLING = 1000
+_SAMPLED = 1000
 """Points, evenly of all, by which motions are found that are judged by all."""
 
 
@@ -97,7 +97,7 @@ def relative_poses(points_a: F64, points_b: F64, *, gate: float) -> list[Relativ
     if len(points_a) < 8:
         return []
     views = _views(points_a, points_b, gate)
-    every = max(1, len(points_a) // _TELLING)
+    every = max(1, len(points_a) // _SAMPLED)
     few = _views(points_a[::every], points_b[::every], gate)
     motions = [_by_essential(few, method) for method in (cv2.USAC_ACCURATE, cv2.USAC_MAGSAC)]
     motions += _by_homography(few)

@@ -43,23 +43,23 @@ class Support:
 
 
 def support_of(
-    points_px: F32, inliers: BoolArray, tracked: int, telling_px: F32, camera: PinholeCamera
+    points_px: F32, inliers: BoolArray, tracked: int, settled_px: F32, camera: PinholeCamera
 ) -> Support:
     """points_px: (N, 2) of the visible landmarks, of which ``inliers`` (N,) fit.   tracked: number
-    of them, the first ones, with tracks.   telling_px: (M, 2) of the tracks that have landmarks if
+    of them, the first ones, with tracks.   settled_px: (M, 2) of the tracks that have landmarks if
     the pose is right, or contradict it.
     """
     count = int(np.count_nonzero(inliers))
     fitting = points_px[inliers]
     width, height = camera.width, camera.height
-    supported, tracks = _per_cell(fitting, width, height), _per_cell(telling_px, width, height)
-    telling = tracks >= _LEAST_SEEN
+    supported, tracks = _per_cell(fitting, width, height), _per_cell(settled_px, width, height)
+    decided = tracks >= _LEAST_SEEN
     size = np.array([width, height])
     return Support(
         inliers=count,
         tracked=int(np.count_nonzero(inliers[:tracked])),
         share=count / max(len(points_px), 1),
-        contrary=float((supported < _AGAINST * tracks)[telling].mean()) if telling.any() else 0.0,
+        contrary=float((supported < _AGAINST * tracks)[decided].mean()) if decided.any() else 0.0,
         spread=float(np.min(fitting.std(axis=0) / size)) if count else 0.0,
     )
 

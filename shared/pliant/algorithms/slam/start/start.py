@@ -43,7 +43,7 @@ _GLANCE = 400
 _CLEARLY_LESS = 0.7
 """Share of the required parallax below which the quick test is conclusive."""
 
-_TELLING = 500
+_DECIDING = 500
 """Tracks, evenly of all, that decide between several motions; the start uses all."""
 
 _NOISE_PX = 1.0
@@ -230,8 +230,8 @@ def _start_from(
     shared = waiting[-1].ids[pair.indices_newest]
     compared = tried[:motions]
     # A single motion needs no comparison, and few tracks are all needed.
-    most = _TELLING if len(compared) > 1 and len(shared) >= 2 * _TELLING else len(shared)
-    telling = shared[:: max(1, len(shared) // most)]
+    most = _DECIDING if len(compared) > 1 and len(shared) >= 2 * _DECIDING else len(shared)
+    sample = shared[:: max(1, len(shared) // most)]
     least = wanted._replace(least_deg=start.min_parallax_deg)
     found: list[tuple[float, Start, RelativePose]] = []
     for two_views in compared:
@@ -241,7 +241,7 @@ def _start_from(
         if isinstance(each, str):
             reason = reason or each
             continue
-        found.append((_misfit(each, telling, waiting, camera, parameters), each, two_views))
+        found.append((_misfit(each, sample, waiting, camera, parameters), each, two_views))
     if not found:
         return reason
     least_misfit, best, two_views = min(found, key=lambda each: each[0])

@@ -9,8 +9,8 @@ from pliant.results.folder import PAGE_NAME, RECORDING_NAME, files_of
 from pliant.wording import counted
 
 
-def tell(output: Path, report: dict[str, Any]) -> None:
-    """Say where the results are, and what they come to."""
+def print_summary(output: Path, report: dict[str, Any]) -> None:
+    """Print where the results are, and their verdict."""
     from pliant.export.export import exports_in
     from pliant.results.verdict import summary
 
