@@ -9,6 +9,8 @@ from test_decimation import grey, grid, waves
 
 from pliant.algorithms.meshing.decimation import clustered, decimated
 from pliant.algorithms.meshing.mesh_blocks import LATTICE, SIDE, MeshBlocks, TriangleMesh, weld
+from pliant.algorithms.meshing.mesh_finish import finished
+from pliant.algorithms.meshing.tsdf_closing import Evidence
 from pliant.pictures.mesh import draw_mesh, mesh_view
 
 
@@ -45,6 +47,20 @@ def test_bytes_for_each_triangle_are_few(work: Callable[[TriangleMesh], None], m
     finally:
         tracemalloc.stop()
     assert peak / len(mesh.triangles) < most
+
+
+def test_finishing_takes_few_bytes_for_each_triangle() -> None:
+    mesh = large()
+    count = len(mesh.positions)
+    evidence = Evidence(np.ones(count, np.float32), np.ones(count, np.float32))
+    finished(mesh, evidence, 0.01)
+    tracemalloc.start()
+    try:
+        finished(mesh, evidence, 0.01)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak / len(mesh.triangles) < 200
 
 
 def many_blocks(side: int = 40) -> MeshBlocks:

@@ -7,7 +7,7 @@ import pytest
 
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
-from pliant.algorithms.meshing.mesh_components import cleaned, components
+from pliant.algorithms.meshing.mesh_components import areas_of, cleaned, components
 from pliant.algorithms.meshing.touching import taken_apart
 from pliant.errors import ResultError
 from pliant.export.watertight import watertight
@@ -197,6 +197,15 @@ def test_pieces_that_are_small_beside_the_largest_are_left_out() -> None:
         np.testing.assert_array_equal(getattr(kept, name), getattr(large, name))
     none = replace(both, triangles=np.zeros((0, 3), np.int32))
     assert cleaned(none) is none
+
+
+def test_areas_are_half_of_the_cross_product() -> None:
+    generator = np.random.default_rng(0)
+    positions = generator.normal(size=(30, 3)).astype(np.float32)
+    triangles = generator.integers(0, 30, (50, 3)).astype(np.int32)
+    a, b, c = (positions.astype(np.float64)[triangles[:, k]] for k in range(3))
+    expected = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    np.testing.assert_allclose(areas_of(positions, triangles), expected, atol=1e-12)
 
 
 def test_components_are_those_of_a_search_from_node_to_node() -> None:

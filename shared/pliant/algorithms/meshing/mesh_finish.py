@@ -13,7 +13,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, I32, BoolArray
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.mesh_borders import smoothed_borders, without_teeth, zipped
-from pliant.algorithms.meshing.mesh_components import components
+from pliant.algorithms.meshing.mesh_components import areas_of, components
 from pliant.algorithms.meshing.mesh_topology import NONE, corner_before, split_fans, stars_of
 from pliant.algorithms.meshing.tsdf_closing import CARRIED, Evidence, is_guessed
 from pliant.compiler.kernel import kernel
@@ -91,11 +91,9 @@ def _large_enough(judged: _Judged, voxel: float) -> BoolArray:
         return np.zeros(0, np.bool_)
     count = len(judged.mesh.positions)
     piece = components(count, triangles[:, :2].ravel(), triangles[:, 1:].ravel())[triangles[:, 0]]
-    corners = judged.mesh.positions[triangles].astype(np.float64) / voxel
-    turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    certain = np.minimum(judged.support[triangles].astype(np.float64).mean(axis=1), 1.0)
-    sizes = np.bincount(piece, 0.5 * np.linalg.norm(turned, axis=1) * certain)
-    return (sizes >= _CRUMB)[piece]
+    certain = np.minimum(judged.support[triangles].mean(axis=1, dtype=np.float64), 1.0)
+    sizes = np.bincount(piece, areas_of(judged.mesh.positions, judged.mesh.triangles) * certain)
+    return (sizes >= _CRUMB * voxel * voxel)[piece]
 
 
 @kernel
