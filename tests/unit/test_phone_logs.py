@@ -8,6 +8,8 @@ import pytest
 from pliant.datasets.measured.fix_files import read_fix_table, read_gpx, read_srt
 from pliant.datasets.measured.gyroflow import read_gcsv
 from pliant.datasets.measured.phone_log import is_phone_log, read_phone_log
+from pliant.datasets.measured.readers import video_sensors
+from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 
 GCSV = """GYROFLOW IMU LOG
@@ -147,3 +149,19 @@ def test_table_of_fixes_needs_its_columns(tmp_path: Path) -> None:
     file.write_text("time,lat,height,x\n0,1,2,3\n")
     with pytest.raises(DatasetError, match="no columns of longitude"):
         read_fix_table(file)
+
+
+def test_subtitles_of_other_cameras_are_none(tmp_path: Path) -> None:
+    file = tmp_path / "a.srt"
+    file.write_text("1\n00:00:00,000 --> 00:00:01,000\nHello.\n")
+    assert not read_srt(file).notes
+
+
+def test_files_beside_a_video(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"")
+    (tmp_path / "a.gcsv").write_text("nonsense")
+    (tmp_path / "a.SRT").write_text(SRT)
+    (tmp_path / "a.gpx").write_text(GPX)
+    found = video_sensors(SourceSpec(location=str(tmp_path / "a.mp4")))
+    assert len(found.gps.stamps_ns) == 3  # the subtitles: they have the clock of the video
+    assert "is no Gyroflow log" in found.imu_notes[0]

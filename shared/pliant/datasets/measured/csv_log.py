@@ -94,7 +94,7 @@ def text_lines(file: Path) -> list[str]:
         text = file.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise DatasetError(f"{file}: cannot be read: {error.strerror}") from None
-    return [line for line in text.splitlines() if line.strip()]
+    return [line for line in text.splitlines() if line and not line.isspace()]
 
 
 def read_sensor(file: Path, *, gyro: bool) -> tuple[Series, float | None, int]:
@@ -123,12 +123,12 @@ def table_of(file: Path) -> tuple[list[str], list[list[str]]]:
 
     Raises DatasetError.
     """
-    lines = text_lines(file)
+    lines = [line.replace('"', "") for line in text_lines(file)]
     first = lines[0] if lines else ""
     split = next((each for each in ";\t," if first.count(each) >= 3), None)
     if not re.search("[a-zA-Z]", first):
         return _ASL, [line.split(split) for line in lines]
-    header = [name.strip().strip('"') for name in first.lstrip("# ").split(split)]
+    header = [name.strip() for name in first.lstrip("# ").split(split)]
     rows = [line.split(split) for line in lines[1:] if not line.startswith("#")]
     return header, rows
 
@@ -140,8 +140,8 @@ def numbers(
     times, values, unreadable = list[Decimal](), list[list[float]](), 0
     for row in rows:
         try:
-            at = Decimal(row[time].strip().strip('"'))
-            found = [float(row[column].strip().strip('"')) for column in wanted]
+            at = Decimal(row[time])
+            found = [float(row[column]) for column in wanted]
         except (InvalidOperation, ValueError, IndexError):
             unreadable += 1
             continue

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from pliant.datasets.measured.base import Measurements, Series, gps_measurements
+from pliant.datasets.measured.base import NOTHING, Measurements, Series, gps_measurements
 from pliant.datasets.measured.csv_log import numbers, stamps_of, table_of, text_lines, time_column
 from pliant.errors import DatasetError
 
@@ -64,7 +64,10 @@ def read_gpx(file: Path) -> Measurements:
 
 
 def read_srt(file: Path) -> Measurements:
-    """The fixes in the subtitles of a video, each once.  Raises DatasetError."""
+    """The fixes in the subtitles of a video, each once; nothing in those of other cameras.
+
+    Raises DatasetError where it cannot be read.
+    """
     stamps, values, stamp = list[int](), list[list[float]](), -1
     before: list[float] = []
     for block in re.split(
@@ -81,7 +84,7 @@ def read_srt(file: Path) -> Measurements:
             before = position
             stamps.append(stamp)
             values.append([*position, _NAN, _NAN, _NAN])
-    return _fixes(stamps, values, file, 0)
+    return _fixes(stamps, values, file, 0) if values else NOTHING
 
 
 def read_fix_table(file: Path) -> Measurements:

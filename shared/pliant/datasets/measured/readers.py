@@ -49,11 +49,22 @@ def read_named(file: Path, readers: Mapping[str, Reader], option: str) -> Measur
 
 
 def video_sensors(spec: SourceSpec) -> Measurements:
-    """What is inside a video, and in files of its name beside it.  Raises DatasetError."""
+    """What is inside a video, and in files of its name beside it.
+
+    Raises DatasetError where the video cannot be read.
+    """
     file = Path(spec.location)
     found = read_gopro(file)
     for ending, reader in _BESIDE:
         path = file.with_suffix(ending)
         if path.is_file():
-            found = found.and_those_of(reader(path))
+            found = found.and_those_of(_read(path, reader))
     return found
+
+
+def _read(path: Path, reader: Reader) -> Measurements:
+    """What a file has; a note where it is damaged."""
+    try:
+        return reader(path)
+    except DatasetError as error:
+        return Measurements(imu_notes=(str(error),))
