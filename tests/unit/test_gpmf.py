@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gpmf_writer import entry, mp4, nested, stream
 
+from pliant.algorithms.geometry import so3_exp
 from pliant.datasets.measured.gopro import read_gopro
 from pliant.datasets.measured.gpmf import Payload, read_gpmf
 
@@ -149,3 +150,28 @@ def test_public_samples_are_read_whole(name: str, samples: int, rate_hz: float, 
     assert 1e9 / steps.mean() == pytest.approx(rate_hz, abs=0.1)
     lengths = np.linalg.norm(found.imu.accel_m_s2, axis=1)
     assert lengths.mean() == pytest.approx(9.81, abs=0.1)
+
+
+def test_gyro_and_accelerometer_of_a_public_sample_have_the_same_axes() -> None:
+    """Gravity turned by the gyro stays where it is, and by no mirrored gyro as well."""
+    file = SAMPLES / "gopro_walk" / "video.mp4"
+    if not file.is_file():
+        pytest.skip("no public sample files of GoPro here")
+    imu = read_gopro(file).imu
+    steps = so3_exp(imu.gyro_rad_s[:-1] * 1e-9 * np.diff(imu.stamps_ns)[:, None])
+
+    def spread(mirror: np.ndarray) -> float:
+        R, directions = np.eye(3), list[np.ndarray]()
+        for step, accel in zip(steps, imu.accel_m_s2[:-1] @ mirror, strict=True):
+            directions.append(R @ accel)
+            R = R @ step
+        means = np.array([np.mean(directions[n : n + 200], axis=0) for n in range(0, 2000, 200)])
+        means /= np.linalg.norm(means, axis=1, keepdims=True)
+        return float(np.degrees(np.linalg.norm(means - means.mean(axis=0), axis=1).mean()))
+
+    there = spread(np.eye(3))
+    assert there < 1.3
+    for axis in range(3):
+        mirror = np.eye(3)
+        mirror[axis, axis] = -1.0
+        assert spread(mirror) > 1.2 * there

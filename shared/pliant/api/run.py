@@ -38,6 +38,8 @@ def run(
     light: bool = False,
     quality: Literal["normal", "high"] = "normal",
     topic: str | None = None,
+    imu: str | Path | None = None,
+    gps: str | Path | None = None,
     max_size: int | None = None,
     mode: Literal["lossless", "live"] | None = None,
     map: str | Path | None = None,
@@ -63,6 +65,7 @@ def run(
     what never changes.    start, end: seconds after
     the first frame; every: one of so many frames; sharpest: of those, not the first.    light: a
     fifth of the tracks.    quality: "high" reads the source again where the camera was lost.
+    imu, gps: a file of inertial samples, of satellite fixes, or their topic.
     max_size: pixels along the longer side.    map: of an earlier run, to go
     on in; localise: only to find the frames in it.    camera, depth, depth_frames: of the
     deformable profile.    settings: ``{"tracking.max_tracks": 5000}`` or
@@ -80,8 +83,8 @@ def run(
         "output": folder, "force": force, "calibration": calibration, "fov": fov, "mask": mask,
         "no-auto-mask": not auto_mask,
         "start": start, "end": end, "every": every, "sharpest": sharpest, "light": light,
-        "quality": quality, "topic": topic, "max-size": max_size, "mode": mode, "map": map,
-        "localise": localise, "profile": profile,
+        "quality": quality, "topic": topic, "imu": imu, "gps": gps, "max-size": max_size,
+        "mode": mode, "map": map, "localise": localise, "profile": profile,
         "camera": camera, "depth": depth, "depth-frames": depth_frames, "no-images": not images,
         "seed": seed, "poses": on_frame is not None,
     }  # fmt: skip
