@@ -80,6 +80,16 @@ def test_accelerations_without_gravity_are_refused(tmp_path: Path) -> None:
         read_csv(write(tmp_path / "a.csv", "t,gx,gy,gz,ax,ay,az", made))
 
 
+def test_the_accelerations_with_gravity_are_chosen(tmp_path: Path) -> None:
+    linear = [f"Linear Acceleration {axis} (m/s^2)" for axis in "xyz"]
+    header = ",".join(["t,gx,gy,gz", *linear, "ax,ay,az"])
+    made = [[0.01 * n, *GYRO, 0.1, 0.2, 0.1, *ACCEL] for n in range(100)]
+    found = read_csv(write(tmp_path / "a.csv", header, made))
+    assert found.imu.accel_m_s2[0].tolist() == ACCEL
+    with pytest.raises(DatasetError, match="without gravity"):
+        read_csv(write(tmp_path / "a.csv", ",".join(["t,gx,gy,gz", *linear]), made))
+
+
 def test_a_column_that_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no columns of accelerometer in its header"):
         read_csv(write(tmp_path / "a.csv", "t,gx,gy,gz", [[0.0, *GYRO]]))

@@ -6,7 +6,7 @@
 Columns are found by their names: time or timestamp; gyro, rotation rate, angular velocity or w; and
 accelerometer, acceleration or a, each with x, y and z.  Units are those that the header gives in
 brackets or behind the name, else those that are likely: times by the usual rates of such sensors,
-accelerations by their length.  Columns of accelerations without gravity are passed over.
+accelerations by their length.  Accelerations without gravity are refused.
 """
 
 import re
@@ -48,8 +48,11 @@ _TIME_UNITS = {
     **dict.fromkeys(("ns", "nsec", "nanoseconds", "nanos"), "nanoseconds"),
 }
 _GYRO = re.compile(r"w|w[_ ].*|g|gyr.*|omega.*|.*angular_?vel.*|.*rotation_?rate.*|.*gyro.*")
-_ACCEL = re.compile(r"a|a[_ ].*|acc.*|.*linear_acceleration.*|.*accelero.*|.*specific_force.*")
-_WITHOUT_GRAVITY = re.compile(r"user|linear_?acc(?!eleration)|gravity|linear acc|motion")
+_ACCEL = re.compile(r"a|a[_ ].*|acc.*|.*acceleration.*|.*accelero.*|.*specific_force.*")
+_OTHER = re.compile(r"gravity|motion")
+_WITHOUT_GRAVITY = re.compile(r"user|linear(?!_acceleration)")
+"""ROS calls linear_acceleration what others call so without gravity: taken where there is no other,
+and then refused by its length."""
 _ANY = re.compile(r".*")
 _APPLE = re.compile(r"accelerometeracceleration")
 """Of loggers that write CoreMotion's numbers: in g, and -1 upwards at rest."""
@@ -251,11 +254,12 @@ def _triple(header: Sequence[str], pattern: re.Pattern[str]) -> tuple[list[int],
             continue
         stem, letter, unit = (each for each in axis.groups() if each is not None)
         stem = stem.lower().rstrip("_. -")
-        if not pattern.fullmatch(stem) or _WITHOUT_GRAVITY.search(stem):
+        if not pattern.fullmatch(stem) or _OTHER.search(stem):
             continue
         found.setdefault(stem, {}).setdefault(letter.lower(), column)
         units.setdefault(stem, (parts.group(2) or unit).strip().lower())
-    for stem, axes in found.items():
+    for stem in sorted(found, key=lambda stem: _WITHOUT_GRAVITY.search(stem) is not None):
+        axes = found[stem]
         if len(axes) == 3:
             return [axes[axis] for axis in "xyz"], units[stem]
     return None
