@@ -6,7 +6,12 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 
 from pliant.algorithms.geometry import align_umeyama, inverse, pose_to_matrix, transform
 from pliant.algorithms.slam.adjust import ordinary_frames
-from pliant.algorithms.slam.adjust.ordinary_frames import OrdinaryFrames, refined_poses
+from pliant.algorithms.slam.adjust.ordinary_frames import (
+    OrdinaryFrames,
+    refined_poses,
+    smoothed_poses,
+)
+from pliant.algorithms.slam.calibration.rolling_shutter import FramePoses
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.map.keyframe import Keyframe
@@ -66,6 +71,22 @@ def test_a_frame_that_sees_little_of_the_map_stays(points):
     frames = passed(points).take_all()
     points.state[:160] = CANDIDATE
     assert refined_poses(frames, points, KNOWN, PARAMETERS) == []
+
+
+@pytest.mark.parametrize(("landmarks", "inliers"), [(200, 200), (3, 70)])
+def test_a_keyframe_with_few_landmarks_keeps_the_support_of_its_candidates(
+    points, landmarks, inliers
+):
+    rows = np.arange(landmarks, dtype=np.int32)
+    points_px = CAMERA.project(transform(inverse(TRUE), points.xyz[rows])).astype(np.float32)
+    keyframe = Keyframe(
+        id=3, frame=20, segment=0, T_world_camera=TRUE, rows=rows, points_px=points_px,
+        rolled_px=np.zeros_like(points_px),
+    )  # fmt: skip
+    path = FramePoses()
+    path.add(20, keyframe, TRUE, 70)
+    (pose,) = smoothed_poses([keyframe], path, {20: 0}, points, KNOWN, PARAMETERS)
+    assert pose.inliers == inliers
 
 
 def test_what_finds_no_room_goes_first(points, monkeypatch):

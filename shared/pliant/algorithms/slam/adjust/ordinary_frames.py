@@ -217,6 +217,8 @@ def smoothed_poses(
             iterations=1,
         )  # fmt: skip
         inliers = int(np.count_nonzero(found.inliers))
+        if inliers < parameters.localisation.min_inliers:
+            continue  # located by candidates, which never had the parallax for a landmark
         path.refine(keyframe.frame, keyframe, keyframe.T_world_camera, inliers, found.information)
     frames, T_world_camera, information = path.frames_on(keyframes)
     if not frames:
