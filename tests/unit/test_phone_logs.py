@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pliant.datasets.measured.csv_log import read_csv
 from pliant.datasets.measured.fix_files import read_fix_table, read_gpx, read_srt
 from pliant.datasets.measured.gyroflow import read_gcsv
 from pliant.datasets.measured.phone_log import is_phone_log, read_phone_log
-from pliant.datasets.measured.readers import video_sensors
+from pliant.datasets.measured.readers import Reader, video_sensors
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError
 
@@ -165,3 +166,48 @@ def test_files_beside_a_video(tmp_path: Path) -> None:
     found = video_sensors(SourceSpec(location=str(tmp_path / "a.mp4")))
     assert len(found.gps.stamps_ns) == 3  # the subtitles: they have the clock of the video
     assert "is no Gyroflow log" in found.imu_notes[0]
+
+
+_TOKENS = [
+    "nan",
+    "inf",
+    "1e999",
+    "1e308",
+    "-",
+    "",
+    '"',
+    ",",
+    ";",
+    "\n",
+    "\0",
+    "9" * 40,
+    "(",
+    "<",
+    "x",
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "reader"),
+    [("a.gcsv", GCSV, read_gcsv), ("a.gpx", GPX, read_gpx), ("a.srt", SRT, read_srt),
+     ("a.csv", "time,gx,gy,gz,ax,ay,az\n" + "0.01,1,2,3,0,9.8,0\n" * 9, read_csv),
+     ("b.csv", "time,lat,lon,alt,accuracy\n" + "1,47,8,400,3\n" * 9, read_fix_table)],
+)  # fmt: skip
+def test_mutated_files_are_read_or_refused(
+    tmp_path: Path, name: str, text: str, reader: Reader
+) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        made = text
+        for _ in range(int(rng.integers(1, 6))):
+            begin = int(rng.integers(len(made)))
+            made = made[:begin] + str(rng.choice(_TOKENS)) + made[begin + int(rng.integers(4)) :]
+        (tmp_path / name).write_text(made)
+        try:
+            found = reader(tmp_path / name)
+        except DatasetError:
+            continue
+        for stamps in (found.imu.stamps_ns, found.gps.stamps_ns):
+            assert np.all(np.diff(stamps) > 0)
+        for values in (found.imu.gyro_rad_s, found.imu.accel_m_s2, found.gps.altitude_m):
+            assert np.isfinite(values).all()

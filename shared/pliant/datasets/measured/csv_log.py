@@ -32,6 +32,8 @@ from pliant.wording import shown
 _STEP_S = 0.005
 """Usual time between two samples."""
 _LOOKED_AT = 1000
+_LATEST, _LARGEST = Decimal(1 << 62), 1e15
+"""Larger numbers measure nothing."""
 _ASL = [
     *("timestamp [ns]", "w_x [rad/s]", "w_y [rad/s]", "w_z [rad/s]"),
     *("a_x [m/s^2]", "a_y [m/s^2]", "a_z [m/s^2]"),
@@ -75,11 +77,10 @@ def read_csv(file: Path) -> Measurements:
     header, rows = table_of(file)
     columns = _columns(header, file)
     wanted = [*columns.gyro, *columns.accel]
-    times, values, unreadable = numbers(rows, columns.time, wanted)
+    times, table, unreadable = numbers(rows, columns.time, wanted)
     if not times:
         raise DatasetError(f"{file}: no line has a time, three angular velocities and three "
                            "accelerations")  # fmt: skip
-    table = np.array(values).reshape(-1, 6)
     accel, note = in_m_s2(table[:, 3:], columns.accel_factor, file)
     gyro = Series(_ns(times, columns.time_unit, file), table[:, :3] * columns.gyro_factor)
     return imu_measurements(
@@ -114,7 +115,7 @@ def read_sensor(file: Path, *, gyro: bool) -> tuple[Series, float | None, int]:
     if not times:
         raise DatasetError(f"{file}: no line has a time, x, y and z")
     factor = gyro_factor(found[1]) if gyro else accel_factor(found[1], header[found[0][0]])
-    return Series(_ns(times, unit, file), np.array(values).reshape(-1, 3)), factor, unreadable
+    return Series(_ns(times, unit, file), values), factor, unreadable
 
 
 def _ns(times: Sequence[Decimal], unit: str, file: Path) -> I64:
@@ -138,22 +139,24 @@ def table_of(file: Path) -> tuple[list[str], list[list[str]]]:
 
 def numbers(
     rows: Sequence[Sequence[str]], time: int, wanted: Sequence[int]
-) -> tuple[list[Decimal], list[list[float]], int]:
-    """Times and values of the lines that have them, and how many have not."""
+) -> tuple[list[Decimal], F64, int]:
+    """Times and values (N, ``wanted``) of the lines that have them, and how many have not."""
     times, values, unreadable = list[Decimal](), list[list[float]](), 0
     for row in rows:
         try:
             at = Decimal(row[time])
             found = [float(row[column]) for column in wanted]
-        except (InvalidOperation, ValueError, IndexError):
-            unreadable += 1
-            continue
-        if not at.is_finite() or abs(at) >= 1 << 62:
+            usable = -_LATEST < at < _LATEST
+        except (InvalidOperation, ValueError, IndexError):  # also of a time that is no number
+            usable = False
+            at, found = Decimal(0), []
+        if not usable:
             unreadable += 1
             continue
         times.append(at)
         values.append(found)
-    return times, values, unreadable
+    table = np.array(values, float).reshape(-1, len(wanted))
+    return times, np.where(np.abs(table) < _LARGEST, table, np.nan), unreadable
 
 
 def stamps_of(

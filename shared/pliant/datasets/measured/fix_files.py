@@ -25,7 +25,7 @@ _STEP_S = 1.0
 _NUMBER = r"\s*[:=]?\s*(-?\d+(?:\.\d+)?)"
 _RADIUS = 1.51
 """Standard deviations within which 68 % of the fixes in a plane lie: what phones give."""
-_CUE = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_CUE = re.compile(r"(\d{1,4}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _LATITUDE = re.compile(rf"latitude{_NUMBER}", re.IGNORECASE)
 _LONGITUDE = re.compile(rf"longt?itude{_NUMBER}", re.IGNORECASE)
 _ALTITUDES = [re.compile(rf"{name}{_NUMBER}") for name in ("abs_alt", "altitude", "rel_alt")]
@@ -104,9 +104,9 @@ def read_fix_table(file: Path) -> Measurements:
     times, read, unreadable = numbers(rows, time, [columns[key] for key in wanted])
     if not times:
         raise DatasetError(f"{file}: no line has a time and a position")
-    found = {key: [row[n] for row in read] for n, key in enumerate(wanted)}
-    unknown = [_NAN] * len(times)
-    across = [radius / _RADIUS for radius in found.get("horizontal", unknown)]
+    found = dict(zip(wanted, read.T, strict=True))
+    unknown = np.full(len(times), np.nan)
+    across = found.get("horizontal", unknown) / _RADIUS
     parts = [found[key] for key in ("latitude", "longitude")]
     parts += [found.get("altitude", unknown), across, across, found.get("vertical", unknown)]
     values = np.array(parts).T.tolist()

@@ -20,6 +20,8 @@ from pliant.datasets.measured.csv_log import in_m_s2, numbers, text_lines
 from pliant.errors import DatasetError
 
 _BEGINNINGS = ("GYROFLOW IMU LOG", "CAMERA IMU LOG")
+_LARGEST = 1e6
+"""Scales turn integers into units of a sensor."""
 _COLUMNS = ("t", "gx", "gy", "gz", "ax", "ay", "az")
 
 
@@ -37,8 +39,7 @@ def read_gcsv(file: Path) -> Measurements:
     said = {row[0].strip(): row[1].strip() for row in rows[1:begin] if len(row) > 1}
     scales = [_scale(said, key, file) for key in ("tscale", "gscale", "ascale")]
     wanted = [header.index(name) for name in _COLUMNS[1:]]
-    times, values, unreadable = numbers(rows[begin + 1 :], header.index("t"), wanted)
-    table = np.array(values).reshape(-1, 6)
+    times, table, unreadable = numbers(rows[begin + 1 :], header.index("t"), wanted)
     stamps = np.clip(np.array(times, float) * scales[0] * 1e9, -(2.0**62), 2.0**62)
     turn = axis_order(said.get("orientation", "XYZ")).T
     gyro = Series(np.rint(stamps).astype(np.int64), table[:, :3] @ turn * scales[1])
@@ -51,6 +52,6 @@ def _scale(said: dict[str, str], key: str, file: Path) -> float:
         scale = float(said.get(key, "1"))
     except ValueError:
         scale = 0.0
-    if not 0.0 < scale < float("inf"):
-        raise DatasetError(f"{file}: {key} is no positive number")
+    if not 0.0 < scale < _LARGEST:
+        raise DatasetError(f"{file}: {key} is no positive number below {_LARGEST:g}")
     return scale
