@@ -180,6 +180,8 @@ def test_a_named_file_replaces_them_or_is_refused(tmp_path: Path) -> None:
     found = found_of(folder, imu=str(own))
     assert len(found.imu.stamps_ns) == 100
     assert found.imu.stamps_ns[0] == BEGIN_NS  # another clock: it begins with the images
+    own = write(tmp_path / "own.csv", ASL, rows(100, begin=BEGIN_NS + 60 * 10**9))
+    assert found_of(folder, imu=str(own)).imu.stamps_ns[0] == BEGIN_NS + 60 * 10**9
     for name, why in (("none.csv", "no such file"), ("mav0/cam0/data.csv", "no columns of")):
         with pytest.raises(DatasetError, match=why):
             found_of(folder, imu=str(folder / name))

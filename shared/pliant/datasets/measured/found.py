@@ -10,8 +10,11 @@ from pliant.datasets.measured.readers import GPS_READERS, IMU_READERS, read_name
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError, PliantError
 
-_NEAR_NS = 3_600 * 10**9
-"""A file that begins or ends within this of the first image has the clock of the images."""
+_FIRST_DATE_NS = 631_152_000 * 10**9
+"""1990: earlier stamps count from elsewhere."""
+_NEAR_DATES_NS, _NEAR_NS = 3_600 * 10**9, 10 * 10**9
+"""Samples have the clock of the images if the first image is this near to one of them: two clocks
+that both begin with zero, or with their device, are soon alike by chance."""
 
 
 def measurements_of(spec: SourceSpec, dataset: Dataset) -> Measurements:
@@ -60,5 +63,6 @@ def _on_clock(found: Measurements, stamps_ns: I64, dataset: Dataset) -> Measurem
     if image is None:
         return found
     first, last = int(stamps_ns[0]), int(stamps_ns[-1])
-    near = first - _NEAR_NS <= image.stamp_ns <= last + _NEAR_NS
+    near_ns = _NEAR_DATES_NS if image.stamp_ns >= _FIRST_DATE_NS else _NEAR_NS
+    near = first - near_ns <= image.stamp_ns <= last + near_ns
     return found if near else found.later(image.stamp_ns - first)
