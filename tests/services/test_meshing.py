@@ -23,6 +23,7 @@ from meshing_scene import (
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.image.masks import packed
 from pliant.algorithms.meshing.mesh_blocks import BlockMesh
+from pliant.algorithms.meshing.parameters import MeshingParameters
 from pliant.algorithms.meshing.rendering import DrawnTriangles
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import load_config
@@ -128,9 +129,19 @@ def test_what_no_keyframe_has_a_surface_of_is_filled_faintly() -> None:
     assert found[0] > 1.06 * found[1]  # 1.02 by what is seen faintly
 
 
+def test_the_final_surface_has_its_own_weight_of_slopes() -> None:
+    dense, points = (MeshingParameters(depth=depth) for depth in ("dense", "points"))
+    assert points.final_surface == points.surface
+    expected = points.surface.nltgv.dense_slope_weight
+    assert dense.final_surface.nltgv.slope_weight == expected
+    assert expected < points.final_surface.nltgv.slope_weight
+    assert dense.final_surface.triangles == dense.surface.triangles
+
+
 def test_without_texture_the_mesh_is_that_of_the_points() -> None:
     points = run(inputs(), settings=["meshing.depth=points"])
-    dense = run(inputs(), settings=["meshing.finish=false"])
+    same = "meshing.surface.nltgv.dense_slope_weight=3"
+    dense = run(inputs(), settings=["meshing.finish=false", same])
     for level in ("fine", "coarse"):
         assert codec.encode(final(points, level)) == codec.encode(final(dense, level))
 

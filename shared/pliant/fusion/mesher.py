@@ -212,7 +212,7 @@ class Mesher:
     def finish(self, *, timer: StageTimer = no_stages) -> Iterator[FinalMesh]:
         """The meshes of every segment, fine and coarse, from the map as it is now."""
         self.note, self._live = "", None
-        self._surfaces = KeyframeSurfaces(self._camera, self._parameters.surface)
+        self._surfaces = KeyframeSurfaces(self._camera, self._parameters.final_surface)
         by_segment: dict[int, list[int]] = {}
         for keyframe in self._spool.keyframes():
             by_segment.setdefault(self._map.keyframes[keyframe].segment, []).append(keyframe)

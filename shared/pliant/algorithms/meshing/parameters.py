@@ -16,6 +16,13 @@ class NltgvParameters(Parameters):
     slope_weight: float = Field(
         default=3.0, gt=0.0, description="Weight of slope changes relative to depth changes."
     )
+    dense_slope_weight: float = Field(
+        default=1.5,
+        gt=0.0,
+        description=(
+            "The same for the final mesh with meshing.depth=dense.  Lower: creases stay sharper."
+        ),
+    )
     huber_sigmas: float = Field(
         default=1.0,
         ge=0.0,
@@ -193,3 +200,12 @@ class MeshingParameters(Parameters):
     )
     surface: SurfaceParameters = SurfaceParameters()
     tsdf: TsdfParameters = TsdfParameters()
+
+    @property
+    def final_surface(self) -> SurfaceParameters:
+        """The surface of the final mesh."""
+        if self.depth == "points":
+            return self.surface
+        nltgv = self.surface.nltgv
+        nltgv = nltgv.model_copy(update={"slope_weight": nltgv.dense_slope_weight})
+        return self.surface.model_copy(update={"nltgv": nltgv})
