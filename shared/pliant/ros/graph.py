@@ -16,8 +16,6 @@ import zenoh
 
 from pliant.ros.definitions import RosError, type_hash
 
-DEFAULT_ROUTER = "tcp/localhost:7447"
-"""Where rmw_zenoh's router listens."""
 _SPACE = "@ros2_lv"
 _NODE_ID, _FIRST_ENTITY = 0, 1
 _DEPTH = 10

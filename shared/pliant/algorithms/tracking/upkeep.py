@@ -22,9 +22,6 @@ from pliant.compiler.kernel import fast_kernel
 BINS = 2048
 """Bins of |kappa|, eight to the octave: the upper bits of its float32."""
 
-MAX_REACH = 31
-"""Pixels: a row of a square of bits fits into one word."""
-
 
 class BirthLimits(NamedTuple):
     """Where new tracks start: see the fields of TrackingParameters."""
@@ -213,7 +210,10 @@ def set_bit(bits: NDArray[np.uint64], at: int) -> None:
 def set_square(
     bits: NDArray[np.uint64], x: int, y: int, reach: int, height: int, width: int
 ) -> None:
-    """Set the pixels of the image within ``reach`` (<= MAX_REACH) of (x, y) in both directions."""
+    """Set the pixels of the image within ``reach`` of (x, y) in both directions.
+
+    reach: at most 31 px, so that a row of bits fits into one word.
+    """
     first, last = max(x - reach, 0), min(x + reach, width - 1)
     row_bits = (np.uint64(2) << np.uint64(last - first)) - np.uint64(1)
     for row in range(max(y - reach, 0), min(y + reach, height - 1) + 1):
