@@ -1,4 +1,4 @@
-"""``pliant scale``: a result in metres, by a known length in the scene."""
+"""``pliant scale``: a result in metres, by a known length in the scene or inertial samples."""
 
 from pathlib import Path
 from typing import Annotated
@@ -45,6 +45,14 @@ def scale(
     gps: Annotated[
         bool, typer.Option("--gps", help="Satellite fixes that came with the source of the run.")
     ] = False,
+    imu: Annotated[
+        str | None,
+        typer.Option(
+            "--imu",
+            metavar="FILE",
+            help="Inertial samples, whose clock may differ; `recorded`: those of the run's source.",
+        ),
+    ] = None,
 ) -> None:
     """Make a result metric: its files, its later exports, and runs that extend its map.
 
@@ -57,9 +65,12 @@ def scale(
     pliant scale results/desk --depth path/to/desk
 
     pliant scale results/flight --gps
+
+    pliant scale results/desk --imu gyro_accel.csv
     """
     from pliant.scale.command import Known, scale_result
 
     a_b = None if points is None else (_point(points[0]), _point(points[1]), points[2])
-    for line in scale_result(result, Known(points=a_b, marker=marker, depth=depth, gps=gps)):
+    known = Known(points=a_b, marker=marker, depth=depth, gps=gps, imu=imu)
+    for line in scale_result(result, known):
         typer.echo(line)

@@ -218,6 +218,7 @@ def _stream(
         cx=camera.cx,
         cy=camera.cy,
         scale_is_metric=known is not None and known.header.metric,
+        z_is_up=known is not None and known.header.level,
         focal_sigma=dataset.calibration.focal_sigma,
         source_width=size[0],
         source_height=size[1],

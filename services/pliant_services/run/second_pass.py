@@ -34,12 +34,12 @@ from pliant.messages.types import (
     MapUpdate,
     StreamEnd,
 )
-from pliant.recording.map_file import MapFile
 from pliant.recording.reader import Recording
 from pliant.recording.summary import summarise
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import CONFIG_NAME, RECORDING_NAME, REPORT_NAME, replace_by
 from pliant.results.judgement import BAD, DOUBTFUL, GOOD
+from pliant.results.known_scale import UNSCALED
 from pliant.results.run import Run, known_keyframes, read_run
 from pliant.results.write import write_rigid_results
 from pliant.staging import staging
@@ -62,7 +62,8 @@ def second_pass(output: Path, request: RunRequest, code: int) -> int:
     code: of the first pass.
     """
     try:
-        run = read_run(output / RECORDING_NAME)
+        # In the unit of the recording, to which the second pass adds: not in metres.
+        run = read_run(output / RECORDING_NAME, UNSCALED)
         stretches, why = what_is_lost(run)
         if why:
             _say(why)
@@ -137,9 +138,13 @@ def _messages(
 ) -> dict[Topic, list[Header]]:
     """The last messages of the map, of both passes."""
     dataset = open_source(request.source, config.ingest)
-    known: list[KeptKeyframe] = list(MapFile(output).keyframes())
-    reached = reach_back(dataset, config, known, stretches, run.history)
     recording = Recording(output / RECORDING_NAME)
+    known: list[KeptKeyframe] = [
+        keyframe
+        for keyframe in recording.decoded(topics.MAP_KEPT)
+        if isinstance(keyframe, MapKeyframe)
+    ]
+    reached = reach_back(dataset, config, known, stretches, run.history)
     (final,) = recording.decoded(topics.MAP_FINAL)
     (rest,) = recording.decoded(topics.KEYFRAME_FINAL)
     assert isinstance(final, MapUpdate)

@@ -66,6 +66,7 @@ class CameraStream(Header):
     calibration: the source's, as YAML, from which the rectified image can be made again.
     width, height, fx, fy, cx, cy: the rectified pinhole camera, in pixels.
     scale_is_metric: whether lengths are metres, as those of a map are whose scale was measured.
+    z_is_up: whether the z axis of the map points against gravity, as inertial samples measured it.
     focal_sigma: standard deviation of the log focal length where it is a guess; 0: calibrated.
     source_width, source_height: of the images before they were made smaller; 0: as they are.
     """
@@ -84,6 +85,7 @@ class CameraStream(Header):
     focal_sigma: float = 0.0
     source_width: int = 0
     source_height: int = 0
+    z_is_up: bool = False
 
     @property
     def camera(self) -> PinholeCamera:

@@ -1,9 +1,9 @@
 """The file of a saved map, ``map.pliant``: MCAP, one message for each keyframe.
 
 A metadata record ``map`` stands first: ``version`` of what the fields mean, ``release`` of Pliant,
-``source`` of the last session and its ``calibration`` as YAML, and whether its lengths are
-``metric``.  The messages are those of the topic ``map/kept``, in the order of their keyframes.
-Nothing in it depends on the time or the machine.
+``source`` of the last session and its ``calibration`` as YAML, whether its lengths are ``metric``
+and whether its z axis is up (``level``).  The messages are those of the topic ``map/kept``, in the
+order of their keyframes.  Nothing in it depends on the time or the machine.
 """
 
 import re
@@ -38,6 +38,7 @@ class MapHeader:
     source: str = ""
     calibration: str = ""
     metric: bool = False
+    level: bool = False
 
 
 class MapFile:
@@ -62,6 +63,7 @@ class MapFile:
             source=found.get("source", ""),
             calibration=found.get("calibration", ""),
             metric=found.get("metric") == str(True),
+            level=found.get("level") == str(True),
         )
         if self.header.version > MAP_VERSION:
             raise MapError(
@@ -141,7 +143,8 @@ def describe(path: Path) -> Iterator[str]:
     header = file.header
     yield f"{file.path}: version {header.version}, written by pliant {shortened(header.release)}"
     yield f"sessions: {len(sessions)}, the last of {shortened(header.source, 200)}"
-    yield f"scale: {'metres' if header.metric else 'arbitrary'}"
+    level = ", z is up" if header.level else ""
+    yield f"scale: {'metres' if header.metric else 'arbitrary'}{level}"
     yield f"cameras: {'; '.join(sorted(cameras))}"
     yield (
         f"{counted(count, 'keyframe')}, {places} of them places, {size / 1e6:.1f} MB, "

@@ -44,6 +44,7 @@ def merge_maps(first: Path, second: Path, output: Path, *, force: bool) -> Itera
         source=files[1].header.source,
         calibration=first_header.calibration,
         metric=first_header.metric,
+        level=first_header.level,
     )
     try:
         make_folder(output.parent)

@@ -87,6 +87,9 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "inliers_per_frame": [run.inliers[f] for f in sorted(run.inliers)],
         "map_points_per_frame": [run.map_points[f] for f in sorted(run.map_points)],
         "scale_is_metric": run.scale_is_metric,
+        "z_is_up": run.z_is_up,
+        "scale": None if run.scale is None else run.scale.content(),
+        "inertial_refusal": run.inertial_refusal,
     }
 
 

@@ -29,7 +29,7 @@ from pliant.results.known_scale import MetricRecording, Scale
 
 _LEFT_ALONE = (
     *(topics.SOURCE, topics.DEPTH, topics.KEYFRAME, topics.KEYFRAME_FINAL, topics.MESH_BLOCKS),
-    topics.CLIP,
+    *(topics.CLIP, topics.IMU, topics.GPS),
     topics.MAP_KEPT,  # it becomes a file of its own
     topics.MAP_KNOWN,  # see known_keyframes
     topics.SURFELS,  # see surfels.py
@@ -63,6 +63,8 @@ class Run:
     recorded: Summary = field(default_factory=Summary)
     known_segments: set[int] = field(default_factory=set[int])
     scale: Scale | None = None
+    inertial_refusal: str = ""
+    """Why inertial samples say nothing of the scale."""
 
     def correction_of(self, segment: int) -> tuple[float, ...]:
         """What its last adjustment found wrong with the calibration; () where it had none."""
@@ -99,6 +101,11 @@ class Run:
         if self.stream is None or not self.stream.scale_is_metric:
             return False
         return self.scale is not None or self.history.longest_segment() in self.known_segments
+
+    @property
+    def z_is_up(self) -> bool:
+        """Whether z points against gravity: measured, or in a known map."""
+        return self.scale_is_metric and self.stream is not None and self.stream.z_is_up
 
     @property
     def frames_per_second(self) -> float:

@@ -44,6 +44,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         for mesh in report["mesh"]
         if mesh["level"] == "fine"
     ]
+    lines += _told_of_scale(report)
     lens = report.get("calibration_verdict")
     lines += [lens] if lens and lens != report["verdict_reason"] else []
     lines += _faults(report)
@@ -82,6 +83,17 @@ def _told_of_map(report: dict[str, Any]) -> list[str]:
         f"{counted(known['frames_in_it'], 'frame')} ({share:.1%}) in {there}, recognised after "
         f"{counted(known['looked'], 'frame')}"
     ]
+
+
+def _told_of_scale(report: dict[str, Any]) -> list[str]:
+    """What inertial samples or a measured length say of the unit."""
+    scale = report.get("scale")
+    if scale is not None:
+        level = scale.get("level")
+        up = "" if level is None else f", z is up (+- {level['sigma_deg']:.2f} degrees)"
+        return [f"in metres by {scale['source']}: scale +- {scale['sigma']:.1%}{up}"]
+    refusal = report.get("inertial_refusal")
+    return [f"inertial samples not used: {refusal}"] if refusal else []
 
 
 def _dropped_parts(counters: Mapping[str, float]) -> list[str]:

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.datasets.calibration import calibration_yaml
 from pliant.formats.ply import write_ply
 from pliant.formats.tum import write_tum
 from pliant.messages import topics
 from pliant.messages.types import MapKeyframe
 from pliant.recording.map_file import MAP_NAME, MapHeader, write_map
+from pliant.recording.measured import imu_of
 from pliant.recording.reader import Recording
 from pliant.results.calibration import found_calibration
 from pliant.results.folder import (
@@ -23,6 +25,7 @@ from pliant.results.folder import (
     SCALE_NAME,
     all_or_none,
 )
+from pliant.results.inertial import by_samples
 from pliant.results.known_scale import MetricRecording, Scale
 from pliant.results.mesh_files import write_meshes
 from pliant.results.page.rigid_page import clip_of_keyframes, drawn_map, write_page
@@ -40,11 +43,18 @@ def write_results(output: Path) -> dict[str, Any]:
 def write_rigid_results(output: Path, scale: Scale | None = None) -> dict[str, Any]:
     """Write trajectories, keyframes, points and report beside the recording; returns the report.
 
-    scale: None: that of the folder, if there is one; otherwise it is one of the files then.
+    scale: None: that of the folder, or else what inertial samples of the source say, if it is
+    known; otherwise it is one of the files then.
     All of them, or none where the disk is full.  Raises RecordingError and ResultError.
     """
     recording = MetricRecording(output / RECORDING_NAME, scale)
     run = read_run(recording.path, scale)
+    samples = ImuSamples.empty() if run.scale_is_metric else imu_of(recording)
+    if len(samples.stamps_ns):
+        found = by_samples(run.history, samples)
+        if isinstance(found, Scale):
+            return write_rigid_results(output, found)
+        run.inertial_refusal = found
     final = run.history.final()
     # What takes the longest, on other cores.  They write nothing: an interruption waits for them.
     with ThreadPoolExecutor() as others, all_or_none(output) as folder:
@@ -67,7 +77,10 @@ def _write_map(folder: Path, recording: Recording, run: Run) -> None:
     if stream is None:
         return
     header = MapHeader(
-        source=stream.source, calibration=stream.calibration, metric=run.scale_is_metric
+        source=stream.source,
+        calibration=stream.calibration,
+        metric=run.scale_is_metric,
+        level=run.z_is_up,
     )
     kept = (k for k in recording.decoded(topics.MAP_KEPT) if isinstance(k, MapKeyframe))
     write_map(folder / MAP_NAME, header, kept)
@@ -96,7 +109,14 @@ def _write_files(folder: Path, run: Run, final: dict[int, Any], report: dict[str
         )
     calibration = found_calibration(run)
     if calibration is not None:
-        text = calibration_yaml(calibration)
+        text = calibration_yaml(calibration) + _scale_comment(run)
         (folder / CALIBRATION_NAME).write_text(text, encoding="utf-8")
     text = json.dumps(report, indent=1) + "\n"
     (folder / REPORT_NAME).write_text(text, encoding="utf-8")
+
+
+def _scale_comment(run: Run) -> str:
+    """For people: a camera has no scale, so readers of a calibration take no notice."""
+    if run.scale is None:
+        return ""
+    return f"# the map of this result is in metres: scale +- {run.scale.sigma:.2%}\n"

@@ -33,6 +33,10 @@ class Canvas(Protocol):
         """
         ...
 
+    def level(self) -> None:
+        """The z axes of all worlds are up; else a camera that began one saw it upright."""
+        ...
+
     def image(self, at: Moment, data: bytes, encoding: str) -> None:
         """A rectified image as the bytes of a file, "jpeg" or "png"."""
         ...

@@ -116,6 +116,8 @@ class Scene:
             self._rectifier = Rectifier(calibration_from_yaml(stream.calibration))
             self._camera = stream.camera
             self._canvas.camera(at, stream.camera)
+            if stream.z_is_up:
+                self._canvas.level()
             self._surfels.camera = stream.camera
 
     def _draw_image(self, at: Moment, frame: SourceFrame) -> None:

@@ -38,6 +38,8 @@ _THIS_ENTITY, _ALL_ENTITIES = 0, 1  # foxglove.SceneEntityDeletion.Type, of the 
 _ENTITY_FACES = 50_000
 Z_UP_XYZW = (-0.5, 0.5, -0.5, 0.5)
 """Rotation of R_map_world: the first camera looks along x of the map, whose z is up (REP-103)."""
+LEVEL_XYZW = (0.0, 0.0, 0.0, 1.0)
+"""As this, of a world whose z is up."""
 
 
 def world_name(segment: int) -> str:
@@ -58,6 +60,7 @@ class FoxgloveFile:
         self._sequences: dict[str, int] = {}
         self._camera: PinholeCamera | None = None
         self._lens = (0.0, 0.0)
+        self._turned_xyzw = Z_UP_XYZW
         self._parts: dict[str, int] = {}
         self._kind("PointCloud")  # said now, before a file is there
         try:
@@ -88,6 +91,10 @@ class FoxgloveFile:
         if is_correction:
             self._write_calibration(at)
 
+    def level(self) -> None:
+        """The worlds are turned as the map is."""
+        self._turned_xyzw = LEVEL_XYZW
+
     def image(self, at: Moment, data: bytes, encoding: str) -> None:
         """The image and its calibration."""
         image = self._kind("CompressedImage")(frame_id="camera", data=data, format=encoding)
@@ -109,7 +116,8 @@ class FoxgloveFile:
         """The two transforms that place the camera."""
         both = self._kind("FrameTransforms")()
         world = world_name(segment)
-        poses = (("map", world, (0.0, 0.0, 0.0, *Z_UP_XYZW)), (world, "camera", pose_world_camera))
+        turned = (0.0, 0.0, 0.0, *self._turned_xyzw)
+        poses = (("map", world, turned), (world, "camera", pose_world_camera))
         for parent, child, pose in poses:
             transform = both.transforms.add(parent_frame_id=parent, child_frame_id=child)
             transform.timestamp.FromNanoseconds(at.stamp_ns)

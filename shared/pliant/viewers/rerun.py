@@ -30,7 +30,7 @@ from pliant.errors import ResultError
 from pliant.pictures.map import PLACES_COLOUR
 from pliant.viewers.age_colours import track_colours
 from pliant.viewers.canvas import Moment
-from pliant.viewers.foxglove import Z_UP_XYZW, world_name
+from pliant.viewers.foxglove import LEVEL_XYZW, Z_UP_XYZW, world_name
 from pliant.viewers.point_blocks import PointBlocks
 from pliant.viewers.rerun_data import RerunData
 from pliant.viewers.rerun_page import RerunPage
@@ -53,7 +53,6 @@ _LAYOUT = "pliant-2"
 """Rerun keeps a user's layout by this name: to be counted up when entities or views change."""
 _CAMERA = "map/camera"
 _IMAGE = f"{_CAMERA}/image"
-_T_MAP_WORLD = pose_to_matrix(np.array([0.0, 0.0, 0.0, *Z_UP_XYZW]))
 
 
 def load_rerun() -> Any:
@@ -84,6 +83,7 @@ class RerunCanvas:
         self._data: RerunData | None = None
         self._stream: Any = rr.RecordingStream(_LAYOUT, recording_id=name)
         self._segment = 0
+        self._turned_xyzw = Z_UP_XYZW
         self._is_window = False
         self._curves: set[str] = set()
         self._services: dict[str, int] = {}
@@ -172,6 +172,10 @@ class RerunCanvas:
         )
         self._log_for_good(_IMAGE, pinhole)
 
+    def level(self) -> None:
+        """The worlds are turned as the map is."""
+        self._turned_xyzw = LEVEL_XYZW
+
     def image(self, at: Moment, data: bytes, encoding: str) -> None:
         """The image as it is encoded."""
         image = self._rr.EncodedImage(contents=data, media_type=f"image/{encoding}")
@@ -186,7 +190,8 @@ class RerunCanvas:
         """Where the camera is."""
         if segment != self._segment:
             self._place_world(segment)
-        pose = matrix_to_pose(_T_MAP_WORLD @ pose_to_matrix(pose_world_camera))
+        T_map_world = pose_to_matrix(np.array([0.0, 0.0, 0.0, *self._turned_xyzw]))
+        pose = matrix_to_pose(T_map_world @ pose_to_matrix(pose_world_camera))
         placed = self._rr.Transform3D(
             translation=pose[:3], quaternion=self._rr.Quaternion(xyzw=pose[3:])
         )
@@ -249,7 +254,7 @@ class RerunCanvas:
 
     def _place_world(self, segment: int) -> None:
         self._segment = segment
-        turned = self._rr.Transform3D(quaternion=self._rr.Quaternion(xyzw=Z_UP_XYZW))
+        turned = self._rr.Transform3D(quaternion=self._rr.Quaternion(xyzw=self._turned_xyzw))
         self._log_for_good("map", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._log_for_good(_world(segment), turned)
 

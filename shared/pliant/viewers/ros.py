@@ -26,12 +26,12 @@ from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.ros.definitions import header, made, serialised
 from pliant.ros.graph import Node, Publisher, RosTopic
 from pliant.viewers.canvas import Moment
-from pliant.viewers.foxglove import Z_UP_XYZW, world_name
+from pliant.viewers.foxglove import LEVEL_XYZW, Z_UP_XYZW, world_name
 from pliant.viewers.point_blocks import PointBlocks
 from pliant.viewers.surfel_quads import SurfelPicture
 
 MAP, OPTICAL, LINK = "map", "camera_optical_frame", "camera_link"
-_UP = np.array([0.0, 0.0, 0.0, *Z_UP_XYZW])  # the pose of a world in map
+_UP = np.array([0.0, 0.0, 0.0, *Z_UP_XYZW])  # the pose in map of a world that a camera began
 _FLOAT32 = 7  # sensor_msgs/msg/PointField
 _TRIANGLE_LIST, _ADD, _DELETE, _DELETE_ALL = 11, 0, 2, 3  # visualization_msgs/msg/Marker
 _ROW = np.dtype([("xyz", "<f4", 3), ("bgr0", "u1", 4)])
@@ -53,6 +53,7 @@ class RosCanvas:
         """name: what all topics but /tf begin with, such as /pliant."""
         self._camera: PinholeCamera | None = None
         self._lens = (0.0, 0.0)
+        self._world = _UP
         self._ids: dict[str, int] = {}
         self._kept: defaultdict[str, dict[str, Make]] = defaultdict(dict)
         self._came: set[str] = set()
@@ -80,6 +81,10 @@ class RosCanvas:
         """Keep the camera: it goes with every image."""
         self._camera, self._lens = camera, lens
 
+    def level(self) -> None:
+        """The worlds are turned as the map is."""
+        self._world = np.array([0.0, 0.0, 0.0, *LEVEL_XYZW])
+
     def image(self, at: Moment, data: bytes, encoding: str) -> None:
         """The image and its camera."""
         self._tell("image", partial(_image, at, data, encoding))
@@ -93,11 +98,11 @@ class RosCanvas:
     def pose(self, at: Moment, segment: int, pose_world_camera: F64) -> None:
         """The transforms that place the camera, and its pose."""
         world = world_name(segment)
-        frames = ((MAP, world, _UP), (world, OPTICAL, pose_world_camera))
+        frames = ((MAP, world, self._world), (world, OPTICAL, pose_world_camera))
         frames = (*frames, (OPTICAL, LINK, matrix_to_pose(inverse(pose_to_matrix(_UP)))))
         self._tell("tf", partial(_transforms, at, frames))
-        T_map_world = pose_to_matrix(_UP)
-        T_map_link = T_map_world @ pose_to_matrix(pose_world_camera) @ inverse(T_map_world)
+        T_map_optical = pose_to_matrix(self._world) @ pose_to_matrix(pose_world_camera)
+        T_map_link = T_map_optical @ inverse(pose_to_matrix(_UP))
         pose = _pose(matrix_to_pose(T_map_link))
         kind = "geometry_msgs/msg/PoseStamped"
         stamped = made(kind, header=header(at.stamp_ns, MAP), pose=pose)

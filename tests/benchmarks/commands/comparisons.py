@@ -126,3 +126,27 @@ def drone_flights(
     from benchmarks.drone_flights import measure
 
     show(measure(motions, only=only or [], frames=frames, overrides=overrides or []))
+
+
+@app.command()
+def inertial(
+    motions: Annotated[
+        Path | None, typer.Argument(help="Folder of TUM files: EuRoC's true motions.")
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Names of motions; may be repeated.")
+    ] = None,
+    runs: Annotated[
+        list[str] | None,
+        typer.Option("--run", help="Motions and built-in scenes to estimate; may be repeated."),
+    ] = None,
+    frames: Annotated[int, typer.Option(min=100, help="First frames of motions to run.")] = 600,
+    seeds: Annotated[int, typer.Option(min=1, help="Sensors and noises of each motion.")] = 4,
+) -> None:
+    """Scale, vertical, offset and rotation from inertial samples, and what wrong ones come to.
+
+    scripts/bench inertial euroc_gt_leftcam --run tabletop --run V102
+    """
+    from benchmarks.inertial import measure
+
+    show(measure(motions, only=only or [], runs=runs or [], frames=frames, seeds=seeds))

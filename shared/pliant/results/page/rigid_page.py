@@ -162,8 +162,18 @@ def _figures(run: Run, report: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("estimated field of view", f"{found:.1f} degrees"))
         if abs(correction["readout"]) > _SOME_READOUT:
             rows.append(("rolling shutter", f"{correction['readout']:.0%} of the frame interval"))
-    rows.append(("scale", "metres" if report["scale_is_metric"] else "unknown (monocular)"))
+    rows.append(("scale", _scale(run, report)))
+    if report["z_is_up"]:
+        rows.append(("vertical", "z is up"))
     return rows
+
+
+def _scale(run: Run, report: dict[str, Any]) -> str:
+    if not report["scale_is_metric"]:
+        return "unknown (monocular)"
+    if run.scale is None or run.scale.sigma < 0.001:
+        return "metres"
+    return f"metres, +- {run.scale.sigma:.1%}"
 
 
 def _fov_deg(width: int, fx: float) -> float:

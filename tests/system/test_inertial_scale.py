@@ -1,0 +1,119 @@
+"""A source with inertial samples: its result is in metres and level, or as it was."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from inertial_motion import PHONE, Motion, samples_of
+from running import NO_MESH, assert_one_line, digests, in_this_process, pliant
+
+from pliant.algorithms.geometry import align_umeyama, so3_exp
+from pliant.algorithms.inertial.samples import ImuSamples
+from pliant.datasets.builtin import builtin_folder
+from pliant.formats.ply import read_ply
+from pliant.formats.tum import read_tum
+from pliant.recording.map_file import MapFile
+from pliant.results.known_scale import UNSCALED
+from pliant.results.run import read_run
+
+pytestmark = pytest.mark.system
+
+SOURCE = "built-in:tabletop?width=320"
+UNITS = (("w", "rad/s"), ("a", "m/s^2"))
+COLUMNS = [(f"{name}_{axis}", unit) for name, unit in UNITS for axis in "xyz"]
+
+
+@pytest.fixture(scope="module")
+def samples() -> ImuSamples:
+    truth = read_tum(builtin_folder(SOURCE) / "groundtruth.txt")
+    motion = Motion(truth.stamps_ns, truth.T_world_camera)
+    return samples_of(
+        motion, PHONE, np.random.default_rng(1), R_camera_imu=so3_exp(np.array([0.4, 1.0, 2.0])),
+        p_camera_imu=np.array([0.02, -0.01, 0.03]), offset_s=0.08,
+    )  # fmt: skip
+
+
+def write_csv(path: Path, samples: ImuSamples) -> Path:
+    lines = [
+        "timestamp [ns],w_x [rad/s],w_y [rad/s],w_z [rad/s],a_x [m/s^2],a_y [m/s^2],a_z [m/s^2]"
+    ]
+    rows = np.column_stack([samples.gyro_rad_s, samples.accel_m_s2]).tolist()
+    for stamp, row in zip(samples.stamps_ns.tolist(), rows, strict=True):
+        lines.append(",".join([str(stamp), *map(repr, row)]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def metric(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("metric")
+    imu = write_csv(folder / "imu.csv", samples)
+    done = pliant("run", SOURCE, "--imu", imu, *NO_MESH, "--output", folder / "result")
+    assert done.returncode == 0, done.stderr
+    assert "in metres by inertial samples of 8 s" in done.stdout
+    return folder / "result"
+
+
+@pytest.fixture(scope="module")
+def refused(samples: ImuSamples, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With axes that are not those of a sensor."""
+    folder = tmp_path_factory.mktemp("refused")
+    mirrored = ImuSamples(
+        stamps_ns=samples.stamps_ns,
+        gyro_rad_s=samples.gyro_rad_s[:, [1, 0, 2]],
+        accel_m_s2=samples.accel_m_s2[:, [1, 0, 2]],
+    )
+    imu = write_csv(folder / "imu.csv", mirrored)
+    done = pliant("run", SOURCE, "--imu", imu, *NO_MESH, "--output", folder / "result")
+    assert done.returncode == 0, done.stderr
+    assert "inertial samples not used: the axes of the gyro are left-handed" in done.stdout
+    return folder / "result"
+
+
+def test_the_result_is_in_metres_and_level(metric: Path) -> None:
+    report = json.loads((metric / "report.json").read_text())
+    assert report["scale_is_metric"]
+    assert report["z_is_up"]
+    found, truth = (
+        read_tum(metric / "trajectory.txt"),
+        read_tum(builtin_folder(SOURCE) / "groundtruth.txt"),
+    )
+    rows = np.searchsorted(truth.stamps_ns, found.stamps_ns)
+    scale, R, t = align_umeyama(found.positions, truth.positions[rows], with_scale=True)
+    assert abs(scale - 1.0) < 3.0 * report["scale"]["sigma"] < 0.04
+    assert np.degrees(np.arccos(R[2, 2])) < 0.3
+    turned = R @ found.T_world_camera[:, :3, :3]
+    assert np.abs(turned - truth.T_world_camera[rows, :3, :3]).max() < 0.01
+    points = scale * read_ply(metric / "points.ply").points @ R.T + t
+    surface = read_ply(builtin_folder(SOURCE) / "surface.ply").points
+    low, high = np.percentile(points, (2.0, 98.0), axis=0)
+    assert (low > surface.min(axis=0) - 0.1).all()
+    assert (high < surface.max(axis=0) + 0.1).all()
+    assert MapFile(metric).header.level
+    assert "<th>vertical</th><td>z is up</td>" in (metric / "report.html").read_text()
+    assert "in metres: scale +- " in (metric / "calibration.yaml").read_text()
+
+
+def test_a_refusal_leaves_the_result_as_it_is(metric: Path, refused: Path) -> None:
+    report = json.loads((refused / "report.json").read_text())
+    assert not report["scale_is_metric"]
+    assert report["scale"] is None
+    assert report["inertial_refusal"].startswith("the axes of the gyro are left-handed")
+    assert not (refused / "scale.yaml").exists()
+    before = read_run(metric / "recording.mcap", UNSCALED).history
+    after = read_run(refused / "recording.mcap").history
+    assert before.final().keys() == after.final().keys()
+    for (_, a), (_, b) in zip(before.final().values(), after.final().values(), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_samples_of_a_file_come_later(refused: Path, metric: Path) -> None:
+    before = digests(refused)
+    done = in_this_process("scale", refused, "--imu", "recorded")
+    assert_one_line(done, "the axes of the gyro are left-handed")
+    assert digests(refused) == before
+    done = in_this_process("scale", refused, "--imu", metric.parent / "imu.csv")
+    assert done.returncode == 0, done.stderr
+    assert "and z is up" in done.stdout
+    assert digests(refused) == digests(metric)
