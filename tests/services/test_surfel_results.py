@@ -1,9 +1,14 @@
-"""What the results of a deforming scene say follows from the configuration that was recorded."""
+"""Results and exports of a deforming scene, from a recording that no process has written."""
 
+import json
+import struct
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from pliant.algorithms.surfels.surface import surface_of
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import config_yaml, load_config
 from pliant.datasets import open_source
@@ -14,6 +19,7 @@ from pliant.export.kinds import OF_STILL_SCENES
 from pliant.messages import codec, topics
 from pliant.recording.writer import RecordingWriter
 from pliant.results.folder import RECORDING_NAME, run_metadata
+from pliant.results.surfels import recorded_surfels
 from pliant.results.write import write_results
 from pliant_services.nodes import ingest, surfels
 from pliant_services.runtime.monitor import SilentMonitor
@@ -21,12 +27,8 @@ from pliant_services.runtime.monitor import SilentMonitor
 FRAMES = 5
 
 
-@pytest.mark.parametrize(
-    ("depth_from", "verdict", "is_metric"), [("sensor", "good", True), ("flat", "doubtful", False)]
-)
-def test_depth_that_was_made_up_is_doubtful_and_not_in_metres(
-    depth_from: str, verdict: str, is_metric: bool, tmp_path: Path
-) -> None:
+def record(folder: Path, depth_from: str) -> None:
+    """A recording of a short run without images, from depth maps or without any."""
     settings = ["surfels.max_surfels=60", "surfels.camera=moving"]
     config = load_config(None, [*settings, f"surfels.depth_from={depth_from}"])
     source = ReplayBus({})
@@ -36,7 +38,7 @@ def test_depth_that_was_made_up_is_doubtful_and_not_in_metres(
     inputs = (topics.STREAM, topics.IMAGE, topics.DEPTH)
     followed = ReplayBus({topic: source.outputs[topic] for topic in inputs})
     surfels.run(followed, config, SilentMonitor())
-    with RecordingWriter(tmp_path / RECORDING_NAME, run_metadata(config_yaml(config))) as writer:
+    with RecordingWriter(folder / RECORDING_NAME, run_metadata(config_yaml(config))) as writer:
         for topic, messages in (
             (topics.STREAM, source.outputs[topics.STREAM]),
             (topics.SURFELS, followed.outputs[topics.SURFELS]),
@@ -44,8 +46,136 @@ def test_depth_that_was_made_up_is_doubtful_and_not_in_metres(
             for n, message in enumerate(messages):
                 data = codec.encode(message)
                 writer.write(topic, data, sequence=n, log_time_ns=n, publish_time_ns=n)
+
+
+@pytest.mark.parametrize(
+    ("depth_from", "verdict", "is_metric"), [("sensor", "good", True), ("flat", "doubtful", False)]
+)
+def test_depth_that_was_made_up_is_doubtful_and_not_in_metres(
+    depth_from: str, verdict: str, is_metric: bool, tmp_path: Path
+) -> None:
+    record(tmp_path, depth_from)
     report = write_results(tmp_path)
     assert (report["verdict"], report["scale_is_metric"]) == (verdict, is_metric)
     for kind in OF_STILL_SCENES:
         with pytest.raises(ResultError, match=f"^--to {kind} needs the map .* use --to surface"):
             export_result(tmp_path, kind, None, force=False)
+    with np.load(export_result(tmp_path, "tracks", None) / "tracks.npz") as tracks:
+        assert tracks["unit"].tolist() == ["metre" if is_metric else "arbitrary"]
+    head = (tmp_path / "tracks" / "tracks.csv").read_text().partition("\n")[0]
+    axes = "x_m,y_m,z_m" if is_metric else "x,y,z"
+    assert head == f"frame,seconds,segment,id,{axes},confirmed,zncc"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("deforming")
+    record(folder, "sensor")
+    return folder
+
+
+def test_tracks_are_the_tracked_surfels_of_the_recording(recorded: Path, tmp_path: Path) -> None:
+    path = export_result(recorded, "tracks", tmp_path / "all")
+    frames = list(recorded_surfels(recorded / RECORDING_NAME))
+    with np.load(path / "tracks.npz") as found:
+        assert found["frames"].tolist() == list(range(FRAMES))
+        assert found["stamps_ns"].tolist() == [frame.stamp_ns for frame in frames]
+        assert found["positions"].shape == (FRAMES, len(found["ids"]), 3)
+        for n, frame in enumerate(frames):
+            rows = np.flatnonzero(frame.state == 0)
+            tracked = np.isfinite(found["positions"][n, :, 0])
+            assert found["ids"][tracked].tolist() == frame.ids[rows].tolist()
+            np.testing.assert_array_equal(found["positions"][n, tracked], frame.positions[rows])
+            np.testing.assert_array_equal(found["zncc"][n, tracked], frame.zncc[rows])
+            np.testing.assert_array_equal(found["confirmed"][n, tracked], frame.confirmed[rows])
+            assert (found["confirmed"][n, ~tracked] == -1).all()
+            np.testing.assert_array_equal(found["T_world_camera"][n], frame.T_world_camera)
+        count = np.isfinite(found["positions"][..., 0]).sum()
+    lines = (path / "tracks.csv").read_text().splitlines()
+    assert len(lines) == 1 + count
+    table = np.loadtxt(lines[1:], delimiter=",")
+    rows = np.flatnonzero(frames[-1].state == 0)
+    last = table[table[:, 0] == FRAMES - 1]
+    np.testing.assert_array_equal(last[:, 3], frames[-1].ids[rows])
+    np.testing.assert_allclose(last[:, 4:7], frames[-1].positions[rows], rtol=1e-8)
+    every = export_result(recorded, "tracks", tmp_path / "every", every=2)
+    with np.load(every / "tracks.npz") as found:
+        assert found["frames"].tolist() == [0, 2, 4]
+
+
+def test_an_animation_has_the_surfels_of_each_key_frame_in_their_places(
+    recorded: Path, tmp_path: Path
+) -> None:
+    path = export_result(recorded, "animation", tmp_path / "a.glb", every=2)
+    again = export_result(recorded, "animation", tmp_path / "b.glb", every=2)
+    assert path.read_bytes() == again.read_bytes()
+    document, arrays = read_glb(path)
+    (mesh,) = document["meshes"]
+    (primitive,) = mesh["primitives"]
+    rest, targets = primitive["attributes"]["POSITION"], primitive["targets"]
+    assert mesh["extras"]["targetNames"] == ["frame 2", "frame 4"]
+    assert mesh["weights"] == [0.0, 0.0]
+    assert document["nodes"][0]["extras"]["unit"] == "metres"
+    frames = list(recorded_surfels(recorded / RECORDING_NAME))
+    for n, frame in enumerate(frames[::2]):
+        rows, _, triangles = surface_of(frame)
+        places = arrays[rest] + (arrays[targets[n - 1]["POSITION"]] if n else 0.0)
+        corners = places[arrays[primitive["indices"]].reshape(-1, 3)]
+        facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        shown = corners[np.linalg.norm(facing, axis=1) > 1e-9]
+        towards = (facing * (frame.T_world_camera[:3, 3] - corners[:, 0])).sum(axis=1)
+        assert (towards > -1e-9).all()
+        assert len(shown) == len(triangles) > 40
+        expected = frame.positions[rows][triangles]
+        order = [np.lexsort(each.mean(axis=1).round(6).T) for each in (shown, expected)]
+        np.testing.assert_allclose(
+            shown[order[0]].mean(axis=1), expected[order[1]].mean(axis=1), atol=1e-6
+        )
+        apart = np.linalg.norm(expected.reshape(-1, 1, 3) - shown.reshape(-1, 3), axis=2)
+        assert apart.min(axis=0).max() < 1e-6
+    (animation,) = document["animations"]
+    (sampler,), (channel,) = animation["samplers"], animation["channels"]
+    assert channel == {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+    seconds = [(frame.stamp_ns - frames[0].stamp_ns) / 1e9 for frame in frames[::2]]
+    np.testing.assert_allclose(arrays[sampler["input"]].ravel(), seconds, rtol=1e-6)
+    weights = arrays[sampler["output"]].reshape(3, 2)
+    np.testing.assert_array_equal(weights, [[0, 0], [1, 0], [0, 1]])
+
+
+def test_an_animation_of_one_frame_is_one_line(recorded: Path, tmp_path: Path) -> None:
+    with pytest.raises(ResultError, match=r"two frames with tracked surfels.*smaller --every"):
+        export_result(recorded, "animation", tmp_path / "a.glb", every=FRAMES)
+    assert not list(tmp_path.iterdir())
+
+
+def read_glb(path: Path) -> tuple[dict[str, Any], list[Any]]:
+    """The document and the arrays of its accessors, whose rules are asserted."""
+    data = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, length, kind, size % 4) == (b"glTF", 2, len(data), b"JSON", 0)
+    document, body = json.loads(data[20 : 20 + size]), data[28 + size :]
+    assert struct.unpack_from("<I4s", data, 20 + size) == (len(body), b"BIN\0")
+    assert document["buffers"] == [{"byteLength": len(body)}]
+    arrays: list[Any] = []
+    for accessor in document["accessors"]:
+        view = document["bufferViews"][accessor["bufferView"]]
+        assert view["byteOffset"] % 4 == 0
+        dtype = {5126: "<f4", 5125: "<u4", 5123: "<u2"}[accessor["componentType"]]
+        columns = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        part = body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        rows = np.frombuffer(part, dtype).reshape(accessor["count"], columns)
+        if "min" in accessor:
+            assert accessor["min"] == rows.min(axis=0).tolist()
+            assert accessor["max"] == rows.max(axis=0).tolist()
+        arrays.append(rows)
+    for mesh in document["meshes"]:
+        for primitive in mesh["primitives"]:
+            count = len(arrays[primitive["attributes"]["POSITION"]])
+            for each in (primitive["attributes"], *primitive.get("targets", [])):
+                assert "min" in document["accessors"][each["POSITION"]]
+                assert all(len(arrays[index]) == count for index in each.values())
+            assert arrays[primitive["indices"]].max() < count
+    for animation in document.get("animations", []):
+        for sampler in animation["samplers"]:
+            assert "min" in document["accessors"][sampler["input"]]
+    return document, arrays

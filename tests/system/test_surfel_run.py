@@ -125,6 +125,22 @@ def test_the_surface_is_a_mesh_for_every_other_frame(result: Path, tmp_path: Pat
     assert np.ptp(mesh.colours) > 50  # of the image
 
 
+def test_the_animation_has_the_colours_of_the_images(result: Path, tmp_path: Path) -> None:
+    done = pliant("export", result, "--to", "animation", "--output", tmp_path / "surface.glb")
+    assert done.returncode == 0, done.stderr
+    data = (tmp_path / "surface.glb").read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    document, body = json.loads(data[20 : 20 + size]), data[28 + size :]
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert len(primitive["targets"]) == FRAMES - 1
+    accessor = document["accessors"][primitive["attributes"]["COLOR_0"]]
+    assert (accessor["type"], accessor["normalized"]) == ("VEC4", True)
+    view = document["bufferViews"][accessor["bufferView"]]
+    rows = np.frombuffer(body, "<u2", 4 * accessor["count"], view["byteOffset"]).reshape(-1, 4)
+    assert (rows[:, 3] == 65535).all()
+    assert np.ptp(rows[:, :3]) > 10_000
+
+
 def test_its_poses_are_exported(result: Path, tmp_path: Path) -> None:
     exported = export_result(result, "tum", tmp_path / "poses.txt")
     assert exported.read_bytes() == (result / "trajectory.txt").read_bytes()

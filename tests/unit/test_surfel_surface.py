@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from pliant.algorithms.surfels.surface import surface_of
+from pliant.algorithms.surfels.surface_over_time import surface_over_time
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 
 FOCAL = 500.0
@@ -56,3 +57,31 @@ def test_only_what_is_tracked_is_surface() -> None:
     assert triangles.max() < len(rows)
     rows, normals, triangles = surface_of(replace(surfels, state=np.full(121, 4, np.uint8)))
     assert (len(rows), len(normals), len(triangles)) == (0, 0, 0)
+
+
+def corners_of(ids: np.ndarray, triangles: np.ndarray) -> set[frozenset[int]]:
+    return {frozenset(corners) for corners in ids[triangles].tolist()}
+
+
+def test_the_surface_over_time_is_that_of_each_frame() -> None:
+    """A surfel in the middle is lost and found, and another row is born."""
+    early, without = surfels_at(grid(2.0)[:110]), surfels_at(grid(2.1)[:110])
+    without.state[60] = SurfelState.OCCLUDED
+    frames = [early, without, surfels_at(grid(2.2))]
+    found = surface_over_time(frames)
+    assert found.ids.tolist() == list(range(121))
+    assert len(found.triangles) == len(corners_of(found.ids, found.triangles))
+    for frame, positions, shown in zip(frames, found.positions, found.shown, strict=True):
+        rows, _, triangles = surface_of(frame)
+        expected = corners_of(frame.ids[rows], triangles)
+        assert corners_of(found.ids, found.triangles[shown]) == expected
+        np.testing.assert_array_equal(positions[rows], frame.positions[rows])
+        assert np.isnan(np.delete(positions, rows, axis=0)).all()
+    assert found.shown.all(axis=0).sum() > 150
+    assert found.shown.sum(axis=1).tolist() == [180, 178, 200]
+
+
+def test_a_triangle_turned_over_is_another_one() -> None:
+    points = np.array([(0.0, 0.0, 2.0), (0.1, 0.0, 2.0), (0.0, 0.1, 2.0)])
+    found = surface_over_time([surfels_at(points), surfels_at(points * (-1.0, 1.0, 1.0))])
+    assert found.shown.tolist() in ([[True, False], [False, True]], [[False, True], [True, False]])

@@ -26,7 +26,12 @@ def export(
         typer.Option("--output", "-o", help="Output file or folder [in the result folder]."),
     ] = None,
     every: Annotated[
-        int | None, typer.Option(min=1, help="surface: write a mesh of every Nth frame [1].")
+        int | None,
+        typer.Option(
+            min=1,
+            help="surface, tracks: write every Nth frame [1]; animation: a key frame at every Nth "
+            "frame [at most 60].",
+        ),
     ] = None,
     triangles: Annotated[
         int | None, typer.Option(min=100, help="glb, obj: maximum number of triangles [40000].")
@@ -67,6 +72,8 @@ def export(
     pliant export results/room --to glb --crop -1,-0.5,0,1,0.8,2.5
 
     pliant export results/cloth --to surface --every 10
+
+    pliant export results/cloth --to animation
 
     pliant export recording.mcap --to kitti --output poses.txt
     """

@@ -10,6 +10,7 @@ from pliant.algorithms.arrays import U8
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.errors import PliantError, ResultError
+from pliant.export.animation import animation
 from pliant.export.colmap import colmap
 from pliant.export.crop import Box
 from pliant.export.depth import depth
@@ -30,6 +31,7 @@ from pliant.export.overview import (
 )
 from pliant.export.splat import splat
 from pliant.export.surface_meshes import overlay_pictures, surfaces
+from pliant.export.surfel_tracks import surfel_tracks
 from pliant.export.textured import glb, obj
 from pliant.files import is_stream, make_folder
 from pliant.formats.euroc import write_euroc
@@ -82,7 +84,7 @@ def export_result(
 ) -> Path:  # fmt: skip
     """Write one export of a result folder or a recording and return where.
 
-    every: of surfaces, which frames.    triangles: most of a textured mesh.
+    every: which frames of a deforming surface.    triangles: most of a textured mesh.
     clean: leave out its small pieces.    observed: leave out its closed holes.
     crop: only the surface or the points in this box.
     progress: called with the number of images read, and of how many.
@@ -318,11 +320,13 @@ _WRITERS: dict[str, Export] = {
     "obj": obj,
     "watertight": solid,
     "surface": surfaces,
+    "animation": animation,
+    "tracks": surfel_tracks,
     "overlay": _overlay,
     "picture": _picture,
     "overview": _overview,
 }
 EXPORTS = {kind: (name, _WRITERS[kind]) for kind, name in KINDS.items()}
 """Kind of export: its default name, and who writes it."""
-_NAMED = ("foxglove", "rerun", "gpx", "geojson", "ply", "glb", "watertight")
+_NAMED = ("foxglove", "rerun", "gpx", "geojson", "ply", "glb", "watertight", "animation")
 """Kinds that other programs know by the ending; trajectories are text under any."""

@@ -18,6 +18,8 @@ KINDS = {
     "obj": "obj",
     "watertight": "mesh_watertight.ply",
     "surface": "surface",
+    "animation": "animation.glb",
+    "tracks": "tracks",
     "overlay": "overlay.webm",
     "picture": "picture.png",
     "overview": "overview.webp",
@@ -40,7 +42,7 @@ OF_STILL_SCENES = (
 )
 """Kinds that are made of a map or mesh, which a run of the deformable profile has not."""
 OPTIONS = {
-    "every": ("surface",),
+    "every": ("surface", "animation", "tracks"),
     "triangles": ("glb", "obj"),
     "clean": ("glb", "obj"),
     "observed": ("glb", "obj"),

@@ -1,11 +1,11 @@
 """The deforming surface as a sequence of meshes: ``pliant export --to surface``."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
-from pliant.algorithms.arrays import U8
+from pliant.algorithms.arrays import F32, U8
 from pliant.algorithms.surfels.surface import surface_of
 from pliant.algorithms.surfels.surfel_frame import SurfelState
 from pliant.errors import ResultError
@@ -26,20 +26,40 @@ def surfaces(recording: Recording, path: Path, folder: Path | None, every: int =
     In metres, or in units of our own map, and in the world of the segment.  Raises ResultError for
     a recording without surfels.
     """
+    check_deformable(recording)
+    make_folder(path)
+    for surfels, pixels in surfels_with_images(recording, lambda s: s.frame % every == 0):
+        _write(path / f"{surfels.frame:06d}.ply", surfels, pixels)
+
+
+def check_deformable(recording: Recording) -> None:
+    """Raise ResultError for a recording without surfels."""
     if not has_surfels(recording.path):
         raise ResultError(f"{recording.path}: has no surfels: run it with --profile deformable")
-    make_folder(path)
+
+
+def surfels_with_images(
+    recording: Recording, wanted: Callable[[Surfels], bool]
+) -> Iterator[tuple[Surfels, U8 | None]]:
+    """The wanted frames that have surfels, with their images, None where there is none."""
     has_images = next(recording.messages(topics.SOURCE), None) is not None
     images = rectified_images(recording, camera_of(recording)) if has_images else iter(())
     pixels: U8 | None = None
     seen = -1
     for surfels in recorded_surfels(recording.path):
-        if surfels.missing or surfels.frame % every:
+        if surfels.missing or not wanted(surfels):
             continue
         while seen < surfels.frame:
             seen, _, pixels, _ = next(images, (surfels.frame, 0, None, None))
-        here = pixels if seen == surfels.frame else None
-        _write(path / f"{surfels.frame:06d}.ply", surfels, here)
+        yield surfels, pixels if seen == surfels.frame else None
+
+
+def colours_at(pixels: U8, points_px: F32) -> U8:
+    """(N, 3) RGB of the nearest pixels."""
+    column, row = np.rint(points_px).astype(np.int64).T
+    height, width = pixels.shape[:2]
+    colours = pixels[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return np.broadcast_to(colours.reshape(len(points_px), -1), (len(points_px), 3))
 
 
 def overlay_pictures(recording: Recording) -> Iterator[U8]:
@@ -66,10 +86,5 @@ def overlay_pictures(recording: Recording) -> Iterator[U8]:
 def _write(path: Path, surfels: Surfels, pixels: U8 | None) -> None:
     rows, normals, triangles = surface_of(surfels)
     positions = surfels.positions[rows].astype(np.float32)
-    colours = None
-    if pixels is not None:
-        column, row = np.rint(surfels.points_px[rows]).astype(np.int64).T
-        height, width = pixels.shape[:2]
-        colours = pixels[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-        colours = np.broadcast_to(colours.reshape(len(rows), -1), (len(rows), 3))
+    colours = None if pixels is None else colours_at(pixels, surfels.points_px[rows])
     write_ply(path, positions, colours, normals=normals, faces=triangles)
