@@ -40,9 +40,10 @@ _SMOOTHING = {
     "Laplacian smoothing": "laplacian",
     "no smoothing": "none",
 }
-_CORRECTIONS = {
-    "keyframes stay where they were put": "settled",
-    "keyframes follow the map": "moved",
+_LIVE = {
+    "keyframes stay where they were put": ("corrections=settled", "live_depth=points"),
+    "keyframes follow the map": ("corrections=moved", "live_depth=points"),
+    "and dense depth": ("corrections=moved", "live_depth=dense"),
 }
 _FIGURES = (
     "covered", "median error", "within 5 %", "with the scale that fits", "normals",
@@ -74,13 +75,16 @@ def measure_live(result: Path, groundtruth: str, overrides: Sequence[str]) -> It
     compared = _Compared(result, groundtruth)
     warm_up()
     rows: list[list[str]] = []
-    for name, way in _CORRECTIONS.items():
-        for when, mesh, voxel, *costs in compared.live([*overrides, f"meshing.corrections={way}"]):
-            rows.append([f"{name}, {when}", *costs, *compared.near(mesh, voxel)])
+    for name, ways in _LIVE.items():
+        settings = [*overrides, *(f"meshing.{way}" for way in ways)]
+        for when, mesh, voxel, *costs in compared.live(settings):
+            figures = [*compared.near(mesh, voxel), *compared.figures(_mesh(mesh))[:-1]]
+            rows.append([f"{name}, {when}", *costs, *figures])
     coarse = meshes_of(compared.make(overrides).pieces)[compared.segment, "coarse"]
-    figures = compared.near(joined(coarse), coarse[0].voxel_size)
+    mesh = joined(coarse)
+    figures = [*compared.near(mesh, coarse[0].voxel_size), *compared.figures(_mesh(mesh))[:-1]]
     rows.append(["the final coarse mesh", "", "", *figures])
-    yield markdown(["coarse mesh", "fusions", "CPU ms a keyframe", *_NEAR], rows)
+    yield markdown(["coarse mesh", "fusions", "CPU ms a keyframe", *_NEAR, *_FIGURES[:-1]], rows)
 
 
 class _Compared:

@@ -119,6 +119,21 @@ def test_what_images_agree_on_is_in_the_final_mesh_and_not_in_the_live_one() -> 
     assert found[0] > 1.1 * found[1]
 
 
+def test_dense_depth_of_the_live_mesh_has_the_same_bytes_again_and_leaves_the_final_one() -> None:
+    def made(depth: str) -> list[list[bytes]]:
+        settings = [f"meshing.live_depth={depth}"]
+        outputs = run(with_texture(fewer_points(inputs())), settings=settings)
+        return [
+            [codec.encode(m) for m in outputs[topic]]
+            for topic in (topics.MESH_BLOCKS, topics.MESH_FINAL)
+        ]
+
+    dense, points = made("dense"), made("points")
+    assert dense == made("dense")
+    assert dense[0] != points[0]
+    assert dense[1] == points[1]
+
+
 def test_what_no_keyframe_has_a_surface_of_is_filled_faintly() -> None:
     found: list[int] = []
     for least in (0.01, 0.1):

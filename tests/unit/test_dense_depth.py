@@ -7,11 +7,12 @@ import pytest
 from stereo_scene import CAMERA, anchors, pose, true_depth_points, true_inverse, view
 
 from pliant.algorithms.arrays import BoolArray
-from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.geometry import inverse, move_by_similarity, transform
+from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.meshing.keyframe_surface import KeyframeSurfaces, SeenPoints
 from pliant.algorithms.meshing.parameters import SurfaceParameters
 from pliant.algorithms.stereo.views import DenseDepth
-from pliant.fusion.dense_depth import DenseDepths
+from pliant.fusion.dense_depth import LIVE, DenseDepths
 from pliant.fusion.keyframe_spool import KeyframeSpool
 
 STEPS = tuple(range(-6, 12, 2))
@@ -88,6 +89,63 @@ def test_the_same_bytes_with_any_number_of_threads(found: dict[int, SeenPoints])
     for step, points in joined(workers=1).items():
         assert points.points_world.tobytes() == found[step].points_world.tobytes()
         assert points.sigmas.tobytes() == found[step].sigmas.tobytes()
+
+
+def one_by_one(spool: KeyframeSpool) -> DenseDepths:
+    """As in the live mesh: each is swept when it comes, from those before it."""
+    dense = DenseDepths(CAMERA, NOISE_PX, spool, detail=LIVE)
+    shown = np.ones((CAMERA.height, CAMERA.width), np.bool_)
+    for step in STEPS:
+        dense.take(step, pose(step), true_depth_points(step), view(step).grey, shown)
+        dense.add(step, seen(step), lambda _: True)
+    return dense
+
+
+def test_keyframes_swept_one_by_one_have_sure_pixels_on_the_surface() -> None:
+    with KeyframeSpool() as spool:
+        dense = one_by_one(spool)
+        first, last = (
+            dense.with_sure_pixels(k, seen(k), dense.agreed_on(k)) for k in (STEPS[0], STEPS[-1])
+        )
+    assert len(first.ids) == 100  # nothing came before it
+    local = transform(inverse(pose(STEPS[-1])), last.points_world[100:])
+    u, v = np.rint(last.points_px[100:]).astype(int).T
+    error = np.abs(1.0 / local[:, 2] / true_inverse(STEPS[-1])[v, u] - 1.0)
+    assert len(error) > 100
+    assert np.mean(error < 0.03) > 0.9
+
+
+def test_sources_that_are_not_usable_are_not_used() -> None:
+    with KeyframeSpool() as spool:
+        dense = one_by_one(spool)
+        dense.add(STEPS[-1], seen(STEPS[-1]), lambda _: False)
+        assert dense.agreed_on(STEPS[-1]) is None
+
+
+def test_depths_move_and_grow_with_the_map() -> None:
+    S = np.eye(4)
+    S[:3] = [[0.0, -2.0, 0.0, 3.0], [2.0, 0.0, 0.0, -1.0], [0.0, 0.0, 2.0, 0.5]]
+    quarter_turn = [3.0, -1.0, 0.5, 0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]
+    moves = MapMoves(keyframe_ids=np.array([STEPS[0]]), moves=np.array([[*quarter_turn, 2.0]]))
+    np.testing.assert_allclose(moves.matrices(np.array([STEPS[-1]]))[0], S, atol=1e-12)
+    last = STEPS[-1]
+    with KeyframeSpool() as spool:
+        dense = one_by_one(spool)
+        before = dense.with_sure_pixels(last, seen(last), dense.agreed_on(last))
+        dense.move(moves)
+        after = dense.with_sure_pixels(last, seen(last), dense.agreed_on(last))
+    # In single precision a pixel may be sure by a hair.
+    assert abs(len(after.ids) - len(before.ids)) <= 0.01 * len(before.ids)
+    at = {tuple(px): row for row, px in enumerate(before.points_px[100:].tolist())}
+    pairs = [(at[tuple(px)], row) for row, px in enumerate(after.points_px[100:].tolist())
+             if tuple(px) in at]  # fmt: skip
+    old, new = np.array(pairs).T
+    expected = transform(S, before.points_world[100:][old])
+    off = np.linalg.norm(after.points_world[100:][new] - expected, axis=1)
+    assert np.mean(off < 2e-3) > 0.99
+    T = move_by_similarity(S, pose(last))
+    local = transform(inverse(T), after.points_world[100:])
+    np.testing.assert_allclose(CAMERA.project(local), after.points_px[100:], atol=1e-3)
 
 
 def test_what_masks_cover_is_no_sure_pixel() -> None:

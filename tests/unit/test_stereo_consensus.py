@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from stereo_scene import CAMERA, true_inverse, view
 
 from pliant.algorithms.arrays import F32, F64, BoolArray
@@ -129,18 +130,16 @@ def test_votes_are_those_of_plain_numpy() -> None:
     assert wrong <= 2
 
 
-def test_sure_pixels_keep_clear_of_the_points_of_the_map() -> None:
+@pytest.mark.parametrize("stride", [1, 2])
+def test_sure_pixels_keep_clear_of_the_points_of_the_map(stride: int) -> None:
     w: F32 = np.full((20, 30), 0.5, np.float32)
     support = np.full((20, 30), 9.0, np.float32)
     support[:, 20:] = 1.0
     points: F64 = np.array([[8.2, 10.4], [40.0, 3.0], [np.nan, 1.0]])
-    found = sure_pixels(DenseDepth(w, support), points)
-    u, v = found.points_px.T
-    assert len(u) > 50
-    assert not (u % 2).any()
-    assert not (v % 2).any()
-    assert u.max() < 20
-    assert np.maximum(np.abs(u - 8), np.abs(v - 10)).min() > 4
+    found = sure_pixels(DenseDepth(w, support), points, stride=stride, min_support=4.0)
+    u, v = np.meshgrid(np.arange(0, 20, stride), np.arange(0, 20, stride))
+    away = np.maximum(np.abs(u - 8), np.abs(v - 10)) > 2 * stride
+    np.testing.assert_array_equal(found.points_px, np.stack([u[away], v[away]], axis=1))
     np.testing.assert_array_equal(found.inverse_depths, 0.5)
 
 

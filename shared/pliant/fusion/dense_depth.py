@@ -5,15 +5,16 @@ what it finds waits on disk.  The second asks the neighbours of a keyframe wheth
 surface.  The pixels that are sure join the map's points; the others fill what is then left bare.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64, U8, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.geometry import transform
+from pliant.algorithms.geometry import move_by_similarity, transform
 from pliant.algorithms.image.sharpness import sharpness
+from pliant.algorithms.map_delta import MapMoves
 from pliant.algorithms.meshing.keyframe_surface import SeenPoints
 from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.stages import StageTimer, no_stages
@@ -34,15 +35,37 @@ from pliant.fusion.parallel import in_order, processors
 
 _SOURCES, _NEIGHBOURS = 4, 12
 """Keyframes with whose images one is swept, and whose depths are asked."""
+_RECENT = 64
+"""Keyframes swept last, of which the live mesh takes its sources: constant time per keyframe."""
 _FIRST_ID = 2**30
 """Of pixels as points: beyond all points of the map."""
 
 
 @dataclass(frozen=True)
+class Detail:
+    """How finely keyframes are swept.
+
+    halvings: of images, beyond ``reduction``.    stride, min_support: as of ``sure_pixels``.
+    """
+
+    halvings: int
+    stride: int
+    min_support: float
+
+
+FINAL = Detail(halvings=0, stride=2, min_support=4.0)
+LIVE = Detail(halvings=1, stride=1, min_support=3.0)
+"""Neighbours are only those before a keyframe: fewer agree.  The stride is the same angle."""
+
+
+@dataclass(frozen=True)
 class _Taken:
+    """scale: by how much the map has grown at this keyframe since it was swept."""
+
     T_world_camera: F64
     some_points: F64
     sharpness: float
+    scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -63,10 +86,10 @@ class DenseDepths:
 
     def __init__(
         self, camera: PinholeCamera, noise_px: float, spool: KeyframeSpool,
-        workers: int | None = None,
+        workers: int | None = None, detail: Detail = FINAL,
     ) -> None:  # fmt: skip
-        self._whole = camera
-        self._times = reduction(camera)
+        self._detail = detail
+        self._times = reduction(camera) * 2**detail.halvings
         self._camera = shrunk_camera(camera, self._times)
         self._noise_px = noise_px
         self._spool = spool
@@ -97,12 +120,48 @@ class DenseDepths:
             self._around[swept.keyframe] = swept.around
             self._spool.put_depth(swept.keyframe, swept.depth)
 
+    def add(
+        self, keyframe: int, seen: SeenPoints, usable: Callable[[int], bool],
+        timer: StageTimer = no_stages,
+    ) -> None:  # fmt: skip
+        """Sweep one more keyframe beside the usable ones of those that were swept last.
+
+        Nothing where it was not taken.
+        """
+        if keyframe not in self._taken:
+            return
+        with timer("dense sweep"):
+            recent = [k for k in list(self._around)[-_RECENT:] if k != keyframe and usable(k)]
+            around = self._neighbours(keyframe, [*recent, keyframe])
+            depth = self._depth_from(keyframe, seen, around)
+            self._around.pop(keyframe, None)  # the last from now on
+            self._around[keyframe] = around
+            self._spool.put_depth(keyframe, depth)
+
+    def is_swept(self, keyframe: int) -> bool:
+        """Whether the depth of a keyframe is there."""
+        return keyframe in self._around
+
+    def move(self, moves: MapMoves) -> None:
+        """The whole map moves, and with it the keyframes that were taken.
+
+        Depths stay in their cameras; they grow with the map.
+        """
+        ids = np.array(list(self._taken), np.int64)
+        for keyframe, matrix in zip(ids.tolist(), moves.matrices(ids), strict=True):
+            taken = self._taken[keyframe]
+            self._taken[keyframe] = replace(
+                taken,
+                T_world_camera=move_by_similarity(matrix, taken.T_world_camera),
+                scale=taken.scale * float(np.cbrt(np.linalg.det(matrix[:3, :3]))),
+            )
+
     def agreed(
         self, keyframes: Sequence[int], timer: StageTimer = no_stages
     ) -> Iterator[DenseDepth | None]:
         """The second pass, of each keyframe in turn, when the first one is done: what it and its
         neighbours agree on; None: nothing."""
-        results = in_order(self._agreed, keyframes, self._workers)
+        results = in_order(self.agreed_on, keyframes, self._workers)
         for _ in keyframes:
             with timer("dense consensus"):
                 agreed = next(results)
@@ -120,7 +179,10 @@ class DenseDepths:
             return seen
         view = self._view(keyframe)
         sources = [self._view(other) for other in self._around[keyframe][:_SOURCES]]
-        sure = sure_pixels(agreed, self._small(seen.points_px.astype(np.float64)))
+        sure = sure_pixels(
+            agreed, self._small(seen.points_px.astype(np.float64)),
+            stride=self._detail.stride, min_support=self._detail.min_support,
+        )  # fmt: skip
         count = len(sure.inverse_depths)
         rays = np.ones((count, 3))
         rays[:, :2] = view.camera.normalise(sure.points_px)
@@ -141,25 +203,34 @@ class DenseDepths:
 
     def _swept(self, told: tuple[int, SeenPoints]) -> _Swept:
         keyframe, seen = told
-        around = self._neighbours(keyframe)
-        sources = [self._view(other) for other in around[:_SOURCES]]
-        depth = swept_depth(self._view(keyframe), sources, self._anchors(keyframe, seen))
-        return _Swept(keyframe, around, depth)
+        around = self._neighbours(keyframe, list(self._taken))
+        return _Swept(keyframe, around, self._depth_from(keyframe, seen, around))
 
-    def _agreed(self, keyframe: int) -> DenseDepth | None:
+    def _depth_from(self, keyframe: int, seen: SeenPoints, around: list[int]) -> DenseDepth:
+        sources = [self._view(other) for other in around[:_SOURCES]]
+        return swept_depth(self._view(keyframe), sources, self._anchors(keyframe, seen))
+
+    def agreed_on(self, keyframe: int) -> DenseDepth | None:
+        """What a keyframe and those around it agree on; None: nothing."""
         around = self._around.get(keyframe, [])
         if not around:
             return None
         views = [self._view(other) for other in around]
-        depths = [self._spool.depth(other) for other in around]
-        return consensus(self._view(keyframe), self._spool.depth(keyframe), views, depths)
+        depths = [self._depth(other) for other in around]
+        return consensus(self._view(keyframe), self._depth(keyframe), views, depths)
 
-    def _neighbours(self, keyframe: int) -> list[int]:
-        known = list(self._taken)
+    def _depth(self, keyframe: int) -> DenseDepth:
+        """As it was swept, in the unit of the map as it is now."""
+        depth = self._spool.depth(keyframe)
+        share = np.float32(1.0 / self._taken[keyframe].scale)
+        return DenseDepth(share * depth.inverse_depths, depth.confidences)
+
+    def _neighbours(self, keyframe: int, known: list[int]) -> list[int]:
+        taken = [self._taken[other] for other in known]
         views = Viewpoints(
             self._camera,
-            np.stack([taken.T_world_camera for taken in self._taken.values()]),
-            np.array([taken.sharpness for taken in self._taken.values()]),
+            np.stack([other.T_world_camera for other in taken]),
+            np.array([other.sharpness for other in taken]),
         )
         some = self._taken[keyframe].some_points
         rows: I64 = choose_sources(views, known.index(keyframe), some, _NEIGHBOURS)

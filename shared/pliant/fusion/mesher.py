@@ -24,7 +24,7 @@ from pliant.algorithms.meshing.rendering import DepthMap
 from pliant.algorithms.meshing.tsdf_volume import VolumeFullError
 from pliant.algorithms.slam.calibration.corrected_view import corrected_view, parts_of
 from pliant.algorithms.stages import StageTimer, no_stages
-from pliant.fusion.dense_depth import DenseDepths
+from pliant.fusion.dense_depth import FINAL, LIVE, DenseDepths, Detail
 from pliant.fusion.final_volume import FinalVolume
 from pliant.fusion.keyframe_images import colour_of, grey_of, unmasked, view_of
 from pliant.fusion.keyframe_spool import KeyframeSpool
@@ -77,6 +77,7 @@ class Mesher:
         self._map = CurrentMap()
         self._corrections: dict[int, tuple[float, ...]] = {}
         self._surfaces = KeyframeSurfaces(camera, parameters.surface)
+        self._live_dense = self._dense_depths(LIVE)
         self._live: LiveMesh | None = None
         self._frozen = parts_of(())
         self._segment = -1
@@ -106,6 +107,7 @@ class Mesher:
         self._map.take(update, frame)
         if len(update.moved_keyframes):
             self._has_moved = True
+            self._live_dense.move(update.map_moves())
             # The last surface is where the map was.
             self._surfaces = KeyframeSurfaces(self._camera, self._parameters.surface)
         if update.calibration_correction:
@@ -148,6 +150,7 @@ class Mesher:
             self._frozen = parts_of(correction)
             self._camera = corrected_view(self._camera, correction).camera
             self._surfaces = KeyframeSurfaces(self._camera, self._parameters.surface)
+            self._live_dense = self._dense_depths(LIVE)
         left = self._left_of(correction)
         self._has_moved |= left != self._corrections.get(segment, left)
         self._corrections[segment] = left
@@ -162,7 +165,8 @@ class Mesher:
     def fuse(self, *, newest_only: bool = False, timer: StageTimer = no_stages) -> list[LiveChange]:
         """Fuse what waits; returns what changed.
 
-        newest_only: of the keyframes that are new, all but the last are passed over.
+        newest_only: of the keyframes that are new, all but the last are passed over.  Of those that
+        settle only the last is swept.
         """
         self.note = ""
         pending, self._pending = self._pending, []
@@ -172,11 +176,15 @@ class Mesher:
             self.counts["passed_over"] += len(passed_over)
             self._told -= {*passed_over} - {keyframe for keyframe, _ in pending}
         changed: list[LiveChange] = []
+        newest_settled = max((k for k, settled in pending if settled), default=-1)
         for keyframe, settled in pending:
             segment = self._map.keyframes[keyframe].segment
             if segment != self._segment:
                 changed += self._changes(timer)
                 self._begin_live(segment)
+            may_sweep = keyframe == newest_settled or not newest_only
+            if settled and may_sweep and not self.behind:
+                self._sweep(keyframe, timer)
             self._fuse_one(keyframe, "settled" if settled else "fused", timer)
         self._follow_map(timer)
         # Keyframes fused again are published with the next one, or when all are.
@@ -225,7 +233,8 @@ class Mesher:
         self._tried.add(keyframe)
         self._again = [other for other in self._again if other != keyframe]
         seen, correction = self._seen(keyframe), self._correction(keyframe)
-        surface = self._surfaces.surface(self._pose(keyframe), seen, timer)
+        dense = self._with_dense(keyframe, seen, timer)
+        surface = self._surfaces.surface(self._pose(keyframe), dense, timer)
         colour = self._colour(keyframe, correction)
         if self._live is not None:
             with timer("coarse fusion"):
@@ -248,6 +257,26 @@ class Mesher:
             self._pass_over(keyframe, too_fine("coarse", tsdf, needed, "the scene so far"))
             return
         self.counts[count] += 1
+
+    def _sweep(self, keyframe: int, timer: StageTimer) -> None:
+        """The dense depth of a keyframe that has left the window, from those swept before it."""
+        if self._parameters.live_depth == "points":
+            return
+        self._take_dense(self._live_dense, keyframe, timer)
+        segment = self._segment
+
+        def usable(other: int) -> bool:
+            return self._map.keyframes[other].segment == segment
+
+        self._live_dense.add(keyframe, self._seen(keyframe), usable, timer)
+
+    def _with_dense(self, keyframe: int, seen: SeenPoints, timer: StageTimer) -> SeenPoints:
+        """What a keyframe sees, and what it and those swept before it agree on."""
+        if not self._live_dense.is_swept(keyframe):
+            return seen
+        with timer("dense consensus"):
+            agreed = self._live_dense.agreed_on(keyframe)
+        return self._live_dense.with_sure_pixels(keyframe, seen, agreed)
 
     def _take_out(
         self, keyframe: int, live: LiveMesh, colour: U8 | None, correction: tuple[float, ...]
@@ -315,21 +344,29 @@ class Mesher:
 
     def _dense(self, keyframes: list[int], timer: StageTimer) -> DenseDepths:
         """The dense depths of the keyframes of a segment; none with the points alone."""
-        dense = DenseDepths(self._camera, self._parameters.surface.noise_px, self._spool)
+        dense = self._dense_depths(FINAL)
         if self._parameters.depth == "points":
             return dense
         for keyframe in keyframes:
-            with timer("dense images"):
-                view = view_of(self._camera, self._correction(keyframe))
-                colour = colour_of(self._spool.image(keyframe), view)
-                if colour is None:
-                    continue
-                used = unmasked(self._spool.mask(keyframe), view)
-                shown = view.shows if used is None else view.shows & used
-                points = self._seen(keyframe).points_world
-                dense.take(keyframe, self._pose(keyframe), points, grey_of(colour), shown)
+            self._take_dense(dense, keyframe, timer)
         dense.sweep(((keyframe, self._seen(keyframe)) for keyframe in keyframes), timer)
         return dense
+
+    def _dense_depths(self, detail: Detail) -> DenseDepths:
+        noise_px = self._parameters.surface.noise_px
+        return DenseDepths(self._camera, noise_px, self._spool, detail=detail)
+
+    def _take_dense(self, dense: DenseDepths, keyframe: int, timer: StageTimer) -> None:
+        """Give the image of a keyframe to be swept; nothing where it has none."""
+        with timer("dense images"):
+            view = view_of(self._camera, self._correction(keyframe))
+            colour = colour_of(self._spool.image(keyframe), view)
+            if colour is None:
+                return
+            used = unmasked(self._spool.mask(keyframe), view)
+            shown = view.shows if used is None else view.shows & used
+            points = self._seen(keyframe).points_world
+            dense.take(keyframe, self._pose(keyframe), points, grey_of(colour), shown)
 
     def _median_depth(self, keyframes: list[int]) -> float:
         """Of the points that the keyframes see, the median of their medians."""

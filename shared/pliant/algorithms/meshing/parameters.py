@@ -190,7 +190,14 @@ class MeshingParameters(Parameters):
         default="dense",
         description=(
             "Source of the final mesh: all pixels with a depth from the images, or only the "
-            "landmarks, as in the live mesh."
+            "landmarks."
+        ),
+    )
+    live_depth: Literal["points", "dense"] = Field(
+        default="points",
+        description=(
+            "Source of the live mesh: only the landmarks, or also the pixels of keyframes that "
+            "have left the window, at half the width and height of those of the final mesh."
         ),
     )
     finish: bool = Field(

@@ -11,12 +11,8 @@ from pliant.algorithms.arrays import F64, Shape
 from pliant.algorithms.stereo.sweep import poses_of
 from pliant.algorithms.stereo.views import DenseDepth, StereoView, motion, parallax_px
 
-_STRIDE = 2
-"""Every so many rows and columns."""
-_MIN_SUPPORT = 4.0
-"""As many confident views agree."""
-_CLEAR_PX = 4
-"""A match within so many pixels of a point of the map, in the same window, tells less than it."""
+_CLEAR_STRIDES = 2
+"""A match as near to a point of the map, in the same window, tells less than it."""
 _MATCHING_PX = 0.7
 """Standard deviation of a match, pixels of the swept view."""
 
@@ -29,21 +25,24 @@ class SurePixels:
     inverse_depths: Annotated[F64, Shape("N")]
 
 
-def sure_pixels(depth: DenseDepth, points_px: F64) -> SurePixels:
+def sure_pixels(
+    depth: DenseDepth, points_px: F64, *, stride: int, min_support: float
+) -> SurePixels:
     """Pixels with much support away from the map's own points.
 
     depth: as of ``consensus``.    points_px: (N, 2) the map's, in pixels of the view.
+    stride: every so many rows and columns.    min_support: as many confident views agree.
     """
     height, width = depth.confidences.shape
-    c = _CLEAR_PX
+    c = _CLEAR_STRIDES * stride
     taken = np.zeros((height + 2 * c, width + 2 * c), np.uint8)
     at = np.rint(points_px[np.isfinite(points_px).all(axis=1)]).astype(np.int64) + c
     inside = (at >= 0).all(axis=1) & (at < (width + 2 * c, height + 2 * c)).all(axis=1)
     taken[at[inside, 1], at[inside, 0]] = 1
     around = np.asarray(cv2.dilate(taken, np.ones((2 * c + 1, 2 * c + 1), np.uint8)), np.uint8)
     free = np.zeros((height, width), np.bool_)
-    free[::_STRIDE, ::_STRIDE] = around[c : c + height : _STRIDE, c : c + width : _STRIDE] == 0
-    sure = free & (depth.confidences > _MIN_SUPPORT)
+    free[::stride, ::stride] = around[c : c + height : stride, c : c + width : stride] == 0
+    sure = free & (depth.confidences > min_support)
     v, u = np.nonzero(sure)
     return SurePixels(
         np.stack([u, v], axis=1).astype(np.float64),
