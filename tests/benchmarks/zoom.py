@@ -49,14 +49,14 @@ def constant(_: int, __: int) -> float:
     return 1.0
 
 
-def breathing(number: int, _: int) -> float:
-    """A focus that hunts within 3 %, once in four seconds."""
-    return 1.015 + 0.015 * float(np.sin(2.0 * np.pi * number / (4.0 * _FPS)))
+def breathing(by: float, number: int, _: int) -> float:
+    """A focus that hunts within a share, once in four seconds."""
+    return 1.0 + by * (0.5 + 0.5 * float(np.sin(2.0 * np.pi * number / (4.0 * _FPS))))
 
 
-def slow_zoom(number: int, count: int) -> float:
-    """By 1.3 from the first frame to the last."""
-    return 1.3 ** (number / (count - 1))
+def slow_zoom(by: float, number: int, count: int) -> float:
+    """From the first frame to the last."""
+    return by ** (number / (count - 1))
 
 
 def fast_zoom(number: int, count: int) -> float:
@@ -66,8 +66,10 @@ def fast_zoom(number: int, count: int) -> float:
 
 MAGNIFICATIONS: dict[str, Magnification] = {
     "constant": constant,
-    "breathing 3 %": breathing,
-    "slow zoom 1.3": slow_zoom,
+    "breathing 3 %": partial(breathing, 0.03),
+    "breathing 2 %": partial(breathing, 0.02),
+    "slow zoom 1.3": partial(slow_zoom, 1.3),
+    "slow zoom 1.02": partial(slow_zoom, 1.02),
     "zoom 1.3 in 1 s": fast_zoom,
 }
 
