@@ -90,7 +90,7 @@ def test_the_magnification_of_one_frame_shows_only_what_is_large_and_certain():
 
 @pytest.mark.parametrize(("second", "changes"), [(0.03, True), (-0.03, False), (0.001, False)])
 def test_a_change_shows_in_two_frames_in_a_row(second, changes, monkeypatch):
-    found = [0.03, second]
+    found = [0.015, second]
     magnification = lambda *_: (found.pop(0) if found else 0.0, 0.0003)  # noqa: E731
     monkeypatch.setattr(frame_focal, "refine_focal", magnification)
     mapper = Mapper(CAMERA, MappingParameters(), 0, None)

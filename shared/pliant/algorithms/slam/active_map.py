@@ -71,7 +71,7 @@ class ActiveMap:
         self.links = TrackLinks()
         self.window = self._window([], fixed=0, outside=0)
         self.candidates_agree = True  # with the landmarks, in the current frame
-        self.magnification = 0.0  # log, of the last frame where it was certain, else 0
+        self.magnification = 0.0  # log, of the last frame where it was clear, else 0
         self._nearby: I32 = np.zeros(0, np.int32)
         self._marks: I64 = np.zeros(0, np.int64)
 

@@ -1,9 +1,9 @@
 """The focal length of each frame, if it changes during a clip (see ``changing_focal``).
 
-Two consecutive frames that are magnified relative to the map, both in the same direction and by far
-more than one step of the camera explains, show the change long before an adjustment of all
-keyframes would be due.  One frame is not enough: a rolling shutter magnifies and reduces the frames
-of a shaking hand in turn.  After a change is found, each frame gets the focal length that fits its
+A frame that is magnified relative to the map by far more than one step of the camera explains, after
+one that was magnified half as much, shows the change long before an adjustment of all keyframes
+would be due.  One frame alone is not enough: a rolling shutter magnifies and reduces the frames of a
+shaking hand in turn.  After a change is found, each frame gets the focal length that fits its
 tracks, with a random walk from that of the frame before as its prior.
 """
 
@@ -57,12 +57,12 @@ def refocused(
         predicted, active.points.xyz[rows], points_px, active.camera, (given.cx, given.cy),
         RATE * np.sqrt(max(motion.lost_s(stamp_ns), _LEAST_GAP_S)) if changes else SPREAD,
     )  # fmt: skip
-    certain = change if shows_at_once(change, sigma) else 0.0
-    lasts = certain * active.magnification > 0.0
-    active.magnification = certain
+    lasts = shows_at_once(change, sigma) and change * active.magnification > 0.0
+    log_focal = calibration.log_focal + change
+    active.magnification = log_focal if shows_at_once(2.0 * log_focal, sigma) else 0.0
     if not changes and not lasts:
         return calibration
-    active.seen_by = replace(calibration, changes=True, log_focal=calibration.log_focal + change)
+    active.seen_by = replace(calibration, changes=True, log_focal=log_focal)
     return active.seen_by
 
 
