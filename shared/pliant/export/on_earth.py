@@ -8,7 +8,7 @@ from pliant.algorithms.inertial.gps_fit import GpsFit
 from pliant.errors import ResultError
 from pliant.formats.earth_track import EarthTrack, write_geojson, write_gpx
 from pliant.recording.reader import Recording
-from pliant.results.earth import place_on_earth, said_of
+from pliant.results.earth import place_on_earth, summary_of
 from pliant.results.run import read_run
 
 
@@ -48,6 +48,6 @@ def _track(recording: Recording) -> tuple[EarthTrack, GpsFit]:
         latitude_deg=latitude,
         longitude_deg=longitude,
         altitude_m=altitude,
-        about=f"Pliant: {said_of(fit)}",
+        about=f"Pliant: {summary_of(fit)}",
     )
     return track, fit

@@ -32,7 +32,7 @@ def place_on_earth(
     return fit
 
 
-def said_of(fit: GpsFit) -> str:
+def summary_of(fit: GpsFit) -> str:
     """A fit in words."""
     return (
         f"{fit.agreeing} of {fit.fixes} satellite fixes, error {fit.error_m:.1f} m, "

@@ -10,7 +10,7 @@ from pliant.results.known_scale import Scale, level_of
 
 
 def by_samples(history: MapHistory, samples: ImuSamples) -> Scale | str:
-    """What samples say of the longest segment, or why they say nothing, in a line."""
+    """Scale and vertical of the longest segment, or in one line why they cannot be estimated."""
     longest = history.longest_segment()
     if longest < 0:
         return "there is no map"

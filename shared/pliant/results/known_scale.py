@@ -61,24 +61,24 @@ class Scale:
 
     @property
     def world(self) -> MetricWorld:
-        """What it does to a recording."""
+        """The transform that brings a recording to metres."""
         if self.level is None:
             return MetricWorld(metres_per_unit=self.metres_per_unit)
         return MetricWorld(metres_per_unit=self.metres_per_unit, R=self.level.R, z_is_up=True)
 
     def content(self) -> dict[str, Any]:
         """As numbers and text, for files."""
-        told: dict[str, Any] = {
+        content: dict[str, Any] = {
             "metres_per_unit": self.metres_per_unit,
             "sigma": self.sigma,
             "source": self.source,
         }
         if self.level is not None:
-            told["level"] = {
+            content["level"] = {
                 "rotation_xyzw": list(self.level.rotation_xyzw),
                 "sigma_deg": self.level.sigma_deg,
             }
-        return told
+        return content
 
     def yaml(self) -> str:
         """What stands in the file."""
@@ -99,12 +99,12 @@ def read_scale(folder: Path) -> Scale | None:
     """That of a result folder; None without.  Raises ResultError for a file that is none."""
     path = folder / SCALE_NAME
     try:
-        told = load_yaml(path.read_text(encoding="utf-8"))
+        content = load_yaml(path.read_text(encoding="utf-8"))
         found = Scale(
-            metres_per_unit=float(told["metres_per_unit"]),
-            sigma=float(told["sigma"]),
-            source=str(told["source"]),
-            level=_read_level(told.get("level")),
+            metres_per_unit=float(content["metres_per_unit"]),
+            sigma=float(content["sigma"]),
+            source=str(content["source"]),
+            level=_read_level(content.get("level")),
         )
     except FileNotFoundError:
         return None
@@ -115,14 +115,14 @@ def read_scale(folder: Path) -> Scale | None:
     return found
 
 
-def _read_level(told: Any) -> Level | None:
+def _read_level(content: Any) -> Level | None:
     """Raises ValueError, KeyError or TypeError."""
-    if told is None:
+    if content is None:
         return None
-    x, y, z, w = (float(value) for value in told["rotation_xyzw"])
+    x, y, z, w = (float(value) for value in content["rotation_xyzw"])
     if not abs(np.linalg.norm([x, y, z, w]) - 1.0) < 1e-3:
         raise ValueError("no unit quaternion")
-    return Level(rotation_xyzw=(x, y, z, w), sigma_deg=float(told["sigma_deg"]))
+    return Level(rotation_xyzw=(x, y, z, w), sigma_deg=float(content["sigma_deg"]))
 
 
 class MetricRecording(Recording):

@@ -44,7 +44,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         for mesh in report["mesh"]
         if mesh["level"] == "fine"
     ]
-    lines += _told_of_scale(report)
+    lines += _scale_lines(report)
     lens = report.get("calibration_verdict")
     lines += [lens] if lens and lens != report["verdict_reason"] else []
     lines += _faults(report)
@@ -85,8 +85,8 @@ def _told_of_map(report: dict[str, Any]) -> list[str]:
     ]
 
 
-def _told_of_scale(report: dict[str, Any]) -> list[str]:
-    """What inertial samples or a measured length say of the unit."""
+def _scale_lines(report: dict[str, Any]) -> list[str]:
+    """The measured unit, or why inertial samples were not used."""
     scale = report.get("scale")
     if scale is not None:
         level = scale.get("level")

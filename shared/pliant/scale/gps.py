@@ -2,7 +2,7 @@
 
 from pliant.errors import ResultError
 from pliant.recording.reader import Recording
-from pliant.results.earth import place_on_earth, said_of
+from pliant.results.earth import place_on_earth, summary_of
 from pliant.results.known_scale import Scale
 from pliant.results.run import Run
 
@@ -15,4 +15,4 @@ def from_gps(recording: Recording, run: Run) -> Scale:
     if not poses:
         raise ResultError(f"{recording.path}: the run has no poses")
     fit = place_on_earth(recording, history.trajectory(poses), oriented=False)
-    return Scale(metres_per_unit=fit.metres_per_unit, sigma=fit.scale_sigma, source=said_of(fit))
+    return Scale(metres_per_unit=fit.metres_per_unit, sigma=fit.scale_sigma, source=summary_of(fit))

@@ -29,7 +29,7 @@ _LONGEST_GAP = 4.0
 _AROUND_S = 0.05
 """By how much the offset may change after it was found by rotations."""
 _LEAST_DENSITY = NoiseDensity(gyro=1e-4, accel=1e-3)
-"""Nobody carries a better sensor on a camera."""
+"""Below those of any sensor that is carried with a camera."""
 _LEAST = 20
 """Poses, samples, and intervals between nodes."""
 _EXPLAINED = 0.9
@@ -39,16 +39,16 @@ _SMOOTHED = 0.003
 """Standard deviation of the scale, as a share, that all parts of a trajectory have in common: an
 estimated one is smoother than the motion, and accelerometers have scale factors."""
 _MOST_SIGMA = 0.05
-"""Of the scale, as a share: 5 % is less than what people know of lengths by eye."""
+"""Of the scale, as a share: beyond 5 % an estimate by eye is as good."""
 _BIASES_M_S2 = 1.0
 """3 standard deviations of the length of an accelerometer's bias."""
 _SPEED_CHANGE_M_S = 10.0
-"""Between begin and end, of what is carried."""
+"""Of a carried sensor, between begin and end."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InertialAlignment:
-    """What samples say of a trajectory, with standard deviations.
+    """Scale, vertical and sensor of a trajectory, with standard deviations.
 
     metres_per_unit: of the trajectory.   scale_sigma: as a share of it.   up: (3,) unit vector
     against gravity, in the trajectory's world; up_sigma_rad: of its direction.

@@ -21,6 +21,7 @@ from pliant.algorithms.inertial.residuals import (
     Nodes,
     State,
     linearised,
+    of_each,
 )
 
 _LEVER_M = 0.05
@@ -34,7 +35,7 @@ only keep the equations regular."""
 _GYRO_WALK = 3e-5
 _ACCEL_WALK = 3e-3
 """Densities of the biases' random walks, rad/s^2/sqrt(Hz) and m/s^3/sqrt(Hz): of a sensor of middle
-quality (EuRoC's ADIS16448), as nobody knows those of a phone."""
+quality (EuRoC's ADIS16448), as those of a phone are unknown."""
 _FIRST_NOISE = 3e-3
 NOISE_RANGE = (1e-5, 0.1)
 """Of poses: radians, and shares of the trajectory's extent.  Poses that would have to be worse than
@@ -117,7 +118,7 @@ class System:
         root: F64 = np.asarray(np.linalg.inv(np.linalg.cholesky(sums.covariance)), np.float64)
         walks = _walks(state, self._tied, ends - starts)
         self._inertial = Linear(
-            residual=np.concatenate([_of_each(root, linear.residual), walks.residual], axis=1),
+            residual=np.concatenate([of_each(root, linear.residual), walks.residual], axis=1),
             by_first=np.concatenate([root @ linear.by_first, walks.by_first], axis=1),
             by_second=np.concatenate([root @ linear.by_second, walks.by_second], axis=1),
             by_common=np.concatenate([root @ linear.by_common, walks.by_common], axis=1),
@@ -245,7 +246,3 @@ def _walks(state: State, tied: I64, seconds: F64) -> Linear:
         by_second=by_second,
         by_common=np.zeros((len(tied), 6, COMMON)),
     )
-
-
-def _of_each(matrices: F64, vectors: F64) -> F64:
-    return (matrices @ vectors[:, :, None])[:, :, 0]

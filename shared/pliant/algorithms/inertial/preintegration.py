@@ -3,8 +3,8 @@
 Forster, Carlone, Dellaert, Scaramuzza: On-Manifold Preintegration for Real-Time Visual-Inertial
 Odometry, IEEE T-RO 33(1), 2017.  Their equations are quoted as (F-n).
 
-The samples between times ``a`` and ``b`` are summed once to what they say of the motion of the
-sensor, whatever its pose, velocity and gravity are (F-33)::
+The samples between times ``a`` and ``b`` are summed once to the motion of the sensor, independent
+of its pose, its velocity and gravity (F-33)::
 
     rotation  = R_a^T R_b
     velocity  = R_a^T (v_b - v_a - g (b - a))

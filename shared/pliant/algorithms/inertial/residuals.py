@@ -131,8 +131,8 @@ def linearised(state: State, sums: Preintegrated, first_nodes: I64) -> Linear:
     Q_t = Q_i.swapaxes(1, 2)
     step, swing = state.scale * (state.p[j] - state.p[i]), R_j - R_i
     P = step + swing @ state.p_camera_imu
-    y_v = _of_each(Q_t, state.v[j] - state.v[i] - state.gravity * dt)
-    y_p = _of_each(Q_t, P - state.v[i] * dt - 0.5 * state.gravity * dt**2)
+    y_v = of_each(Q_t, state.v[j] - state.v[i] - state.gravity * dt)
+    y_p = of_each(Q_t, P - state.v[i] * dt - 0.5 * state.gravity * dt**2)
     r_R = so3_log(sums.rotation.swapaxes(1, 2) @ Q_t @ Q_j)
     J = np.linalg.inv(right_jacobian(r_R))
     back = J @ so3_exp(-r_R)
@@ -154,15 +154,16 @@ def linearised(state: State, sums: Preintegrated, first_nodes: I64) -> Linear:
     second[:, 3:6, VELOCITY] = Q_t
     common[:, :, TURN] = by_turn
     common[:, 0:3, TURN] += J
-    common[:, 6:9, 0] = _of_each(Q_t, step)
+    common[:, 6:9, 0] = of_each(Q_t, step)
     by_gravity = Q_t @ tangent(state.gravity)
     common[:, 3:6, GRAVITY] = -by_gravity * h
     common[:, 6:9, GRAVITY] = -0.5 * by_gravity * h**2
     common[:, 6:9, LEVER] = Q_t @ swing
-    common[:, 0:3, 9] = -_of_each(back, sums.by_offset[:, 0:3])
+    common[:, 0:3, 9] = -of_each(back, sums.by_offset[:, 0:3])
     common[:, 3:9, 9] = -sums.by_offset[:, 3:9]
     return Linear(residual=residual, by_first=first, by_second=second, by_common=common)
 
 
-def _of_each(matrices: F64, vectors: F64) -> F64:
+def of_each(matrices: F64, vectors: F64) -> F64:
+    """(K, n): the product of each matrix (K, n, m) with its vector (K, m)."""
     return (matrices @ vectors[:, :, None])[:, :, 0]

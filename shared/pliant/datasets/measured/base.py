@@ -112,9 +112,9 @@ def imu_measurements(
             accel_m_s2=np.stack(between, axis=1),
         )
     alone = len(ordered) - len(rows)
-    told = _said(samples, where) + _left_out(wrong)
-    told += f"; {alone} without an accelerometer sample near left out" if alone else ""
-    return Measurements(imu=samples, imu_notes=(told, *notes))
+    note = _summary(samples, where) + _left_out(wrong)
+    note += f"; {alone} without an accelerometer sample near left out" if alone else ""
+    return Measurements(imu=samples, imu_notes=(note, *notes))
 
 
 def gps_measurements(fixes: Series, where: str, *, unreadable: int = 0) -> Measurements:
@@ -139,8 +139,8 @@ def gps_measurements(fixes: Series, where: str, *, unreadable: int = 0) -> Measu
         sigma_m=sigma,
     )
     wrong = len(fixes) + unreadable - len(found.stamps_ns)
-    told = f"{where}: satellite fixes: {len(found.stamps_ns)}"
-    return Measurements(gps=found, gps_notes=(f"{told}{_left_out(wrong)}",))
+    note = f"{where}: satellite fixes: {len(found.stamps_ns)}"
+    return Measurements(gps=found, gps_notes=(f"{note}{_left_out(wrong)}",))
 
 
 def _within(stamps_ns: I64, others_ns: I64) -> I64:
@@ -157,7 +157,7 @@ def _within(stamps_ns: I64, others_ns: I64) -> I64:
     return np.flatnonzero(inside & ((gaps <= _LONGEST_GAP * step) | (near <= step)))
 
 
-def _said(samples: ImuSamples, where: str) -> str:
+def _summary(samples: ImuSamples, where: str) -> str:
     stamps = samples.stamps_ns
     if len(stamps) < 2:
         return f"{where}: no inertial samples with gyro and accelerometer at one time"

@@ -63,8 +63,8 @@ class _Stream:
         begun = about["STMP"].numbers() if "STMP" in about else np.empty(0)
         follows = self.first[-1] + len(self.values[-1]) if self.first else 0
         # TSMP is the number of samples until the end of this payload.
-        told = int(counted.flat[0]) - len(values) if counted.size else follows
-        self.first.append(told if follows <= told < follows + (1 << 24) else follows)
+        first = int(counted.flat[0]) - len(values) if counted.size else follows
+        self.first.append(first if follows <= first < follows + (1 << 24) else follows)
         self.values.append(values)
         self.begin_ns.append(payload.begin_ns)
         self.end_ns.append(payload.end_ns)
