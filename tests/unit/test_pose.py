@@ -1,20 +1,19 @@
 """One pose with fixed points: its equations by finite differences, and priors of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from bundle_scene import make_scene, move
 from mapping_scene import CAMERA, looking
 
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.slam.estimate.dense_layout import BLOCK, Table
-from pliant.algorithms.slam.estimate.pose import (
-    Correspondences,
-    PosePrior,
-    Spread,
-    add_prior,
-    refine_pose,
-)
+from pliant.algorithms.slam.estimate.pose import Correspondences, Spread, refine_pose
+from pliant.algorithms.slam.estimate.pose_prior import PosePrior, add_prior
 from pliant.algorithms.slam.estimate.problem import BundleParameters
 from pliant.algorithms.slam.estimate.projection import Cameras, limits_of, move_camera
+from pliant.algorithms.slam.estimate.subspace import solve_subspace
 from pliant.algorithms.slam.estimate.subspace_kernels import linearise_camera
 
 PARAMETERS = BundleParameters(kernel_sigma_px=2.0)
@@ -148,3 +147,26 @@ def test_a_fixed_centre_stays_exactly_and_the_rotation_follows_its_prior():
         T, *_ = refine_pose(start, view()._replace(prior=prior), CAMERA, PARAMETERS)
         assert np.array_equal(T[:3, 3], start[:3, 3])
         assert np.linalg.norm(so3_log(T[:3, :3].T @ expected[:3, :3])) < 1e-3
+
+
+def test_sweeps_respect_a_prior_of_the_last_camera_as_the_pose_alone_does():
+    """With certain landmarks, held by four fixed cameras, both minimise nearly the same cost."""
+    scene = make_scene(points=300, noise_px=0.5)
+    problem = replace(scene.problem, T_world_camera=scene.T_world_camera)
+    problem.fixed_cameras[:-1] = True
+    last, sweeps = problem.camera_index == 4, PARAMETERS.model_copy(update={"max_sweeps": 50})
+    px = np.full((300, 2), np.nan, np.float32)
+    px[problem.point_index[last]] = problem.points_px[last]
+    camera = replace(CAMERA, **dict(zip(("fx", "fy", "cx", "cy"), problem.intrinsics[0, :4])))
+    seen = Correspondences(scene.points_world, px)
+    start = scene.T_world_camera[4]
+    mean = move(start, np.array([0.02, -0.03, 0.01, 0.02, -0.01, 0.015]))
+    information = refine_pose(start, seen, camera, PARAMETERS).information
+    for factor in (0.0, 1.0, 1e4):
+        prior = PosePrior(mean, factor * information)
+        found = solve_subspace(problem, sweeps, prior=prior)
+        alone = refine_pose(start, seen._replace(prior=prior), camera, PARAMETERS, iterations=50)
+        np.testing.assert_allclose(found.T_world_camera[4], alone.T_world_camera, atol=2e-3)
+        assert (np.diff(found.costs) <= 1e-5 * found.costs[:-1]).all()
+    assert np.linalg.norm(found.T_world_camera[4] - start) > 0.03
+    np.testing.assert_allclose(found.T_world_camera[4], mean, atol=1e-3)

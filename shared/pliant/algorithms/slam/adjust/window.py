@@ -17,6 +17,7 @@ from pliant.algorithms.slam.estimate.observation_table import (
     seen_in_state,
     weigh,
 )
+from pliant.algorithms.slam.estimate.pose_prior import NO_PRIOR, PosePrior
 from pliant.algorithms.slam.estimate.problem import BundleResult, BundleWindow, shared_intrinsics
 from pliant.algorithms.slam.estimate.schur import solve_schur
 from pliant.algorithms.slam.estimate.subspace import solve_subspace
@@ -103,11 +104,11 @@ class Window:
         # Not in place: keyframes and others may have rows of it.
         self.T_world_camera = np.array([*(k.T_world_camera for k in self.keyframes), frame])
 
-    def sweep_current(self, parameters: MappingParameters) -> F64:
+    def sweep_current(self, parameters: MappingParameters, prior: PosePrior = NO_PRIOR) -> F64:
         """Run a few subspace Gauss-Newton sweeps (Eq. 11-12) with the current frame.
 
-        The frame and its landmarks are free; in the paper the keyframes are free as well.  Returns
-        the pose of the frame.
+        The frame and its landmarks are free; in the paper the keyframes are free as well.
+        prior: of the frame's pose.  Returns T_world_camera (4, 4) of the frame.
         """
         columns = seen_in_state(
             self.rows, self.points.state, MAPPED, self.seen, len(self.keyframes), 1
@@ -115,7 +116,7 @@ class Window:
         problem = self._problem(columns)
         problem.fixed_cameras[:-1] = True
         bundle = parameters.bundle.model_copy(update={"max_sweeps": parameters.window.sweeps})
-        self._take(columns, solve_subspace(problem, bundle))
+        self._take(columns, solve_subspace(problem, bundle, prior=prior))
         return self.T_world_camera[-1].copy()
 
     def adjust(self, parameters: MappingParameters) -> None:

@@ -5,13 +5,7 @@ Levenberg-Marquardt over the pose and an unknown s that all points share finds t
     sum w rho(r^T W r) + s^2 + d^T L d.
 
 W and s belong to points with an uncertain depth, see ``inverse_depth``; for others W = I and s = 0.
-d and L are the difference from the mean of a prior, and its information.  With R, t of the camera,
-R_0, t_0 of the mean and E = R R_0^T,
-
-    d = (E^T t - t_0, vee(E - E^T) / 2),    d d / d (rho, theta) = diag(E^T, (tr(E) I - E) / 2):
-
-the difference of the centres along the axes of the mean, and the axis of the rotation between the
-two times the sine of its angle.  Near the mean that is the step (rho, theta) from it.
+d and L are the difference from the mean of a prior, and its information, see ``pose_prior``.
 """
 
 from typing import Any, NamedTuple
@@ -21,6 +15,12 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.slam.estimate.dense_layout import BLOCK, Layout, Table
+from pliant.algorithms.slam.estimate.pose_prior import (
+    NO_PRIOR,
+    PosePrior,
+    add_prior,
+    shifted_motion,
+)
 from pliant.algorithms.slam.estimate.problem import BundleParameters
 from pliant.algorithms.slam.estimate.projection import (
     Cameras,
@@ -37,23 +37,6 @@ _LOWER = np.tril_indices(6)
 
 _NEAREST = -1.8
 """Least s: at -2 a point that no other keyframe has seen would be at the camera."""
-
-
-class PosePrior(NamedTuple):
-    """A Gaussian prior of a pose, in units of observations with an error of 1 px.
-
-    T_world_camera: (4, 4) its mean.   information: (6, 6) of d, see the module, as of a
-    ``PoseEstimate``.  Infinity on the diagonal holds that part of the pose as it is at the start.
-    """
-
-    T_world_camera: F64 = np.eye(4)
-    information: F64 = np.zeros((6, 6))
-
-    def with_fixed_centre(self) -> "PosePrior":
-        """Return it with a camera that may only rotate."""
-        information = np.diag([np.inf] * 3 + [0.0] * 3)
-        information[3:, 3:] = self.information[3:, 3:]
-        return self._replace(information=information)
 
 
 class Spread(NamedTuple):
@@ -75,7 +58,7 @@ class Correspondences(NamedTuple):
     points_px: F32
     weights: F32 | None = None
     spread: Spread | None = None
-    prior: PosePrior = PosePrior()
+    prior: PosePrior = NO_PRIOR
 
 
 class PoseEstimate(NamedTuple):
@@ -111,7 +94,7 @@ def refine_pose(
         depths = (np.zeros(layout.points.shape),)
         depths[0][:, :N] = seen.spread.vectors.T
     before = layout.cameras.motion[0]
-    mean = _shifted(seen.prior.T_world_camera, layout.origin)
+    mean = shifted_motion(seen.prior.T_world_camera, layout.origin)
     pose, normal = before.copy(), np.zeros(36)
     shared, cost = _minimise(
         pose, layout.cameras.single(), layout.points.astype(np.float32), layout.table,
@@ -146,7 +129,7 @@ def _one_camera(T_world_camera: F64, seen: Correspondences, camera: PinholeCamer
     _fill(points_world, points_px, origin, table, points)
     if seen.weights is not None:
         w[0, :N] *= seen.weights
-    cameras = Cameras(_shifted(T_world_camera, origin)[None], pinhole, np.zeros(0))
+    cameras = Cameras(shifted_motion(T_world_camera, origin)[None], pinhole, np.zeros(0))
     return Layout(
         column=np.arange(N), cameras=cameras, free=np.ones(1, np.bool_), origin=origin,
         points=points, table=table,
@@ -166,12 +149,6 @@ def _fill(points_world: F64, points_px: F32, origin: F64, table: Table, points: 
             table.seen[0, n // BLOCK] = 1
             for k in range(3):
                 points[k, n] = points_world[n, k] - origin[k]
-
-
-def _shifted(T_world_camera: F64, origin: F64) -> F64:
-    """(12,) the camera in the world shifted by the origin."""
-    R = T_world_camera[:3, :3].T
-    return np.concatenate([R.reshape(-1), R @ (origin - T_world_camera[:3, 3])])
 
 
 def _motion(camera: F64, origin: F64) -> F64:
@@ -222,8 +199,7 @@ def _minimise(
         fresh[27] += 1.0
         fresh[34] -= trial_shared
         fresh[35] += trial_shared * trial_shared
-        if np.any(information != 0.0):
-            add_prior(trial, mean, information, fresh)
+        add_prior(trial, mean, information, fresh)
         if fresh[35] <= lowest:
             small = lowest - fresh[35] <= min_relative_decrease * fresh[35]
             lowest, shared = fresh[35], trial_shared
@@ -257,37 +233,3 @@ def _of_pose(normal: F64) -> tuple[F64, F64]:
             at += 1
         g[r] = normal[28 + r] - share * normal[34]
     return H, g
-
-
-@kernel
-def add_prior(camera: F64, mean: F64, information: F64, normal: F64) -> None:
-    """Add a prior's part to the equations (36,) of a camera (12,).   mean: (12,)."""
-    E, d, J, L = np.zeros((3, 3)), np.empty(6), np.zeros((6, 6)), np.empty((6, 6))
-    for r in range(3):
-        for c in range(3):
-            for k in range(3):
-                E[r, c] += camera[3 * r + k] * mean[3 * c + k]
-    for r in range(3):
-        a, b = (r + 1) % 3, (r + 2) % 3
-        d[r] = E[0, r] * camera[9] + E[1, r] * camera[10] + E[2, r] * camera[11] - mean[9 + r]
-        d[3 + r] = 0.5 * (E[b, a] - E[a, b])
-        for c in range(3):
-            J[r, c] = E[c, r]
-            J[3 + r, 3 + c] = -0.5 * E[r, c]
-        J[3 + r, 3 + r] += 0.5 * (E[0, 0] + E[1, 1] + E[2, 2])
-    for a in range(6):
-        for b in range(6):
-            L[a, b] = information[a, b] if np.isfinite(information[a, b]) else 0.0
-            normal[35] += d[a] * L[a, b] * d[b]
-    for a in range(6):
-        for b in range(6):
-            for r in range(6):
-                normal[28 + r] -= J[a, r] * L[a, b] * d[b]
-                for c in range(r + 1):
-                    normal[r * (r + 1) // 2 + c] += J[a, r] * L[a, b] * J[b, c]
-    for held in range(6):
-        if information[held, held] == np.inf:
-            for r in range(7):
-                low, high = min(r, held), max(r, held)
-                normal[high * (high + 1) // 2 + low] = 1.0 if r == held else 0.0
-            normal[28 + held] = 0.0

@@ -21,6 +21,12 @@ from pliant.algorithms.slam.estimate.dense_layout import (
     poses_of,
     residuals_of,
 )
+from pliant.algorithms.slam.estimate.pose_prior import (
+    NO_PRIOR,
+    PosePrior,
+    prior_cost,
+    shifted_motion,
+)
 from pliant.algorithms.slam.estimate.problem import (
     AnyProblem,
     BundleParameters,
@@ -47,32 +53,40 @@ def solve_subspace(
     problem: AnyProblem,
     parameters: BundleParameters,
     on_iteration: Callable[[float], None] | None = None,
+    *,
+    prior: PosePrior = NO_PRIOR,
 ) -> BundleResult:
     """Sweep until ``max_sweeps``, or until a sweep reduces the cost by too little.
 
     Works in float32 around the mean of the cameras; steps accumulate in float64.  Meant for a
     window near convergence: from a poor initial state use ``solve_schur``.
+
+    prior: of the last camera's pose; costs include it.
     """
     layout = build_layout(problem)
     motion, points = layout.cameras.motion.copy(), layout.points.copy()
     cameras, points32 = layout.cameras.single(), points.astype(np.float32)
     limits, damping = limits_of(parameters, np.float32), np.float32(parameters.sweep_damping)
+    mean, L = shifted_motion(prior.T_world_camera, layout.origin), prior.information
     costs: list[float] = []
     converged = False
     for _ in range(parameters.max_sweeps):
+        held = 0.5 * prior_cost(motion[-1], mean, L)
         before, after = sweep_points(cameras, points32, points, layout.table, limits, damping)
+        before, after = before + held, after + held
         if not costs:
             costs.append(before)
         cost = after - sweep_cameras(
-            motion, cameras, layout.free, points32, layout.table, limits, parameters.sweep_damping
-        )
+            motion, cameras, layout.free, points32, layout.table, limits,
+            parameters.sweep_damping, mean, L,
+        )  # fmt: skip
         costs.append(cost)
         if on_iteration is not None:
             on_iteration(cost)
         converged = before - cost <= parameters.min_relative_decrease * cost
         if converged:
             break
-    last = total_cost(layout, motion, points, parameters)
+    last = total_cost(layout, motion, points, parameters) + 0.5 * prior_cost(motion[-1], mean, L)
     costs = [*costs[:-1], last] if costs else [last]
     return make_result(problem, layout, motion, points, costs, converged, parameters)
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, BoolArray
 from pliant.algorithms.slam.estimate.dense_layout import BLOCK, Table
+from pliant.algorithms.slam.estimate.pose_prior import add_prior, prior_cost
 from pliant.algorithms.slam.estimate.projection import (
     Cameras,
     Limits,
@@ -292,12 +293,16 @@ def sweep_cameras(
     table: Table,
     limits: Limits,
     damping: float,
+    mean: F64,
+    information: F64,
 ) -> float:
     """One damped Gauss-Newton step of every movable camera, points fixed (Eq. 11).
 
     exact (M, 12) is the float64 master of the cameras' motion; both are moved in place.  A camera
-    moves only if that lowers its own cost.  Returns the decrease of the cost.
+    moves only if that lowers its own cost.   mean, information: (12,) and (6, 6) of a prior of the
+    last camera.  Returns the decrease of the cost.
     """
+    last = exact.shape[0] - 1
     normal = np.empty(36)
     step = np.empty(6)
     moved = np.empty(12)
@@ -307,12 +312,16 @@ def sweep_cameras(
         if not free[m]:
             continue
         linearise_camera(m, cameras, points, table, limits, (), ZERO, normal)
+        if m == last:
+            add_prior(exact[m], mean, information, normal)
         if not solve_camera(normal, normal[28:], damping, step):
             continue
         move_camera(exact[m], step, moved)
         for k in range(12):
             trial[k] = np.float32(moved[k])
         cost = camera_cost(trial, m, cameras, points, table, limits)
+        if m == last:
+            cost += prior_cost(moved, mean, information)
         if cost < normal[35]:
             decrease += 0.5 * (normal[35] - cost)
             for k in range(12):
