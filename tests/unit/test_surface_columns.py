@@ -6,8 +6,8 @@ import pytest
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import so3_exp
 from pliant.evaluation.criteria import Similarity
-from pliant.evaluation.nearest_points import nearest
 from pliant.evaluation.surface_columns import format_columns, registered, surface_columns
+from pliant.evaluation.surface_distance import nearest
 
 
 @pytest.mark.parametrize("most", [0.02, 0.3, 5.0])

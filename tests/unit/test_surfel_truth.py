@@ -10,7 +10,6 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.evaluation.surfel_truth import (
     SurfelTruth,
-    distances,
     format_surfels,
     lift,
     mean_rows,
@@ -78,14 +77,6 @@ def test_depth_is_not_lifted_across_an_edge_a_hole_or_the_border() -> None:
     points = np.array([[20.5, 20.5], [79.5, 20.0], [50.5, 50.0], [-1.0, 5.0], [159.5, 5.0]])
     _, known = lift(points.astype(np.float32), depth, CAMERA)
     assert known.tolist() == [True, False, False, False, False]
-
-
-def test_distances_are_those_of_brute_force() -> None:
-    generator = np.random.default_rng(0)
-    points, cloud = generator.normal(5.0, 1.0, (150, 3)), generator.normal(5.0, 1.0, (400, 3))
-    expected = np.linalg.norm(points[:, None] - cloud[None], axis=2).min(axis=1)
-    np.testing.assert_allclose(distances(points, cloud), expected, rtol=1e-9)
-    assert len(distances(points, cloud[:0])) == len(distances(points[:0], cloud)) == 0
 
 
 def test_area_under_the_curve_is_the_chance_of_the_right_order() -> None:

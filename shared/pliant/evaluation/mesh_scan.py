@@ -12,18 +12,14 @@ from pliant.algorithms.geometry import so3_log
 from pliant.errors import ResultError
 from pliant.evaluation.criteria import Similarity
 from pliant.evaluation.presentation import metres
-from pliant.evaluation.surface_distance import sample_surface, thin_out
+from pliant.evaluation.surface_columns import registered
+from pliant.evaluation.surface_distance import nearest, sample_surface, share_within, thin_out
 from pliant.formats.ply import read_ply
-from pliant.open3d_geometry import to_cloud
-from pliant.open3d_library import load_open3d
 
 SURFACE_LIMIT = 0.01
 """Share of the scan's diameter within which two surfaces are the same, for the F-score."""
-_GATES = (0.05, 0.01)
-"""Shares of it within which ICP takes points for the same, one after the other."""
 _SPACING = 0.25
 """Samples of both surfaces stand so far apart, as a share of the limit."""
-_ITERATIONS = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +50,6 @@ def mesh_against_scan(
     result: Path, scan: Path, alignment: Similarity | None, figures: dict[str, Any]
 ) -> Iterator[str]:
     """The fine mesh of a result folder.  Raises PliantError."""
-    load_open3d()
     if alignment is None:
         raise ResultError("without an aligned trajectory the mesh cannot be placed in the scan")
     if not (result / "mesh.ply").is_file():
@@ -82,15 +77,14 @@ def mesh_against_scan(
 def compare_with_scan(samples: F64, scan: F64, diameter: float) -> ScanTruth:
     """Samples (N, 3) of a mesh, registered to those of a scan (M, 3) by ICP with scale."""
     limit = SURFACE_LIMIT * diameter
-    before = _distances(samples, scan) <= limit
-    change = _registered(samples, scan, diameter)
+    change = registered(samples, scan, diameter, with_scale=True)
     moved = change.apply(samples)
-    accuracy, completeness = _distances(moved, scan), _distances(scan, moved)
+    accuracy, completeness = nearest(moved, scan, np.inf)[1], nearest(scan, moved, np.inf)[1]
     precision, recall = float(np.mean(accuracy <= limit)), float(np.mean(completeness <= limit))
     centre = scan.mean(axis=0)
     return ScanTruth(
         diameter_m=diameter,
-        registered=float(before.mean()),
+        registered=share_within(samples, scan, limit),
         scale=change.scale,
         turn_deg=float(np.degrees(np.linalg.norm(so3_log(change.R[None])))),
         shift_m=float(np.linalg.norm(change.apply(centre[None])[0] - centre)),
@@ -113,27 +107,3 @@ def format_scan(truth: ScanTruth) -> str:
         f"{metres(t.chamfer_m)}\nwithin 1 % of the diameter ({t.diameter_m:.2f} m): F-score "
         f"{t.f_score:.3f}, precision {t.precision:.3f}, recall {t.recall:.3f}"
     )
-
-
-def _registered(samples: F64, scan: F64, diameter: float) -> Similarity:
-    open3d = load_open3d()
-    registration = open3d.pipelines.registration
-    found: Any = np.eye(4)
-    for gate in _GATES:
-        found = registration.registration_icp(
-            to_cloud(samples, None),
-            to_cloud(scan, None),
-            gate * diameter,
-            found,
-            registration.TransformationEstimationPointToPoint(True),
-            registration.ICPConvergenceCriteria(max_iteration=_ITERATIONS),
-        ).transformation
-    moved = np.asarray(found, np.float64)
-    scale = float(np.cbrt(np.linalg.det(moved[:3, :3])))
-    return Similarity(scale=scale, R=moved[:3, :3] / scale, t=moved[:3, 3].copy())
-
-
-def _distances(points: F64, others: F64) -> F64:
-    """(N,) from each point to the nearest of the others."""
-    found = to_cloud(points, None).compute_point_cloud_distance(to_cloud(others, None))
-    return np.asarray(found, np.float64)

@@ -10,9 +10,8 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.meshing.mesh_blocks import no_rows
 from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.evaluation.criteria import Similarity
-from pliant.evaluation.nearest_points import nearest
 from pliant.evaluation.surface_columns import SurfaceFigures, surface_columns
-from pliant.evaluation.surface_distance import sample_surface, share_within, thin_out
+from pliant.evaluation.surface_distance import nearest, sample_surface, share_within, thin_out
 from pliant.evaluation.visible_depth import DepthView
 
 DEPTH_LIMIT = 0.05

@@ -13,8 +13,8 @@ import numpy as np
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import align_umeyama, so3_log
 from pliant.evaluation.criteria import Similarity
-from pliant.evaluation.nearest_points import nearest
 from pliant.evaluation.presentation import metres, table
+from pliant.evaluation.surface_distance import nearest
 
 CUT_M, NEAR_M = 0.5, 0.05
 """Pairs farther apart are left out of the RMSE; those nearer count for the F-score at 5 cm."""

@@ -1,10 +1,14 @@
-"""Samples of surfaces, and which of them have another surface within a distance."""
+"""Samples of surfaces, and the nearest of many points."""
 
+from typing import Any
+
+import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64
-from pliant.compiler.kernel import kernel
 
+_ONE_TREE = {"algorithm": 4}
+"""FLANN's KDTREE_SINGLE: one k-d tree, searched exactly."""
 _MAX_CELL = 1 << 20
 """Cells along an axis: 21 bits of a key for each."""
 
@@ -35,46 +39,28 @@ def thin_out(points: F64, spacing: float) -> F64:
 
 def share_within(points: F64, others: F64, distance: float) -> float:
     """Share of (N, 3) points that have one of the (M, 3) others within a distance."""
+    rows, _ = nearest(points, others, distance)
+    return float(np.mean(rows >= 0)) if len(rows) else 0.0
+
+
+def nearest(points: F64, others: F64, most: float) -> tuple[I64, F64]:
+    """(N,) rows of the (M, 3) others and distances, -1 and infinite where none is within ``most``.
+
+    points: (N, 3).  Of others that single precision cannot tell apart, it may be any.
+    """
+    rows, distances = np.full(len(points), -1, np.int64), np.full(len(points), np.inf)
     if len(points) == 0 or len(others) == 0:
-        return 0.0
-    low = np.minimum(points.min(axis=0), others.min(axis=0)) - 2.0 * distance
-    keys = cell_keys(others, low, distance)
-    order = np.argsort(keys, kind="stable")
-    found = _near(points, np.ascontiguousarray(others[order]), keys[order], low, distance)
-    return float(found / len(points))
+        return rows, distances
+    middle = others.mean(axis=0)  # small numbers keep their digits
+    tree: Any = cv2.flann.Index((others - middle).astype(np.float32), _ONE_TREE)
+    found = tree.knnSearch((points - middle).astype(np.float32), 1, params={"checks": -1})[0][:, 0]
+    lengths = np.linalg.norm(points - others[found], axis=1)
+    near = lengths <= most
+    rows[near], distances[near] = found[near], lengths[near]
+    return rows, distances
 
 
 def cell_keys(points: F64, low: F64, size: float) -> I64:
     """(N,) numbers of the cubes in which (N, 3) points lie, 21 bits for each axis."""
     cells = np.clip(((points - low) / size).astype(np.int64), 0, _MAX_CELL)
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
-
-
-@kernel
-def _near(points: F64, others: F64, keys: I64, low: F64, distance: float) -> int:
-    found = 0
-    limit = distance * distance
-    for i in range(len(points)):
-        x = int((points[i, 0] - low[0]) / distance)
-        y = int((points[i, 1] - low[1]) / distance)
-        z = int((points[i, 2] - low[2]) / distance)
-        near = False
-        for a in range(x - 1, x + 2):
-            for b in range(y - 1, y + 2):
-                # Three cells along z follow each other in the keys.
-                key = (a << 42) | (b << 21) | (z - 1)
-                k = np.searchsorted(keys, key)
-                while k < len(keys) and keys[k] <= key + 2:
-                    d0 = others[k, 0] - points[i, 0]
-                    d1 = others[k, 1] - points[i, 1]
-                    d2 = others[k, 2] - points[i, 2]
-                    if d0 * d0 + d1 * d1 + d2 * d2 <= limit:
-                        near = True
-                        break
-                    k += 1
-                if near:
-                    break
-            if near:
-                break
-        found += near
-    return found

@@ -24,11 +24,11 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.evaluation.presentation import table
+from pliant.evaluation.surface_distance import nearest
 
 MAX_RETURN_PX = 0.5
 MAX_STEP = 0.01
 """Relative range of the four pixels about a track beyond which it is on an edge of the depth."""
-_CHUNK = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,8 +116,8 @@ class SurfelTruth:
             rmse=rmse(where[both] - truth[both]),
             rmse_all=rmse(where[known] - truth[known]),
             frozen_rmse=rmse(born[known] - truth[known]),
-            cloud=_median(distances(where[alive], cloud)),
-            frozen_cloud=_median(distances(born, cloud)),
+            cloud=_median(nearest(where[alive], cloud, np.inf)[1]),
+            frozen_cloud=_median(nearest(born, cloud, np.inf)[1]),
             scaled_mean_80=scaled_mean(where[both], truth[both], 0.8),
             depth_rmse_90=trimmed_rmse(where[both, 2] - truth[both, 2], 0.9),
         )
@@ -150,20 +150,6 @@ def cloud_of(depth_m: F64, camera: PinholeCamera) -> F64:
     v, u = np.nonzero(depth_m > 0.0)
     rays = camera.normalise(np.stack([u, v], axis=1).astype(np.float64))
     return np.concatenate([rays, np.ones((len(u), 1))], axis=1) * depth_m[v, u, None]
-
-
-def distances(points: F64, cloud: F64) -> F64:
-    """(N,) distance of each point to the nearest of the cloud; empty without a cloud."""
-    if not len(points) or not len(cloud):
-        return np.zeros(0)
-    middle = cloud.mean(axis=0)  # squares of small numbers keep their digits
-    p, c = points - middle, cloud - middle
-    squares = (c * c).sum(axis=1)
-    nearest = [
-        cloud[np.argmin(squares - 2.0 * (p[i : i + _CHUNK] @ c.T), axis=1)]
-        for i in range(0, len(p), _CHUNK)
-    ]
-    return np.linalg.norm(points - np.concatenate(nearest), axis=1)
 
 
 def rmse(errors: F64) -> float:
@@ -234,4 +220,5 @@ def format_surfels(rows: list[SurfelRow]) -> str:
 
 
 def _median(values: F64) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else float("nan")
