@@ -96,15 +96,9 @@ class Pipeline:
         return list(self._mapper.kept())
 
 
-def process(
-    dataset: Dataset,
-    config: Config,
-    history: MapHistory,
-    *,
-    timers: Timers = Timers(),
-) -> Iterator[MappedFrame]:
+def process(dataset: Dataset, config: Config, history: MapHistory) -> Iterator[MappedFrame]:
     """Track and map every frame of a source; ``history`` is complete once the iterator ends."""
-    pipeline = Pipeline(dataset.calibration, config, history, timers)
+    pipeline = Pipeline(dataset.calibration, config, history)
     for source in dataset:
         yield pipeline.take(source)
     pipeline.finish()

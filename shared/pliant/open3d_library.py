@@ -10,7 +10,7 @@ from pliant.errors import PliantError
 SYSTEM_PACKAGES = "libegl1 libgl1 libx11-6 libusb-1.0-0"
 """Of Debian and Ubuntu, which `import open3d` needs."""
 
-OPEN3D_IS_FOR = "--watertight, --scan, `pliant view --open3d` and `to_open3d()`"
+OPEN3D_IS_FOR = "--watertight, `pliant view --open3d` and `to_open3d()`"
 
 
 class Open3dError(PliantError):

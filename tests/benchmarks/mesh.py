@@ -17,7 +17,7 @@ from pliant.datasets.base import is_builtin
 from pliant.datasets.builtin import builtin_folder
 from pliant.errors import ResultError
 from pliant.evaluation.mesh_truth import Mesh
-from pliant.evaluation.recorded_mesh import compare_mesh, depth_camera
+from pliant.evaluation.recorded_mesh import depth_camera, measure_mesh
 from pliant.evaluation.run_evaluation import evaluate_result
 from pliant.evaluation.surface_distance import share_within, thin_out
 from pliant.evaluation.truth import true_frames
@@ -172,7 +172,9 @@ class _Compared:
 
     def figures(self, mesh: Mesh) -> list[str]:
         """One of each of _FIGURES."""
-        found = compare_mesh(mesh, self.history, self._camera, self._truth, self._evaluation)
+        found = measure_mesh(
+            mesh, self.history, self._camera, self._truth, self._evaluation
+        ).result()
         return [
             f"{100 * found.covered:.1f} %",
             f"{100 * found.median_error:.2f} %",

@@ -26,14 +26,12 @@ def count_distinct(
     *,
     camera: PinholeCamera,
     T_world_camera: dict[int, F64],
-    max_distance_px: float = DUPLICATE_PX,
-    max_depth_difference: float = DUPLICATE_DEPTH,
 ) -> int:
     """How many points remain when duplicates are merged.
 
     Two points are duplicates when, seen from the frame of either of them, they lie within
-    ``max_distance_px`` of each other and their depths differ by at most
-    ``max_depth_difference`` of the smaller.  Duplicates of duplicates merge as well, so the count
+    ``DUPLICATE_PX`` of each other and their depths differ by at most
+    ``DUPLICATE_DEPTH`` of the smaller.  Duplicates of duplicates merge as well, so the count
     errs on the low side.  Points that are not in the image of their own frame stay as they are.
 
     points_world: (P, 3), of one map segment.      frames: (P,) a frame that observes each point,
@@ -59,8 +57,8 @@ def count_distinct(
             frames == frame,
             px,
             depths,
-            max_distance_px,
-            max_depth_difference,
+            DUPLICATE_PX,
+            DUPLICATE_DEPTH,
             head,
             following,
             parent,

@@ -109,14 +109,14 @@ def frame_pairs(stamps_ns: I64) -> tuple[I64, I64]:
     return first, first + 1
 
 
-def second_pairs(stamps_ns: I64, *, seconds: float = 1.0) -> tuple[I64, I64]:
-    """Rows of poses ``seconds`` apart: for each pose the one closest to that much later.
+def second_pairs(stamps_ns: I64) -> tuple[I64, I64]:
+    """Rows of poses a second apart: for each pose the one closest to a second later.
 
     It must be within half the median interval of it, else the pose has no partner.
     """
     if len(stamps_ns) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    wanted = stamps_ns + round(seconds * 1e9)
+    wanted = stamps_ns + 1_000_000_000
     second = np.clip(np.searchsorted(stamps_ns, wanted), 1, len(stamps_ns) - 1)
     earlier_is_closer = wanted - stamps_ns[second - 1] <= stamps_ns[second] - wanted
     second = np.where(earlier_is_closer, second - 1, second)

@@ -9,7 +9,7 @@ from pliant.evaluation.run_evaluation import Evaluation
 _COLOURS = {"final": "#1668b8", "online": "#e0751a"}
 
 
-def plot_errors(path: Path, evaluation: Evaluation, *, title: str | None = None) -> None:
+def plot_errors(path: Path, evaluation: Evaluation) -> None:
     """Write a PNG: distance to the true position over time, online and final.
 
     Raises ResultError where matplotlib is not installed, or where neither trajectory could be
@@ -50,7 +50,7 @@ def plot_errors(path: Path, evaluation: Evaluation, *, title: str | None = None)
     axes.spines[["top", "right"]].set_visible(False)
     # Above the axes, where no curve can run through it.
     axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-    axes.set_title(title or "Error over time, Sim(3) aligned", fontsize=10, loc="left")
+    axes.set_title("Error over time, Sim(3) aligned", fontsize=10, loc="left")
     try:
         # Without the version of matplotlib in the file, equal numbers give equal bytes.
         figure.savefig(path, format="png", metadata={"Software": None})

@@ -12,7 +12,7 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.errors import ResultError
-from pliant.evaluation.mesh_truth import Mesh, MeshEvaluation, MeshTruth, format_mesh
+from pliant.evaluation.mesh_truth import Mesh, MeshEvaluation, format_mesh
 from pliant.evaluation.presentation import metres
 from pliant.evaluation.run_evaluation import Evaluation
 from pliant.evaluation.surface_columns import format_columns
@@ -78,13 +78,6 @@ def _draw_errors(path: Path, measured: MeshEvaluation, run: Run) -> str:
     except OSError as error:
         return f"{path}: cannot be written ({error.strerror})"
     return f"where the mesh is wrong: {path}"
-
-
-def compare_mesh(
-    mesh: Mesh, history: MapHistory, camera: PinholeCamera, truth: Path, evaluation: Evaluation
-) -> MeshTruth:
-    """The figures of ``measure_mesh``."""
-    return measure_mesh(mesh, history, camera, truth, evaluation).result()
 
 
 def measure_mesh(

@@ -236,7 +236,6 @@ def evaluate_result(
     times: Path | None = None,
     frames: int | None = None,
     offset: str = "",
-    max_difference_ns: int = MAX_DIFFERENCE_NS,
 ) -> Evaluation:
     """Evaluate a result folder (or one trajectory file) against a ground truth.
 
@@ -258,9 +257,7 @@ def evaluate_result(
         estimate = read_trajectory(result, times=times, allow_empty=True)
         by_ns = offset_ns(offset or "0", estimate)
         estimate = shifted(estimate, by_ns)
-        final = evaluate_trajectory(
-            estimate, truth, frames=frames, max_difference_ns=max_difference_ns
-        )
+        final = evaluate_trajectory(estimate, truth, frames=frames)
         return Evaluation(
             result=str(result),
             groundtruth=true_name,
@@ -285,7 +282,6 @@ def evaluate_result(
                 frames=report.frames if frames is None else frames,
                 other_segments=others,
                 origin_ns=int(estimate.stamps_ns[0]) if len(estimate) else None,
-                max_difference_ns=max_difference_ns,
             )
     return Evaluation(
         result=str(result),

@@ -23,7 +23,7 @@ _HEADER = (
 _FIELD_COUNTS = (8, 17)
 
 
-def read_euroc(path: Path, *, allow_empty: bool = False) -> Trajectory:
+def read_euroc(path: Path) -> Trajectory:
     """Read and check every line.  ResultError names file and line of the first bad one.
 
     The ground truth of a EuRoC sequence is that of the body; its camera's is
@@ -46,7 +46,7 @@ def read_euroc(path: Path, *, allow_empty: bool = False) -> Trajectory:
             raise ResultError(f"{path}:{number}: {error}") from None
         poses.append([x, y, z, qx, qy, qz, qw])
         lines.append(number)
-    return build_trajectory(path, lines, stamps, np.array(poses), allow_empty=allow_empty)
+    return build_trajectory(path, lines, stamps, np.array(poses))
 
 
 def write_euroc(path: Path, trajectory: Trajectory) -> None:

@@ -20,7 +20,7 @@ ROTATION_TOLERANCE = 1e-3
 """Largest entry of R^T R - I: the benchmark's own files reach 1e-6."""
 
 
-def read_kitti(path: Path, stamps_ns: I64, *, allow_empty: bool = False) -> Trajectory:
+def read_kitti(path: Path, stamps_ns: I64) -> Trajectory:
     """Read and check every line.  ResultError names file and line of the first bad one.
 
     stamps_ns: (N,) time of each line, which the format does not hold (``read_kitti_times``).
@@ -47,7 +47,7 @@ def read_kitti(path: Path, stamps_ns: I64, *, allow_empty: bool = False) -> Traj
     if len(matrices):
         T[:, :3] = np.array(matrices).reshape(-1, 3, 4)
         T[:, :3, :3] = rotation_from_quat(quat_from_rotation(T[:, :3, :3]))
-    return build_trajectory(path, lines, stamps_ns.tolist(), T, allow_empty=allow_empty)
+    return build_trajectory(path, lines, stamps_ns.tolist(), T)
 
 
 def read_kitti_times(path: Path) -> I64:

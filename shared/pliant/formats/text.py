@@ -93,7 +93,7 @@ def check_quaternion(quaternion: Sequence[float]) -> None:
 
 
 def build_trajectory(
-    path: Path, lines: list[int], stamps_ns: list[int], poses: F64, *, allow_empty: bool
+    path: Path, lines: list[int], stamps_ns: list[int], poses: F64, *, allow_empty: bool = False
 ) -> Trajectory:
     """Check that times increase and make the Trajectory; errors name file and line.
 

@@ -18,6 +18,7 @@ _DOT = 0.008
 
 FOCAL = 1.2  # of the height of the picture
 _ASPECT = 4.0 / 3.0
+_FROM_DEG = ((25.0, 35.0),)  # azimuth and elevation of the usual view
 _FILLED = 0.92  # of the picture, by what it is framed on
 _FRAMED_BY, _STOPS = 20_000, 40  # so many points and places of the path are enough
 _MOST_UP_DEG, _MOST_DOWN_DEG = 15, 60  # that cameras look, all the time
@@ -48,9 +49,6 @@ def choose_view(
     points: F64,
     T_world_camera: F64,
     *,
-    azimuth_deg: float = 25.0,
-    elevation_deg: float = 35.0,
-    distance: float = 1.0,
     aspect: float = _ASPECT,
     swing_deg: float = 0.0,
 ) -> MapView:
@@ -58,14 +56,9 @@ def choose_view(
 
     points: (P, 3).      T_world_camera: (N, 4, 4), N >= 1: up is the mean of the cameras' up, but
     for the angle by which they look down.
-    azimuth_deg, elevation_deg: turn about up away from the mean viewing direction, and height.
-    distance: 1 fills the picture with most of the points and the path; less is closer.
     aspect: columns over rows.      swing_deg: they stay in it when it is ``turned`` so far.
     """
-    angles = ((azimuth_deg, elevation_deg),)
-    return views_from(
-        points, T_world_camera, angles, distance=distance, aspect=aspect, swing_deg=swing_deg
-    )[0]
+    return views_from(points, T_world_camera, _FROM_DEG, aspect=aspect, swing_deg=swing_deg)[0]
 
 
 def views_from(
@@ -73,12 +66,11 @@ def views_from(
     T_world_camera: F64,
     angles_deg: Iterable[tuple[float, float]],
     *,
-    distance: float = 1.0,
     aspect: float = _ASPECT,
     swing_deg: float = 0.0,
     with_path: bool = True,
 ) -> list[MapView]:
-    """As ``choose_view``, one for each azimuth and elevation.
+    """As ``choose_view``, one for each azimuth, from the mean viewing direction, and elevation.
 
     with_path: frame them on the path, too; else on what is near to it.
     """
@@ -103,7 +95,7 @@ def views_from(
         away = max(float((centre - eye) @ R[:, 2]), radius)
         middle = eye + away * R[:, 2]
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, middle - distance * away * R[:, 2]
+        T[:3, :3], T[:3, 3] = R, middle - away * R[:, 2]
         found.append(
             MapView(T_world_view=T, centre=middle, up=up, ceiling=ceiling, reach=2.3 * away)
         )

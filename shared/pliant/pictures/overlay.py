@@ -140,14 +140,12 @@ def palette(size: int) -> list[tuple[int, int, int]]:
     return [(int(r), int(g), int(b)) for b, g, r in bgr]
 
 
-def draw_marks(
-    image: U8, points_px: F32, colours: U8, words: str, *, scale: int | None = None
-) -> U8:
+def draw_marks(image: U8, points_px: F32, colours: U8, words: str) -> U8:
     """An image with a small disc at each point and a bar of words under it, (H', W', 3) RGB.
 
     image: (H, W) grey or (H, W, 3) RGB.    points_px: (N, 2).    colours: (N, 3) RGB.
     """
-    scale = scale or (2 if image.shape[1] < _SHARPEST_PX else 1)
+    scale = 2 if image.shape[1] < _SHARPEST_PX else 1
     canvas = _enlarge(_muted(image), scale)
     centres = _fixed_point(points_px, scale).tolist()
     radius = round(_LARGEST_DOT * canvas.shape[1] * (1 << _SHIFT))

@@ -23,9 +23,9 @@ def meshes_of(pieces: Sequence[MeshPiece]) -> dict[tuple[int, str], list[MeshPie
     return {key: some for key, some in found.items() if len(some) == some[0].pieces}
 
 
-def mesh_of(pieces: Sequence[MeshPiece], segment: int, level: str = "fine") -> TriangleMesh | None:
-    """One of them, None where it is not there."""
-    found = meshes_of(pieces).get((segment, level))
+def mesh_of(pieces: Sequence[MeshPiece], segment: int) -> TriangleMesh | None:
+    """The fine one of a segment, None where it is not there."""
+    found = meshes_of(pieces).get((segment, "fine"))
     return None if found is None else joined(found)
 
 
