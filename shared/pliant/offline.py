@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from pliant.algorithms.image.masks import clearance_in, filled
 from pliant.algorithms.map_delta import MapDelta
+from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.calibration_bootstrap import mapper_for
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.known_places import KnownPlaces
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.stages import StageTimer, no_stages

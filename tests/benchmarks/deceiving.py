@@ -15,10 +15,10 @@ from benchmarks.deceiving_scenes import CAMERA, Deceiver, Film, Way, doors, floo
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64, U8
 from pliant.algorithms.geometry import pose_to_matrix
+from pliant.algorithms.slam.adjust.loops import Loop
+from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.known_places import KnownPlaces
 from pliant.algorithms.slam.mapper import Mapper
-from pliant.algorithms.slam.places.loops import Loop
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.config import Config
 from pliant.map_history import MapHistory

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 
 from benchmarks.kept_maps import Source, through_file
 from benchmarks.table import markdown_header, markdown_row
+from pliant.algorithms.slam.atlas.merging import merge
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.mapper import Mapper
-from pliant.algorithms.slam.merging import merge
 from pliant.config import Config
 
 _ENDS, _BEGINS = 0.6, 0.4

@@ -10,11 +10,11 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import align_umeyama
+from pliant.algorithms.slam.adjust.loops import Loop
+from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.calibration_bootstrap import mapper_for
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.known_places import KnownPlaces
 from pliant.algorithms.slam.mapper import Mapper
-from pliant.algorithms.slam.places.loops import Loop
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.config import Config
 from pliant.datasets import open_source

@@ -13,7 +13,7 @@ from benchmarks.deceiving_scenes import CAMERA, Deceiver, Film, Way
 from benchmarks.in_process import shown_ate, true_poses
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64, U8
-from pliant.algorithms.slam.known_places import KnownPlaces
+from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.backwards import lost_stretches, reach_back
 from pliant.config import Config

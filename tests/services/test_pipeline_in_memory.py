@@ -8,7 +8,7 @@ import pytest
 
 from pliant.algorithms.geometry import pose_to_matrix, transform
 from pliant.algorithms.map_delta import TRACKING, WAITING
-from pliant.algorithms.slam.known_places import Comparisons
+from pliant.algorithms.slam.atlas.known_places import Comparisons
 from pliant.bus.replay_bus import ReplayBus
 from pliant.config import Config, load_config
 from pliant.datasets import open_source

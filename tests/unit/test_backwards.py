@@ -9,8 +9,8 @@ import pytest
 from benchmarks.in_process import true_poses
 from benchmarks.second_pass import Frames, Pass, run
 
-from pliant.algorithms.slam.known_places import KnownPlaces
-from pliant.algorithms.slam.places.loops import Loop
+from pliant.algorithms.slam.adjust.loops import Loop
+from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.backwards import (
     Reached,
     Stretch,

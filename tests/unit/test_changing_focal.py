@@ -7,13 +7,13 @@ import pytest
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
 from test_mapper import Published, trajectory_error
 
-from pliant.algorithms.slam import frame_focal
+from pliant.algorithms.slam.active import frame_focal
+from pliant.algorithms.slam.active.frame_focal import shows_at_once
 from pliant.algorithms.slam.adjust import final_adjustment
 from pliant.algorithms.slam.adjust.ordinary_frames import OrdinaryFrames
 from pliant.algorithms.slam.calibration.changing_focal import Evidence, focal_range
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.frame_focal import shows_at_once
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import MappingParameters

@@ -17,11 +17,11 @@ from pliant.algorithms.geometry import (
     transform,
 )
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.slam import global_adjustment
+from pliant.algorithms.slam.adjust import global_adjustment
 from pliant.algorithms.slam.adjust.final_adjustment import _spread_out, adjust_list
+from pliant.algorithms.slam.adjust.global_adjustment import find_moves
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.global_adjustment import find_moves
 from pliant.algorithms.slam.map.landmarks import MAPPED
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import (

@@ -10,10 +10,10 @@ from test_mapper import Published, run, trajectory_error
 
 from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
 from pliant.algorithms.map_delta import LOST, TRACKING, MapMoves
+from pliant.algorithms.slam.active.frame_pose import localise
 from pliant.algorithms.slam.estimate.pose import Correspondences, Spread
 from pliant.algorithms.slam.estimate.problem import BundleParameters
 from pliant.algorithms.slam.frame import Frame, IdealFrame
-from pliant.algorithms.slam.frame_pose import localise
 from pliant.algorithms.slam.locate.inverse_depth import (
     at_infinity,
     off_epipolar_line,

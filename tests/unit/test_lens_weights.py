@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.slam.active_map import ActiveMap
+from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.adjust.final_adjustment import list_observations
 from pliant.algorithms.slam.adjust.segment import Segment
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration

@@ -1,6 +1,6 @@
 """How many observations make a point, by how many points a frame sees."""
 
-from pliant.algorithms.slam.frame_pose import limits_of_points
+from pliant.algorithms.slam.active.frame_pose import limits_of_points
 from pliant.algorithms.slam.parameters import MappingParameters
 
 

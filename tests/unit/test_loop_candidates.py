@@ -6,9 +6,9 @@ from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
 from test_mapper import Published, trajectory_error
 from test_recovery import picture, textures
 
-from pliant.algorithms.slam import known_places
+from pliant.algorithms.slam.atlas import known_places
+from pliant.algorithms.slam.atlas.known_places import Comparisons, LoopCandidates
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.known_places import Comparisons, LoopCandidates
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import Landmarks
 from pliant.algorithms.slam.mapper import Mapper

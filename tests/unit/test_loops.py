@@ -12,8 +12,9 @@ from test_mapper import Published, trajectory_error
 from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.slam.adjust.final_adjustment import ObservationList
+from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
+from pliant.algorithms.slam.adjust.loops import Loop, close_loops
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.map.landmarks import MAPPED, Landmarks
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import (
@@ -22,7 +23,6 @@ from pliant.algorithms.slam.parameters import (
     WholeMapParameters,
     WindowParameters,
 )
-from pliant.algorithms.slam.places.loops import Loop, close_loops
 from pliant.state import load_state, save_state
 
 AWAY = 80

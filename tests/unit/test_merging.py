@@ -13,12 +13,12 @@ from test_segment_merges import PARAMETERS, along, film, wall
 
 from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.map_delta import TRACKING
+from pliant.algorithms.slam.atlas.merging import Merged, merge
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.localiser import Localiser
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.mapper import Mapper
-from pliant.algorithms.slam.merging import Merged, merge
 from pliant.algorithms.slam.store.kept_map import corrected_as
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.errors import PliantError

@@ -11,7 +11,7 @@ import pytest
 import typer
 from benchmarks.__main__ import app as bench
 
-from pliant.algorithms.slam.known_places import Comparisons
+from pliant.algorithms.slam.atlas.known_places import Comparisons
 from pliant.export.export import EXPORTS
 from pliant_services.cli import app
 

@@ -10,8 +10,8 @@ from test_recovery import dark, picture, textures
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.map_delta import LOST, TRACKING, MapMoves
+from pliant.algorithms.slam.adjust.global_adjustment import held
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.global_adjustment import held
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import MappingParameters, WholeMapParameters
 from pliant.algorithms.slam.places.place_match import PlaceMatch, match_places

@@ -7,10 +7,10 @@ import pytest
 from mapping_scene import CAMERA, looking
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.slam import known_places
 from pliant.algorithms.slam.adjust.segment import Segment
+from pliant.algorithms.slam.atlas import known_places
+from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.known_places import KnownPlaces
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import Landmarks
 from pliant.algorithms.slam.parameters import MappingParameters

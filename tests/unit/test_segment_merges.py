@@ -12,9 +12,9 @@ from test_recovery import dark, picture, textures
 
 from pliant.algorithms.geometry import align_umeyama, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.slam.adjust.global_adjustment import held
 from pliant.algorithms.slam.adjust.segment import Moved
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.global_adjustment import held
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import (
     MappingParameters,

@@ -11,7 +11,7 @@ from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.slam.adjust.segment import DroppedKeyframes, Segment
-from pliant.algorithms.slam.atlas import Atlas
+from pliant.algorithms.slam.atlas.atlas import Atlas
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.map.keyframe import Keyframe

@@ -26,22 +26,22 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
 from pliant.algorithms.image.masks import filled
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
-from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.calibration_bootstrap import mapper_for
-from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac
-from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.frame_mapper import FrameMapper
-from pliant.algorithms.slam.global_adjustment import (
+from pliant.algorithms.slam.adjust.global_adjustment import (
     AdjustmentJob,
     AdjustmentResult,
     GlobalAdjustment,
     find_moves,
 )
+from pliant.algorithms.slam.adjust.loops import Loop
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.calibration_bootstrap import mapper_for
+from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac
+from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.frame_mapper import FrameMapper
 from pliant.algorithms.slam.map.keyframe import Keyframe as KeyframeOfMap
 from pliant.algorithms.slam.map.landmarks import Landmarks
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import MappingParameters, WindowParameters
-from pliant.algorithms.slam.places.loops import Loop
 from pliant.algorithms.slam.places.place_index import PlaceIndex, describe, match
 from pliant.algorithms.slam.places.similarity import Pairs, similarity_by_ransac
 from pliant.algorithms.slam.store.sparsification import sparsify

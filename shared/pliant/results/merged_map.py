@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from pliant.algorithms.slam.merging import Merged, merge
+from pliant.algorithms.slam.atlas.merging import Merged, merge
 from pliant.config import load_config
 from pliant.errors import MapError
 from pliant.files import make_folder

@@ -5,11 +5,14 @@ Packages, each of which imports only those before it:
 estimate: solvers of a pose, a window, all keyframes, a graph of similarities.
 map: landmarks, keyframes, and their links to tracks.
 calibration: the camera's calibration as the images show it, its readout, its changing focal length.
-locate: the pose of one frame in the map.
-adjust: adjustment of a window, a segment, ordinary frames.
+locate: the pose of a camera from landmarks in its image.
+adjust: adjustment of a window, a segment, ordinary frames, the whole map; loop closure.
 start: the first map.
-places: place recognition, loops, relocalisation.
+places: place recognition, relocalisation.
 store: maps of earlier segments and sessions.
+active: the segment that the camera is in, and the pose of a frame in it.
+atlas: all segments, and how they merge.
 
-The modules beside them are the flow of a frame.  Begin with ``mapper.py``.
+Begin with ``mapper.py``.  Three classes process frames, each a ``FrameMapper``: ``Mapper``,
+``Localiser`` in a loaded map, and ``BootstrapMapper`` of an unknown camera.
 """

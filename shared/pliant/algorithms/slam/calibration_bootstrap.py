@@ -13,10 +13,10 @@ import numpy as np
 
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.map_delta import TRACKING, WAITING, KeyframeDelta, MapDelta
+from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.calibration.self_calibration import is_guess, widened
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.frame_mapper import FrameMapper
-from pliant.algorithms.slam.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.journal import Journal, Outcome
 from pliant.algorithms.slam.localiser import Localiser
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from typing import Protocol
 
 from pliant.algorithms.map_delta import KeyframeDelta, MapDelta
+from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.stages import StageTimer, no_stages
 

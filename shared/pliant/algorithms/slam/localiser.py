@@ -14,14 +14,15 @@ from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
-from pliant.algorithms.slam.active_map import ActiveMap
+from pliant.algorithms.slam.active.active_map import ActiveMap
+from pliant.algorithms.slam.active.frame_pose import localise, reacquire_points, to_global_shutter
+from pliant.algorithms.slam.active.tracked_pose import pose_by_tracks
+from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
+from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.estimate.observation_table import reprojection_errors
 from pliant.algorithms.slam.frame import Frame, IdealFrame, PlacedFrame
-from pliant.algorithms.slam.frame_pose import localise, reacquire_points, to_global_shutter
-from pliant.algorithms.slam.global_adjustment import GlobalAdjustment
 from pliant.algorithms.slam.journal import Journal, Outcome
-from pliant.algorithms.slam.known_places import KnownPlaces
 from pliant.algorithms.slam.locate.localisation import Motion
 from pliant.algorithms.slam.locate.pose_quality import support_of, why_doubtful
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
@@ -30,7 +31,6 @@ from pliant.algorithms.slam.map.landmarks import MAPPED, Landmarks
 from pliant.algorithms.slam.parameters import MappingParameters
 from pliant.algorithms.slam.places.relocalisation import Recognised, is_same_pose
 from pliant.algorithms.slam.store.kept_map import known_camera, take_in
-from pliant.algorithms.slam.tracked_pose import pose_by_tracks
 from pliant.algorithms.stages import StageTimer, no_stages
 
 _LOOK_TURN_RAD = np.radians(5.0)

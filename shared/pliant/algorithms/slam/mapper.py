@@ -14,18 +14,8 @@ from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.image.exposure import flaw_of
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING, KeyframeDelta, MapDelta
-from pliant.algorithms.slam.active_map import ActiveMap
-from pliant.algorithms.slam.adjust.ordinary_frames import (
-    STANDING_ROOMS,
-    OrdinaryFrame,
-    refined_poses,
-    smoothed_poses,
-)
-from pliant.algorithms.slam.adjust.segment import Moved, Segment
-from pliant.algorithms.slam.atlas import Atlas
-from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.frame import Frame, IdealFrame, PlacedFrame
-from pliant.algorithms.slam.frame_pose import (
+from pliant.algorithms.slam.active.active_map import ActiveMap
+from pliant.algorithms.slam.active.frame_pose import (
     adjust,
     check_pure_rotation,
     limits_of_points,
@@ -34,7 +24,18 @@ from pliant.algorithms.slam.frame_pose import (
     to_global_shutter,
     tracks_to_points,
 )
-from pliant.algorithms.slam.global_adjustment import GlobalAdjustment
+from pliant.algorithms.slam.active.tracked_pose import pose_by_tracks
+from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
+from pliant.algorithms.slam.adjust.ordinary_frames import (
+    STANDING_ROOMS,
+    OrdinaryFrame,
+    refined_poses,
+    smoothed_poses,
+)
+from pliant.algorithms.slam.adjust.segment import Moved, Segment
+from pliant.algorithms.slam.atlas.atlas import Atlas
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.frame import Frame, IdealFrame, PlacedFrame
 from pliant.algorithms.slam.journal import Journal, Outcome
 from pliant.algorithms.slam.keyframe_rule import is_due
 from pliant.algorithms.slam.locate.localisation import Motion
@@ -53,7 +54,6 @@ from pliant.algorithms.slam.start.initialisation_buffer import (
 )
 from pliant.algorithms.slam.start.start import with_minimum_parallax
 from pliant.algorithms.slam.store.kept_map import known_camera
-from pliant.algorithms.slam.tracked_pose import pose_by_tracks
 from pliant.algorithms.stages import StageTimer, no_stages
 
 _LEAST_LOST = 3

@@ -1,1 +1,1 @@
-"""Adjustment of a window, a segment and ordinary frames."""
+"""Adjustment of a window, a segment, ordinary frames and the whole map; loop closure."""

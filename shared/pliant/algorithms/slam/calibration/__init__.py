@@ -1,1 +1,1 @@
-"""The calibration of the camera, as the images tell it."""
+"""The calibration of the camera, as the images determine it."""

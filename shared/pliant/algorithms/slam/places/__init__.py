@@ -1,1 +1,1 @@
-"""Place recognition, loop closure and relocalisation."""
+"""Place recognition and relocalisation."""

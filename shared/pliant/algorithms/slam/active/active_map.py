@@ -7,6 +7,7 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera, size_unit
 from pliant.algorithms.map_delta import MapMoves
+from pliant.algorithms.slam.adjust.loops import Loop
 from pliant.algorithms.slam.adjust.segment import Segment
 from pliant.algorithms.slam.adjust.window import Window
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
@@ -26,7 +27,6 @@ from pliant.algorithms.slam.map.keyframe import Keyframe, Observations
 from pliant.algorithms.slam.map.landmarks import CANDIDATE, MAPPED
 from pliant.algorithms.slam.map.track_links import UNLINKED, TrackLinks
 from pliant.algorithms.slam.parameters import MappingParameters
-from pliant.algorithms.slam.places.loops import Loop
 from pliant.algorithms.slam.start.first_map import BufferedFrame, Start
 from pliant.algorithms.slam.store.sparsification import sparsify
 from pliant.algorithms.tracks import FrameExtrema

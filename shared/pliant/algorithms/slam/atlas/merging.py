@@ -9,16 +9,16 @@ the remaining error (``loops``, ``global_adjustment``).
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from pliant.algorithms.slam.active_map import ActiveMap
+from pliant.algorithms.slam.active.active_map import ActiveMap
+from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment, held
+from pliant.algorithms.slam.adjust.loops import Loop
 from pliant.algorithms.slam.adjust.segment import Segment, bend
+from pliant.algorithms.slam.atlas.known_places import KnownPlaces, join
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.global_adjustment import GlobalAdjustment, held
-from pliant.algorithms.slam.known_places import KnownPlaces, join
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import Landmarks
 from pliant.algorithms.slam.parameters import MappingParameters
-from pliant.algorithms.slam.places.loops import Loop
 from pliant.algorithms.slam.store.kept_map import (
     Origin,
     corrected_as,

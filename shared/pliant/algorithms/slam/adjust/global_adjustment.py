@@ -33,12 +33,12 @@ from pliant.algorithms.slam.adjust.final_adjustment import (
     list_observations,
     moves_between,
 )
+from pliant.algorithms.slam.adjust.loops import Loop, close_loops
 from pliant.algorithms.slam.adjust.segment import Segment
 from pliant.algorithms.slam.calibration.rolling_shutter import readout_flow
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.estimate.problem import BundleResult, CalibrationUncertainty
 from pliant.algorithms.slam.parameters import MappingParameters
-from pliant.algorithms.slam.places.loops import Loop, close_loops
 
 _LEAST_TOLD = 0.2
 """Minimum share of the information about the readout that must come from the images, not

@@ -5,16 +5,16 @@ It searches nothing in the image and does not change the map; it costs a tenth o
 
 import numpy as np
 
-from pliant.algorithms.slam.active_map import ActiveMap
-from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.frame import Frame, IdealFrame, PlacedFrame
-from pliant.algorithms.slam.frame_pose import (
+from pliant.algorithms.slam.active.active_map import ActiveMap
+from pliant.algorithms.slam.active.frame_pose import (
     judge_tracks,
     localise,
     refine_by_all,
     supported,
     to_global_shutter,
 )
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.frame import Frame, IdealFrame, PlacedFrame
 from pliant.algorithms.slam.locate.localisation import Motion
 
 

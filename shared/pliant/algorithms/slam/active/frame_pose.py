@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
-from pliant.algorithms.slam.active_map import ActiveMap
+from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.estimate.observation_table import reprojection_errors
 from pliant.algorithms.slam.estimate.pose import Correspondences
 from pliant.algorithms.slam.frame import IdealFrame, PlacedFrame

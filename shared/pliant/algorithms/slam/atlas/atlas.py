@@ -16,14 +16,14 @@ import numpy as np
 from pliant.algorithms.arrays import F32, F64, I64, U8
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.slam.active_map import ActiveMap
+from pliant.algorithms.slam.active.active_map import ActiveMap
+from pliant.algorithms.slam.active.frame_focal import refocused
+from pliant.algorithms.slam.adjust.global_adjustment import AdjustmentResult, GlobalAdjustment, held
 from pliant.algorithms.slam.adjust.segment import Moved, Segment, see_by
+from pliant.algorithms.slam.atlas.known_places import KnownPlaces, SegmentMerges, join
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration, is_guess
 from pliant.algorithms.slam.frame import IdealFrame
-from pliant.algorithms.slam.frame_focal import refocused
-from pliant.algorithms.slam.global_adjustment import AdjustmentResult, GlobalAdjustment, held
 from pliant.algorithms.slam.journal import Journal
-from pliant.algorithms.slam.known_places import KnownPlaces, SegmentMerges, join
 from pliant.algorithms.slam.locate.localisation import Motion
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.map.keyframe import Keyframe

@@ -21,17 +21,17 @@ from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import matrix_to_similarity, move_by_similarity, so3_log
 from pliant.algorithms.map_delta import MapMoves
-from pliant.algorithms.slam.active_map import ActiveMap
+from pliant.algorithms.slam.active.active_map import ActiveMap
+from pliant.algorithms.slam.adjust.global_adjustment import held
+from pliant.algorithms.slam.adjust.loops import Loop
 from pliant.algorithms.slam.adjust.segment import Moved, Segment
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.global_adjustment import held
 from pliant.algorithms.slam.map.covisibility import marks_fewer
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import MAPPED, Landmarks
 from pliant.algorithms.slam.parameters import MappingParameters
-from pliant.algorithms.slam.places.loops import Loop
 from pliant.algorithms.slam.places.place_index import Features, PlaceIndex, describe
 from pliant.algorithms.slam.places.place_match import Refusal, match_places
 from pliant.algorithms.slam.places.relocalisation import (

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pliant.algorithms.slam.active_map import ActiveMap
+from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.calibration.changing_focal import RATE, SPREAD
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.estimate.focal_pose import refine_focal

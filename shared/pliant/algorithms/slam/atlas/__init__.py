@@ -1,0 +1,1 @@
+"""All segments of the map: recognised, resumed and merged."""
