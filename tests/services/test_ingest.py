@@ -21,7 +21,7 @@ from pliant.datasets.measured.base import Measurements
 from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
-from pliant.messages.types import MASKED, CameraStream, Depth, Header, Image, SourceImage
+from pliant.messages.types import CAPTURED, MASKED, CameraStream, Depth, Header, Image, SourceImage
 from pliant.recording.measured import fixes_of, imu_of
 from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
@@ -73,10 +73,12 @@ class Counters(SilentMonitor):
     def __init__(self) -> None:
         self.frames: list[int] = []
         self.counters: dict[str, float] = {}
+        self.captured_s = 0.0
         self.note = ""
 
     def report(self, header: Header, *, note: str = "", **counters: float) -> None:
         self.frames.append(header.frame)
+        self.captured_s = counters.pop(CAPTURED, 0.0)
         self.counters, self.note = counters, note
 
 
@@ -248,10 +250,11 @@ def test_live_holds_the_pixels_of_one_frame_only() -> None:
 
 
 def test_a_data_set_played_live_keeps_the_pace_of_its_stamps() -> None:
-    start = time.monotonic()
-    images, _, _ = run(FakeDataset([png(i) for i in range(4)]), mode="live")
+    start, start_s = time.monotonic(), time.time()
+    images, monitor, _ = run(FakeDataset([png(i) for i in range(4)]), mode="live")
     assert time.monotonic() - start >= 3 * STEP_NS * 1e-9
     assert len(images) == 4
+    assert start_s + 3 * STEP_NS * 1e-9 <= monitor.captured_s <= time.time()
 
 
 @pytest.mark.parametrize("is_live", [False, True])

@@ -79,6 +79,11 @@ def test_tracking_goes_on_and_the_run_can_be_replayed(tmp_path: Path) -> None:
     placed = [m.frame for m in updates if m.frame in m.pose_frames]
     assert {*over} - {*unplaced} & {*placed}
     assert any(f"{len(over)} images not mapped" in line for line in summary(report))
+    # The first image of those that stood still is as old as they are many.
+    age = report["image_age_ms"]
+    assert 0.0 < age["p50"] < age["p99"]
+    assert age["p99"] > 1e3 * (GO_FRAME - STOP_FRAME) / FPS / 2
+    assert any("age of an image when its pose is published" in line for line in summary(report))
     again = ("replay", output / RECORDING_NAME, "--services", "tracking,bundle_adjustment")
     done = pliant(*again, "--output", tmp_path / "again", "--check")
     assert done.returncode == 0, done.stderr

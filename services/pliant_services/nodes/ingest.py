@@ -15,6 +15,7 @@ out  camera/stream   once: the camera
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -32,6 +33,7 @@ from pliant.messages import topics
 from pliant.messages.types import (
     BROKEN,
     CAMERA_FRAME_ID,
+    CAPTURED,
     CameraStream,
     Depth,
     Image,
@@ -113,6 +115,7 @@ def run(
             bus.publish(topics.DEPTH, _depth_message(source), may_lag=may_lag)
             counters = {"dropped": dropped, "broken": broken, **pace.counters}
             counters |= static_counters(dataset)
+            counters |= {CAPTURED: source.captured_s} if live else {}
             monitor.report(image, note="", **counters, **drops.counters)
             kept = (tuple(vars(pace).values()), (drops.counters,))
             bus.checkpoint(image.frame, (image.frame + 1, dropped, broken, *kept, sent))
@@ -163,13 +166,17 @@ def newest(
 
     def play() -> None:
         start_s, first_ns = time.monotonic(), None
+        started_s = time.time()
         for frame in dataset:
             first_ns = frame.stamp_ns if first_ns is None else first_ns
+            captured_s = time.time()
             if not dataset.is_live:
-                due_s = start_s + (frame.stamp_ns - first_ns) * 1e-9
-                finished.wait(max(0.0, due_s - time.monotonic()))
+                after_s = (frame.stamp_ns - first_ns) * 1e-9
+                captured_s = started_s + after_s
+                finished.wait(max(0.0, start_s + after_s - time.monotonic()))
             if finished.is_set():
                 return
+            frame = replace(frame, captured_s=captured_s)
             with changed:
                 if slot:  # passed over: only its number and time are kept
                     slot[-1] = slot[-1].without_data()

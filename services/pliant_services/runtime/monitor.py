@@ -10,7 +10,7 @@ import numpy as np
 
 from pliant.bus.base import Bus
 from pliant.messages import topics
-from pliant.messages.types import Header, Status
+from pliant.messages.types import REPORTED, Header, Status
 
 
 class Monitor(Protocol):
@@ -57,6 +57,7 @@ class StatusMonitor:
 
     def report(self, header: Header, *, note: str = "", **counters: float) -> None:
         """Publish the frame's status and begin the next frame."""
+        counters[REPORTED] = time.time()
         counters["cpu_seconds"] = time.process_time()
         counters["peak_memory_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
         message = Status(

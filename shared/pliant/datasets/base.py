@@ -30,6 +30,8 @@ class SourceFrame:
     mask: an image file that says which part of it is used; b"": all of it.
     number: in the source, where only a part of that is taken; -1: ``index``.
     name: of the file that it comes from; "" where it has none; tells no frames apart.
+    captured_s: in live mode, when it came or was due by the clock of this machine; tells none
+    apart, either.
     """
 
     index: int
@@ -44,6 +46,7 @@ class SourceFrame:
     mask: bytes = b""
     number: int = -1
     name: str = field(default="", compare=False)
+    captured_s: float = field(default=0.0, compare=False)
 
     @property
     def dropped(self) -> bool:

@@ -285,6 +285,10 @@ class Surfels(Header, SurfelFrame):
     note: str = ""
 
 
+CAPTURED, REPORTED = "captured_s", "reported_s"
+"""Counters that are times: when an image came (live mode), and when a status was made."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Status(Header):
     """How a service fares; never an input of another one.

@@ -67,6 +67,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "frames_that_never_came": absent_frames(run, frames),
         "frames_with_pose": len(final),
         "frames_per_second": round(run.frames_per_second, 2),
+        "image_age_ms": _image_age(run),
         "success_rate": len(final) / frames if frames else 0.0,
         "initialisation_retries": max(0, len(segments) - 1),
         "segments": segments,
@@ -208,6 +209,15 @@ def _correction(run: Run) -> dict[str, float] | None:
 def _median(values: Any) -> float:
     values = list(values)
     return float(np.median(values)) if values else 0.0
+
+
+def _image_age(run: Run) -> dict[str, float] | None:
+    """How old live images are when their poses are published; None for recorded ones."""
+    ages = run.image_ages_ms
+    if not len(ages):
+        return None
+    p50, p99 = np.percentile(ages, (50.0, 99.0)).tolist()
+    return {"p50": round(p50, 1), "p99": round(p99, 1)}
 
 
 def _milliseconds(seconds: list[float]) -> dict[str, float]:

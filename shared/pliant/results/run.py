@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, I64
+from pliant.algorithms.arrays import F32, F64, I64
 from pliant.algorithms.map_delta import MapDelta
 from pliant.map_history import MapHistory
 from pliant.messages import topics
 from pliant.messages.topics import by_key
 from pliant.messages.types import (
+    CAPTURED,
     PASSED_OVER,
+    REPORTED,
     CameraStream,
     Extrema,
     Keyframe,
@@ -53,6 +55,8 @@ class Run:
     )
     counters: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
     cpu_seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    captured_s: dict[int, float] = field(default_factory=dict[int, float])
+    mapped_s: dict[int, float] = field(default_factory=dict[int, float])
     source_failure: str = ""
     corrections: dict[int, tuple[float, ...]] = field(default_factory=dict[int, tuple[float, ...]])
     calibration_sigmas: tuple[float, ...] = ()
@@ -113,6 +117,13 @@ class Run:
         if len(self.arrivals_ns) < 2 or self.arrivals_ns[-1] <= self.arrivals_ns[0]:
             return 0.0
         return (len(self.arrivals_ns) - 1) * 1e9 / (self.arrivals_ns[-1] - self.arrivals_ns[0])
+
+    @property
+    def image_ages_ms(self) -> F64:
+        """Of live images, when their poses were published."""
+        frames = [frame for frame in self.history.online if frame in self.captured_s]
+        ages_s = [self.mapped_s[f] - self.captured_s[f] for f in frames if f in self.mapped_s]
+        return 1e3 * np.array(ages_s, np.float64)
 
     @property
     def complete(self) -> bool:
@@ -210,6 +221,11 @@ def _take_status(run: Run, status: Status) -> None:
     for stage, seconds in zip(status.stages, status.seconds.tolist(), strict=True):
         run.seconds[status.service][stage].append(seconds)
     values = dict(zip(status.counters, status.values.tolist(), strict=True))
+    captured_s, reported_s = values.pop(CAPTURED, None), values.pop(REPORTED, None)
+    if captured_s is not None:
+        run.captured_s[status.frame] = captured_s
+    if status.service == "bundle_adjustment" and reported_s is not None:
+        run.mapped_s.setdefault(status.frame, reported_s)  # the last frame has one more, of the end
     if "cpu_seconds" in values:
         run.cpu_seconds[status.service].append(values["cpu_seconds"])
     run.counters[status.service] = {**run.counters.get(status.service, {}), **values}

@@ -36,6 +36,12 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         f"{counted(report['keyframes'], 'keyframe')}, {counted(report['points'], 'point')}",
         f"median per frame: {report['median_tracks_per_frame']:.0f} tracks, {_mapped(report)}",
     ]
+    age = report.get("image_age_ms")
+    if age is not None:
+        lines.append(
+            f"age of an image when its pose is published: median {age['p50']:.0f} ms, "
+            f"99 % below {age['p99']:.0f} ms"
+        )
     lines += _told_of_map(report)
     lines += _dropped_parts(report.get("counters", {}).get("bundle_adjustment", {}))
     lines += [
