@@ -5,7 +5,7 @@ from importlib import import_module
 from benchmarks.commands.app import app
 from pliant_services.cli import main
 
-SUBJECTS = ("places", "comparisons", "recording", "parts", "running", "surfaces")
+SUBJECTS = ("pages", "places", "comparisons", "recording", "parts", "running", "surfaces")
 """In the order of the help page: a command is registered when its file is imported."""
 
 for subject in SUBJECTS:

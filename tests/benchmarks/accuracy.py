@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from benchmarks.table import markdown
 from pliant.datasets import open_source
@@ -23,6 +24,7 @@ _HEADER = (
     "points",
     "well observed",
     "frames/s",
+    "CPU ms/frame",
 )
 
 
@@ -58,9 +60,16 @@ def measure(
                 f"{report['points']}",
                 f"{report['points_well_observed']}",
                 f"{report['frames_per_second']:.1f}",
+                f"{_cpu_ms(report):.0f}",
             ]
         )
     yield markdown(_HEADER, rows)
+
+
+def _cpu_ms(report: dict[str, Any]) -> float:
+    """Of all processes but the recorder."""
+    spent = report["cpu_milliseconds_per_frame"]
+    return sum(each for service, each in spent.items() if service != "recorder")
 
 
 def _spread(value) -> str:

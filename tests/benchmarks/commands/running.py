@@ -48,6 +48,17 @@ def in_process(
     show(measure(sources, overrides or [], range(seed, seed + seeds), focal, off_centre, aspect))
 
 
+@app.command()
+def light(sources: Sources) -> None:
+    """What --light and --localise save: CPU of each service, and the final ATE.
+
+    scripts/bench light built-in:room path/to/tum_fr1_xyz
+    """
+    from benchmarks.light import measure
+
+    show(measure(sources))
+
+
 @app.command("map-starts")
 def map_starts(
     sources: Sources,
