@@ -21,14 +21,17 @@ SOLVERS = [
 
 
 def to_window(problem: BundleProblem) -> BundleWindow:
-    shape = (len(problem.T_world_camera), len(problem.points_world))
-    u, v, w = (np.zeros(shape, np.float32) for _ in range(3))
-    at = (problem.camera_index, problem.point_index)
-    u[at], v[at] = problem.points_px[:, 0], problem.points_px[:, 1]
+    """Every second column of a table, with others between that are no part of the problem."""
+    columns = 1 + 2 * np.arange(len(problem.points_world), dtype=np.int32)
+    u, v, w = np.full((3, len(problem.T_world_camera), 2 * len(columns) + 1), 7.0, np.float32)
+    seen = np.zeros(u.shape, np.bool_)
+    at = (problem.camera_index, columns[problem.point_index])
+    u[at], v[at], seen[at] = problem.points_px[:, 0], problem.points_px[:, 1], True
     w[at] = 1.0 if problem.weights is None else problem.weights
     return BundleWindow(
-        T_world_camera=problem.T_world_camera, points_world=problem.points_world, u=u, v=v,
-        weights=w, intrinsics=problem.intrinsics, fixed_cameras=problem.fixed_cameras,
+        T_world_camera=problem.T_world_camera, points_world=problem.points_world, columns=columns,
+        u=u, v=v, weights=w, seen=seen, intrinsics=problem.intrinsics,
+        fixed_cameras=problem.fixed_cameras,
     )  # fmt: skip
 
 

@@ -11,7 +11,6 @@ from pliant.algorithms.slam.estimate.observation_table import (
     count_in_view,
     flows,
     forget_outliers,
-    gather,
     has_parallax,
     observe,
     seen_in_state,
@@ -215,14 +214,14 @@ class Window:
         fixed = np.zeros(len(self.keyframes) + 1, np.bool_)
         fixed[: self.fixed] = True
         fixed[-1] = not self.seen[-1].any()
-        table = np.zeros((3, len(self.seen), len(columns)), np.float32)
-        gather(columns, self.u, self.v, self.w, self.seen, table[0], table[1], table[2])
         return BundleWindow(
             T_world_camera=self.T_world_camera,
             points_world=self.points.xyz[self.rows[columns]],
-            u=table[0],
-            v=table[1],
-            weights=table[2],
+            columns=columns,
+            u=self.u,
+            v=self.v,
+            weights=self.w,
+            seen=self.seen,
             intrinsics=shared_intrinsics(self._camera, len(fixed)),
             fixed_cameras=fixed,
         )

@@ -69,7 +69,9 @@ def build_layout(problem: AnyProblem) -> Layout:
             column, usable, u, v, w,
         )  # fmt: skip
     else:
-        _copy_dense(problem.u, problem.v, problem.weights, usable, u, v, w)
+        _select(
+            problem.columns, usable, problem.u, problem.v, problem.weights, problem.seen, u, v, w
+        )  # fmt: skip
     _mark_blocks(w, seen)
     table = Table(u, v, w, seen)
     return Layout(**vars(unknowns_of(problem, column, usable, P)), table=table)
@@ -200,14 +202,28 @@ def _scatter(
 
 
 @kernel
-def _copy_dense(u_in: F32, v_in: F32, w_in: F32, usable: BoolArray, u: F32, v: F32, w: F32) -> None:
-    for m in range(u_in.shape[0]):
-        for n in range(u_in.shape[1]):
-            finite = np.isfinite(u_in[m, n]) and np.isfinite(v_in[m, n])
-            good = usable[n] and finite and w_in[m, n] > 0.0
-            u[m, n] = u_in[m, n] if good else np.float32(0.0)
-            v[m, n] = v_in[m, n] if good else np.float32(0.0)
-            w[m, n] = w_in[m, n] if good else np.float32(0.0)
+def _select(
+    columns: I32,
+    usable: BoolArray,
+    all_u: F32,
+    all_v: F32,
+    all_w: F32,
+    seen: BoolArray,
+    u: F32,
+    v: F32,
+    w: F32,
+) -> None:
+    """Copy the columns of a table, 0 where there is no observation."""
+    zero, most = np.float32(0.0), np.float32(np.inf)
+    for m in range(u.shape[0]):
+        for n in range(columns.size):
+            # Selected, not branched: whether a camera sees a point is nearly random.
+            c = columns[n]
+            a, b, weight = all_u[m, c], all_v[m, c], all_w[m, c]
+            good = seen[m, c] & usable[n] & (abs(a) < most) & (abs(b) < most) & (weight > zero)
+            u[m, n] = a if good else zero
+            v[m, n] = b if good else zero
+            w[m, n] = weight if good else zero
 
 
 @kernel

@@ -60,18 +60,6 @@ def observe(
 
 
 @kernel
-def gather(
-    columns: I32, u: F32, v: F32, w: F32, seen: BoolArray, out_u: F32, out_v: F32, out_w: F32
-) -> None:
-    """Copy some columns of the table; the weight is 0 where there is no observation."""
-    for m in range(u.shape[0]):
-        for i in range(columns.size):
-            n = columns[i]
-            if seen[m, n]:
-                out_u[m, i], out_v[m, i], out_w[m, i] = u[m, n], v[m, n], w[m, n]
-
-
-@kernel
 def count_cameras(columns: I32, seen: BoolArray, first: int, last: int) -> I32:
     """(C,) number of the cameras first, ..., last - 1 that see each of the columns."""
     counts = np.zeros(columns.size, np.int32)

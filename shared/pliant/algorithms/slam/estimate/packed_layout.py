@@ -71,9 +71,10 @@ def build_packed_layout(problem: AnyProblem) -> PackedLayout:
     N, usable = len(problem.points_world), finite_points(problem.points_world)
     unknowns = unknowns_of(problem, columns_of(problem), usable, N)
     if not isinstance(problem, BundleProblem):
-        counts, start = _count(problem.u, problem.v, problem.weights, usable)
+        table = (problem.columns, usable, problem.u, problem.v, problem.weights, problem.seen)
+        counts, start = _count(*table)
         slots, places, first = _room(counts, start)
-        _pack_window(problem.u, problem.v, problem.weights, usable, first, slots, places)
+        _pack_window(*table, first, slots, places)
         place, flow = np.zeros(0, np.int32), np.zeros((2, 0, BLOCK), np.float32)
         return PackedLayout(**vars(unknowns), slots=slots, places=places, place=place, flow=flow)
     camera_index, point_index = problem.camera_index, problem.point_index
@@ -122,12 +123,15 @@ def _usable(u: float, v: float, weight: float) -> bool:
 
 
 @kernel
-def _count(u: F32, v: F32, weights: F32, usable: BoolArray) -> tuple[I64, I64]:
+def _count(
+    columns: I32, usable: BoolArray, u: F32, v: F32, weights: F32, seen: BoolArray
+) -> tuple[I64, I64]:
     """(M,) usable observations of each camera of a window, (N,) start of each point."""
     counts, of_point = np.zeros(weights.shape[0], np.int64), np.zeros(usable.size, np.int64)
     for m in range(weights.shape[0]):
-        for n in range(usable.size):
-            if usable[n] and _usable(u[m, n], v[m, n], weights[m, n]):
+        for n in range(columns.size):
+            c = columns[n]
+            if seen[m, c] and usable[n] and _usable(u[m, c], v[m, c], weights[m, c]):
                 counts[m] += 1
                 of_point[n] += 1
     return counts, np.cumsum(of_point) - of_point
@@ -135,24 +139,27 @@ def _count(u: F32, v: F32, weights: F32, usable: BoolArray) -> tuple[I64, I64]:
 
 @kernel
 def _pack_window(
+    columns: I32,
+    usable: BoolArray,
     u: F32,
     v: F32,
     weights: F32,
-    usable: BoolArray,
+    seen: BoolArray,
     first: I64,
     slots: Slots,
     places: Places,
 ) -> None:
     for m in range(weights.shape[0]):
         b, i = first[m] // BLOCK, 0
-        for n in range(usable.size):
-            if usable[n] and _usable(u[m, n], v[m, n], weights[m, n]):
+        for n in range(columns.size):
+            c = columns[n]
+            if seen[m, c] and usable[n] and _usable(u[m, c], v[m, c], weights[m, c]):
                 at = places.stop[n]
                 places.stop[n] += 1
                 places.camera[at] = m
                 slots.point[b, i] = n
                 slots.place[b, i] = at
-                slots.u[b, i], slots.v[b, i], slots.w[b, i] = u[m, n], v[m, n], weights[m, n]
+                slots.u[b, i], slots.v[b, i], slots.w[b, i] = u[m, c], v[m, c], weights[m, c]
                 i += 1
                 if i == BLOCK:
                     b, i = b + 1, 0

@@ -1,7 +1,7 @@
 """Input and output of bundle adjustment: cameras, points and observations.
 
 Two forms of the same problem are accepted everywhere: ``BundleProblem`` lists its observations,
-``BundleWindow`` holds them as dense camera x point arrays, which is how the solvers work inside.
+``BundleWindow`` selects them from dense camera x point arrays, as a window of keyframes has them.
 """
 
 from dataclasses import dataclass, field
@@ -158,19 +158,21 @@ class BundleProblem:
 
 @dataclass(frozen=True, kw_only=True)
 class BundleWindow:
-    """Cameras, points and dense observations: the form that needs no conversion.
+    """Cameras, and points that are some columns of a dense table of observations.
 
-    u, v: pixels where camera m observes point n; any finite number elsewhere.
-    weights: factor of the cost term of each observation, 0 where there is none.
+    columns: of the points.   seen: whether camera m observes column c.
+    u, v, weights: pixel and factor of the cost term of each observation; anything elsewhere.
     Points created together should be adjacent: blocks of points that a camera does not observe are
     skipped.  The other fields are those of ``BundleProblem``.
     """
 
     T_world_camera: Annotated[F64, Shape("M", 4, 4)]
     points_world: Annotated[F64, Shape("N", 3)]
-    u: Annotated[F32, Shape("M", "N")]
-    v: Annotated[F32, Shape("M", "N")]
-    weights: Annotated[F32, Shape("M", "N")]
+    columns: Annotated[I32, Shape("N")]
+    u: Annotated[F32, Shape("M", "C")]
+    v: Annotated[F32, Shape("M", "C")]
+    weights: Annotated[F32, Shape("M", "C")]
+    seen: Annotated[BoolArray, Shape("M", "C")]
     intrinsics: Annotated[F64, Shape("M", 6)]
     fixed_cameras: Annotated[BoolArray, Shape("M")]
 
