@@ -117,7 +117,10 @@ class Journal:
     def unpublished(self, rows: I32) -> I32:
         """Return rows whose landmarks readers lack or have with another reference keyframe."""
         self._grow()
-        return rows[np.isnan(self._sigmas[rows]) | ~self._is_current(rows)]
+        points = self._points
+        return _unpublished(
+            rows, points.ids, self._ids, points.first_keyframe, self._hosts, self._sigmas
+        )
 
     def publish(self, outcome: Outcome) -> MapDelta:
         """Return all changes since the last call."""
@@ -227,6 +230,21 @@ class Journal:
             point_ids=np.concatenate(ids),
             points_px=np.concatenate(pixels),
         )
+
+
+@kernel
+def _unpublished(
+    rows: I32, ids: I64, published: I64, first_keyframe: I32, hosts: I32, sigmas: F32
+) -> I32:
+    """As ``Journal.unpublished``; published, hosts, sigmas: as readers have them."""
+    chosen = np.empty(rows.size, np.int32)
+    count = 0
+    for i in range(rows.size):
+        row = rows[i]
+        current = published[row] == ids[row] and hosts[row] == first_keyframe[row]
+        chosen[count] = row
+        count += not current or np.isnan(sigmas[row])
+    return chosen[:count].copy()
 
 
 @kernel

@@ -14,7 +14,7 @@ import numpy as np
 from pliant.algorithms.slam.active.active_map import ActiveMap
 from pliant.algorithms.slam.calibration.changing_focal import RATE, SPREAD
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.estimate.focal_pose import refine_focal
+from pliant.algorithms.slam.estimate.focal_pose import refine_focal, thinning
 from pliant.algorithms.slam.estimate.problem import CalibrationUncertainty
 from pliant.algorithms.slam.locate.localisation import Motion
 from pliant.algorithms.slam.map.landmarks import MAPPED
@@ -45,10 +45,12 @@ def refocused(
     linked, changes = active.linked(MAPPED), calibration.changes
     if len(linked) < active.parameters.localisation.min_inliers:
         return calibration
+    every = thinning(len(linked))
+    linked = linked[::every]
     rows, predicted = active.links.rows[linked], motion.predictions(stamp_ns)[0]
     points_px = calibration.frame_view.pixels(tracks.points_px[linked])
     if calibration.readout:
-        rolled = active.segment.rolled(calibration, motion.velocity())
+        rolled = active.segment.rolled(calibration, motion.velocity)
         points_px = points_px - rolled.shifts(
             points_px, active.segment.inverse_depths(rows, predicted)
         )
@@ -56,6 +58,7 @@ def refocused(
     change, sigma = refine_focal(
         predicted, active.points.xyz[rows], points_px, active.camera, (given.cx, given.cy),
         RATE * np.sqrt(max(motion.lost_s(stamp_ns), _LEAST_GAP_S)) if changes else SPREAD,
+        every,
     )  # fmt: skip
     lasts = shows_at_once(change, sigma) and change * active.magnification > 0.0
     log_focal = calibration.log_focal + change

@@ -82,7 +82,7 @@ def localise(
     if len(linked) >= limits.min_inliers:
         rows, points_px = active.links.rows[linked], tracks.points_px[linked]
         if frame.calibration.readout:
-            rolled = active.segment.rolled(frame.calibration, motion.velocity())
+            rolled = active.segment.rolled(frame.calibration, motion.velocity)
             depths = active.segment.inverse_depths(rows, predictions[0])
             points_px = points_px - rolled.shifts(points_px, depths)
         located = _by_tracks(active, predictions, rows, points_px, candidates, generator)

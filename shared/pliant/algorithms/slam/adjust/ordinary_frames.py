@@ -17,7 +17,7 @@ from pliant.algorithms.slam.calibration.changing_focal import RATE
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, moved_px
 from pliant.algorithms.slam.calibration.rolling_shutter import FramePoses
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.estimate.focal_pose import refine_focal
+from pliant.algorithms.slam.estimate.focal_pose import refine_focal, thinning
 from pliant.algorithms.slam.estimate.observation_table import weigh
 from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.estimate.trajectory_smoothing import smooth_trajectory
@@ -172,7 +172,9 @@ def refined_poses(
         start = keyframe.T_world_camera @ each.T_keyframe_camera
         if seen_by.changes:
             centre = seen_by.given.cx, seen_by.given.cy
-            change, _ = refine_focal(start, xyz, points_px, camera, centre, RATE)
+            every = thinning(len(xyz))
+            some = slice(None, None, every)
+            change, _ = refine_focal(start, xyz[some], points_px[some], camera, centre, RATE, every)
             factors = np.full(len(points_px), change)
             points_px = moved_px(points_px, seen_by.view, seen_by.view, factors)
         weights = weigh(points_px, camera, seen_by.k_sigmas(parameters.calibration))

@@ -24,13 +24,18 @@ from pliant.compiler.kernel import kernel
 
 _SIGMAS_PX = (8.0, 8.0, 2.0, 2.0)
 _MIN_DEPTH = 1e-6
-_MOST = 250
-"""Points are thinned evenly to at most twice as many, which is sufficient."""
+_ENOUGH = 250
+"""Points to which they are thinned evenly; nearly twice as many stay at most."""
 
 _MEDIAN_OF_TWO = 1.386
 """The median of chi-square with two degrees of freedom."""
 
 UNKNOWNS = 7
+
+
+def thinning(count: int) -> int:
+    """Of how many of a frame's points one is enough."""
+    return max(1, count // _ENOUGH)
 
 
 def refine_focal(
@@ -40,21 +45,21 @@ def refine_focal(
     camera: PinholeCamera,
     centre: tuple[float, float],
     deviation: float,
+    every: int = 1,
 ) -> tuple[float, float]:
     """Return the log magnification d of a frame, and its standard deviation by the residuals,
     scaled to all points.
 
     T_world_camera: (4, 4) to start from.  points_world: (N, 3).  points_px: (N, 2).  deviation:
-    standard deviation of d.
+    standard deviation of d.   every: of how many points one is given, as of ``thinning``.
     """
-    every = max(1, len(points_px) // _MOST)
-    world, px = points_world[::every], points_px[::every].astype(np.float64)
+    px = points_px.astype(np.float64)
     lens = np.array([*camera.intrinsics, *centre])
     T_camera_world = inverse(T_world_camera)
     motion = np.concatenate([T_camera_world[:3, :3].ravel(), T_camera_world[:3, 3]])
     d, normal, squared = 0.0, np.eye(UNKNOWNS), np.zeros(0)
     for sigma in _SIGMAS_PX:
-        residuals, J = linearise(motion, d, world, px, lens)
+        residuals, J = linearise(motion, d, points_world, px, lens)
         squared = (residuals**2).sum(axis=1)
         weights = 1.0 / (1.0 + squared / sigma**2) ** 2
         weighted = (weights[:, None, None] * J).reshape(-1, UNKNOWNS)

@@ -8,6 +8,7 @@ projection must verify it.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -124,7 +125,7 @@ class VerifiedPose(NamedTuple):
     rows: I32
 
 
-@dataclass(kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Motion:
     """The last motion of the camera: T_world_camera (4, 4) of two frames, the newer one last.
 
@@ -175,6 +176,7 @@ class Motion:
         before, last = (move_by_similarity(S, pose) for pose in self.poses)
         return replace(self, poses=(before, last))
 
+    @cached_property
     def velocity(self) -> F64:
         """(6,) between the two frames, as of ``FramePoses.motions``."""
         frames = max(1, self.frames[1] - self.frames[0])
@@ -182,12 +184,12 @@ class Motion:
 
     def velocity_at(self, frame: int, T_world_camera: F64) -> F64:
         """(6,) at a later frame with this pose."""
-        between = self.then(frame, 0, T_world_camera).velocity()
+        between = self.then(frame, 0, T_world_camera).velocity
         if self.frames[0] == self.frames[1]:
             return between
         # The velocity between the frames has changed since.
         share = (frame - self.frames[1]) / (frame - self.frames[0])
-        return between + _SPEEDING_UP * share * (between - self.velocity())
+        return between + _SPEEDING_UP * share * (between - self.velocity)
 
     def interval_s(self) -> float:
         """Seconds between the two."""
@@ -197,17 +199,23 @@ class Motion:
         """Seconds since the last pose."""
         return 1e-9 * (stamp_ns - self.stamps_ns[1])
 
+    @cached_property
+    def _step(self) -> tuple[F64, F64]:
+        """Rotation vector and translation (3,) from one frame to the other."""
+        step = inverse(self.poses[0]) @ self.poses[1]
+        return so3_log(step[:3, :3]), step[:3, 3]
+
     def predictions(self, stamp_ns: int) -> list[F64]:
         """Predict T_world_camera by constant velocity, and for a camera that has stopped."""
-        before, last = self.poses
+        last = self.poses[1]
         elapsed = self.stamps_ns[1] - self.stamps_ns[0]
         if elapsed <= 0:
             return [last]
         share = (stamp_ns - self.stamps_ns[1]) / elapsed
-        step = inverse(before) @ last
+        turn, shift = self._step
         moved = np.eye(4)
-        moved[:3, :3] = so3_exp(share * so3_log(step[:3, :3]))
-        moved[:3, 3] = share * step[:3, 3]
+        moved[:3, :3] = so3_exp(share * turn)
+        moved[:3, 3] = share * shift
         return [last @ moved, last]
 
 

@@ -42,18 +42,14 @@ class TrackLinks:
         See ``_LOST_AT_ONCE`` for which rows are stored.
         """
         before, rows = self.ids, np.full(len(ids), UNLINKED, np.int32)
-        _carry_over(before, self.rows, ids, rows)
-        gone = np.flatnonzero(~np.isin(before, ids, assume_unique=True) & (self.rows != UNLINKED))
+        gone, back = _carry_over(before, self.rows, ids, rows)
         at_once = len(gone) >= _LOST_AT_ONCE * max(len(before), 1)
         stay = rows[rows != UNLINKED]
         mapped = np.count_nonzero(points.state[stay] == MAPPED)
         if not at_once or self._lost_at_once or mapped >= MAPPED_SHARE * max(len(stay), 1):
             gone = gone[points.state[self.rows[gone]] == MAPPED]
         self._lost_at_once = at_once
-        if len(before):
-            old = np.flatnonzero(ids <= before[-1])
-            back = old[~np.isin(ids[old], before, assume_unique=True)]
-            self._take_back(ids, rows, back, points)
+        self._take_back(ids, rows, back, points)
         row = self.rows[gone]
         new = np.column_stack([before[gone], row, _identity(points, row)])
         self._gone = np.concatenate([self._gone, new.astype(np.int64)])[-_KEPT_GONE:]
@@ -104,10 +100,23 @@ def _in_state(rows: I32, state: U8, wanted: int) -> I64:
 
 
 @kernel
-def _carry_over(ids: I64, rows: I32, new_ids: I64, new_rows: I32) -> None:
-    i = 0
-    for j in range(new_ids.size):
-        while i < ids.size and ids[i] < new_ids[j]:
+def _carry_over(ids: I64, rows: I32, new_ids: I64, new_rows: I32) -> tuple[I64, I64]:
+    """Write the rows of the tracks that go on.  Returns the indices of linked tracks that have
+    gone, and the new indices of tracks that are older than the last one before, but were not there.
+    """
+    gone, back = np.empty(ids.size, np.int64), np.empty(new_ids.size, np.int64)
+    went, came, i = 0, 0, 0
+    for j in range(new_ids.size + 1):
+        while i < ids.size and (j == new_ids.size or ids[i] < new_ids[j]):
+            gone[went] = i
+            went += rows[i] != UNLINKED
             i += 1
-        if i < ids.size and ids[i] == new_ids[j]:
+        if i == ids.size:
+            break
+        if ids[i] == new_ids[j]:
             new_rows[j] = rows[i]
+            i += 1
+        else:
+            back[came] = j
+            came += 1
+    return gone[:went].copy(), back[:came].copy()
