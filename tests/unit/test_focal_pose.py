@@ -1,6 +1,7 @@
 """Pose and focal length of one frame: the Jacobian, what it recovers, and what holds it."""
 
 import numpy as np
+import pytest
 from mapping_scene import CAMERA
 
 from pliant.algorithms.geometry import inverse, so3_exp
@@ -58,3 +59,22 @@ def test_a_step_ahead_is_no_magnification_and_without_depth_the_prior_holds_it()
     start = T_world_camera.copy()
     assert abs(refine_focal(start, world, px, CAMERA, CENTRE, 1e-6)[0]) < 1e-5
     assert refine_focal(start, world[:0], px[:0], CAMERA, CENTRE, 0.1) == (0.0, np.inf)
+
+
+def test_the_deviation_is_that_of_the_normal_equations_and_scaled_to_all_points():
+    T_world_camera, world, px = scene(0.02, noise_px=0.3)
+    d, sigma = refine_focal(T_world_camera, world, px, CAMERA, CENTRE, 0.1)
+    T = inverse(T_world_camera)
+    motion = np.concatenate([T[:3, :3].ravel(), T[:3, 3]])
+    lens = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, *CENTRE])
+    residuals, J = linearise(motion, d, world, px.astype(np.float64), lens)
+    squared = (residuals**2).sum(axis=1)
+    weights = 1.0 / (1.0 + squared / 4.0) ** 2
+    normal = np.einsum("n,nka,nkb->ab", weights, J, J) + np.diag([0.0] * 6 + [100.0])
+    expected = np.sqrt(np.median(squared) / 1.386 * np.linalg.inv(normal)[6, 6])
+    np.testing.assert_allclose(sigma, expected, rtol=0.05)
+    some, of_all = (
+        refine_focal(T_world_camera, world[::2], px[::2], CAMERA, CENTRE, 0.1, every)[1]
+        for every in (1, 2)
+    )
+    assert of_all == pytest.approx(some / np.sqrt(2.0))

@@ -68,10 +68,8 @@ class IdealFrame:
     def to_global_shutter(self, rolled: RolledFrame, inverse_depths: F64) -> "IdealFrame":
         """Return the frame with a global shutter.   inverse_depths: (N,) of the tracks."""
         before = self.tracks
-        maxima = before.maxima.copy()
-        maxima[:, :2] -= rolled.shifts(np.ascontiguousarray(maxima[:, :2]))
-        points_px = before.points_px - rolled.shifts(before.points_px, inverse_depths)
-        tracks = replace(before, points_px=points_px, maxima=maxima)
+        points_px = rolled.removed(before.points_px, inverse_depths)
+        tracks = replace(before, points_px=points_px, maxima=rolled.removed(before.maxima))
         return replace(self, tracks=tracks, rolled=rolled, rolled_px=before.points_px - points_px)
 
     @property

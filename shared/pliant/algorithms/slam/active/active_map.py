@@ -164,8 +164,9 @@ class ActiveMap:
         misses[visible] = np.minimum(misses[visible], MAX_MISSES - 1) + 1
         misses[reacquired.rows] = 0
         camera = self.camera
-        places = np.column_stack([tracks.points_px, tracks.kappas])
-        nearby = MaximaGrid.build(places, camera.width, camera.height, _TRACK_AT_MAXIMUM_PX)
+        nearby = MaximaGrid.build(
+            tracks.points_px, camera.width, camera.height, _TRACK_AT_MAXIMUM_PX
+        )
         track = nearby.nearest(tracks.maxima[reacquired.maxima, :2], _TRACK_AT_MAXIMUM_PX)
         alone = track < 0
         new = reacquired.rows[~alone]

@@ -51,9 +51,8 @@ def refocused(
     points_px = calibration.frame_view.pixels(tracks.points_px[linked])
     if calibration.readout:
         rolled = active.segment.rolled(calibration, motion.velocity)
-        points_px = points_px - rolled.shifts(
-            points_px, active.segment.inverse_depths(rows, predicted)
-        )
+        depths = active.segment.inverse_depths(rows, predicted)
+        points_px = rolled.removed(points_px, depths)
     given = calibration.given
     change, sigma = refine_focal(
         predicted, active.points.xyz[rows], points_px, active.camera, (given.cx, given.cy),

@@ -84,7 +84,7 @@ def localise(
         if frame.calibration.readout:
             rolled = active.segment.rolled(frame.calibration, motion.velocity)
             depths = active.segment.inverse_depths(rows, predictions[0])
-            points_px = points_px - rolled.shifts(points_px, depths)
+            points_px = rolled.removed(points_px, depths)
         located = _by_tracks(active, predictions, rows, points_px, candidates, generator)
         inliers = int(located.inliers.sum())
         of_points = int(located.inliers[: len(linked) - len(candidates)].sum())

@@ -190,6 +190,15 @@ class RolledFrame:
         """(N, 2) rolling-shutter offsets, px, of observations at points_px (N, 2)."""
         return self._shifts(points_px, inverse_depths, seen=True)
 
+    def removed(self, points: F32, inverse_depths: F64 | None = None) -> F32:
+        """Observations (N, 2 or more), of which the first two columns are px, less ``shifts``."""
+        if inverse_depths is None:
+            inverse_depths = np.array([self.inverse_depth])
+        axis, K = self._read_out()
+        still = points.copy()
+        _remove(still, inverse_depths, self.readout * self.motion, K, axis)
+        return still
+
     def found(self, points_px: F32, inverse_depths: F64) -> tuple[F32, F32]:
         """Move matches at points_px (N, 2) of ``image`` to the position for their own depth;
         returns it with their offsets.
@@ -219,14 +228,17 @@ class RolledFrame:
         return places[0], places[1]
 
     def _shifts(self, points_px: F32, inverse_depths: F64 | None, *, seen: bool) -> F32:
-        camera = self.camera
-        axis, length = _read_out_along(camera)
-        K = np.array([*camera.intrinsics, length])
+        axis, K = self._read_out()
         if inverse_depths is None:
-            inverse_depths = np.full(len(points_px), self.inverse_depth)
+            inverse_depths = np.array([self.inverse_depth])
         shifts = np.empty((len(points_px), 2), np.float32)
         _shifts(points_px, inverse_depths, self.readout * self.motion, K, axis, shifts, seen)
         return shifts
+
+    def _read_out(self) -> tuple[int, F64]:
+        """The axis along which it is read out; intrinsics and the length of that axis (5,)."""
+        axis, length = _read_out_along(self.camera)
+        return axis, np.array([*self.camera.intrinsics, length])
 
 
 def readout_flow(
@@ -291,22 +303,45 @@ def _velocity(motion: F64, x: float, y: float, inverse_depth: float) -> tuple[fl
 def _shifts(
     points_px: F32, inverse_depths: F64, motion: F64, K: F64, axis: int, shifts: F32, seen: bool
 ) -> None:
-    """Write p - q for the observed points p, or else for the points q."""
-    middle = 0.5 * (K[4] - 1.0)
+    """Write p - q for the observed points p, or else for the points q.
+
+    inverse_depths: (N,) or (1,) for all.
+    """
+    last = inverse_depths.size - 1
     for n in range(points_px.shape[0]):
-        u, v = float(points_px[n, 0]), float(points_px[n, 1])
-        du, dv = 0.0, 0.0
-        for _ in range(_STEPS):
-            if seen:
-                x, y = (u - du - K[2]) / K[0], (v - dv - K[3]) / K[1]
-                row = v if axis else u
-            else:
-                x, y = (u - K[2]) / K[0], (v - K[3]) / K[1]
-                row = v + dv if axis else u + du
-            share = (row - middle) / K[4]
-            a, b = _velocity(motion, x, y, inverse_depths[n])
-            du, dv = share * K[0] * a, share * K[1] * b
+        u, v, inverse_depth = points_px[n, 0], points_px[n, 1], inverse_depths[min(n, last)]
+        du, dv = _shift(u, v, inverse_depth, motion, K, axis, seen)
         shifts[n, 0], shifts[n, 1] = du, dv
+
+
+@kernel
+def _remove(points: F32, inverse_depths: F64, motion: F64, K: F64, axis: int) -> None:
+    """Subtract the shifts of observed points from their first two columns."""
+    last = inverse_depths.size - 1
+    for n in range(points.shape[0]):
+        u, v, inverse_depth = points[n, 0], points[n, 1], inverse_depths[min(n, last)]
+        du, dv = _shift(u, v, inverse_depth, motion, K, axis, True)
+        points[n, 0], points[n, 1] = u - np.float32(du), v - np.float32(dv)
+
+
+@kernel
+def _shift(
+    u: float, v: float, inverse_depth: float, motion: F64, K: F64, axis: int, seen: bool
+) -> tuple[float, float]:
+    u, v = float(u), float(v)
+    middle = 0.5 * (K[4] - 1.0)
+    du, dv = 0.0, 0.0
+    for _ in range(_STEPS):
+        if seen:
+            x, y = (u - du - K[2]) / K[0], (v - dv - K[3]) / K[1]
+            row = v if axis else u
+        else:
+            x, y = (u - K[2]) / K[0], (v - K[3]) / K[1]
+            row = v + dv if axis else u + du
+        share = (row - middle) / K[4]
+        a, b = _velocity(motion, x, y, inverse_depth)
+        du, dv = share * K[0] * a, share * K[1] * b
+    return du, dv
 
 
 @kernel

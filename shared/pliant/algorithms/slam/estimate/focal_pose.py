@@ -57,23 +57,70 @@ def refine_focal(
     lens = np.array([*camera.intrinsics, *centre])
     T_camera_world = inverse(T_world_camera)
     motion = np.concatenate([T_camera_world[:3, :3].ravel(), T_camera_world[:3, 3]])
-    d, normal, squared = 0.0, np.eye(UNKNOWNS), np.zeros(0)
+    normal, squared = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(len(px))
+    d, count = _adjust(motion, points_world, px, lens, deviation**-2, normal, squared)
+    variance = np.median(squared[:count]) / _MEDIAN_OF_TWO if count else np.inf
+    # d is the last unknown, so its variance is that of the last pivot of L L^T.
+    return d, float(np.sqrt(variance / every) / normal[-1, -1])
+
+
+@kernel
+def _adjust(
+    motion: F64,
+    points_world: F64,
+    points_px: F64,
+    lens: F64,
+    precision: float,
+    normal: F64,
+    squared: F64,
+) -> tuple[float, int]:
+    """Move the camera (12,); returns d and the number n of points in front.
+
+    precision: of the prior.   normal: (7, 7) receives L of the last step.   squared: (N,) receives
+    n squared residuals.
+    """
+    d, count = 0.0, 0
     for sigma in _SIGMAS_PX:
-        residuals, J = linearise(motion, d, points_world, px, lens)
-        squared = (residuals**2).sum(axis=1)
-        weights = 1.0 / (1.0 + squared / sigma**2) ** 2
-        weighted = (weights[:, None, None] * J).reshape(-1, UNKNOWNS)
-        normal = weighted.T @ J.reshape(-1, UNKNOWNS)
-        g = weighted.T @ residuals.reshape(-1)
-        normal[6, 6] += deviation**-2
-        g[6] -= d * deviation**-2
-        normal[np.diag_indices(6)] *= 1.0 + 1e-9
-        normal[np.diag_indices(6)] += 1e-9
-        step = np.linalg.solve(normal, g)
+        residuals, J = linearise(motion, d, points_world, points_px, lens)
+        count = len(residuals)
+        normal[:] = 0.0
+        step = np.zeros(UNKNOWNS)
+        for n in range(count):
+            squared[n] = residuals[n, 0] ** 2 + residuals[n, 1] ** 2
+            weight = 1.0 / (1.0 + squared[n] / sigma**2) ** 2
+            for k in range(2):
+                for a in range(UNKNOWNS):
+                    weighted = weight * J[n, k, a]
+                    step[a] += weighted * residuals[n, k]
+                    for b in range(a + 1):
+                        normal[a, b] += weighted * J[n, k, b]
+        normal[-1, -1] += precision
+        step[-1] -= d * precision
+        for a in range(UNKNOWNS - 1):
+            normal[a, a] += 1e-9 * (1.0 + normal[a, a])
+        _solve(normal, step)
         move_camera(motion, step[:6], motion)
-        d += float(step[6])
-    variance = np.median(squared) / _MEDIAN_OF_TWO if len(squared) else np.inf
-    return d, float(np.sqrt(variance / every * np.linalg.inv(normal)[6, 6]))
+        d += step[-1]
+    return d, count
+
+
+@kernel
+def _solve(A: F64, x: F64) -> None:
+    """Solve ``A x = b`` in place of b by Cholesky's L, which replaces the lower triangle of A."""
+    for a in range(x.size):
+        for b in range(a + 1):
+            for k in range(b):
+                A[a, b] -= A[a, k] * A[b, k]
+            if a > b:
+                A[a, b] /= A[b, b]
+        A[a, a] = np.sqrt(A[a, a])
+        for k in range(a):
+            x[a] -= A[a, k] * x[k]
+        x[a] /= A[a, a]
+    for a in range(x.size - 1, -1, -1):
+        for k in range(a + 1, x.size):
+            x[a] -= A[k, a] * x[k]
+        x[a] /= A[a, a]
 
 
 @kernel

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, I64, BoolArray
+from pliant.algorithms.arrays import F32, F64, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.slam.parameters import SupportParameters
 from pliant.compiler.kernel import kernel
@@ -49,18 +49,17 @@ def support_of(
     of them, the first ones, with tracks.   settled_px: (M, 2) of the tracks that have landmarks if
     the pose is right, or contradict it.
     """
-    count = int(np.count_nonzero(inliers))
-    fitting = points_px[inliers]
     width, height = camera.width, camera.height
-    supported, tracks = _per_cell(fitting, width, height), _per_cell(settled_px, width, height)
+    supported, still_tracked, deviations = _fitting(points_px, inliers, tracked, width, height)
+    tracks, count = _per_cell(settled_px, width, height), int(supported.sum())
     decided = tracks >= _LEAST_SEEN
     size = np.array([width, height])
     return Support(
         inliers=count,
-        tracked=int(np.count_nonzero(inliers[:tracked])),
+        tracked=still_tracked,
         share=count / max(len(points_px), 1),
         contrary=float((supported < _AGAINST * tracks)[decided].mean()) if decided.any() else 0.0,
-        spread=float(np.min(fitting.std(axis=0) / size)) if count else 0.0,
+        spread=float(np.min(deviations / size)) if count else 0.0,
     )
 
 
@@ -79,7 +78,34 @@ def why_doubtful(support: Support, parameters: SupportParameters) -> str:
 def _per_cell(points_px: F32, width: int, height: int) -> I64:
     counts = np.zeros(_COLUMNS * _LINES, np.int64)
     for i in range(points_px.shape[0]):
-        column = min(max(int(points_px[i, 0] * _COLUMNS / width), 0), _COLUMNS - 1)
-        line = min(max(int(points_px[i, 1] * _LINES / height), 0), _LINES - 1)
-        counts[line * _COLUMNS + column] += 1
+        counts[_cell(points_px[i, 0], points_px[i, 1], width, height)] += 1
     return counts
+
+
+@kernel
+def _cell(u: float, v: float, width: int, height: int) -> int:
+    column = min(max(int(u * _COLUMNS / width), 0), _COLUMNS - 1)
+    line = min(max(int(v * _LINES / height), 0), _LINES - 1)
+    return line * _COLUMNS + column
+
+
+@kernel
+def _fitting(
+    points_px: F32, inliers: BoolArray, tracked: int, width: int, height: int
+) -> tuple[I64, int, F64]:
+    """Inliers in each cell, how many of the first ``tracked`` points, and standard deviations (2,)
+    of all.
+    """
+    counts = np.zeros(_COLUMNS * _LINES, np.int64)
+    count, still_tracked, mean, squares = 0, 0, np.zeros(2), np.zeros(2)
+    for i in range(points_px.shape[0]):
+        if not inliers[i]:
+            continue
+        counts[_cell(points_px[i, 0], points_px[i, 1], width, height)] += 1
+        still_tracked += i < tracked
+        count += 1
+        for k in range(2):
+            step = points_px[i, k] - mean[k]
+            mean[k] += step / count
+            squares[k] += step * (points_px[i, k] - mean[k])
+    return counts, still_tracked, np.sqrt(squares / max(count, 1))

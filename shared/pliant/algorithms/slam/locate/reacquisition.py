@@ -41,6 +41,7 @@ FLAT = np.float32(1.0)
 class MaximaGrid(NamedTuple):
     """Maxima (M, 3) as (u, v, kappa); those of cell c are ``order[starts[c] : starts[c + 1]]``.
 
+    Those without kappa, (M, 2), only have a nearest one.
     cell_px: side of a cell, no less than any search radius, so that nine cells suffice.
     """
 
