@@ -257,6 +257,19 @@ def test_a_data_set_played_live_keeps_the_pace_of_its_stamps() -> None:
     assert start_s + 3 * STEP_NS * 1e-9 <= monitor.captured_s <= time.time()
 
 
+def test_a_file_is_looked_into_while_its_readers_start() -> None:
+    read: list[int] = []
+
+    class Readers(ReplayBus):
+        def publish(self, topic: Topic, message: Header, *, may_lag: Collection[str] = ()) -> None:
+            if topic is topics.STREAM:
+                assert read == [0]
+            super().publish(topic, message, may_lag=may_lag)
+
+    run(FakeDataset([png(i) for i in range(3)], before=read.append), Readers({}))
+    assert read == [0, 1, 2, 3]
+
+
 @pytest.mark.parametrize("is_live", [False, True])
 def test_stopping_ends_after_the_frame_at_hand(is_live: bool) -> None:
     taken: list[int] = []

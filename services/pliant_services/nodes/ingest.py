@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import chain, islice
 from typing import Any
 
 from pliant.bus.base import Bus, resume
@@ -88,6 +89,7 @@ def run(
         bus.end(topics.MAP_KNOWN)
         return 0, 0, 0, tuple(vars(MappingPace.of(config.bus)).values()), ({},), checksum
 
+    frames = None if live else begun(every(dataset, stopping))  # while readers start
     begin, dropped, broken, *kept, sent = resume(bus, start)
     if sent != checksum:  # taken up again with another file
         clip = None
@@ -96,7 +98,7 @@ def run(
     counters: dict[str, float] = {}
     try:
         ready = partial(bus.wait_until_taken, topics.IMAGE)
-        for source in newest(dataset, stopping, ready) if live else every(dataset, stopping):
+        for source in frames or newest(dataset, stopping, ready):
             if source.index < begin:  # sent before we were started again
                 continue
             drops.take(dropped=source.dropped, waited_s=bus.waited_s)
@@ -138,6 +140,11 @@ def every(dataset: Dataset, stopping: Callable[[], bool]) -> Iterator[SourceFram
         if stopping():
             return
         yield frame
+
+
+def begun(frames: Iterator[SourceFrame]) -> Iterator[SourceFrame]:
+    """The frames, the first of which is read now: a source may look far ahead for it."""
+    return chain([*islice(frames, 1)], frames)
 
 
 def newest(

@@ -119,7 +119,7 @@ class StaticRegions:
         elif not _has_moved(self._last, gradient):
             return False
         self._last, self._counted_ns = gradient, stamp_ns
-        length = np.linalg.norm(gradient, axis=2, keepdims=True)
+        length = np.sqrt(_squares(gradient))[..., None]
         new = np.dstack([image, image**2, gradient, length, length**2])
         self._sums = (self._sums + new).astype(np.float32)
         self._counted += 1
@@ -145,11 +145,17 @@ class StaticRegions:
 
 def _has_moved(before: F32, now: F32) -> bool:
     """Whether most of the blocks that have texture differ as unrelated ones would."""
-    changed = _per_block(((now - before) ** 2).sum(axis=2))
-    energy = _per_block((now**2).sum(axis=2)), _per_block((before**2).sum(axis=2))
+    changed = _per_block(_squares(now - before))
+    energy = _per_block(_squares(now)), _per_block(_squares(before))
     textured = np.maximum(*energy) > _EDGE**2
     moved = changed > _MOVED * (energy[0] + energy[1])
     return bool(np.count_nonzero(moved & textured) > _MOVED * max(1, np.count_nonzero(textured)))
+
+
+def _squares(vectors: F32) -> F32:
+    """Squared lengths.  numpy sums over an axis of two in ten times the time."""
+    x, y = vectors[..., 0], vectors[..., 1]
+    return x * x + y * y
 
 
 def _per_block(values: F32) -> F32:
@@ -162,7 +168,7 @@ def _per_block(values: F32) -> F32:
 def _border(means: F32) -> tuple[str, BoolArray]:
     """Dark, flat regions along the image's edge, with their outlines, which do not move."""
     steady = (_deviation(means) < _STEADY) & (means[..., 0] < _DARK)
-    length = np.linalg.norm(means[..., 2:4], axis=2)
+    length = np.sqrt(_squares(means[..., 2:4]))
     outline = (length > _EDGE) & (length > _SAME_DIRECTION * means[..., 4])
     near = _grown(outline, _MARGIN)
     _count, labels = cv2.connectedComponents((steady & ~outline).astype(np.uint8), connectivity=4)
@@ -220,7 +226,7 @@ def _outside_circle(outline: BoolArray, steady: BoolArray) -> BoolArray | None:
 def _overlay(means: F32) -> BoolArray:
     """Texture that does not move where all around it does."""
     deviation, gradient = _deviation(means), means[..., 2:4]
-    energy = (gradient**2).sum(axis=2)
+    energy = _squares(gradient)
     still = (energy > _EDGE**2) & (energy > _SAME_EDGE * means[..., 5])
     side = max(still.shape)
     joined = _dilated(still, round(_JOINED * side))
