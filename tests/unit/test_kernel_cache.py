@@ -18,6 +18,7 @@ from pliant.compiler import (
     kernel,
     kernel_cache,
     kernel_linking,
+    kernel_loading,
     reference_counts,
     subroutines,
 )
@@ -65,11 +66,31 @@ def added(pair):
 """
 
 
+# A kernel that makes an array, and one that calls it.
+_ARRAY = """
+import numpy as np
+from pliant.compiler.kernel import kernel
+
+@kernel
+def doubled(x):
+    return x + x
+"""
+_CALLER = """
+from pliant.compiler.kernel import kernel
+from pliant.algorithms.doubled import doubled
+
+@kernel
+def total(x):
+    return doubled(x).sum()
+"""
+
+
 def _package(root: Path) -> Path:
     package, compiler = (root / "pliant" / name for name in ("algorithms", "compiler"))
     for folder in (package, compiler):
         folder.mkdir(parents=True)
-    for module in (kernel, kernel_cache, kernel_linking, reference_counts, subroutines):
+    ours = kernel, kernel_cache, kernel_linking, kernel_loading, reference_counts, subroutines
+    for module in ours:
         source = Path(module.__file__)
         (compiler / source.name).write_bytes(source.read_bytes())
     for module in (cache, errors):
@@ -126,6 +147,23 @@ def test_a_kernel_calls_the_helpers_in_its_own_object_file(tmp_path: Path) -> No
     (file,) = package.rglob("helped.helped-*.nbc")
     found = [binding for name, binding in _functions(_object(file)) if "helper" in name]
     assert found == ["local"]
+
+
+def test_a_kernel_from_disk_needs_no_compiler_and_is_linked_into_one_compiled_later(
+    tmp_path: Path,
+) -> None:
+    package = _package(tmp_path)
+    (package / "doubled.py").write_text(_ARRAY)
+    (package / "caller.py").write_text(_CALLER)
+    one = (
+        "import sys, numpy as np; from pliant.algorithms.doubled import doubled; "
+        "print(doubled(np.ones(3)).sum(), *doubled.stats.cache_hits.values(), "
+        "'numba.misc.cffiimpl' in sys.modules)"
+    )
+    both = "; from pliant.algorithms.caller import total; print(total(np.ones(3)))"
+    assert _call(tmp_path, one) == "6.0 True"
+    assert _call(tmp_path, one + both).split() == ["6.0", "1", "False", "6.0"]
+    assert _call(tmp_path, one + both).split() == ["6.0", "1", "False", "6.0"]
 
 
 def test_kernels_go_to_the_cache_folder_where_the_sources_are_not_to_be_written(

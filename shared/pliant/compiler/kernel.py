@@ -17,6 +17,7 @@ from numba import extending
 
 from pliant.compiler.kernel_cache import SourcesCache
 from pliant.compiler.kernel_linking import keep_copies_apart
+from pliant.compiler.kernel_loading import parse_when_needed
 from pliant.compiler.reference_counts import BorrowingCompiler
 from pliant.compiler.subroutines import keep_subroutines_apart
 
@@ -77,6 +78,7 @@ def fast_kernel(function: Any = None, *, inline: bool = False) -> Any:
 def _compile(function: _Function, *, fastmath: Any, forceinline: bool = False) -> _Function:
     keep_copies_apart()
     keep_subroutines_apart()
+    parse_when_needed()
     # What is left out here, numba takes from the kernel that happens to call this one first.
     options: dict[str, Any] = {"fastmath": fastmath, "forceinline": forceinline, "_nrt": True}
     dispatcher: Any = numba.njit(**_OPTIONS, **options)(function)

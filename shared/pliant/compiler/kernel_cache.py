@@ -22,6 +22,7 @@ from numba.core.caching import (
     UserProvidedCacheLocator,
     UserWideCacheLocator,
 )
+from numba.core.runtime.nrt import rtsys
 
 from pliant.cache import cache_folder
 from pliant.errors import PliantError
@@ -73,6 +74,18 @@ class SourcesCache(FunctionCache):
             filename_base=self._impl.filename_base,
             source_stamp=stamp.hexdigest(),
         )
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """A kernel from disk; None where it is not there.
+
+        Numba registers all that a compiler may need first, a tenth of a second in every process:
+        machine code needs the functions that count references, no more.  Who compiles registers
+        the rest then.
+        """
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
+        return None
 
 
 @cache
