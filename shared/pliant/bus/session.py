@@ -26,6 +26,9 @@ _PATIENCE_MS = 60_000  # Zenoh's defaults lose messages after a stall of 5 to 10
 TOKEN_LEASE_S = 5.0 + 1e-3 * _PATIENCE_MS
 """Seconds after which the router drops a service whose machine has vanished."""
 _LONGEST_SOCKET = 100  # bytes; Linux takes 107 and macOS 103
+_SHARED_BYTES = 4 << 20
+"""Without images; each process has that of all that it reads.  Zenoh's default has room for some
+images."""
 _SOCKET = "unixsock-stream"
 _FOLDER, _BUS = "pliant-", "bus"
 _NO_SHARED_MEMORY = "shm segment"
@@ -76,8 +79,12 @@ class Identity:
         return own
 
 
-def _config(mode: str, identity: Identity | None) -> zenoh.Config:
+def _config(mode: str, identity: Identity | None, *, pixels: bool = False) -> zenoh.Config:
     config = zenoh.Config()
+    if not pixels:
+        config.insert_json5(
+            "transport/shared_memory/transport_optimization/pool_size", str(_SHARED_BYTES)
+        )
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("scouting/gossip/enabled", "false")
@@ -103,12 +110,15 @@ def _config(mode: str, identity: Identity | None) -> zenoh.Config:
     return config
 
 
-def open_session(endpoints: Sequence[str], identity: Identity | None = None) -> zenoh.Session:
+def open_session(
+    endpoints: Sequence[str], identity: Identity | None = None, *, pixels: bool = False
+) -> zenoh.Session:
     """Connect as a client.  ``identity``: for endpoints such as tls/host:7447.
 
+    pixels: images are sent, so that more memory is shared with readers on this machine.
     Raises BusError when no endpoint answers in time.
     """
-    config = _config("client", identity)
+    config = _config("client", identity, pixels=pixels)
     _set_endpoints(config, "connect", endpoints)
     config.insert_json5("connect/timeout_ms", str(int(CONNECT_TIMEOUT_S * 1000)))
     config.insert_json5("connect/exit_on_failure", "true")
