@@ -14,6 +14,7 @@ import importlib
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import cached_property
 from typing import Any, cast
 
 import msgpack
@@ -256,7 +257,12 @@ def _schema(classes: Iterable[type]) -> str:
 
 def _attributes(value: Any) -> Mapping[str, Any]:
     if hasattr(value, "__dict__"):
-        return vars(value)
+        own = type(value)
+        return {
+            name: item
+            for name, item in vars(value).items()
+            if not isinstance(getattr(own, name, None), cached_property)  # found again
+        }
     if is_dataclass(value):
         return {field.name: getattr(value, field.name) for field in fields(value)}
     raise StateError(f"{type(value).__name__} cannot be kept")

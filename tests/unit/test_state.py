@@ -1,5 +1,7 @@
 """A service's state as bytes and back: exact, shared things stay shared, no code from outside."""
 
+from dataclasses import fields
+
 import msgpack
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 from pliant import __version__
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.locate.localisation import Motion
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import MappingParameters
 from pliant.algorithms.tracking.parameters import TrackingParameters
@@ -70,6 +73,16 @@ def test_a_generator_goes_on_where_it_was() -> None:
     generator.random(5)
     again = load_state(save_state(generator))
     assert (again.random(100) == generator.random(100)).all()
+
+
+def test_what_a_record_has_computed_is_no_state() -> None:
+    moved = np.eye(4)
+    moved[:3, 3] = 0.1, 0.2, 0.3
+    motion = Motion.at(0, 0, np.eye(4)).then(1, 10, moved)
+    expected = motion.predictions(20)
+    again = load_state(save_state(motion))
+    assert vars(again).keys() == {field.name for field in fields(Motion)}
+    np.testing.assert_array_equal(again.predictions(20), expected)
 
 
 def test_foreign_classes_are_refused() -> None:
