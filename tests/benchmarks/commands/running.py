@@ -255,3 +255,26 @@ def growth(
     from benchmarks.growth import measure
 
     show(measure(Clip(source, calibration), frames or [500, 1000, 2000, 4000], overrides or []))
+
+
+@app.command()
+def budget(
+    source: Source = "built-in:room",
+    *,
+    runs: Annotated[int, typer.Option(min=1, help="Of which the median counts.")] = 1,
+    end: Annotated[float | None, typer.Option(min=1.0, help="Seconds of the source.")] = None,
+    live: Annotated[bool, typer.Option(help="At the pace of the time stamps.")] = False,
+    against: Annotated[str | None, typer.Option(help="Commit to compare with, in turns.")] = None,
+    short: Annotated[bool, typer.Option(help="One line.")] = False,
+    overrides: Overrides = None,
+) -> None:
+    """What a run costs: CPU and memory of each process, its stages, its start.
+
+    scripts/bench budget path/to/sequence --against HEAD~1 --runs 3
+    """
+    from benchmarks.budget import measure
+
+    options = ["--mode", "live"] if live else []
+    options += ["--end", str(end)] if end is not None else []
+    options += [word for override in overrides or [] for word in ("--set", override)]
+    show(measure(source, runs, options, against, short=short))
