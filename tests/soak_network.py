@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent / "system"))
 import pytest
 from benchmarks import latency
 from hosts import THREE, TWO, Hosts, Spread, hosts
-from test_faults import run, run_attacked
+from watched_runs import run, run_attacked
 
 from pliant_services.run.command import RunRequest
 from pliant_services.runtime.launcher import Fleet, ServiceDiedError

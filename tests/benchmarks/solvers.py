@@ -68,7 +68,7 @@ def compare_bundle_adjustment(
     """Run all methods on the synthetic windows and, with a folder, on the public problems in it.
 
     Of each method the shortest of its repetitions counts.  The public problems of libmv start
-    within 0.1 % of the optimum, so that their time to the goal is 0 and says nothing.
+    within 0.1 % of the optimum, so that their time to the goal is 0.
     Ten minutes long: pyceres evaluates in Python.  Raises PliantError without pyceres, DatasetError
     for files that cannot be read.
     """

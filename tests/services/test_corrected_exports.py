@@ -112,7 +112,7 @@ def test_exported_images_are_those_of_the_corrected_camera(corrected_run: Path) 
     np.testing.assert_allclose(taken_from, seen_through_a_wrong_calibration(pinhole), atol=1.0)
 
 
-def test_viewers_are_told_the_corrected_camera_in_the_end(corrected_run: Path) -> None:
+def test_viewers_get_the_corrected_camera_at_the_end(corrected_run: Path) -> None:
     pytest.importorskip("foxglove_schemas_protobuf")
     decoder: Any = pytest.importorskip("mcap_protobuf.decoder")
     with export_result(corrected_run, "foxglove", None).open("rb") as file:

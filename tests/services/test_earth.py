@@ -114,7 +114,7 @@ def test_gpx_is_where_the_camera_was(placed: Path) -> None:
     assert ElementTree.parse(file).getroot().tag.endswith("gpx")
 
 
-def test_geojson_says_where_the_map_lies(placed: Path) -> None:
+def test_geojson_has_the_place_of_the_map(placed: Path) -> None:
     feature = json.loads(export_result(placed, "geojson", None).read_text())
     assert feature["geometry"]["type"] == "LineString"
     longitude, latitude, altitude = np.array(feature["geometry"]["coordinates"]).T

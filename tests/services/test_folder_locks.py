@@ -34,7 +34,7 @@ with written(Path(sys.argv[1]), force=True):
 """
 
 
-def test_one_process_writes_a_result_folder_and_a_dead_one_holds_nobody_up(room: Path) -> None:
+def test_one_process_writes_a_result_folder_and_a_dead_one_blocks_no_other(room: Path) -> None:
     command = [sys.executable, "-c", HOLD, str(room)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None

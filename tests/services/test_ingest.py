@@ -181,7 +181,7 @@ def test_a_frame_that_is_masked_as_a_whole_has_no_pixels_and_is_not_broken() -> 
 
 @pytest.mark.parametrize("kind", BROKEN)
 @pytest.mark.parametrize("mode", ["lossless", "live"])
-def test_a_broken_frame_keeps_its_number_and_says_what_is_wrong(kind: str, mode: str) -> None:
+def test_a_broken_frame_keeps_its_number_and_has_a_reason(kind: str, mode: str) -> None:
     data, text = BROKEN[kind]
     taken = threading.Semaphore(0)
 

@@ -133,7 +133,7 @@ def bus_of(endpoint: str, service: str, config: Config, **how: object) -> ZenohB
     [("raw", LAG_S), ("jpeg", LAG_S), ("raw", 1e9)],
     ids=["late", "late, over a link", "as many as there is credit for"],
 )
-def test_tracking_goes_on_while_bundle_adjustment_stands_still(
+def test_tracking_continues_while_bundle_adjustment_is_stopped(
     link_images: str, lag_s: float
 ) -> None:
     """It has taken an image, and not its tracks.  Far more than a window of frames come.
@@ -287,7 +287,7 @@ def test_only_who_reads_what_is_passed_over_may_lag() -> None:
     assert lags(config, PROFILES["deformable-map"]).keys() == {"bundle_adjustment", "surfels"}
 
 
-def test_whoever_was_waited_for_longest_is_why_images_were_dropped() -> None:
+def test_the_longest_wait_is_the_reason_for_dropped_images() -> None:
     drops = Drops()
     waits = [("", {}), ("d", {"recorder": 0.5}), ("", {"tracking": 0.75, "recorder": 0.5})]
     waits += [("d", waits[-1][1]), ("d", waits[-1][1]), ("", waits[-1][1])]  # of nobody

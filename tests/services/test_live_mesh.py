@@ -97,7 +97,7 @@ def test_segments_that_were_joined_are_one_mesh(outputs: dict[Topic, list[Header
     assert len(live(made, 0).triangles) == pytest.approx(triangles, rel=0.2)
 
 
-def test_a_segment_that_goes_on_has_its_mesh_again(outputs: dict[Topic, list[Header]]) -> None:
+def test_a_resumed_segment_has_its_mesh_again(outputs: dict[Topic, list[Header]]) -> None:
     """The camera is recognised in the first of two segments: the keyframes from before that only
     they saw the left of the wall."""
     given = two_segments()

@@ -54,7 +54,7 @@ def test_the_final_mesh_lies_on_the_wall_and_the_box(outputs: dict[Topic, list[H
 
 
 @pytest.mark.parametrize("segment", [0, 1])
-def test_only_the_segment_that_the_last_adjustment_had_is_seen_by_the_corrected_camera(
+def test_only_the_segment_of_the_last_adjustment_has_the_corrected_camera(
     segment: int, outputs: dict[Topic, list[Header]]
 ) -> None:
     """The keyframes are of segment 0."""

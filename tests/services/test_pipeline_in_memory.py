@@ -121,7 +121,7 @@ def test_bundle_adjustment_sends_one_update_a_frame_and_the_same_again(
         assert wire(again[topic]) == wire(first[topic])
 
 
-def test_the_last_report_says_what_came_of_comparing_places(
+def test_the_last_report_counts_place_comparisons(
     config: Config, ingested: dict[Topic, list[Header]], tracked: list[Header]
 ) -> None:
     last = LastReport()
@@ -156,7 +156,7 @@ def test_updates_fold_to_a_pose_for_every_frame(
     assert np.isfinite(known.positions).all()
 
 
-def test_every_keyframe_is_told_when_new_and_once_more_when_it_is_settled(
+def test_every_keyframe_is_published_when_new_and_when_settled(
     config: Config, ingested: dict[Topic, list[Header]], tracked: list[Header]
 ) -> None:
     small = config.bundle_adjustment.window.model_copy(update={"keyframes": 3})
@@ -251,7 +251,7 @@ def test_frames_that_are_not_mapped_are_localised_all_the_same(
     assert updates[-1].segment == 0
 
 
-def test_a_video_of_nothing_starts_no_map_and_says_why(
+def test_a_video_without_texture_starts_no_map_with_a_reason(
     config: Config, ingested: dict[Topic, list[Header]]
 ) -> None:
     black = [

@@ -70,7 +70,7 @@ def test_a_service_reads_the_images_that_were_sent_in_the_run(
     assert images == [codec.encode(m) for m in ingested.outputs[topics.IMAGE]]
 
 
-def test_playing_begins_and_ends_where_it_is_told(endpoint: str, path: Path) -> None:
+def test_playing_begins_and_ends_as_requested(endpoint: str, path: Path) -> None:
     playback = Playback(path)
     times: list[int] = []
 
@@ -158,7 +158,7 @@ def test_a_rate_is_a_share_of_the_pace_of_capture() -> None:
     assert unbounded.wait_until(10**18)
 
 
-def test_a_loop_stays_in_one_session_and_is_not_seen_to_end(
+def test_a_loop_stays_in_one_session_without_an_end(
     endpoint: str, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A session that is closed leaves some memory behind, and a compose profile loops for ever."""

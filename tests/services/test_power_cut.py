@@ -123,7 +123,7 @@ def test_results_are_those_of_a_run_as_a_whole(disk: Disk, tmp_path: Path) -> No
     assert [path.name for path in files if not disk.holds(path)] == []
 
 
-def test_a_checkpoint_is_told_when_a_power_cut_leaves_it(disk: Disk, tmp_path: Path) -> None:
+def test_a_checkpoint_of_a_power_cut_is_reported(disk: Disk, tmp_path: Path) -> None:
     folder = tmp_path / "state" / "tracking"
     checkpoints = Checkpoints(folder, interval=1)
     told: list[bool] = []

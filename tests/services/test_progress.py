@@ -16,7 +16,7 @@ from pliant_services.run.progress import Progress
         (("recorder",), "closing the recording"),
     ],
 )
-def test_after_the_last_frame_the_bar_says_what_is_done(
+def test_after_the_last_frame_the_bar_shows_the_remaining_work(
     monkeypatch: pytest.MonkeyPatch, still_there: tuple[str, ...], says: str
 ) -> None:
     terminal = io.StringIO()

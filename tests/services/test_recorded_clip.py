@@ -188,7 +188,7 @@ class WritingBus(ReplayBus):
                 file.write(b"more")
 
 
-def test_a_clip_that_is_written_to_during_the_run_costs_no_image_and_is_told(
+def test_a_clip_that_is_written_to_during_the_run_is_reported_and_costs_no_image(
     clip: Path, tmp_path: Path
 ) -> None:
     own = tmp_path / "own.mp4"

@@ -65,7 +65,7 @@ def test_made_once_and_keys_are_secret(folder: Path) -> None:
     assert (folder / "tracking.key").stat().st_mode & 0o077 == 0
 
 
-def test_only_a_folder_that_nobody_mounts_has_the_key_that_signs(folder: Path) -> None:
+def test_only_a_folder_that_is_not_mounted_has_the_signing_key(folder: Path) -> None:
     assert not (folder / "ca.key").exists()
     key = folder.with_name(f"{folder.name}-authority") / "ca.key"
     assert key.stat().st_mode & 0o077 == key.parent.stat().st_mode & 0o077 == 0
@@ -73,7 +73,7 @@ def test_only_a_folder_that_nobody_mounts_has_the_key_that_signs(folder: Path) -
         make_certificates(folder, NAMES, [], authority=folder / "authority")
 
 
-def test_an_authority_that_is_elsewhere_is_asked_for(folder: Path, tmp_path: Path) -> None:
+def test_an_authority_that_is_elsewhere_is_requested(folder: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     (copy / "operator.key").unlink()
@@ -106,7 +106,7 @@ def test_only_the_routers_certificate_proves_a_server(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.1"])
-def test_a_router_that_anybody_reaches_says_so(host: str) -> None:
+def test_a_router_on_a_public_address_warns(host: str) -> None:
     endpoint = free_endpoint().replace("127.0.0.1", host)
     router = subprocess.Popen(
         command("router", "--listen", endpoint),
@@ -131,7 +131,7 @@ def test_which_endpoints_other_machines_reach() -> None:
 
 
 @pytest.mark.usefixtures("impatient")
-def test_without_a_certificate_nobody_gets_in(endpoint: str) -> None:
+def test_without_a_certificate_there_is_no_access(endpoint: str) -> None:
     with pytest.raises(BusError, match="cannot reach"):
         open_session([endpoint])
 

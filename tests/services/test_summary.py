@@ -91,7 +91,7 @@ def test_no_map_has_a_reason_that_is_not_a_broken_frame(tmp_path: Path, missing:
     assert line == f"no map could start: {REASON if missing else 'no frames'}"
 
 
-def test_dropped_and_broken_images_are_told_apart(tmp_path: Path) -> None:
+def test_dropped_and_broken_images_are_distinguished(tmp_path: Path) -> None:
     why = ["", "dropped", "broken: frame 2: the png image is cut off", "dropped"]
     lines = record(tmp_path, why)
     assert "2 images dropped to keep up (live mode)" in lines
@@ -112,13 +112,13 @@ def test_dropped_and_broken_images_are_told_apart(tmp_path: Path) -> None:
     assert not any("broken" in line for line in lines)
 
 
-def test_the_last_line_says_what_the_run_is_worth(tmp_path: Path) -> None:
+def test_the_last_line_has_the_verdict(tmp_path: Path) -> None:
     assert record(tmp_path, ["", ""])[-1] == "bad: there is no map"
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["verdict"], report["doubtful_frames"]) == ("bad", [])
 
 
-def test_what_a_map_cannot_tell_is_left_out_and_what_it_dropped_is_reported() -> None:
+def test_values_without_evidence_are_left_out_and_dropped_parts_reported() -> None:
     report: dict[str, Any] = {
         **dict.fromkeys(("frames", "frames_with_pose", "keyframes", "points"), 60),
         **dict.fromkeys(("ended_early", "verdict", "verdict_reason"), ""),
@@ -179,7 +179,7 @@ def test_broken_images_are_a_fault_and_dropped_ones_are_not(
     assert pipeline._finish(tmp_path, interrupted=False, failure=None) == code
 
 
-def test_the_end_of_a_run_says_what_to_look_at_and_how_large_it_is(
+def test_the_summary_lists_files_with_their_sizes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     record(tmp_path, [""] * 3)
@@ -189,7 +189,7 @@ def test_the_end_of_a_run_says_what_to_look_at_and_how_large_it_is(
     assert second == f"open in a browser: {tmp_path / 'report.html'}"
 
 
-def test_a_source_that_failed_says_why(tmp_path: Path) -> None:
+def test_a_source_that_failed_has_a_reason(tmp_path: Path) -> None:
     lines = record(tmp_path, [""] * 3, note="camera:0: delivers no more images", complete=False)
     assert "ended early: camera:0: delivers no more images" in lines
 
@@ -272,7 +272,7 @@ def in_segment(delta: MapDelta, frame: int, segment: int) -> MapDelta:
         ([-1, -1], -1, "{} was recognised in none of 2 frames"),
     ],
 )
-def test_it_is_said_how_long_a_known_map_was_looked_for(
+def test_the_search_time_for_a_loaded_map_is_reported(
     segments: list[int], joined_at: int, told: str
 ) -> None:
     """joined_at: the update with which segment 1 becomes part of the known 0; beyond the frames:

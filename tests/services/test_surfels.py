@@ -124,7 +124,7 @@ def test_a_surfel_is_lost_by_the_stamps_of_frames_without_pixels_too(ingested: M
         assert (state == SurfelState.LOST).all() == dropped
 
 
-def test_a_service_that_is_started_again_goes_on_with_the_same_bytes(
+def test_a_restarted_service_continues_with_the_same_bytes(
     config: Config, ingested: Messages
 ) -> None:
     inputs = with_depth(ingested, {n: depths_of(ingested)[n].data for n in (0, 3)})

@@ -298,7 +298,7 @@ def test_without_any_depth_surfels_start_on_a_plane(everything: Messages) -> Non
     assert len(followed[0].ids) > 20
 
 
-def test_tracks_tell_where_surfels_went(
+def test_tracks_predict_the_motion_of_surfels(
     everything: Messages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The image leaps by 12 px a frame: too far at full size for a surfel that is not told."""
@@ -323,6 +323,6 @@ def test_tracks_tell_where_surfels_went(
 
 
 @pytest.mark.parametrize("setting", ["surfels.depth_from=map", "surfels.prediction=tracks"])
-def test_what_nobody_publishes_is_said_at_once(everything: Messages, setting: str) -> None:
+def test_a_topic_without_a_publisher_fails_at_once(everything: Messages, setting: str) -> None:
     with pytest.raises(ConfigError, match=f"{setting}: no service of this session publishes"):
         follow(load_config(None, [setting]), everything)

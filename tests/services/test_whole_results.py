@@ -186,13 +186,13 @@ def test_a_session_is_believed_while_its_folder_is_held(room: Path) -> None:
         *("tcp/127.0.0.1:7447#iface=eth0", "tcp/127.0.0.1:7447?prio=1", "", "unixsock-stream", 7),
     ],
 )
-def test_a_folder_sends_nobody_elsewhere(endpoint: str, room: Path) -> None:
+def test_a_folder_sends_no_viewer_to_another_host(endpoint: str, room: Path) -> None:
     with written(room, force=True):
         say(room, endpoint)
         assert running_session(room) == ([], "")
 
 
-def test_a_session_that_ends_leaves_what_another_folder_says(room: Path) -> None:
+def test_a_session_that_ends_leaves_the_announcement_of_another_folder(room: Path) -> None:
     with announced(room, "tcp/127.0.0.1:1", "run-1"):
         say(room, "tcp/127.0.0.1:2", "run-2")
     assert "run-2" in (room / "session.json").read_text()

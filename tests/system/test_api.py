@@ -118,7 +118,7 @@ def test_a_run_takes_what_the_command_takes() -> None:
     assert given - options == {"settings", "on_frame"}
 
 
-def test_a_run_tells_each_pose_as_it_is_known(tmp_path: Path) -> None:
+def test_a_run_prints_each_pose_as_it_comes(tmp_path: Path) -> None:
     told: list[tuple[int, object]] = []
     part = pliant.run(
         TINY, output=tmp_path / "part", start=0.2, every=2, sharpest=True, max_size=280,
@@ -168,7 +168,7 @@ def test_images_one_by_one_give_the_same(followed: list[pliant.Tracked]) -> None
         slam.track(decode(next(iter(dataset))), 1e6)
 
 
-def test_of_a_video_nothing_else_need_be_known(tmp_path: Path) -> None:
+def test_a_video_needs_no_other_input(tmp_path: Path) -> None:
     path = tmp_path / "clip.avi"
     images = [decode(frame) for frame in open_source(TINY)]
     height, width = images[0].shape[:2]

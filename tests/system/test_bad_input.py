@@ -160,7 +160,7 @@ def test_an_earlier_result_survives_a_mistake_with_force(here: Path) -> None:
     assert (here / "result" / "trajectory.txt").read_text() == "precious\n"
 
 
-def test_output_that_nobody_reads_or_that_finds_no_room() -> None:
+def test_output_without_a_reader_or_without_room() -> None:
     with subprocess.Popen(
         command("config"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:

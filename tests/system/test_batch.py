@@ -90,7 +90,7 @@ def disturbed(
     return batch.returncode, output, errors
 
 
-def test_an_interrupted_batch_goes_on_and_a_broken_clip_stops_nobody(
+def test_an_interrupted_batch_resumes_and_a_broken_clip_stops_no_other(
     tmp_path: Path, tiny_run: Path, engine: tuple[str, str]
 ) -> None:
     clips, output = tmp_path / "clips", tmp_path / "results"

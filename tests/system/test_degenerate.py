@@ -82,7 +82,7 @@ VIDEOS: dict[str, Callable[[], list[Any]]] = {
 
 
 @pytest.mark.parametrize("name", VIDEOS)
-def test_a_video_without_a_map_says_why(name: str, tmp_path: Path) -> None:
+def test_a_video_without_a_map_has_the_reason(name: str, tmp_path: Path) -> None:
     """The services' algorithms in one process; what the processes add is tested below."""
     source = write_sequence(tmp_path / "video", VIDEOS[name]())
     history = MapHistory()
@@ -102,7 +102,7 @@ def test_images_that_are_too_narrow_to_track_in_are_refused(
     assert len(str(refused.value).splitlines()) == 1
 
 
-def test_a_camera_that_stands_still_starts_no_map(rigid_data: Path) -> None:
+def test_a_static_camera_starts_no_map(rigid_data: Path) -> None:
     history = MapHistory()
     reason = run(rigid_data / "euroc_v101_still30", history)
     assert history.final() == {}

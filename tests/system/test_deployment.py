@@ -80,7 +80,7 @@ def test_every_compose_on_this_machine_reads_the_file(profile: str) -> None:
 
 
 @pytest.mark.parametrize("profile", ["rigid", "deformable"])
-def test_a_profile_starts_its_services_and_each_is_told_of_the_others(profile: str) -> None:
+def test_a_profile_starts_its_services_and_each_knows_the_others(profile: str) -> None:
     content = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
     mine = [s for s in content["services"].values() if profile in s.get("profiles", [])]
     told = {part for s in mine for part in s["command"] if part.startswith("--profile=")}
@@ -115,7 +115,7 @@ def test_systemd_takes_the_units(unit: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["service", "router"])
-def test_what_the_units_are_told_are_options_of_their_commands(command: str) -> None:
+def test_options_in_systemd_units_exist(command: str) -> None:
     known = pliant(command, "--help", env={"COLUMNS": "200"}).stdout
     files = ["router.env"] if command == "router" else ["session.env", "ingest.env", "recorder.env"]
     for file in files:

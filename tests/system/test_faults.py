@@ -1,12 +1,8 @@
 """Services killed in the middle of a run: the results are the same bytes as without the fault."""
 
 import json
-import os
 import shutil
-import signal
-import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -14,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hostile import attack, samples
 from running import TINY, assert_one_line, digests, in_this_process, pliant
+from watched_runs import REQUEST, SERVICES, TooLateError, run, run_attacked
 
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.config import config_yaml, load_config
@@ -29,11 +25,8 @@ from pliant.messages import topics
 from pliant.messages.types import ClipPiece, MapUpdate, SourceImage, Status
 from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
-from pliant.results.folder import RECORDING_NAME, STATE_FOLDER, prepare
-from pliant.results.write import write_results
-from pliant_services.profiles import PROFILES
+from pliant.results.folder import RECORDING_NAME, STATE_FOLDER
 from pliant_services.replay.command import SAME, ReplayRequest, run_replay
-from pliant_services.run.command import service_arguments
 from pliant_services.run.request import RunRequest
 from pliant_services.run.resume import resumed_config, resumed_map
 from pliant_services.runtime import launcher
@@ -42,44 +35,7 @@ from pliant_services.runtime.launcher import Fleet, ServiceDiedError
 pytestmark = pytest.mark.system
 
 FRAMES = 40
-SERVICES = PROFILES["points"]
-_HELD_S, _LET_GO_S = 10.0, 0.01
 _ATTEMPTS = 5
-REQUEST = RunRequest(source=SourceSpec(location=TINY))
-
-
-def run(
-    output: Path,
-    victims: Callable[[Status, Fleet], Sequence[str]] = lambda status, fleet: (),
-    *,
-    resume: bool = False,
-    settings: Sequence[str] = (),
-    request: RunRequest = REQUEST,
-) -> dict[str, str]:
-    """One run in which the victims of each status are killed; returns the result files."""
-    config = load_config(overrides=["bus.checkpoint_frames=6", *settings])
-    if not resume:
-        prepare(output, config_yaml(config))
-    fleet: Fleet | None = None
-
-    def on_status(status: Status) -> None:
-        assert fleet is not None
-        for name in victims(status, fleet):
-            signal_if_there(fleet.pids[name], signal.SIGKILL)
-
-    fleet = Fleet(
-        SERVICES,
-        log_folder=output / "logs",
-        on_status=on_status,
-        state=output / STATE_FOLDER,
-    )
-    try:
-        fleet.start(lambda name: service_arguments(name, request, output))
-        fleet.wait()
-    finally:
-        fleet.close()
-    write_results(output)
-    return digests(output)
 
 
 def run_until_killed(
@@ -113,11 +69,6 @@ def run_until_killed(
     pytest.fail(f"{_ATTEMPTS} runs were over before they could be killed")
 
 
-def signal_if_there(process: int, number: signal.Signals) -> None:
-    with suppress(ProcessLookupError):
-        os.kill(process, number)
-
-
 @pytest.fixture
 def undisturbed(tiny_run: Path) -> dict[str, str]:
     """Of an ordinary run: neither checkpoints nor a mesher change what the others make."""
@@ -136,7 +87,9 @@ def once_at(*when: tuple[int, Sequence[str]]) -> Callable[[Status, Fleet], Seque
     return victims
 
 
-def test_killed_services_go_on_where_they_were(tmp_path: Path, undisturbed: dict[str, str]) -> None:
+def test_killed_services_resume_where_they_were(
+    tmp_path: Path, undisturbed: dict[str, str]
+) -> None:
     """Each in its turn, early, before there is a checkpoint, and late."""
     killed: list[str] = []
     each = [(3 * i, (name,)) for i, name in enumerate(SERVICES)]
@@ -243,7 +196,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> RunRequest:
     return RunRequest(source=SourceSpec(location=str(file)))
 
 
-def test_the_recording_of_a_video_has_all_images_whoever_is_killed(
+def test_the_recording_of_a_video_has_all_images_after_any_kill(
     tmp_path: Path, clip: RunRequest
 ) -> None:
     """The ingest and the recorder, early and late, then all with the launcher, and a resume."""
@@ -322,7 +275,7 @@ def test_a_live_run_is_not_resumed_but_its_recording_is_a_source(
     assert "frames at" in again.stdout
 
 
-def test_messages_that_no_service_sends_are_counted_told_and_change_nothing(
+def test_messages_that_no_service_sends_are_counted_reported_and_change_nothing(
     tmp_path: Path, undisturbed: dict[str, str], tiny_run: Path
 ) -> None:
     """To every key, also under the numbers of the true ones, while the source is held up."""
@@ -344,68 +297,6 @@ def test_messages_that_no_service_sends_are_counted_told_and_change_nothing(
         assert "refused" in said, name
     # Its last frame may pass before the last of them, in whichever order they come.
     assert "credit of camera/" in (output / "logs" / "ingest.log").read_text()
-
-
-class TooLateError(Exception):
-    """The source of a run had sent its last frame before it could be held up."""
-
-
-def run_attacked(
-    output: Path,
-    recording: Path,
-    each: int,
-    request: RunRequest = REQUEST,
-    watch: Callable[[Fleet], None] = lambda fleet: None,
-) -> dict[str, str]:
-    """A run that meets so many hostile messages on every key; returns the result files.
-
-    Its source is held up meanwhile, not for so long at a time that it would be taken for dead.
-    watch: called now and then as long as messages come.
-    Raises TooLateError.
-    """
-    attackers: list[threading.Thread] = []
-    failures: list[Exception] = []
-    sent, let_go = -1, False
-
-    def hold_and_attack(status: Status, fleet: Fleet) -> Sequence[str]:
-        nonlocal sent
-        if status.service == "ingest" and not let_go:  # a slow attack may see its end, too
-            sent = status.frame
-        if not attackers and status.service == "tracking" and status.frame >= 4:
-            source = fleet.pids["ingest"]
-            signal_if_there(source, signal.SIGSTOP)  # before it is done
-
-            def work() -> None:
-                try:
-                    attack(fleet.endpoint, fleet.session, SERVICES, samples(recording), each)
-                except Exception as error:
-                    failures.append(error)
-
-            def hold() -> None:
-                nonlocal let_go
-                while True:
-                    attackers[0].join(_HELD_S)
-                    watch(fleet)
-                    let_go = True
-                    signal_if_there(source, signal.SIGCONT)
-                    attackers[0].join(_LET_GO_S)
-                    if not attackers[0].is_alive():
-                        return
-                    signal_if_there(source, signal.SIGSTOP)
-
-            attackers.append(threading.Thread(target=work))
-            attackers[0].start()  # no Zenoh call in a callback
-            threading.Thread(target=hold).start()
-        return ()
-
-    narrow = ["bus.window=4"]  # so it is not done yet
-    found = run(output, hold_and_attack, settings=narrow, request=request)
-    assert attackers
-    attackers[0].join()
-    if sent + 1 == open_source(request.source).frame_count:
-        raise TooLateError
-    assert not failures, failures
-    return found
 
 
 DEADLY = """

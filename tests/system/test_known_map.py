@@ -23,7 +23,7 @@ def office(tiny_run: Path) -> Path:
     return tiny_run
 
 
-def test_a_run_goes_on_in_a_map_and_replays(office: Path, tmp_path: Path) -> None:
+def test_a_run_continues_in_a_map_and_replays(office: Path, tmp_path: Path) -> None:
     before = (office / "map.pliant").read_bytes()
     done = pliant("run", TINY, "--map", office, "--output", tmp_path / "today")
     assert done.returncode == 0, done.stderr
@@ -63,7 +63,7 @@ def test_a_run_only_localises(source: str, office: Path, tmp_path: Path) -> None
     assert not (tmp_path / "robot" / "map.pliant").exists()
 
 
-def test_a_map_tells_python_where_an_image_was_taken(office: Path) -> None:
+def test_a_map_localises_an_image_in_python(office: Path) -> None:
     known = library.load_map(office)
     frames = list(open_source(TINY))
     found = known.localise(decode(frames[10]))
@@ -75,7 +75,7 @@ def test_a_map_tells_python_where_an_image_was_taken(office: Path) -> None:
     assert len(known.points) == len(known.colours) == len(known.segments) > 100
 
 
-def test_an_answer_depends_on_no_image_that_was_asked_for_before(office: Path) -> None:
+def test_a_result_depends_on_no_earlier_request(office: Path) -> None:
     known = library.load_map(office)
     images = [decode(frame) for frame in list(open_source(TINY))[::8]]
     answers = [known.localise(image) for image in images]

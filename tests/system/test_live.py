@@ -32,7 +32,7 @@ STOP_FRAME, GO_FRAME = 10, 34
 """Bundle adjustment stands still from the one until tracking has told of the other."""
 
 
-def test_tracking_goes_on_and_the_run_can_be_replayed(tmp_path: Path) -> None:
+def test_tracking_continues_and_the_run_can_be_replayed(tmp_path: Path) -> None:
     warm_up.compile_kernels(print)
     output = tmp_path / "run"
     config = load_config(overrides=["ingest.mode=live", f"bus.window={WINDOW}"])

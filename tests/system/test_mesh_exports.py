@@ -92,7 +92,7 @@ def test_a_solid_is_closed(result: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "command", [("export", "--to", "watertight"), ("mesh", "--watertight")]
 )  # fmt: skip
-def test_without_open3d_s_libraries_one_line_says_what_to_install(
+def test_without_open3d_s_libraries_one_line_names_the_packages(
     result: Path, command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(name: str) -> None:
@@ -135,9 +135,7 @@ def test_a_box_crops_meshes_and_points(result: Path, tmp_path: Path) -> None:
     assert box.holds(dense).all()
 
 
-def test_an_empty_box_is_one_line_that_says_where_the_mesh_lies(
-    result: Path, tmp_path: Path
-) -> None:
+def test_an_empty_box_is_one_line_with_the_place_of_the_mesh(result: Path, tmp_path: Path) -> None:
     box = Box(low=(1e3, 1e3, 1e3), high=(2e3, 2e3, 2e3))
     for kind, what in (("glb", "triangle of the mesh"), ("ply", "point"), ("splat", "point")):
         path = tmp_path / {"splat": "splat"}.get(kind, f"out.{kind}")

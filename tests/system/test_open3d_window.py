@@ -36,7 +36,7 @@ def has_open3d() -> None:
 
 
 @pytest.mark.usefixtures("has_open3d")
-def test_points_mesh_and_path_are_seen(tiny_run: Path, tmp_path: Path) -> None:
+def test_points_mesh_and_path_are_drawn(tiny_run: Path, tmp_path: Path) -> None:
     if shutil.which("xvfb-run") is None:
         pytest.skip("xvfb is not installed")
     picture = tmp_path / "window.png"

@@ -89,7 +89,7 @@ def test_a_full_disk_is_one_line_and_what_was_written_is_readable(tmp_path: Path
     assert not summary.topics[topics.EXTREMA.key].gaps
 
 
-def test_a_recording_without_images_says_what_cannot_be_replayed(tmp_path: Path) -> None:
+def test_a_recording_without_images_lists_what_cannot_be_replayed(tmp_path: Path) -> None:
     folder = tmp_path / "small"
     pliant("run", f"{TINY}?frames=12", "--output", folder, "--no-images", *NO_MESH)
     summary = summarise(folder)

@@ -39,7 +39,7 @@ def page(result: pliant.Result) -> str:
     return (result.path / "report.html").read_text(encoding="utf-8")
 
 
-def test_it_says_what_the_report_says(result: pliant.Result, page: str) -> None:
+def test_it_prints_the_report(result: pliant.Result, page: str) -> None:
     report = json.loads((result.path / "report.json").read_text())
     for said in ("built-in:tiny", report["verdict_reason"], f"{report['points']:,} points"):
         assert said in page
@@ -48,7 +48,7 @@ def test_it_says_what_the_report_says(result: pliant.Result, page: str) -> None:
         assert (result.path / name).exists(), name
 
 
-def test_every_field_of_the_report_is_told_in_the_docs(result: pliant.Result) -> None:
+def test_every_field_of_the_report_is_documented(result: pliant.Result) -> None:
     report = json.loads((result.path / "report.json").read_text())
     assert undescribed(report) == set()
     assert undescribed({**report, "new": 1, "known_map": {"newer": 2}}) == {"new", "newer"}
@@ -168,9 +168,7 @@ def test_the_truth_adds_the_error_over_time(result: pliant.Result, tmp_path: Pat
     assert re.search(rf"ATE RMSE +{re.escape(rmse)} ", done.stdout)
 
 
-def test_two_points_that_are_picked_tell_how_far_apart_they_are(
-    result: pliant.Result, tmp_path: Path
-) -> None:
+def test_two_picked_points_show_their_distance(result: pliant.Result, tmp_path: Path) -> None:
     clicks = """<script>setTimeout(() => {
       const canvas = document.getElementById("view"), box = canvas.getBoundingClientRect();
       for (let x = 20; x < box.width; x += 20) for (let y = 20; y < box.height; y += 20)
@@ -191,7 +189,7 @@ def test_two_points_that_are_picked_tell_how_far_apart_they_are(
         assert np.linalg.norm(away, axis=1).min() < 0.05
 
 
-def test_a_page_without_a_map_says_why(tmp_path: Path) -> None:
+def test_a_page_without_a_map_has_the_reason(tmp_path: Path) -> None:
     sequence = tmp_path / "still"
     (sequence / "images").mkdir(parents=True)
     squares = np.random.default_rng(0).integers(0, 255, (12, 16), dtype=np.uint8)
@@ -304,14 +302,14 @@ def report(**changes: Any) -> dict[str, Any]:
 STAMPS = {frame: 10**9 + frame * 33_000_000 for frame in range(100)}
 
 
-def test_of_a_good_run_there_is_nothing_to_say() -> None:
+def test_a_good_run_has_no_advice() -> None:
     assert advice(report(), STAMPS) == []
     # A clip so short that all of its frames waited for the map to begin.
     assert advice(report(median_inliers_per_frame=0.0), STAMPS) == []
     assert advice(report(calibration_verdict=f"{FOUND} (60.0 degrees)"), STAMPS) == []
 
 
-def test_what_the_verdict_says_of_the_lens_is_not_said_again() -> None:
+def test_advice_does_not_repeat_the_verdict() -> None:
     """And the frame in a hundred that is doubtful is not what makes the run so."""
     open_lens = "unknown focal length"
     doubtful = {"verdict": "doubtful", "verdict_reason": open_lens, "doubtful_frames": [7]}
@@ -344,6 +342,6 @@ def test_what_the_verdict_says_of_the_lens_is_not_said_again() -> None:
         ),
     ],
 )
-def test_what_went_wrong_is_told(changes: dict[str, Any], said: str) -> None:
+def test_advice_names_the_fault(changes: dict[str, Any], said: str) -> None:
     (line,) = advice(report(**changes), STAMPS)
     assert said in line

@@ -152,7 +152,7 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
     assert_one_line(done, "in use")
 
 
-def test_a_service_that_cannot_reach_its_peers_says_so_within_ten_seconds(tmp_path: Path) -> None:
+def test_a_service_without_its_peers_reports_it_within_ten_seconds(tmp_path: Path) -> None:
     unused = free_endpoint()
     done = pliant("service", "tracking", "--connect", unused)
     assert_one_line(done, "cannot reach")

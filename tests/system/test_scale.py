@@ -85,9 +85,7 @@ def test_a_mesh_that_is_made_again_is_in_metres(doubled: Path, tmp_path: Path) -
     np.testing.assert_allclose(again.points.min(axis=0), before.points.min(axis=0), rtol=0.02)
 
 
-def test_the_scale_goes_on_in_the_map_and_goes_with_the_result(
-    doubled: Path, tmp_path: Path
-) -> None:
+def test_the_scale_is_saved_with_the_map_and_the_result(doubled: Path, tmp_path: Path) -> None:
     assert "scale: metres" in command("map", "info", doubled).stdout
     today = tmp_path / "today"
     arguments = ("--map", doubled, "--end", "0.7", *NO_MESH)
@@ -101,7 +99,7 @@ def test_the_scale_goes_on_in_the_map_and_goes_with_the_result(
     assert not (again / "scale.yaml").exists()
 
 
-def test_what_is_told_last_counts(doubled: Path, tmp_path: Path) -> None:
+def test_the_last_given_scale_counts(doubled: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(doubled, tmp_path / "tiny"))
     done = command("scale", folder, "--depth", TINY)
     assert done.returncode == 0, done.stderr
@@ -111,7 +109,7 @@ def test_what_is_told_last_counts(doubled: Path, tmp_path: Path) -> None:
     assert abs(found.scale - 1.0) < 0.005
 
 
-def test_a_marker_tells_the_scale(tmp_path: Path) -> None:
+def test_a_marker_determines_the_scale(tmp_path: Path) -> None:
     source, result = tmp_path / "with-marker", tmp_path / "result"
     shutil.copytree(builtin_folder(TINY), source)
     put_marker_into(source, side_m=0.25)
@@ -191,7 +189,9 @@ def put_marker_into(sequence: Path, side_m: float) -> None:
         (Known(depth="nowhere"), "nowhere"),
     ],
 )
-def test_what_tells_nothing_changes_nothing(tiny_run: Path, known: Known, says: str) -> None:
+def test_lengths_without_information_change_nothing(
+    tiny_run: Path, known: Known, says: str
+) -> None:
     before = {path: path.stat().st_mtime_ns for path in tiny_run.iterdir()}
     with pytest.raises(PliantError, match=says):
         list(scale_result(tiny_run, known))

@@ -82,7 +82,7 @@ def test_what_was_lost_at_the_beginning_is_found(
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), PliantError("no more"), MemoryError()])
 @pytest.mark.parametrize("place", ["reach_back", "write_rigid_results"])
-def test_the_first_result_stays_whatever_ends_the_second_pass(
+def test_the_first_result_stays_if_the_second_pass_fails(
     error: BaseException,
     place: str,
     first: tuple[RunRequest, Path],

@@ -66,7 +66,7 @@ def test_the_page_shows_the_surface(result: Path) -> None:
     assert "://" not in page
 
 
-def test_surfels_are_seen_in_both_viewers(result: Path, tmp_path: Path) -> None:
+def test_surfels_are_drawn_in_both_viewers(result: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     pytest.importorskip("foxglove_schemas_protobuf")
     scene_update: Any = importlib.import_module("foxglove_schemas_protobuf.SceneUpdate_pb2")

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.system
 
 
 @pytest.mark.slow
-def test_a_run_is_seen_live_and_afterwards(tmp_path: Path) -> None:
+def test_a_run_is_shown_live_and_afterwards(tmp_path: Path) -> None:
     rr = pytest.importorskip("rerun")
     result, live, after = tmp_path / "tiny", tmp_path / "live.rrd", tmp_path / "after.rrd"
     done = pliant("run", "built-in:tiny", "--output", result, "--save", live)
@@ -119,7 +119,7 @@ def test_a_taken_port_is_one_line() -> None:
         RerunCanvas("web", name="taken", web_port=taken.getsockname()[1])
 
 
-def test_two_are_seen_in_browsers_at_once() -> None:
+def test_two_runs_are_shown_in_browsers_at_once() -> None:
     pytest.importorskip("rerun")
     one = RerunCanvas("web", name="one")
     try:
@@ -149,7 +149,7 @@ def test_two_that_begin_at_once_do_not_share_a_port(monkeypatch: pytest.MonkeyPa
             canvas.close()
 
 
-def test_a_browser_is_told_to_reach_this_machine_alone() -> None:
+def test_a_browser_may_reach_this_machine_alone() -> None:
     """Rerun's page would fetch fonts, look for updates and report its use."""
     pytest.importorskip("rerun")
     canvas = RerunCanvas("web", name="page")

@@ -1,12 +1,18 @@
 """Small synthetic windows with known truth, and a plain numpy model of Eq. 6, for the tests."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pliant.algorithms.geometry import inverse, so3_exp
-from pliant.algorithms.slam.estimate.problem import BundleParameters, BundleProblem
+from pliant.algorithms.slam.estimate.problem import (
+    SHARED,
+    BundleParameters,
+    BundleProblem,
+    CalibrationUncertainty,
+)
 
 F64 = NDArray[np.float64]
 
@@ -127,3 +133,42 @@ def dense_normal_equations(problem: BundleProblem, parameters: BundleParameters)
     inverse_s2 = 0.0 if sigma == 0.0 else sigma**-2
     w = np.repeat(1.0 / (1.0 + s * inverse_s2) ** 2, 2)
     return J.T @ (w[:, None] * J), -J.T @ (w * r.reshape(-1))
+
+
+EXACT = BundleParameters(kernel_sigma_px=0.0, max_iterations=60, min_relative_decrease=1e-10)
+
+
+FREE = CalibrationUncertainty(
+    focal=1.0, k1=1.0, k2=1.0, readout=1.0, principal_point=1.0, aspect=1.0, prior_px=1e-3
+)
+
+
+def with_lens(problem, s=0.0, k1=0.0, k2=0.0, a=0.0, b=0.0, t=0.0):
+    """The problem as a camera with this lens is believed to see it."""
+    intrinsics = problem.intrinsics.copy()
+    intrinsics[:, :2] *= np.exp(s)
+    intrinsics[:, 1] *= np.exp(t)
+    intrinsics[:, 2:4] += intrinsics[:, :2] * (a, b)
+    intrinsics[:, 4:] = k1, k2
+    return dataclasses.replace(problem, intrinsics=intrinsics)
+
+
+def with_flow(problem):
+    """The problem with what a rolling shutter would do, here at random."""
+    shape = (len(problem.camera_index), 2)
+    flow = np.random.default_rng(1).normal(0.0, 3.0, shape).astype(np.float32)
+    return dataclasses.replace(problem, readout_flow=flow)
+
+
+def calibration_jacobian(problem, q, step=1e-6):
+    """(2 O, SHARED) central differences of what is predicted, at the problem's poses and points."""
+
+    def predicted(q):
+        lens = with_lens(problem, *q[:3], *q[4:]).intrinsics
+        px = project(problem.T_world_camera, problem.points_world, lens)
+        at = (problem.camera_index, problem.point_index)
+        return (px[at] + q[3] * problem.readout_flow).reshape(-1)
+
+    sides = [(predicted(q + d), predicted(q - d)) for d in step * np.eye(SHARED)]
+    J = np.stack([(a - b) / (2.0 * step) for a, b in sides], axis=1)
+    return J, problem.points_px.astype(np.float64).reshape(-1) - predicted(q)

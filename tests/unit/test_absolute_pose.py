@@ -71,7 +71,7 @@ def test_ransac_survives_60_percent_outliers_and_repeats_itself():
     assert inliers[:360].mean() < 0.05
 
 
-def test_ransac_says_none_for_too_few_points():
+def test_ransac_returns_none_for_too_few_points():
     _, _, points, points_n = scene(0.0)
     generator = np.random.default_rng(0)
     assert pose_by_ransac(points[:3], points_n[:3], generator, gate=0.01, samples=10) is None

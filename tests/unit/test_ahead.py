@@ -15,7 +15,7 @@ def test_all_items_come_in_their_order() -> None:
     assert list(read_ahead([])) == []
 
 
-def test_few_are_made_before_they_are_asked_for() -> None:
+def test_few_are_made_before_they_are_requested() -> None:
     made: list[int] = []
 
     def items() -> Iterator[int]:
@@ -57,7 +57,7 @@ def test_a_job_that_fails_is_heard_of() -> None:
         do(fail)
 
 
-def test_the_first_error_is_the_one_that_is_told() -> None:
+def test_the_first_error_is_reported() -> None:
     def fail() -> None:
         raise ValueError("a later one")
 

@@ -260,3 +260,10 @@ def test_no_two_modules_have_one_name_with_two_meanings() -> None:
     files = python_files(LIBRARY) + python_files(SERVICES)
     names = [path.stem for path in files if path.parent != command_line]
     assert {name for name in names if names.count(name) > 1} <= ONE_MEANING
+
+
+def test_no_test_imports_another() -> None:
+    """What tests share is in a module of its own."""
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        found = re.findall(r"^(?:from|import) (test_\w+)", path.read_text("utf-8"), re.MULTILINE)
+        assert not found, path

@@ -46,7 +46,7 @@ def test_broken_libmv_is_refused(tmp_path):
 
 
 @needs_data
-def test_ladybug_costs_what_the_literature_says():
+def test_ladybug_has_the_cost_of_the_literature():
     problem = load_bal(DATA / "ladybug-problem-49-7776-pre.txt")
     result = solve_schur(problem, LEAST_SQUARES)
     assert result.initial_cost == pytest.approx(8.509125e5, rel=1e-6)

@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from test_tracking import follow, motion, render
+from moving_texture import follow, motion, render
 
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.slam.map.covisibility import collect_garbage
@@ -23,7 +23,7 @@ def film() -> list[U8]:
     return frames
 
 
-def test_tracks_go_on_after_frames_without_details() -> None:
+def test_tracks_continue_after_frames_without_details() -> None:
     results = follow(film(), TrackingParameters(max_tracks=3000))
     before, after = results[BLURRED[0] - 1], results[-1]
     assert len(np.intersect1d(before.ids, results[BLURRED[-1]].ids)) < 0.3 * len(before.ids)

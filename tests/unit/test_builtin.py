@@ -46,7 +46,7 @@ def test_the_folder_is_a_dataset_like_the_others(folder: Path):
     np.testing.assert_allclose(np.linalg.norm(poses[:, 4:], axis=1), 1.0, atol=1e-8)
 
 
-def test_the_surface_lies_where_the_depth_says(folder: Path):
+def test_the_surface_is_at_the_given_depth(folder: Path):
     data = (folder / "surface.ply").read_bytes()
     header, _, body = data.partition(b"end_header\n")
     count = int(header.split(b"element vertex ")[1].split()[0])
@@ -64,7 +64,7 @@ def test_rendering_twice_gives_the_same_bytes(folder: Path, tmp_path: Path):
     assert contents(again) == contents(folder)
 
 
-def test_the_cache_is_used_and_told_apart_by_options(folder: Path, monkeypatch):
+def test_the_cache_is_used_and_separated_by_options(folder: Path, monkeypatch):
     def fail(*_: object) -> None:
         raise AssertionError("rendered again")
 

@@ -19,7 +19,7 @@ def small_window(points: int) -> BundleProblem:
     return synthetic_window(4, points, disturbance=0.5)
 
 
-def test_windows_are_what_they_say():
+def test_synthetic_windows_have_the_given_sizes():
     whole = synthetic_window(5, 200)
     assert np.bincount(whole.camera_index).tolist() == [200] * 5
     short = synthetic_window(8, 300, track_length=3)

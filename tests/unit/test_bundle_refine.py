@@ -73,7 +73,7 @@ def test_pose_without_observations_stays():
 
 
 @pytest.mark.parametrize("distortion", [(0.0, 0.0), (-0.2, 0.05)])
-def test_points_are_found_with_known_cameras(distortion):
+def test_points_are_triangulated_with_given_cameras(distortion):
     scene = make_scene(points=300, distortion=distortion)
     problem = dataclasses.replace(
         scene.problem,

@@ -74,7 +74,7 @@ def test_nothing_is_kept_that_no_reader_can_ask_for() -> None:
         outbox.again(2)
 
 
-def test_what_was_asked_for_and_has_come_since_is_not_sent_again() -> None:
+def test_requested_messages_that_arrived_meanwhile_are_not_sent_again() -> None:
     """After a cut the words of a reader come in one go: the first asks, the last has it all."""
     outbox = Outbox("t", ["a", "b"], window=10)
     for _ in range(6):
@@ -90,7 +90,7 @@ def test_what_was_asked_for_and_has_come_since_is_not_sent_again() -> None:
     assert outbox.asked_for() == ()
 
 
-def test_a_wait_is_told_with_its_length_once_it_is_long() -> None:
+def test_a_long_wait_is_reported_with_its_length() -> None:
     waiting = Waiting()
     assert waiting.told(now=100.0) == ""
     waiting.begin("an image", now=100.0)
@@ -229,7 +229,7 @@ def test_versions_that_do_not_fit_are_both_named() -> None:
         assert "\n" not in str(said.value)
 
 
-def test_a_viewer_of_another_version_is_told_both() -> None:
+def test_a_viewer_of_another_version_names_both() -> None:
     own = [f"pliant/s/{token_key('ingest', 3)}", "pliant/s/ready/nonsense"]
     check_versions(own)
     for token in ("ready/ingest/3/99/9.9.9", token_key("ingest", 3)[:-8] + "01234567"):
@@ -239,7 +239,7 @@ def test_a_viewer_of_another_version_is_told_both() -> None:
 
 
 @pytest.mark.parametrize("stranger", ["ingest/9", "tracking/9", "surfels/9"])
-def test_a_stranger_of_another_version_stops_nobody_and_is_told(stranger: str) -> None:
+def test_a_stranger_of_another_version_is_reported_and_stops_no_service(stranger: str) -> None:
     """Neither under a name that is here, nor under our own, nor under one that nobody needs."""
     peers = Peers("tracking", incarnation=5, needed=["ingest"])
     for name, number in (("ingest", 3), ("tracking", 5)):
@@ -314,7 +314,7 @@ def test_who_was_here_before_us_is_not_awaited_for_ever() -> None:
     assert peers.lost(["tracking", "recorder"], patience_s=60.0, now=61.0) == ["recorder"]
 
 
-def test_nobody_waits_once_the_session_is_over() -> None:
+def test_no_service_waits_once_the_session_is_over() -> None:
     peers = Peers("ingest", incarnation=5)
     peers.raise_if_refused()
     peers.over = True

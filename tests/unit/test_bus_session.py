@@ -76,9 +76,7 @@ def test_what_routers_that_were_killed_have_left_goes(tmp_path, monkeypatch) -> 
 
 
 @pytest.mark.parametrize("why", ["too long", "No such file", "is the port in use"])
-def test_where_no_socket_can_be_had_a_run_meets_on_loopback_and_says_so(
-    why: str, tmp_path, monkeypatch
-) -> None:
+def test_without_a_socket_a_run_uses_loopback_with_a_note(why: str, tmp_path, monkeypatch) -> None:
     folder = tmp_path / ("x" * (100 if why == "too long" else 1))
     if why != "No such file":
         folder.mkdir()

@@ -18,7 +18,7 @@ from pliant_services.runtime.status import listen, table
 from pliant_services.view.command import follow
 
 
-def test_who_looks_on_at_another_version_is_told(endpoint: str) -> None:
+def test_a_viewer_of_another_version_is_reported(endpoint: str) -> None:
     with open_session([endpoint]) as connection:
         token = connection.liveliness().declare_token("pliant/s/ready/ingest/3/99/9.9.9")
         with pytest.raises(BusError, match=r"ingest is pliant 9\.9\.9 .*this viewer is"):
@@ -41,7 +41,7 @@ def test_a_sender_that_ignores_credit_fills_no_memory(endpoint: str) -> None:
         assert box.limit == 2 * WINDOW
 
 
-def test_what_is_no_message_is_counted_told_and_asked_for_again(endpoint: str) -> None:
+def test_a_malformed_message_is_counted_reported_and_requested_again(endpoint: str) -> None:
     """Also where it comes first under the number of a true one, and where it looks like an end."""
     said: list[str] = []
     told = threading.Event()
@@ -85,7 +85,7 @@ def test_what_is_no_message_is_counted_told_and_asked_for_again(endpoint: str) -
     assert "tracking: ignored messages: camera/image" in said[0]
 
 
-def test_a_credit_of_nobody_is_refused(endpoint: str) -> None:
+def test_a_credit_without_a_reader_is_refused(endpoint: str) -> None:
     with writer(endpoint) as bus:
         other = bus._session.declare_publisher(f"pliant/test/credit/{topics.IMAGE.key}/tracking")
         box = bus._outputs[topics.IMAGE.key].box
@@ -107,7 +107,7 @@ def test_a_message_that_readers_would_refuse_is_not_sent(endpoint: str) -> None:
         bus.publish(small, image(0))
 
 
-def test_whoever_writes_as_a_start_of_the_sender_that_was_not_announced_is_not_believed(
+def test_messages_of_an_unannounced_incarnation_are_ignored(
     endpoint: str,
 ) -> None:
     """Not even a message that fits, under the next number: it is refused unread."""

@@ -288,7 +288,7 @@ def test_field_of_view() -> None:
             calibration_from_fov(640, 480, impossible)
 
 
-def test_a_lens_that_nobody_describes_sees_as_much_held_upright() -> None:
+def test_an_unknown_camera_has_the_same_field_of_view_upright() -> None:
     wide, upright = calibration_from_fov(1920, 1080), calibration_from_fov(1080, 1920)
     assert upright.fx == upright.fy == wide.fx == pytest.approx(960.0 * 3.0**0.5)
     assert upright.focal_sigma == wide.focal_sigma > calibration_from_fov(640, 480, 60).focal_sigma
@@ -337,7 +337,7 @@ def test_yaml_gives_back_the_same_numbers(
         | st.lists(st.floats() | st.integers(), max_size=9),
     )
 )
-def test_whatever_the_keys_hold_it_is_a_calibration_or_a_calibration_error(
+def test_any_content_is_a_calibration_or_a_calibration_error(
     tmp_path_factory: pytest.TempPathFactory, content: dict[str, Any]
 ) -> None:
     file = written(tmp_path_factory.getbasetemp(), {**RADTAN, **content}, "random.yaml")

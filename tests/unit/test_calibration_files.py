@@ -124,7 +124,7 @@ def test_pycolmap_writes_the_models_that_are_read(tmp_path: Path) -> None:
         assert text == binary
 
 
-def test_of_a_chain_the_user_topic_folder_or_size_tells_the_camera(tmp_path: Path) -> None:
+def test_user_topic_folder_or_size_selects_the_camera_of_a_chain(tmp_path: Path) -> None:
     file = tmp_path / "camchain.yaml"
     file.write_text(CHAIN)
     asked = refused(file)
@@ -143,7 +143,7 @@ def test_of_a_chain_the_user_topic_folder_or_size_tells_the_camera(tmp_path: Pat
     assert read_calibration(file, SIZE).fx == 600.0
 
 
-def test_of_a_chain_the_folder_or_the_topic_of_a_source_tells(tmp_path: Path) -> None:
+def test_the_folder_or_topic_of_a_source_selects_the_camera_of_a_chain(tmp_path: Path) -> None:
     text = CHAIN.replace("640, 480", f"{bags.WIDTH}, {bags.HEIGHT}")
     for n in range(2):
         text = text.replace(f"[{500.0 + 100 * n}, 501.0", f"[{40.0 + n}, 40.0")

@@ -169,7 +169,7 @@ def test_every_model_of_colmap_is_read_as_colmap_means_it(tmp_path: Path) -> Non
     assert read >= 9  # newer versions have more of them
 
 
-def test_of_several_cameras_the_size_tells(tmp_path: Path) -> None:
+def test_the_size_selects_one_of_several_cameras(tmp_path: Path) -> None:
     lines = ["# Camera list", "1 PINHOLE 320 240 250 250 160 120", "2 PINHOLE 640 480 5e2 5e2 1 2"]
     file = written(tmp_path, "\n".join(lines), "cameras.txt")
     assert intrinsics(read_calibration(file, (640, 480))) == (500.0, 500.0, 0.5, 1.5)

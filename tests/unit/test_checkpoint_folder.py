@@ -9,7 +9,7 @@ from pliant.bus.checkpoints import Checkpoints
 from pliant.errors import BusError
 
 
-def test_a_folder_of_somebody_else_names_the_user_to_run_as(
+def test_a_folder_of_another_user_names_the_user_to_run_as(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(folder: Path) -> None:

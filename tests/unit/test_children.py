@@ -49,7 +49,7 @@ def test_who_went_away_is_named_however_long_its_process_takes_to_end(
         child.close()
 
 
-def test_where_all_say_that_another_one_went_away_the_first_is_named(tmp_path: Path) -> None:
+def test_if_all_report_a_lost_peer_the_first_is_named(tmp_path: Path) -> None:
     services = [service(tmp_path, name, "router went away") for name in ("tracking", "meshing")]
     for child in services:
         end(child)

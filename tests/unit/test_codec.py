@@ -132,7 +132,7 @@ def test_a_map_of_a_recording_from_before_segments_were_joined() -> None:
     assert codec.decode(MapUpdate, msgpack.packb(content)).joined.shape == (0, 2)
 
 
-def test_surfels_of_a_recording_that_does_not_tell_where_they_were_tried() -> None:
+def test_surfels_of_a_recording_without_tried_positions() -> None:
     header = Header(frame=0, stamp_ns=0, frame_id="world")
     content = msgpack.unpackb(codec.encode(Surfels.of(header, SurfelFrame.empty())))
     del content["tried"]

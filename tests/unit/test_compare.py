@@ -69,7 +69,7 @@ def test_counts_come_before_order_before_fields(tmp_path: Path) -> None:
     assert found[0].first == "message 1 is of frame 2, was of 1"
 
 
-def test_the_first_difference_is_told_and_the_others_counted(tmp_path: Path) -> None:
+def test_the_first_difference_is_reported_and_the_others_counted(tmp_path: Path) -> None:
     was = [status(n, 1.0, 2.0, 3.0) for n in range(5)]
     now = [was[0], *(status(n, 1.0, 2.5, 4.0) for n in range(1, 5))]
     (found,) = differences(tmp_path, was, now)

@@ -65,7 +65,7 @@ def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
         load_config(tmp_path / "none.yaml")
 
 
-def test_every_parameter_says_what_it_means() -> None:
+def test_every_parameter_has_a_description() -> None:
     unexplained = [key for key, _, meaning in describe() if not meaning]
     assert not unexplained
 

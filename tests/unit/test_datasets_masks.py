@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_datasets_rectifier import DISTORTED, HEIGHT, PLAIN, WIDTH, picture, raw
+from raw_frames import DISTORTED, HEIGHT, PLAIN, WIDTH, picture, raw
 
 from pliant.algorithms.arrays import U8, BoolArray
 from pliant.algorithms.image.masks import packed, unpacked
@@ -132,7 +132,7 @@ def test_a_mask_that_breaks_later_breaks_its_frame_alone(tmp_path: Path) -> None
     ]
 
 
-def test_a_frame_without_a_mask_is_whole_whatever_came_before_it(tmp_path: Path) -> None:
+def test_a_frame_without_a_mask_is_whole_after_masked_ones(tmp_path: Path) -> None:
     write(tmp_path / "masks" / "b.png", columns(20))
     opened = open_source(
         SourceSpec(location=images(tmp_path / "images"), fov_deg=60.0, mask=tmp_path / "masks")

@@ -276,7 +276,7 @@ def test_any_bytes_are_one_line(tmp_path: Path) -> None:
             assert "\n" not in said
 
 
-def test_of_colour_and_depth_the_colour_is_used_and_a_line_says_so(tmp_path: Path) -> None:
+def test_colour_is_used_instead_of_depth_with_a_note(tmp_path: Path) -> None:
     ros = Ros(2)
     deep = np.full((HEIGHT, WIDTH), 900, "<u2")
     messages = {

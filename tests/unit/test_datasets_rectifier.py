@@ -5,29 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from raw_frames import DISTORTED, HEIGHT, PLAIN, WIDTH, picture, raw
 
 from pliant.datasets.base import BrokenFrame, SourceFrame, encoding_of
-from pliant.datasets.calibration import Calibration, calibration_from_yaml, calibration_yaml
+from pliant.datasets.calibration import calibration_from_yaml, calibration_yaml
 from pliant.datasets.rectifier import Rectifier, decode
-
-WIDTH, HEIGHT = 64, 48
-PLAIN = Calibration(model="pinhole", width=WIDTH, height=HEIGHT, fx=60, fy=60, cx=31.5, cy=23.5)
-DISTORTED = Calibration(
-    model="pinhole-radtan",
-    width=WIDTH,
-    height=HEIGHT,
-    fx=60,
-    fy=60,
-    cx=31.5,
-    cy=23.5,
-    distortion=(-0.2, 0.03, 1e-3, -1e-3, 0.0),
-)
-
-
-def picture(colour: bool = True) -> np.ndarray:
-    shape = (HEIGHT, WIDTH, 3) if colour else (HEIGHT, WIDTH)
-    noise = np.random.default_rng(3).integers(0, 256, shape, np.uint8)
-    return cv2.GaussianBlur(noise, (0, 0), 2.0)
 
 
 def source(data: bytes, index: int = 7) -> SourceFrame:
@@ -38,12 +20,6 @@ def encode(image: np.ndarray, suffix: str = ".png") -> bytes:
     done, data = cv2.imencode(suffix, image)
     assert done
     return data.tobytes()
-
-
-def raw(image: np.ndarray, encoding: str) -> SourceFrame:
-    return SourceFrame(
-        index=7, stamp_ns=1, encoding=encoding, data=image.tobytes(), width=WIDTH, height=HEIGHT
-    )
 
 
 def test_pixels_are_untouched_without_distortion() -> None:

@@ -107,7 +107,7 @@ def test_gyro_and_accelerometer_in_topics_of_their_own(tmp_path: Path) -> None:
     assert found.accel_m_s2[:, 1].tolist() == [9.5] * 16
 
 
-def test_without_sensors_there_is_nothing_to_say(tmp_path: Path) -> None:
+def test_without_sensors_there_is_no_note(tmp_path: Path) -> None:
     ros = Ros(2)
     write_ros_mcap(tmp_path / "a.mcap", ros, usual(ros))
     assert not found_in(tmp_path / "a.mcap").notes

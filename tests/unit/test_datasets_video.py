@@ -186,7 +186,7 @@ def test_camera() -> None:
     assert captures[1].released
 
 
-def test_camera_is_released_when_nobody_reads_any_more() -> None:
+def test_camera_is_released_without_readers() -> None:
     captures: list[SimulatedCapture] = []
 
     def open_device(_: int) -> SimulatedCapture:
@@ -200,7 +200,7 @@ def test_camera_is_released_when_nobody_reads_any_more() -> None:
     assert captures[-1].released
 
 
-def test_camera_is_asked_for_the_size_of_its_calibration(tmp_path: Path) -> None:
+def test_camera_opens_with_the_size_of_its_calibration(tmp_path: Path) -> None:
     capture = SimulatedCapture()
     file = tmp_path / "calib.yaml"
     file.write_text(yaml.safe_dump({**CALIBRATION, "width": 128, "height": 96}))
@@ -247,7 +247,7 @@ def test_a_video_that_is_replaced_after_it_was_opened_is_not_read_as_what_it_was
         next(iter(dataset))
 
 
-def test_a_video_that_is_written_to_while_it_is_read_is_told_and_one_without_a_name_is_none(
+def test_a_video_written_to_while_it_is_read_is_reported_and_a_deleted_one_is_none(
     tmp_path: Path,
 ) -> None:
     file = video(tmp_path)
@@ -264,7 +264,7 @@ def test_a_video_that_is_written_to_while_it_is_read_is_told_and_one_without_a_n
     assert len(list(frames)) == 5
 
 
-def test_a_video_that_is_written_to_while_a_part_of_it_is_read_is_told(tmp_path: Path) -> None:
+def test_a_video_written_to_while_a_part_is_read_is_reported(tmp_path: Path) -> None:
     file = video(tmp_path)
     content = file.read_bytes()
     for time, mask in enumerate((None, _white(tmp_path / "mask.png"))):

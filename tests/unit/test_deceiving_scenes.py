@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
+from mapped_scene import Published, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene
-from test_mapper import Published, trajectory_error
-from test_recovery import dark, textures
-from test_relocalisation import Film
-from test_segment_merges import PARAMETERS, along, film
+from pictured_scene import MERGING, Film, along, dark, film, textures
 
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.mapper import Mapper
@@ -51,7 +49,7 @@ def rooms(share: float) -> tuple[Scene, list[np.ndarray]]:
 
 def run(shots: Film) -> tuple[Published, int, Mapper]:
     """What a run publishes, how many segments have been joined, and the mapper."""
-    mapper, published, joined = Mapper(CAMERA, PARAMETERS, 0), Published(), 0
+    mapper, published, joined = Mapper(CAMERA, MERGING, 0), Published(), 0
     for k, (tracks, grey) in enumerate(shots):
         delta = mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey))
         mapper.publish_keyframes()

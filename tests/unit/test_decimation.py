@@ -2,24 +2,11 @@
 
 import numpy as np
 import pytest
+from wavy_meshes import grey, grid, height, waves
 
 from pliant.algorithms.arrays import F32, F64, I32
 from pliant.algorithms.meshing import decimation
 from pliant.algorithms.meshing.decimation import clustered, decimated
-
-
-def grid(side: int) -> tuple[F32, I32]:
-    """A plane of 2 (side - 1)^2 triangles from (0, 0) to (1, 1), anticlockwise from above."""
-    x, y = np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side), indexing="ij")
-    positions = np.stack([x, y, 0.0 * x], axis=-1).reshape(-1, 3).astype(np.float32)
-    a = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
-    lower = np.stack([a, a + side, a + 1], axis=1)
-    upper = np.stack([a + 1, a + side, a + side + 1], axis=1)
-    return positions, np.concatenate([lower, upper]).astype(np.int32)
-
-
-def grey(positions: F32) -> np.ndarray:
-    return np.full((len(positions), 3), 100, np.uint8)
 
 
 def turned(positions: F32, triangles: I32) -> F64:
@@ -123,16 +110,6 @@ def test_the_same_mesh_gives_the_same_bytes() -> None:
     second = decimated(positions, grey(positions), triangles, 500)
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def waves(side: int) -> tuple[F32, I32]:
-    positions, triangles = grid(side)
-    positions[:, 2] = height(positions)
-    return positions, triangles
-
-
-def height(positions: F32) -> F32:
-    return np.float32(0.05) * np.sin(12.0 * positions[:, 0]) * np.cos(9.0 * positions[:, 1])
 
 
 def test_a_very_large_mesh_is_clustered_first_and_ends_as_near(

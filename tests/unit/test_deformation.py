@@ -62,7 +62,7 @@ def origin(track: Track) -> F64:
     return np.array([track["left"], track["top"]], np.float64)
 
 
-def test_birth_keeps_the_surroundings_and_goes_on_beyond_the_image() -> None:
+def test_birth_keeps_the_surroundings_and_continues_beyond_the_image() -> None:
     image = np.random.default_rng(0).random((SIZE, SIZE)).astype(np.float32)
     for left, top in ((20, 30), (1, 1), (SIZE - 9, 25)):
         births = np.zeros(BIRTH_FLOATS, np.float32)

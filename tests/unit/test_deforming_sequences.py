@@ -47,7 +47,7 @@ TRACKS = made_up_tracks()
 
 
 @pytest.mark.parametrize("name", sorted(DEFORMING))
-def test_the_texture_is_where_the_truth_says(name: str) -> None:
+def test_the_texture_is_where_the_ground_truth_has_it(name: str) -> None:
     """Material points of the first image, followed by the truth, keep their grey values."""
     scene = deforming_scene(name, DEFORMING[name].options(), TRACKS)
     renderer = SheetRenderer(
@@ -117,7 +117,7 @@ def test_the_depth_map_is_that_of_the_surface_within_reach() -> None:
 @pytest.mark.parametrize(
     ("held", "poisson", "across"), [(False, 0.0, 1.0), (False, 1.0, 1 / 1.2), (True, 0.0, 1.0)]
 )
-def test_the_sheet_stretches_by_what_was_asked(held: bool, poisson: float, across: float) -> None:
+def test_the_sheet_stretches_by_the_given_amount(held: bool, poisson: float, across: float) -> None:
     options = StretchingOptions(stretch=0.2, poisson=poisson, held=held)
     sheet = deforming_scene("stretching", options).sheets[0]
     rest, pulled = sheet.shape(0.0), sheet.shape(2.0)
@@ -231,7 +231,7 @@ def test_the_camera_is_on_its_way_when_the_first_shutter_opens() -> None:
     np.testing.assert_allclose(0.5 * (opens + closes), middle, atol=1e-5)
 
 
-def test_a_longer_film_goes_on() -> None:
+def test_a_longer_film_continues() -> None:
     options = DEFORMING["breathing"].options(seconds=10.0)
     scene = deforming_scene("breathing", options)
     assert scene.frames == 300

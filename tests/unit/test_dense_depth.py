@@ -170,7 +170,7 @@ def test_a_keyframe_alone_or_with_a_broken_pose_keeps_its_points() -> None:
             assert len(dense.with_sure_pixels(keyframe, seen(0), agreed).ids) == 100
 
 
-def test_depths_on_disk_have_half_precision_whatever_the_scale_of_the_map() -> None:
+def test_depths_on_disk_have_half_precision_at_any_scale() -> None:
     generator = np.random.default_rng(0)
     with KeyframeSpool() as spool:
         for keyframe, unit in enumerate((1e-6, 1.0, 1e6)):

@@ -55,7 +55,7 @@ def test_relative_pose_needs_eight_points():
     assert likely_pose(points_a[:7], points_b[:7], gate=0.01) is None
 
 
-def test_a_motion_that_a_part_of_the_points_tells_is_judged_by_all():
+def test_a_motion_estimated_from_some_points_is_verified_by_all():
     """Ten times as many points as motions are found by."""
     _, _, points_a, points_b = two_views(outliers=150, noise=0.0002)
     found = relative_poses(np.tile(points_a, (20, 1)), np.tile(points_b, (20, 1)), gate=0.002)[0]

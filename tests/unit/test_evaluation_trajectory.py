@@ -169,7 +169,7 @@ def test_below_ninety_percent_is_a_failure_without_accuracy() -> None:
 @pytest.mark.parametrize(
     ("rows", "reason"), [([], "no frame was localised"), ([0, 1], "only 2 of 2 poses")]
 )
-def test_too_few_poses_say_so(rows: list[int], reason: str) -> None:
+def test_too_few_poses_are_reported(rows: list[int], reason: str) -> None:
     truth = walk()
     part = evaluate_trajectory(truth.select(np.array(rows, np.int64)), truth)
     assert part.ate_m is None
@@ -204,7 +204,7 @@ def test_a_failure_or_a_short_map_is_not_apart_from_the_truth() -> None:
     assert (whole.apart, whole.partly_compared) == (False, False)
 
 
-def test_a_camera_that_stands_still_has_no_accuracy() -> None:
+def test_a_static_camera_has_no_accuracy() -> None:
     truth = walk()
     still = Trajectory(
         stamps_ns=truth.stamps_ns, T_world_camera=np.tile(np.eye(4), (len(truth), 1, 1))
@@ -328,7 +328,7 @@ def test_summary_json_and_plot(tmp_path: Path) -> None:
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
-def test_plot_without_matplotlib_says_what_to_install(
+def test_plot_without_matplotlib_names_the_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truth = walk()

@@ -102,7 +102,7 @@ def test_errors_are_those_that_were_put_in(breathing: SurfaceTruth) -> None:
     assert "camera: RMSE of its position" in format_exact(judge, moving_camera=True)
 
 
-def test_the_error_of_the_camera_is_told_apart(breathing: SurfaceTruth) -> None:
+def test_the_error_of_the_camera_is_separate(breathing: SurfaceTruth) -> None:
     judge = ExactSurfels(breathing)
     start, T_first = world_of(breathing, 0)
     n = len(start)

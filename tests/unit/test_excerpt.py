@@ -66,7 +66,7 @@ def test_one_of_several_is_the_first_or_the_sharpest() -> None:
     assert taken(every=3, start_s=0.1, end_s=0.8) == [1, 4, 7]
 
 
-def test_how_many_come_is_said_where_it_is_known() -> None:
+def test_the_number_of_frames_is_given_where_it_is_known() -> None:
     assert Excerpt(Frames(), IngestParameters(every=7)).frame_count == 5
     assert Excerpt(Frames(), IngestParameters(end_s=1.0)).frame_count is None
     assert Excerpt(Frames(frame_count=None), IngestParameters(every=2)).frame_count is None
@@ -91,7 +91,7 @@ def test_nothing_left_is_one_line() -> None:
     Excerpt(Frames(), IngestParameters(start_s=2.9)).check_start()
 
 
-def test_where_a_source_ends_is_known_without_reading_it_all(tmp_path: Path) -> None:
+def test_the_end_of_a_source_is_known_without_reading_it_all(tmp_path: Path) -> None:
     images = Excerpt(open_source("built-in:tiny"), IngestParameters(start_s=99.0))
     with pytest.raises(DatasetError, match=r"is 1.30 s long"):
         images.check_start()

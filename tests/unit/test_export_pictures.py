@@ -302,7 +302,7 @@ def path(z: float) -> F64:
     return T
 
 
-def test_a_mesh_is_seen_from_where_it_shows_its_front() -> None:
+def test_a_mesh_is_viewed_from_its_front() -> None:
     x, y, z = np.eye(3)
     wall = grid(4.0 * z - y, 2.0 * z, 2.0 * y, -x)  # its back is to the usual view
     usual = choose_view(wall.positions.astype(float), path(0.0))

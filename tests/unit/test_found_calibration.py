@@ -86,7 +86,7 @@ def path(turn_rad, step):
     return poses
 
 
-def test_one_line_says_what_was_found_or_what_leaves_it_open():
+def test_one_line_has_the_estimate_or_why_it_is_open():
     guess = calibration_from_fov(640, 480, 60.0)
     ahead, round_about = path(0.1, (0.0, 0.0, 1.0)), path(1.0, (1.0, 0.0, 0.0))
     found = calibration_verdict(run_with(guess, (0.1, 0.0, 0.0, 0.0), (0.004,) * 4), round_about)
@@ -97,7 +97,7 @@ def test_one_line_says_what_was_found_or_what_leaves_it_open():
     assert "moves straight ahead and it rotates by only 6 degrees" in unknown
 
 
-def test_a_calibration_that_the_images_contradict_is_told_and_by_how_much():
+def test_a_calibration_that_the_images_contradict_is_reported_with_the_error():
     correction = (math.log(1.2), 0.0, 0.0, 0.0)
     told = calibration_verdict(run_with(PINHOLE, correction, (0.003,) * 4), {})
     assert "contradict" in told
@@ -106,7 +106,7 @@ def test_a_calibration_that_the_images_contradict_is_told_and_by_how_much():
     assert not calibration_verdict(run_with(PINHOLE, correction, (0.2,) * 4), {})
 
 
-def test_a_principal_point_that_the_images_contradict_is_told_and_far_off_is_a_doubt():
+def test_a_contradicted_principal_point_is_reported_and_doubtful_if_far_off():
     near, off, far = ((0.0, 0.0, 0.0, 0.0, a, -0.01) for a in (0.02, 0.04, 0.06))
     assert not calibration_verdict(run_with(PINHOLE, near, (1e-3,) * 6), {})
     run = run_with(PINHOLE, off, (1e-3,) * 6)

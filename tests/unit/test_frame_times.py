@@ -145,7 +145,7 @@ def test_a_message_that_cannot_be_read_costs_one_frame(
             decode(came[9])
 
 
-def test_a_source_that_holds_fewer_images_than_it_announces_says_so(
+def test_a_source_with_fewer_images_than_announced_has_a_note(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from pliant.datasets import mcap_file

@@ -167,7 +167,7 @@ def test_neither_the_place_nor_the_order_of_blocks_changes_the_mesh() -> None:
     assert_same(volume.extract_all(), fused(range(4)).extract_all())
 
 
-def test_what_is_seen_through_is_cleared() -> None:
+def test_free_space_is_cleared() -> None:
     def ghosts(parameters: TsdfParameters) -> int:
         volume = TsdfVolume(VOXEL, parameters)
         volume.integrate(*make_view(0, ball=True).arguments())
@@ -199,7 +199,7 @@ def test_a_voxel_that_needs_too_much_memory_is_refused_with_one_that_fits() -> N
     assert coarser.memory_bytes <= 1e6
 
 
-def test_what_a_view_needs_is_known_before() -> None:
+def test_memory_of_a_view_is_computed_before() -> None:
     depth = np.ones((CAMERA.height, CAMERA.width), np.float32)
     for voxel in (1 / 40, 1 / 120, 1 / 400):
         scale = TsdfVolume(voxel, PARAMETERS).scale

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from mapped_scene import error_of, similarity
 from mapping_scene import CAMERA, Scene, looking
 
 from pliant.algorithms.geometry import (
@@ -40,12 +41,6 @@ GROWING = MappingParameters(
     whole_map=WholeMapParameters(growth=0.2, distance_frames=7, observations_per_frame=1000),
 )
 AT_THE_END = GROWING.model_copy(update={"whole_map": WholeMapParameters(growth=0.0)})
-
-
-def similarity(scale, rotation_vector, t):
-    R = np.eye(4)
-    R[:3, :3], R[:3, 3] = so3_exp(np.array(rotation_vector, np.float64)), t
-    return np.concatenate([matrix_to_pose(R), [scale]])
 
 
 def path(frames):
@@ -245,7 +240,7 @@ def test_a_large_map_is_taken_over_later():
         assert mapper.global_adjustment.is_due(60 + distance)
 
 
-def test_a_point_that_many_keyframes_see_is_told_of_by_some_of_all_of_the_time():
+def test_a_point_in_many_keyframes_keeps_observations_from_the_whole_time():
     """So that a room that is seen again and again takes no more time than a path as long."""
     seen = np.array([3, 10, 200, 201])
     point = np.concatenate([np.flatnonzero(seen > k) for k in range(201)]).astype(np.int32)
@@ -259,14 +254,6 @@ def test_a_point_that_many_keyframes_see_is_told_of_by_some_of_all_of_the_time()
 
 def error(active):
     return error_of(active, path(FRAMES))
-
-
-def error_of(active, true_path):
-    """Sim(3) RMSE of the keyframes."""
-    true = np.array(true_path)[[keyframe.frame for keyframe in active.keyframes], :3, 3]
-    at = np.array([keyframe.T_world_camera[:3, 3] for keyframe in active.keyframes])
-    scale, R, t = align_umeyama(at, true, with_scale=True)
-    return np.sqrt(((scale * at @ R.T + t - true) ** 2).sum(axis=1).mean())
 
 
 def test_a_common_move_changes_nothing_that_a_camera_sees(grown):

@@ -67,7 +67,7 @@ def test_cut_payload_between_others_costs_its_samples_alone() -> None:
     ("orin", "expected"),
     [("XYZ", [1.0, 2.0, 3.0]), ("XzY", [1.0, 3.0, -2.0]), ("", [2.0, 3.0, 1.0])],
 )
-def test_axes_as_the_camera_says(orin: str, expected: list[float]) -> None:
+def test_axes_are_those_of_the_camera(orin: str, expected: list[float]) -> None:
     about = [entry("ORIN", "c", 1, orin.encode())] if orin else []
     rows = np.tile([1.0, 2.0, 3.0], (100, 1))
     found = read_gpmf([Payload(camera(rows, rows, *about), 0, 10**9)], "a").imu

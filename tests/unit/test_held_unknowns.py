@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mapped_scene import Published, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
-from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.mapper import Mapper

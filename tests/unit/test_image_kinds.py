@@ -44,7 +44,7 @@ def names(folder: Path) -> tuple[list[str], list[str]]:
         ("photo{}.jpg", "photo{}.png", COLOUR[::2, ::2]),  # previews
     ],
 )
-def test_one_kind_is_used_and_a_line_says_which(
+def test_one_kind_is_used_with_a_note(
     used: str, other: str, pixels: np.ndarray, tmp_path: Path
 ) -> None:
     write(tmp_path, used, COLOUR)
@@ -77,7 +77,7 @@ def test_a_thumbnail_first_costs_itself(tmp_path: Path) -> None:
     assert broken == [0]
 
 
-def test_images_that_are_turned_by_what_they_say_of_themselves(tmp_path: Path) -> None:
+def test_images_are_rotated_by_their_orientation_tag(tmp_path: Path) -> None:
     write(tmp_path, "{}.jpg", COLOUR)
     for path in tmp_path.iterdir():  # an EXIF header: orientation 6
         data = path.read_bytes()

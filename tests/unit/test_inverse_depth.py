@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mapped_scene import Published, run, similarity, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
-from test_global_adjustment import similarity
-from test_mapper import Published, run, trajectory_error
 
 from pliant.algorithms.geometry import inverse, so3_exp, so3_log, transform
 from pliant.algorithms.map_delta import LOST, TRACKING, MapMoves
@@ -56,7 +55,7 @@ def test_a_point_without_parallax_is_as_far_as_the_map_and_uncertain():
     assert np.isnan(spread[2]).all()
 
 
-def test_parallax_tells_the_distance_and_how_well_it_is_known():
+def test_parallax_determines_the_distance_and_its_sigma():
     points = np.array([[0.3, 0.2, 2.0], [-0.5, 0.1, 9.0], [0.0, 0.0, 1e4]])
     poses = np.array([looking((0.2 * k, 0, 0)) for k in range(4)])
     u, v = seen_from(poses, points)
@@ -107,7 +106,7 @@ def refined_from(start, X, spread, px):
     )  # fmt: skip
 
 
-def test_a_camera_that_turns_among_directions_stands_still():
+def test_a_camera_that_rotates_among_directions_has_no_translation():
     X = np.random.default_rng(0).uniform((-2, -2, 3), (2, 2, 8), (500, 3))
     true = looking((0, 0, 0), (0.02, -0.03, 0.04))
     (T, inliers, *_), stands = refined(true, X, 0.5 * X)
@@ -117,7 +116,7 @@ def test_a_camera_that_turns_among_directions_stands_still():
     assert inliers.mean() > 0.99
 
 
-def test_points_of_the_map_tell_a_step_and_wrong_depths_do_not_bend_it():
+def test_landmarks_determine_a_step_and_wrong_depths_do_not_bend_it():
     X = np.random.default_rng(0).uniform((-2, -2, 3), (2, 2, 8), (500, 3))
     true = looking((0.2, 0, 0.05), (0.02, -0.03, 0.04))
     spread = 0.5 * X
@@ -133,7 +132,7 @@ def test_points_of_the_map_tell_a_step_and_wrong_depths_do_not_bend_it():
 
 
 @pytest.mark.parametrize("nearer", [0.5, 0.7, 1.5, 2.5])
-def test_depths_that_err_together_do_not_bend_a_step_that_few_points_tell(nearer):
+def test_depths_that_err_together_do_not_bend_a_step_of_few_points(nearer):
     """As where the camera looks at what is not mapped, and it is not as far as the map."""
     generator = np.random.default_rng(0)
     X = generator.uniform((-2, -2, 3), (2, 2, 8), (4000, 3))
@@ -168,7 +167,7 @@ def test_a_full_turn_on_the_spot_stays_in_one_map(axis):
 
 
 @pytest.mark.parametrize(("count", "state"), [(45, LOST), (80, TRACKING)])
-def test_a_direction_tells_half_of_what_a_point_does(count, state):
+def test_a_direction_has_half_the_information_of_a_point(count, state):
     *frames, last = surroundings().frames(full_turn((0, 1, 0))[:65])
     mapper = Mapper(CAMERA, MappingParameters(), 0)
     states = [mapper.process(Frame(k, k * INTERVAL_NS, t)).state for k, t in enumerate(frames)]

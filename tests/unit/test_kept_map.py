@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mapped_scene import Published, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
-from test_mapper import Published, trajectory_error
-from test_recovery import dark, textures
-from test_relocalisation import Film, film, run
+from pictured_scene import Film, dark, film, messages, run, textures
 
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.camera import PinholeCamera
@@ -27,7 +26,7 @@ from pliant.algorithms.tracks import FrameExtrema, FrameTracks
 from pliant.errors import MapError
 from pliant.map_history import MapHistory
 from pliant.messages import codec
-from pliant.messages.types import Header, MapKeyframe
+from pliant.messages.types import MapKeyframe
 from pliant.recording import map_file
 from pliant.recording.map_file import MAP_NAME, MapFile, MapHeader, describe, write_map
 from pliant.state import load_state, save_state
@@ -44,20 +43,15 @@ def place() -> tuple[Scene, list[np.ndarray]]:
 
 @pytest.fixture(scope="module")
 def kept(place: tuple[Scene, list[np.ndarray]]) -> list[MapKeyframe]:
-    _, mapper = run(film(place[0], THERE, place[1]))
+    _, mapper = run(film(*place, THERE))
     mapper.finish()
     return messages(mapper)
-
-
-def messages(mapper: Mapper) -> list[MapKeyframe]:
-    kept = enumerate(mapper.kept())
-    return [MapKeyframe.of(Header(frame=n, stamp_ns=0, frame_id="world"), k) for n, k in kept]
 
 
 def again(place: tuple[Scene, list[np.ndarray]]) -> tuple[list[np.ndarray], Film]:
     """The same place on another day, from a little aside."""
     poses = [T @ looking((0.05, 0.1, 0.1), (0.02, -0.05, 0.1)) for T in THERE[5:25]]
-    return poses, film(place[0], poses, place[1])
+    return poses, film(*place, poses)
 
 
 def test_a_map_is_the_same_bytes_after_it_was_loaded(kept: list[MapKeyframe]) -> None:
@@ -77,7 +71,7 @@ def test_a_file_holds_the_map(kept: list[MapKeyframe], tmp_path: Path) -> None:
     assert f"{len(kept)} keyframes" in "\n".join(describe(tmp_path))
 
 
-def test_another_session_goes_on_in_the_map(
+def test_another_session_continues_in_the_map(
     place: tuple[Scene, list[np.ndarray]], kept: list[MapKeyframe]
 ) -> None:
     poses, shots = again(place)
@@ -140,7 +134,7 @@ def test_what_is_elsewhere_becomes_a_segment_of_its_own(
 ) -> None:
     elsewhere = Scene.box(500, seed=9, noise_px=0.1)
     published, mapper = run(
-        film(elsewhere, THERE, place[1][::-1]), Mapper(CAMERA, PARAMETERS, 0, known=kept)
+        film(elsewhere, place[1][::-1], THERE), Mapper(CAMERA, PARAMETERS, 0, known=kept)
     )
     mapper.finish()
     assert {segment for _, _, segment in published.poses.values()} == {1}
@@ -209,7 +203,7 @@ def test_frames_of_a_rolling_shutter_are_localised_as_if_taken_at_once(
         return looking((0.3 + 0.03 * moved, 0.05 * np.sin(0.3 * moved), 0.0), turn)
 
     poses = [at(k) for k in range(30)]
-    (_, grey), *_ = film(place[0], poses[:1], place[1])
+    (_, grey), *_ = film(*place, poses[:1])
     frames = list(place[0].frames(poses, later=at, readout=readout))
     errors: list[float] = []
     for known in (0.0, readout):

@@ -179,7 +179,7 @@ def test_kernels_go_to_the_cache_folder_where_the_sources_are_not_to_be_written(
     assert list((tmp_path / "cache" / "kernels").rglob("scaled*.nbc"))
 
 
-def test_one_line_says_that_kernels_can_be_kept_nowhere(tmp_path: Path) -> None:
+def test_one_line_warns_that_kernels_cannot_be_cached(tmp_path: Path) -> None:
     package = _package(tmp_path)
     (package / "constants.py").write_text("FACTOR = 3.0\n")
     (package / "scaled.py").write_text(_KERNEL)
@@ -231,7 +231,7 @@ def test_a_power_is_as_strict_as_its_kernel_whichever_was_compiled_first() -> No
         assert "fmul reassoc" not in codes["strict"]
 
 
-def test_a_kernel_is_strict_whoever_calls_it_first() -> None:
+def test_a_kernel_is_strict_for_every_first_caller() -> None:
     @kernel.kernel
     def strict(a: float, b: float, c: float) -> float:
         return a * b + c

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from test_decimation import grey, grid, waves
+from wavy_meshes import grey, grid, waves
 
 from pliant.algorithms.meshing.decimation import clustered, decimated
 from pliant.algorithms.meshing.mesh_blocks import LATTICE, SIDE, MeshBlocks, TriangleMesh, weld

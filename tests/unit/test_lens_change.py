@@ -35,7 +35,7 @@ def active():
     return mapper.atlas.active
 
 
-def test_points_are_seen_where_their_hosts_saw_them(active, monkeypatch):
+def test_points_project_to_the_observations_of_their_keyframes(active, monkeypatch):
     monkeypatch.setattr(active, "_adjust_window", lambda: None)
     rows, host = active.segment.mapped_rows(), active.keyframes[0]
     mine = rows[active.points.first_keyframe[rows] == host.id]

@@ -63,7 +63,7 @@ def test_an_adjustment_of_k1_lets_more_of_the_image_count(uncertain, covariance,
     assert (expected[-1] < 1.0) == any(sigmas)
 
 
-def test_the_window_counts_as_much_as_is_known_of_its_camera():
+def test_observations_weigh_by_the_uncertainty_of_the_camera():
     points = Landmarks()
     rows = points.allocate(3)
     given = SelfCalibration.of(CAMERA, CalibrationUncertainty())

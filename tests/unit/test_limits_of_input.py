@@ -129,7 +129,7 @@ def huge_png(side: int) -> bytes:
     )
 
 
-def test_an_image_that_says_it_is_huge_is_one_line(tmp_path: Path) -> None:
+def test_an_image_with_a_huge_size_in_its_header_is_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "images"
     folder.mkdir()
     for name in ("0.png", "1.png"):

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from mapped_scene import Published, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
-from test_mapper import Published, trajectory_error
-from test_recovery import picture, textures
+from pictured_scene import picture, textures
 
 from pliant.algorithms.slam.atlas import known_places
 from pliant.algorithms.slam.atlas.known_places import Comparisons, LoopCandidates
@@ -76,7 +76,7 @@ def look(own, monkeypatch, segment, newest, proves, alike=None, elsewhere=(), co
     return told, asked
 
 
-def test_two_keyframes_must_tell_the_same(monkeypatch, segment):
+def test_two_keyframes_must_agree(monkeypatch, segment):
     own = LoopCandidates()
     assert look(own, monkeypatch, segment, 10, {1: drift(-3.0)})[0] == []
     loops, _ = look(own, monkeypatch, segment, 11, {2: drift(-3.05)})
@@ -90,7 +90,7 @@ def test_two_keyframes_must_tell_the_same(monkeypatch, segment):
 @pytest.mark.parametrize(
     "other", [drift(-2.0), drift(-3.0, 1.2), looking((-3.0, 0, 0), (0, 0.1, 0))]
 )
-def test_keyframes_that_contradict_each_other_prove_nothing(monkeypatch, segment, other):
+def test_keyframes_that_contradict_each_other_verify_nothing(monkeypatch, segment, other):
     own = LoopCandidates()
     look(own, monkeypatch, segment, 10, {1: drift(-3.0)})
     assert look(own, monkeypatch, segment, 11, {2: other})[0] == []
@@ -116,7 +116,7 @@ def test_one_keyframe_is_no_witness_for_itself(monkeypatch, segment):
         assert look(own, monkeypatch, segment, 10, {1: drift(-3.0)})[0] == []
 
 
-def test_what_was_told_long_ago_counts_no_more(monkeypatch, segment):
+def test_old_loop_candidates_expire(monkeypatch, segment):
     own = LoopCandidates()
     look(own, monkeypatch, segment, 10, {1: drift(-3.0)})
     assert look(own, monkeypatch, segment, 14, {2: drift(-3.0)})[0] == []
@@ -144,7 +144,7 @@ def test_what_came_of_comparisons_is_counted(monkeypatch, segment):
     }  # fmt: skip
 
 
-def test_neither_the_window_nor_what_shares_points_is_asked(monkeypatch, segment):
+def test_neither_the_window_nor_covisible_keyframes_are_compared(monkeypatch, segment):
     points, keyframes = segment
     keyframes[10].rows = np.concatenate([keyframes[10].rows, keyframes[5].rows])
     _, asked = look(LoopCandidates(), monkeypatch, segment, 10, {}, alike=[9, 8, 5, 4, 3, 2, 1])

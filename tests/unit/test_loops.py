@@ -1,15 +1,14 @@
 """A place that is seen again: drift goes, and points that were mapped twice become one."""
 
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
-from test_global_adjustment import error_of, similarity
-from test_mapper import Published, trajectory_error
+from drifted_scene import AWAY, PARAMETERS, recognised, there_and_back
+from mapped_scene import error_of, similarity, trajectory_error
+from mapping_scene import CAMERA, INTERVAL_NS, looking
 
-from pliant.algorithms.geometry import align_umeyama, inverse, transform
+from pliant.algorithms.geometry import inverse
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.slam.adjust.final_adjustment import ObservationList
 from pliant.algorithms.slam.adjust.global_adjustment import GlobalAdjustment
@@ -18,82 +17,9 @@ from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.map.landmarks import MAPPED, Landmarks
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import (
-    MappingParameters,
-    ReacquisitionParameters,
     WholeMapParameters,
-    WindowParameters,
 )
 from pliant.state import load_state, save_state
-
-AWAY = 80
-PARAMETERS = MappingParameters(
-    window=WindowParameters(keyframes=5, keyframe_iterations=2),
-    reacquisition=ReacquisitionParameters(enabled=False),
-    whole_map=WholeMapParameters(growth=0.0, distance_frames=3),
-)
-
-
-def there_and_back():
-    """A camera that goes along a wall, and comes back."""
-    return [
-        looking((0.08 * k, 0.03 * np.sin(0.3 * k), 0.0)) for k in [*range(AWAY), *range(AWAY)[::-1]]
-    ]
-
-
-@pytest.fixture(scope="module")
-def world():
-    generator = np.random.default_rng(0)
-    points = generator.uniform((-4.0, -3.0, 3.0), (11.0, 3.0, 9.0), (1500, 3))
-    kappas = generator.uniform(5.0, 500.0, len(points)).astype(np.float32)
-    scene = Scene(points, kappas, death=0.01)
-    return scene, list(scene.frames([*there_and_back(), *there_and_back()[:10]]))
-
-
-@pytest.fixture(scope="module")
-def drifted_once(world):
-    """A map whose points were mapped again on the way back, and whose scale drifts on the way."""
-    scene, frames = world
-    mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()
-    for k, tracks in enumerate(frames[: 2 * AWAY]):
-        published.apply(mapper.process(Frame(k, k * INTERVAL_NS, tracks)))
-    active = mapper.atlas.active
-    ids = np.array([keyframe.id for keyframe in active.keyframes])
-    drift = np.array([similarity(1.005**k, (0, 1e-3 * k, 0), (0, 0, 0)) for k in range(len(ids))])
-    moved = mapper.atlas.move(MapMoves(keyframe_ids=ids, moves=drift))
-    mapper.follow([moved])
-    assert moved.S[0, 0] > 1.1
-    return scene, frames, mapper, published
-
-
-@pytest.fixture
-def drifted(drifted_once):
-    """A copy of it that a test may change: to map the way takes longer than what is tested."""
-    scene, frames, mapper, published = drifted_once
-    return scene, frames, load_state(save_state(mapper)), deepcopy(published)
-
-
-def recognised(scene, mapper, *, wrong=False):
-    """The loop between the first keyframe and the last, by what they see of the scene."""
-    active, points = mapper.atlas.active, mapper.atlas.points
-    old, new = active.keyframes[0], active.keyframes[-1]
-    seen = []
-    for keyframe in (old, new):
-        px = CAMERA.project(transform(inverse(there_and_back()[keyframe.frame]), scene.points))
-        rows = keyframe.rows[points.state[keyframe.rows] == MAPPED]
-        at = keyframe.points_px[points.state[keyframe.rows] == MAPPED]
-        apart = np.linalg.norm(at[:, None] - px[None], axis=2)
-        which = apart.argmin(axis=1)
-        good = apart.min(axis=1) < 1.0
-        seen.append(dict(zip(which[good].tolist(), rows[good].tolist(), strict=True)))
-    both = sorted(set(seen[0]) & set(seen[1]))
-    rows = np.array([(seen[0][k], seen[1][k]) for k in both], np.int32)
-    rows = rows[rows[:, 0] != rows[:, 1]]
-    S = np.eye(4)
-    scale, R, t = align_umeyama(points.xyz[rows[:, 1]], points.xyz[rows[:, 0]], with_scale=True)
-    S[:3, :3], S[:3, 3] = scale * R, t
-    if wrong:
-        S[:3, 3] += (3.0, 0.0, 2.0)
-    return Loop(old=old.id, new=new.id, S_old_new=S, rows=rows, ids=points.ids[rows])
 
 
 def error(active):
@@ -140,7 +66,7 @@ def test_a_loop_takes_out_the_drift_and_joins_the_points(drifted):
     assert np.isin(loop.rows[:, 0], shared).mean() > 0.9
 
 
-def test_the_map_goes_on_and_readers_have_it(drifted):
+def test_the_map_continues_and_readers_have_it(drifted):
     scene, frames, mapper, published = drifted
     loop, told = recognised(scene, mapper), []
     mapper.global_adjustment.loops.append(loop)
@@ -249,7 +175,7 @@ def test_a_place_that_looks_alike_is_too_far_for_drift(world):
     assert error_of(active, there_and_back()) == before
 
 
-def test_a_camera_that_was_recognised_stands_where_it_was_whatever_looks_alike():
+def test_a_recognised_camera_is_where_it_was_despite_similar_places():
     """Back in the first of two rooms that are alike, it sees little of what it saw there before."""
     cameras = [looking((x, 0.0, 0.0)) for x in (0.0, 0.2, 6.0, 12.0, 12.2, 0.1, 0.3)]
     generator = np.random.default_rng(0)

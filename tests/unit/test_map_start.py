@@ -146,7 +146,7 @@ def test_it_waits_for_more_parallax_but_not_for_long(total_m: float) -> None:
     assert (first >= patient) == (total_m < 0.2)
 
 
-def test_a_camera_that_has_hardly_moved_is_told_by_a_glance(
+def test_a_camera_that_has_hardly_moved_is_rejected_quickly(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """All tracks are compared once it has moved: that takes ten times as long."""

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mapped_scene import PARAMETERS, Published, run, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
 
-from pliant.algorithms.arrays import check_arrays
-from pliant.algorithms.geometry import align_umeyama, move_by_similarity, pose_to_matrix
 from pliant.algorithms.map_delta import LOST, TRACKING, WAITING
 from pliant.algorithms.slam.calibration_bootstrap import BootstrapMapper
 from pliant.algorithms.slam.frame import Frame
@@ -20,69 +19,6 @@ from pliant.algorithms.slam.parameters import (
 from pliant.algorithms.slam.start.start import with_minimum_parallax
 from pliant.algorithms.tracks import FrameExtrema
 
-PARAMETERS = MappingParameters()
-
-
-class Published:
-    """What a reader of the deltas knows."""
-
-    def __init__(self):
-        self.keyframes, self.poses, self.points, self.states, self.reasons = {}, {}, {}, [], []
-        self.frame_of_keyframe = {}
-
-    def apply(self, delta):
-        check_arrays(delta)
-        if len(delta.moved_keyframes):
-            self._move(delta.map_moves())
-        for i, pose in zip(delta.keyframe_ids.tolist(), delta.keyframe_poses, strict=True):
-            self.keyframes[i] = pose_to_matrix(pose)
-        frames = delta.keyframe_frames.tolist()
-        self.frame_of_keyframe |= zip(delta.keyframe_ids.tolist(), frames, strict=True)
-        for k, frame in enumerate(delta.pose_frames.tolist()):
-            pose = pose_to_matrix(delta.poses_keyframe_camera[k])
-            segment = int(delta.pose_segments[k])
-            self.poses[frame] = (int(delta.pose_keyframes[k]), pose, segment)
-        for point in delta.removed_point_ids.tolist():
-            del self.points[point]
-        for k, point in enumerate(delta.point_ids.tolist()):
-            told = (delta.points_world[k], int(delta.point_keyframes[k]), delta.point_hosts[k])
-            self.points[point] = told
-        self.states.append(delta.state)
-        self.reasons.append(delta.reason)
-        return self
-
-    def _move(self, moves):
-        for i, T in self.keyframes.items():
-            self.keyframes[i] = move_by_similarity(moves.matrices(np.array(i)), T)
-        if self.points:
-            xyz, seen, hosts = zip(*self.points.values(), strict=True)
-            moved = moves.points(np.array(xyz), np.array(hosts))
-            self.points = dict(zip(self.points, zip(moved, seen, hosts, strict=True), strict=True))
-
-    def pose(self, frame):
-        keyframe, T_keyframe_camera, _ = self.poses[frame]
-        return self.keyframes[keyframe] @ T_keyframe_camera
-
-
-def run(frames, parameters=PARAMETERS, seed=0):
-    mapper, published, deltas = Mapper(CAMERA, parameters, seed), Published(), []
-    for frame, tracks in enumerate(frames):
-        deltas.append(mapper.process(Frame(frame, frame * INTERVAL_NS, tracks)))
-        published.apply(deltas[-1])
-    deltas.append(mapper.finish())
-    published.apply(deltas[-1])
-    return published, deltas
-
-
-def trajectory_error(published, poses):
-    """Sim(3) RMSE as a share of the path."""
-    frames = sorted(published.poses)
-    estimated = np.array([published.pose(k)[:3, 3] for k in frames])
-    true = np.array([poses[k][:3, 3] for k in frames])
-    scale, R, t = align_umeyama(estimated, true, with_scale=True)
-    rmse = np.sqrt(((scale * estimated @ R.T + t - true) ** 2).sum(axis=1).mean())
-    return rmse / np.linalg.norm(np.diff(true, axis=0), axis=1).sum(), (scale, R, t)
-
 
 @pytest.fixture(scope="module")
 def flight():
@@ -91,7 +27,7 @@ def flight():
     return scene, poses, *run(scene.frames(poses))
 
 
-def test_points_are_told_again_only_where_they_are_known_otherwise():
+def test_points_are_published_again_only_if_they_have_moved():
     """What readers know of the others is near enough, and exact in the end."""
     mapper, known, again = Mapper(CAMERA, PARAMETERS, 0), {}, 0
 
@@ -128,7 +64,7 @@ def test_points_are_told_again_only_where_they_are_known_otherwise():
     np.testing.assert_allclose(xyz, points.xyz[rows], rtol=1e-6, atol=1e-6)
 
 
-def test_points_are_told_as_files_have_them():
+def test_points_are_published_as_files_have_them():
     """What is below is noise, which no compression makes smaller."""
     _, deltas = run(Scene.box().frames(sideways(12)))
     told = np.concatenate([delta.points_world for delta in deltas])
@@ -168,7 +104,7 @@ def test_lost_tracks_come_back_to_their_points(flight):
     assert len(published.points) < 1.3 * len(scene.points)
 
 
-def test_keyframes_are_the_first_to_tell_their_own_pose(flight):
+def test_keyframes_publish_their_own_pose_first(flight):
     _, _, published, deltas = flight
     known = set()
     for delta in deltas:
@@ -202,21 +138,21 @@ def test_a_late_reader_catches_up_by_the_snapshots():
     assert late.pose(41).shape == (4, 4)
 
 
-def test_a_still_camera_starts_no_map_and_says_why():
+def test_a_still_camera_starts_no_map_with_a_reason():
     published, _ = run(Scene.box().frames([np.eye(4)] * 12))
     assert set(published.states) == {WAITING}
     assert "too little parallax" in published.reasons[-2]
     assert not published.poses
 
 
-def test_a_turning_camera_starts_no_map_and_says_why():
+def test_a_rotating_camera_starts_no_map_with_a_reason():
     turning = [looking((0.0, 0.0, 0.0), (0.0, 0.02 * k, 0.0)) for k in range(15)]
     published, _ = run(Scene.box().frames(turning))
     assert set(published.states) == {WAITING}
     assert "pure rotation" in published.reasons[-2]
 
 
-def test_too_few_tracks_start_no_map_and_say_why():
+def test_too_few_tracks_start_no_map_with_a_reason():
     published, _ = run(Scene.box(60).frames(sideways(8)))
     assert set(published.states) == {WAITING}
     assert published.reasons[0] == "too few frames: 1 of 3"
@@ -323,7 +259,7 @@ def test_a_short_gap_is_bridged():
     assert len({segment for _, _, segment in published.poses.values()}) <= 2
 
 
-def test_frames_that_are_passed_over_get_no_pose_and_the_next_one_goes_on():
+def test_skipped_frames_get_no_pose_and_the_next_one_continues():
     """Also where the map starts, and with tracks that begin and end between."""
     poses = sideways(60)
     mapper, published = Mapper(CAMERA, PARAMETERS, 0), Published()

@@ -341,7 +341,7 @@ def test_missing_points_are_mapped_have_no_track_and_wait_after_many_misses():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5])
-def test_marks_are_counted_as_far_as_is_asked(share):
+def test_marks_are_counted_up_to_the_limit(share):
     rng = np.random.default_rng(0)
     marked = rng.random(4000) < share
     rows = rng.choice(4000, 1500, replace=False).astype(np.int32)

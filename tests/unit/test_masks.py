@@ -5,9 +5,9 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+from moving_texture import HEIGHT, WIDTH, follow, render, stamp_ns
+from moving_texture import motion as motion_of_texture
 from surfel_scene import STEP_S, board_renderer, film, motion
-from test_tracking import HEIGHT, WIDTH, follow, render, stamp_ns
-from test_tracking import motion as motion_of_texture
 
 from pliant.algorithms.arrays import U8, BoolArray
 from pliant.algorithms.image.masks import (
@@ -154,7 +154,7 @@ def test_without_a_mask_a_pattern_that_stays_misleads_the_flow_and_with_it_does_
     assert off[1] < 0.5
 
 
-def test_no_surfel_is_born_or_seen_where_it_is_covered() -> None:
+def test_no_surfel_is_created_or_tracked_under_a_mask() -> None:
     still = motion((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     renderer, camera = board_renderer([still, still])
     first, second = film(renderer, 2)

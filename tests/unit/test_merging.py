@@ -6,10 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mapping_scene import CAMERA, INTERVAL_NS
-from test_kept_map import messages
-from test_recovery import dark, textures
-from test_relocalisation import Film
-from test_segment_merges import PARAMETERS, along, film, wall
+from pictured_scene import MERGING, Film, along, dark, film, messages, textures, wall
 
 from pliant.algorithms.geometry import align_umeyama, inverse, transform
 from pliant.algorithms.map_delta import TRACKING
@@ -35,7 +32,7 @@ NIGHT = [dark(FrameExtrema.empty())] * 40
 
 
 def mapped(shots: Film) -> list[MapKeyframe]:
-    mapper = Mapper(CAMERA, PARAMETERS, 0)
+    mapper = Mapper(CAMERA, MERGING, 0)
     for k, (tracks, grey) in enumerate(shots):
         mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey))
         mapper.publish_keyframes()
@@ -54,7 +51,7 @@ def two() -> Two:
 
 @pytest.fixture(scope="module")
 def one(two: Two) -> Merged:
-    made = merge(*two, PARAMETERS)
+    made = merge(*two, MERGING)
     assert made is not None
     return made
 
@@ -80,7 +77,7 @@ def test_what_shows_the_same_places_is_one_world(two: Two, one: Merged) -> None:
     assert errors_of(one.keyframes).max() < 5e-3
 
 
-def test_what_both_have_seen_is_one_point(two: Two, one: Merged) -> None:
+def test_common_points_of_two_maps_are_merged(two: Two, one: Merged) -> None:
     ids = [set(k.point_ids.tolist()) for k in one.keyframes]
     assert len(set.union(*ids)) == sum(map(len, ids))
     seen = [
@@ -102,7 +99,7 @@ def test_what_met_nothing_stays_as_it_was(two: Two, one: Merged) -> None:
 
 
 def test_the_same_maps_give_the_same_bytes(two: Two, one: Merged) -> None:
-    again = merge(*two, PARAMETERS)
+    again = merge(*two, MERGING)
     assert again is not None
     for each, other in zip(one.keyframes, again.keyframes, strict=True):
         for name, value in vars(each).items():
@@ -111,7 +108,7 @@ def test_the_same_maps_give_the_same_bytes(two: Two, one: Merged) -> None:
 
 def test_frames_of_either_find_themselves_in_it(one: Merged) -> None:
     for poses in (FIRST[:3], SECOND[:3]):
-        localiser = Localiser(CAMERA, PARAMETERS, 0, known=one.keyframes)
+        localiser = Localiser(CAMERA, MERGING, 0, known=one.keyframes)
         for k, (tracks, grey) in enumerate(film(WALL, SQUARES, poses, 5)):
             delta = localiser.process(Frame(k, k * INTERVAL_NS, tracks, grey))
             assert (delta.state, delta.segment) == (TRACKING, 0)
@@ -119,7 +116,7 @@ def test_frames_of_either_find_themselves_in_it(one: Merged) -> None:
 
 def test_another_wall_is_not_merged(two: Two) -> None:
     first, second = two
-    assert merge(first, [k for k in second if k.segment == 1], PARAMETERS) is None
+    assert merge(first, [k for k in second if k.segment == 1], MERGING) is None
 
 
 def test_another_correction_of_the_camera_moves_nothing_in_the_image(two: Two) -> None:
@@ -147,7 +144,7 @@ def test_a_map_of_another_focal_length_is_merged_as_this_one_would_have_it(two: 
         here[:, :2] *= before.fx / other.view.camera.fx
         there = transform(each.T_world_camera, here)
         made.append(replace(corrected_as(each, other), points_world=there))
-    merged = merge(first, made, PARAMETERS)
+    merged = merge(first, made, MERGING)
     assert merged is not None
     assert merged.joined == [(0, 0)]
 
@@ -169,7 +166,7 @@ def test_another_camera_is_merged_by_its_own_rays(two: Two) -> None:
         )
         for k in second
     ]  # fmt: skip
-    made = merge(first, other, PARAMETERS)
+    made = merge(first, other, MERGING)
     assert made is not None
     assert made.joined == [(0, 0)]
     assert errors_of(made.keyframes).max() < 1e-2

@@ -188,7 +188,7 @@ def test_a_small_hole_is_closed_on_the_surface_and_marked_and_nothing_grows() ->
         assert np.abs(grown).max() <= VOXEL
 
 
-def test_a_large_hole_stays_as_large_and_what_is_seen_through_stays_open() -> None:
+def test_a_large_hole_stays_as_large_and_free_space_stays_open() -> None:
     assert holes(wall(patch(30)).extract_finished()) == 1
     through = wall(patch(6))
     depths = np.where(patch(6), np.float32(3.0 * DEPTH), np.float32(0.0))

@@ -103,7 +103,7 @@ def test_no_mesh_covers_nothing() -> None:
     assert np.isnan(found.median_error)
 
 
-def test_a_wall_aside_is_told_by_its_columns_and_its_vertices() -> None:
+def test_a_displaced_wall_shows_in_its_columns_and_vertices() -> None:
     """ICP moves it back; true depth at our own poses has no error where those are true."""
     points, faces = wall(3.1)
     measured = evaluate(points, faces)

@@ -30,7 +30,7 @@ def listed():
     )
 
 
-def test_every_keyframe_has_its_points_and_those_seen_most_come_first(listed):
+def test_every_keyframe_has_its_points_most_observed_first(listed):
     few = listed.most_seen(100)
     counts = np.bincount(listed.point, minlength=POINTS)
     have, chosen = np.zeros(KEYFRAMES, int), []

@@ -49,7 +49,7 @@ def test_a_rigid_motion_with_a_little_of_their_own_is_one(
     assert share or not seen
 
 
-def test_some_that_stand_still_behind_what_moves_tell_that_it_is_not_the_camera() -> None:
+def test_static_points_behind_moving_ones_show_that_the_camera_is_static() -> None:
     together, still = MovingTogether(), surface(0.0, 0.0) + np.array([0.0, 0.0, 0.2])
     for frame in range(10):
         positions = np.concatenate([surface(0.0, frame / 9.0), still])

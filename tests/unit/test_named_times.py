@@ -114,7 +114,7 @@ def write(folder: Path, names: list[str]) -> None:
         cv2.imwrite(str(folder / name), np.full((24, 32), row, np.uint8))
 
 
-def test_a_folder_is_in_the_order_of_its_times_and_says_which_they_are(tmp_path: Path) -> None:
+def test_a_folder_is_in_the_order_of_its_times_with_a_note_on_them(tmp_path: Path) -> None:
     write(tmp_path / "a", ["0.1.png", "0.2.png", "0.13.png"])
     source = open_source(SourceSpec(location=str(tmp_path / "a"), fov_deg=60.0))
     frames = list(source)
@@ -132,7 +132,7 @@ def test_times_without_a_leading_zero_are_no_hidden_files(tmp_path: Path) -> Non
     assert [f.stamp_ns for f in frames] == [900000000, 950000000, 1000000000]
 
 
-def test_a_folder_whose_names_tell_no_times_says_what_is_assumed(tmp_path: Path) -> None:
+def test_a_folder_without_times_in_names_has_a_note_on_the_assumption(tmp_path: Path) -> None:
     write(tmp_path / "a", ["2.png", "10.png", "1.png"])
     source = open_source(SourceSpec(location=str(tmp_path / "a"), fov_deg=60.0))
     assert [f.name for f in source] == ["1.png", "2.png", "10.png"]

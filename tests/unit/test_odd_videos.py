@@ -122,7 +122,7 @@ def test_a_preview_in_matroska_is_passed_over(tmp_path: Path) -> None:
         ([(20.0, 10.0)], range(10)),  # nothing would be shown
     ],
 )
-def test_an_edit_list_says_which_frames_come(
+def test_an_edit_list_selects_the_frames(
     tmp_path: Path,
     film: bytes,
     images: list[np.ndarray],
@@ -195,7 +195,7 @@ def test_a_cut_may_begin_with_frames_that_hang_on_what_is_gone() -> None:
     assert found.tobytes() == b"\0\0\0\1abc\0\0\0\1de"
 
 
-def test_two_fields_in_a_file_that_says_nothing_of_it(tmp_path: Path) -> None:
+def test_two_fields_in_a_file_that_is_not_marked_interlaced(tmp_path: Path) -> None:
     """As of old tapes that were converted: a frame that is a comb of two times is one field."""
     shown = moving(FRAMES, 320, 240, step=6)
     combed = [image.copy() for image in shown]

@@ -58,7 +58,7 @@ def test_a_frame_is_placed_where_it_sees_the_points_as_they_are_now(points):
     assert frames.take_all() == []
 
 
-def test_rows_that_became_other_points_tell_nothing(points):
+def test_rows_that_became_other_points_are_ignored(points):
     frames = passed(points).take_all()
     points.xyz[:120] += 0.03  # all in one direction: robustness alone would not do
     points.first_keyframe[:120] = 4
@@ -101,7 +101,7 @@ def test_what_finds_no_room_goes_first(points, monkeypatch):
     assert [each.frame for each in frames.take_all()] == [25, 26]
 
 
-def test_a_camera_that_stands_still_keeps_no_more_and_more(monkeypatch):
+def test_a_static_camera_needs_bounded_memory(monkeypatch):
     """No keyframe comes, after which what finds no room would go."""
     monkeypatch.setattr(ordinary_frames, "_ROOM", 1000)
     poses = sideways(12)

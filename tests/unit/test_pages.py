@@ -63,7 +63,7 @@ def test_commands_of_the_pages_are_commands(page: str, words: list[str]) -> None
     command.make_context(name, arguments)
 
 
-def test_what_came_of_comparing_places_is_told_by_its_names() -> None:
+def test_counters_of_place_comparisons_are_documented() -> None:
     told = re.findall(r"`(\w+)`", (ROOT / "docs" / "places.md").read_text(encoding="utf-8"))
     assert set(Comparisons().counters) <= set(told)
 

@@ -8,7 +8,7 @@ import pytest
 from pliant.fusion.parallel import in_order, processors
 
 
-def test_results_come_in_the_order_of_the_items_whoever_is_first() -> None:
+def test_results_come_in_the_order_of_the_items() -> None:
     second_is_done = Event()
 
     def work(item: int) -> int:

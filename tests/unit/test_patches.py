@@ -126,9 +126,7 @@ def test_steps_are_the_inverse_of_finite_differences() -> None:
 
 @pytest.mark.parametrize("gain", [0.7, 1.0, 1.4])
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.6, -0.4), (-1.3, 0.9)])
-def test_alignment_finds_the_shift_whatever_the_exposure(
-    gain: float, shift: tuple[float, float]
-) -> None:
+def test_alignment_finds_the_shift_at_any_exposure(gain: float, shift: tuple[float, float]) -> None:
     template, strength = template_of(texture(), 20, 18)
     assert strength > 1.0
     image = np.float32(gain) * texture(*shift) - np.float32(11.0)

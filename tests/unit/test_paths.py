@@ -9,7 +9,7 @@ from pliant.datasets.builtin_rigid import SequenceOptions, rigid_plan
 
 
 @pytest.mark.parametrize(("turn", "axis"), [("pitch", 0), ("yaw", 1), ("roll", 2)])
-def test_a_full_turn_on_the_spot_and_then_the_path_goes_on(turn, axis):
+def test_a_full_turn_on_the_spot_and_then_the_path_continues(turn, axis):
     name, options = parse_builtin(f"built-in:tiny?turn={turn}")
     assert isinstance(options, SequenceOptions)
     plain, turned = rigid_plan(name, SequenceOptions()), rigid_plan(name, options)

@@ -95,7 +95,7 @@ def test_a_patch_is_as_the_last_keyframe_saw_it_that_sees_the_point(wall):
     assert look_alike(S_old_new, rows, [first], [new], points, MIN_ZNCC).mean() < 0.5
 
 
-def test_what_is_flat_or_was_seen_at_the_border_looks_like_nothing(wall):
+def test_flat_patches_and_those_at_the_border_match_nothing(wall):
     points = Landmarks()
     old = seen_from(AHEAD, wall, points, np.eye(4))
     rows = np.column_stack([old.rows, old.rows])

@@ -153,7 +153,7 @@ def test_a_loop_takes_out_drift_of_scale_and_direction(count):
     assert weights[-1] > 0.9
 
 
-def test_the_loop_that_others_contradict_has_no_say():
+def test_a_loop_that_others_contradict_is_ignored():
     true, drifted = circle(60)
     pairs = [(k, k + n) for n in (1, 2, 5) for k in range(60 - n)]
     chain = edges_of(drifted, pairs, 0.02)

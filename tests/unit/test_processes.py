@@ -55,7 +55,7 @@ def test_every_process_has_a_module_with_run(process: processes.Process) -> None
     assert callable(getattr(module, "warm_up", None)) == process.kernels
 
 
-def test_what_is_kept_for_checkpoints_is_what_the_docs_say() -> None:
+def test_messages_kept_for_checkpoints_are_as_documented() -> None:
     windows = checkpoint_windows(Config(), PROFILES["points"])
     assert {name: window.messages for name, window in windows.items()} == {
         "tracking": 784,

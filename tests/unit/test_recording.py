@@ -126,7 +126,7 @@ def test_the_final_map_comes_after_the_updates_that_it_corrects(tmp_path: Path) 
     assert [r.sequence for r in Recording(path).messages(topics.MAP_FINAL)] == [1]
 
 
-def test_what_nobody_asked_for_is_not_read(tmp_path: Path) -> None:
+def test_unrequested_files_are_not_read(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     image = SourceImage(
         frame=0, stamp_ns=0, frame_id="", encoding="mono8", width=80, height=10, data=b"X" * 800

@@ -77,7 +77,7 @@ def test_no_part_is_written_over(path: Path) -> None:
 
 
 @pytest.mark.parametrize(("hole", "kept"), [(3, 2), (5, 5), (6, 5)])
-def test_senders_are_told_what_is_there_without_a_gap(path: Path, hole: int, kept: int) -> None:
+def test_messages_count_up_to_the_first_gap(path: Path, hole: int, kept: int) -> None:
     """A power cut leaves blocks of zeros: in a chunk that was written whole, or in the last."""
     record(path, range(2))
     part = record(path, range(2, 8), per_chunk=5)  # chunks of 2 to 4 and of 5 to 7
@@ -90,7 +90,7 @@ def test_senders_are_told_what_is_there_without_a_gap(path: Path, hole: int, kep
     assert summarise(path).has_index
 
 
-def test_a_chunk_that_never_reached_the_disk_is_asked_for_again(path: Path) -> None:
+def test_a_chunk_that_never_reached_the_disk_is_requested_again(path: Path) -> None:
     """Although the next one did, as did the index."""
     part = record(path, range(6))
     content = bytearray(part.read_bytes())

@@ -53,7 +53,7 @@ def test_a_whole_recording(tmp_path: Path) -> None:
     assert any("pliant 1.2" in line for line in lines)
 
 
-def test_gaps_and_what_the_end_says_are_counted(tmp_path: Path) -> None:
+def test_gaps_and_the_count_of_the_end_are_compared(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, [0, 1, 4, 5, 7, 8], end=11)
     topic = summarise(path).topics[topics.EXTREMA.key]
@@ -85,7 +85,7 @@ def test_an_interrupted_run_is_closed_and_not_complete(tmp_path: Path) -> None:
     assert state(summary) == "closed after an interruption, no gaps"
 
 
-def test_a_cut_recording_says_so(tmp_path: Path) -> None:
+def test_a_cut_recording_is_reported_as_cut(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, list(range(40)), end=40)
     path.write_bytes(path.read_bytes()[:-40])

@@ -5,52 +5,18 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from mapped_scene import Published, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
-from test_mapper import Published, trajectory_error
+from pictured_scene import _SIDE, dark, picture, textures
 
-from pliant.algorithms.arrays import F64, U8
-from pliant.algorithms.geometry import inverse, transform
+from pliant.algorithms.arrays import U8
+from pliant.algorithms.geometry import inverse
 from pliant.algorithms.map_delta import LOST, TRACKING
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.locate.localisation import Motion, search_radius_px
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import MappingParameters, RecoveryParameters
 from pliant.algorithms.tracks import FrameExtrema
-
-_SIDE = 13
-
-
-def textures(count: int) -> list[np.ndarray]:
-    """A square of its own for each point."""
-    noise = np.random.default_rng(7).uniform(0, 255, (count, _SIDE, _SIDE)).astype(np.float32)
-    return [cv2.GaussianBlur(one, (0, 0), 1.2) for one in noise]
-
-
-def picture(scene: Scene, squares: list[np.ndarray], T_world_camera: F64) -> U8:
-    """The image of the scene: the square of each point where it is seen, near ones in front."""
-    points = transform(inverse(T_world_camera), scene.points)
-    image = np.full((CAMERA.height, CAMERA.width), 120, np.float32)
-    order = np.argsort(-points[:, 2])
-    order = order[points[order, 2] >= 0.1]
-    corners = CAMERA.project(points[order]) - 0.5 * (_SIDE - 1)
-    floors = np.floor(corners)
-    fits = (floors >= 0).all(axis=1) & (floors + _SIDE < (CAMERA.width, CAMERA.height)).all(axis=1)
-    shift = np.eye(2, 3)
-    for i, (x, y), rest in zip(
-        order[fits].tolist(),
-        floors[fits].astype(int).tolist(),
-        (corners - floors)[fits],
-        strict=True,
-    ):
-        shift[:, 2] = rest
-        square = cv2.warpAffine(squares[i], shift, (_SIDE, _SIDE), borderMode=cv2.BORDER_REFLECT)
-        image[y : y + _SIDE, x : x + _SIDE] = square
-    return image.astype(np.uint8)
-
-
-def dark(_: FrameExtrema) -> tuple[FrameExtrema, U8]:
-    """Nothing to be seen."""
-    return FrameExtrema.empty(), np.zeros((CAMERA.height, CAMERA.width), np.uint8)
 
 
 def covered(tracks: FrameExtrema) -> tuple[FrameExtrema, U8]:
@@ -84,7 +50,7 @@ def seen():
 
 @pytest.mark.parametrize("spoil", [dark, covered])
 @pytest.mark.parametrize("count", [1, 3, 10])
-def test_the_map_goes_on_after_frames_that_show_nothing_of_it(seen, spoil, count):
+def test_the_map_continues_after_frames_that_show_nothing_of_it(seen, spoil, count):
     _, poses, images, frames = seen
     mapper, published = Mapper(CAMERA, MappingParameters(), 0), Published()
     blind = range(20, 20 + count)
@@ -119,7 +85,7 @@ def test_another_place_is_not_taken_for_the_map(seen):
 
 
 @pytest.mark.parametrize(("every", "state"), [(1, TRACKING), (6, LOST)])
-def test_the_map_does_not_go_on_by_fewer_points_than_it_starts_with(seen, every, state):
+def test_the_map_does_not_resume_with_fewer_points_than_it_starts_with(seen, every, state):
     """Of some 300 points in view all or a sixth are to be seen after the dark."""
     scene, poses, images, frames = seen
     flat, limits = np.full((_SIDE, _SIDE), 120, np.float32), MappingParameters()

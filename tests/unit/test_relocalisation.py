@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
-from test_mapper import Published, trajectory_error
-from test_recovery import dark, picture, textures
+from mapped_scene import trajectory_error
+from mapping_scene import CAMERA, Scene, looking, sideways
+from pictured_scene import dark, film, run, textures
 
-from pliant.algorithms.arrays import F64
 from pliant.algorithms.map_delta import LOST, TRACKING, MapMoves
 from pliant.algorithms.slam.adjust.global_adjustment import held
-from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import MappingParameters, WholeMapParameters
 from pliant.algorithms.slam.places.place_match import PlaceMatch, match_places
@@ -22,15 +20,6 @@ from pliant.state import load_state, save_state
 _DARK = 40
 """Frames in the dark: the map is given up before it is light again."""
 
-Film = list[tuple[FrameExtrema, np.ndarray]]
-
-
-def film(scene: Scene, poses: list[F64], squares: list[np.ndarray], cut: int = 0) -> Film:
-    """What a camera sees; tracks of another cut are others."""
-    images = [picture(scene, squares, T) for T in poses]
-    frames = [replace(f, ids=f.ids + 1_000_000 * cut) for f in scene.frames(poses)]
-    return list(zip(frames, images, strict=True))
-
 
 @pytest.fixture(scope="module")
 def known() -> tuple[Scene, list[np.ndarray]]:
@@ -39,15 +28,7 @@ def known() -> tuple[Scene, list[np.ndarray]]:
     return scene, textures(len(scene.points))
 
 
-def run(shots: Film, mapper: Mapper | None = None, first: int = 0) -> tuple[Published, Mapper]:
-    mapper, published = mapper or Mapper(CAMERA, MappingParameters(), 0), Published()
-    for k, (tracks, grey) in enumerate(shots, first):
-        published.apply(mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey)))
-        mapper.publish_keyframes()
-    return published, mapper
-
-
-def test_a_camera_that_was_carried_off_goes_on_in_its_map(known):
+def test_a_relocated_camera_continues_in_its_map(known):
     scene, squares = known
     there = sideways(36, step=0.04)
     # Back in a place between, from elsewhere, turned, and on another way.
@@ -55,8 +36,8 @@ def test_a_camera_that_was_carried_off_goes_on_in_its_map(known):
         T @ looking((0.05, 0.15 - 0.01 * k, 0.1), (0.02, -0.05, 0.12))
         for k, T in enumerate(there[6:26])
     ]
-    shots = film(scene, there, squares) + [dark(FrameExtrema.empty())] * _DARK
-    published, mapper = run(shots + film(scene, back, squares, cut=1))
+    shots = film(scene, squares, there) + [dark(FrameExtrema.empty())] * _DARK
+    published, mapper = run(shots + film(scene, squares, back, cut=1))
     published.apply(mapper.finish())
     assert {segment for _, _, segment in published.poses.values()} == {0}
     first = len(shots)
@@ -67,14 +48,14 @@ def test_a_camera_that_was_carried_off_goes_on_in_its_map(known):
     assert error < 3e-3
 
 
-def test_a_young_map_ends_where_the_older_one_is_seen_again(known):
+def test_a_young_map_ends_where_the_older_one_is_recognised(known):
     scene, squares = known
     elsewhere = Scene.box(500, seed=9, noise_px=0.1)
     there = sideways(36, step=0.04)
     night = [dark(FrameExtrema.empty())] * _DARK
-    shots = film(scene, there, squares) + night
-    shots += film(elsewhere, there[:20], squares[::-1], cut=1)
-    again = film(scene, there[5:25], squares, cut=2)
+    shots = film(scene, squares, there) + night
+    shots += film(elsewhere, squares[::-1], there[:20], cut=1)
+    again = film(scene, squares, there[5:25], cut=2)
     published, mapper = run(shots + again)
     published.apply(mapper.finish())
     segments = [segment for _, (_, _, segment) in sorted(published.poses.items())]
@@ -88,8 +69,8 @@ def test_a_young_map_ends_where_the_older_one_is_seen_again(known):
 def test_the_same_frames_give_the_same_bytes_from_a_checkpoint(known):
     scene, squares = known
     there = sideways(30, step=0.04)
-    shots = film(scene, there, squares) + [dark(FrameExtrema.empty())] * _DARK
-    shots += film(scene, there[5:15], squares, cut=1)
+    shots = film(scene, squares, there) + [dark(FrameExtrema.empty())] * _DARK
+    shots += film(scene, squares, there[5:15], cut=1)
     whole, _ = run(shots)
     cut = 30 + _DARK - 3
     first, mapper = run(shots[:cut])
@@ -125,13 +106,13 @@ def place_of(mapper: Mapper, number: int) -> Place:
 
 
 @pytest.mark.parametrize("alike", [True, False])
-def test_two_maps_of_one_place_tell_how_they_lie_to_each_other(known, alike):
+def test_two_maps_of_one_place_have_their_relative_pose(known, alike):
     """But not where what lies at the same places looks otherwise."""
     scene, squares = known
     parameters = MappingParameters(whole_map=WholeMapParameters(growth=0.0))
     mapper = Mapper(CAMERA, parameters, 0)
     there = sideways(36, step=0.04)
-    run(film(scene, there, squares), mapper)
+    run(film(scene, squares, there), mapper)
     old = place_of(mapper, 5)
     assert mapper.atlas.active is not None
     # The same map again, as a world of its own.
@@ -169,8 +150,8 @@ def test_two_places_are_not_one(known):
     parameters = MappingParameters()
     there = sideways(20, step=0.04)
     a, b = Mapper(CAMERA, parameters, 0), Mapper(CAMERA, parameters, 0)
-    run(film(scene, there, squares), a)
-    run(film(elsewhere, there, squares[::-1]), b)
+    run(film(scene, squares, there), a)
+    run(film(elsewhere, squares[::-1], there), b)
     why = match_places(
         place_of(a, 3), place_of(b, 3), a.atlas.points, CAMERA, parameters, np.random.default_rng(0)
     )

@@ -100,7 +100,7 @@ def test_the_nearer_solid_hides_the_farther_one_in_any_order():
 
 
 @pytest.mark.parametrize("name", sorted(SCENES))
-def test_tiles_list_every_solid_that_can_be_seen(name: str):
+def test_tiles_list_every_visible_solid(name: str):
     """The culled kernel against a plain search over all solids, at random pixels."""
     builtin = SCENES[name]()
     geometry = SceneGeometry(builtin.scene)

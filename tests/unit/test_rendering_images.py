@@ -135,7 +135,7 @@ def test_noise_has_its_deviation_and_its_seed(painted):
     assert (following != first).mean() > 0.5
 
 
-def test_exposure_swings_by_as_much_as_it_says():
+def test_exposure_swings_by_the_given_amount():
     gains = np.array([exposure_gain(t, 0.2) for t in np.arange(0.0, 10.0, 1.0 / 30.0)])
     assert 0.17 < gains.max() - gains.min() <= 0.2
     assert np.abs(np.diff(gains)).max() < 0.01

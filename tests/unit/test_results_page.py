@@ -62,7 +62,7 @@ def test_a_table_without_raw_results_stays_as_it_is(tmp_path: Path) -> None:
         rendered("<!-- bench unheard-of -->\n<!-- end -->", tmp_path)
 
 
-def test_measured_once_at_a_commit_and_a_failure_says_why(
+def test_measured_once_at_a_commit_and_a_failure_has_its_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page, raw = tmp_path / "page.md", tmp_path / "raw"

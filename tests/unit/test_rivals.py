@@ -114,7 +114,7 @@ def test_what_the_image_shows_again_a_step_aside_proves_no_pose(
     assert ask(monkeypatch, {0: (170, 2400)}, repeated=0.6) is None
 
 
-def test_fewer_points_and_corners_than_a_map_starts_with_prove_no_place_but_rival_another(
+def test_fewer_points_and_corners_than_a_start_needs_verify_no_place_but_rival_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert ask(monkeypatch, {0: (99, 99)}) is None
@@ -124,7 +124,7 @@ def test_fewer_points_and_corners_than_a_map_starts_with_prove_no_place_but_riva
 
 
 @pytest.mark.parametrize(("points", "place"), [(3000, 4), (2300, 4), (1000, 0)])
-def test_points_that_prove_another_pose_about_one_decide(
+def test_points_that_support_another_pose_decide(
     monkeypatch: pytest.MonkeyPatch, points: int, place: int
 ) -> None:
     """More of them place the camera; half as many leave it open."""
@@ -143,7 +143,7 @@ def test_points_that_prove_another_pose_about_one_decide(
     assert found.inliers == max(points, 2400)
 
 
-def test_places_elsewhere_are_asked_where_one_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rival_places_are_compared_where_one_is_verified(monkeypatch: pytest.MonkeyPatch) -> None:
     own, points, asked = KnownPlaces(), Landmarks(), list[int]()
     known = keyframes(points, 12)
 

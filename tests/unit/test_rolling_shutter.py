@@ -41,7 +41,7 @@ def keyframe(number, T_world_camera):
     )  # fmt: skip
 
 
-def test_the_motion_of_an_earlier_session_is_known_and_scales_with_the_map():
+def test_the_motion_of_an_earlier_session_scales_with_the_map():
     path = FramePoses({3: np.concatenate([OMEGA, NU])})
     known, unknown = keyframe(3, np.eye(4)), keyframe(4, np.eye(4))
     np.testing.assert_array_equal(path.motions([known])[0], [*OMEGA, *NU])
@@ -176,7 +176,7 @@ def test_an_image_is_as_if_taken_at_once():
         np.testing.assert_allclose(centre, seen - rolled.shifts(seen[None])[0], atol=0.1)
 
 
-def test_a_motion_goes_on_to_change_as_it_did():
+def test_a_motion_continues_to_change_as_before():
     frames, poses = (3, 4), (pose(-2.0), pose(-1.0))
     steady = Motion(frames=frames, stamps_ns=(0, 1), poses=poses)
     np.testing.assert_allclose(steady.velocity_at(5, pose(0.0)), MOTION, rtol=0.05, atol=1e-3)
@@ -261,14 +261,14 @@ def finished(mapper, history):
     return history.final()
 
 
-def test_frames_with_a_known_readout_are_as_good_as_if_taken_at_once(known, straight):
+def test_frames_with_a_given_readout_are_as_good_as_global_shutter(known, straight):
     shaken, _, history, _, _ = known
     _, _, best, _, _ = straight
     reached = shaken.error(history, history.online)
     assert reached < 2.0 * shaken.error(best, best.online)  # unknown it would be 13 times
 
 
-def test_published_is_what_was_seen(known):
+def test_published_pixels_are_the_measured_ones(known):
     _, mapper, _, tracks, keyframes = known
     newest = mapper.atlas.active.keyframes[-1]
     assert np.abs(newest.rolled_px).max() > 0.5

@@ -152,7 +152,7 @@ class Reader:
         return self._waiting.setdefault(topic, queue.Queue())
 
 
-def test_a_run_is_read_by_whoever_knows_the_keys(endpoint: str) -> None:
+def test_a_run_is_read_with_the_keys_alone(endpoint: str) -> None:
     at = Moment(2, 1_700_000_000_123_456_789)
     camera = PinholeCamera(width=8, height=6, fx=9.0, fy=10.0, cx=3.5, cy=2.5)
     points = PointBlocks()
@@ -266,7 +266,7 @@ def test_a_camera_of_ros_is_a_source(ros: tuple[str, Node]) -> None:
         np.testing.assert_array_equal(decode(frame), bags.picture(number))
 
 
-def test_it_ends_when_nobody_publishes_any_more(endpoint: str) -> None:
+def test_it_ends_without_publishers(endpoint: str) -> None:
     with open_session([endpoint]) as session:
         driver = Driver(endpoint, Node(session, "/driver"))
         source = iter(

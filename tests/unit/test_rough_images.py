@@ -42,7 +42,7 @@ def blurred(pixels):
 @pytest.mark.parametrize(
     ("spoilt", "change"), [(range(24, 25), np.zeros_like), (range(24, 28), blurred)]
 )
-def test_the_map_goes_on_after_a_dark_frame_and_after_blurred_ones(spoilt, change):
+def test_the_map_continues_after_a_dark_frame_and_after_blurred_ones(spoilt, change):
     run, error = follow_tiny(
         lambda number, pixels: change(pixels) if number in spoilt else pixels, spoilt
     )
@@ -55,7 +55,7 @@ def test_the_map_goes_on_after_a_dark_frame_and_after_blurred_ones(spoilt, chang
     assert error < 1e-3
 
 
-def test_half_of_the_image_that_moves_by_itself_is_told_and_does_not_carry_the_camera_along():
+def test_half_of_the_image_that_moves_is_reported_and_does_not_move_the_camera():
     plain, _ = follow_tiny(lambda _, pixels: pixels)
     assert not doubtful_frames(plain.history)
     moves, first = partial(thing, 0.5), 20

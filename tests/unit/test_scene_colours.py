@@ -29,7 +29,7 @@ def test_a_colour_is_more_or_less_red_and_blue_than_grey() -> None:
     assert ends[0].tolist() == [[0, 0, 0], [255, 255, 255]]
 
 
-def test_a_tint_says_nothing_of_brightness() -> None:
+def test_a_tint_does_not_change_brightness() -> None:
     assert shares((1.0, 1.0, 1.0)) == pytest.approx((0.0, 0.0))
     assert shares((0.3, 0.2, 0.1)) == pytest.approx(shares((1.2, 0.8, 0.4)))
     for make in SCENES.values():
@@ -43,7 +43,7 @@ def test_a_tint_says_nothing_of_brightness() -> None:
     [("room", True), ("tabletop", True), ("tiny", False), ("room?colour=0", False),
      ("tiny?colour=1", True)],
 )  # fmt: skip
-def test_scenes_are_in_colour_as_they_say_or_the_user_does(source: str, colour: bool) -> None:
+def test_scenes_are_in_colour_by_default_or_option(source: str, colour: bool) -> None:
     name, options = parse_builtin(source)
     assert isinstance(options, SequenceOptions)
     assert rigid_plan(name, options).camera.colour == colour

@@ -109,7 +109,7 @@ def test_what_is_drawn_is_what_the_service_holds() -> None:
 
 
 @pytest.mark.parametrize("missed", [slice(0, 30), slice(12, 40), slice(0, 40), slice(34, 35)])
-def test_whoever_came_late_or_missed_some_has_all_after_a_turn(missed: slice) -> None:
+def test_late_readers_have_all_after_a_turn(missed: slice) -> None:
     told, held = grown()
     canvas = Drawn()
     scene = scene_on(canvas)
@@ -137,7 +137,7 @@ def test_a_turn_of_the_service_brings_all_and_takes_away_what_is_gone() -> None:
     assert canvas.corners() == sorted(rows(service.held.mesh()))
 
 
-def test_an_old_recording_says_nothing_of_what_is_gone() -> None:
+def test_an_old_recording_has_no_note_on_removed_settings() -> None:
     canvas = Drawn()
     scene = scene_on(canvas)
     scene.take_blocks(AT, update(one_block(1, 2, 0)))
@@ -188,7 +188,7 @@ def test_the_mesh_of_a_world_that_is_over_goes() -> None:
     assert len(canvas.corners()) == 3
 
 
-def test_the_mesh_of_a_world_that_goes_on_comes_back() -> None:
+def test_the_mesh_of_a_resumed_world_comes_back() -> None:
     canvas = Drawn()
     scene = scene_on(canvas)
     for segment in (0, 1):

@@ -1,14 +1,13 @@
 """Two segments that see the same place become one, for the map and for all who read of it."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
-from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking
-from test_mapper import Published, trajectory_error
-from test_recovery import dark, picture, textures
+from mapped_scene import Published, trajectory_error
+from mapping_scene import CAMERA, INTERVAL_NS
+from pictured_scene import MERGING, WALL_POINTS, along, dark, film, textures, wall
 
 from pliant.algorithms.geometry import align_umeyama, matrix_to_pose
 from pliant.algorithms.map_delta import MapMoves
@@ -16,11 +15,6 @@ from pliant.algorithms.slam.adjust.global_adjustment import held
 from pliant.algorithms.slam.adjust.segment import Moved
 from pliant.algorithms.slam.frame import Frame
 from pliant.algorithms.slam.mapper import Mapper
-from pliant.algorithms.slam.parameters import (
-    MappingParameters,
-    WholeMapParameters,
-    WindowParameters,
-)
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.map_history import MapHistory
 from pliant.messages import topics
@@ -29,34 +23,13 @@ from pliant.state import load_state, save_state
 from pliant.viewers.canvas import Canvas
 from pliant.viewers.drawn_scene import Scene as Viewed
 
-_DARK, _COUNT = 40, 1150
-PARAMETERS = MappingParameters(
-    window=WindowParameters(keyframes=5),
-    whole_map=WholeMapParameters(growth=0.0, distance_frames=3),
-)
-
-
-def wall(seed=0):
-    generator = np.random.default_rng(seed)
-    points = generator.uniform((-4.0, -3.0, 3.0), (16.5, 3.0, 7.0), (_COUNT, 3))
-    return Scene(points, generator.uniform(5.0, 500.0, len(points)).astype(np.float32))
-
-
-def along(first, last, step=0.15):
-    """Positions along the wall."""
-    count = round(abs(last - first) / step)
-    return [looking((x, 0.02 * np.sin(2.0 * x), 0.0)) for x in np.linspace(first, last, count + 1)]
-
-
-def film(scene, squares, poses, cut):
-    tracks = [replace(f, ids=f.ids + 1_000_000 * cut) for f in scene.frames(poses)]
-    return [(f, picture(scene, squares, T)) for f, T in zip(tracks, poses, strict=True)]
+_DARK = 40
 
 
 def run(shots, restored=()):
     """Frame by frame; what is published is checked against the map.  restored: frames before which
     the mapper is a restarted one."""
-    mapper, published, history = Mapper(CAMERA, PARAMETERS, 0), Published(), MapHistory()
+    mapper, published, history = Mapper(CAMERA, MERGING, 0), Published(), MapHistory()
     joined, deltas = {}, []
     for k, (tracks, grey) in enumerate(shots):
         if k in restored:
@@ -132,16 +105,16 @@ def test_segments_that_meet_become_one(two):
     assert set(points.segments.tolist()) == {0}
 
 
-def test_what_both_have_seen_is_mapped_once(two):
+def test_common_points_of_two_segments_are_mapped_once(two):
     shots, _, made = two
     active = made.mapper.atlas.active
     before = [k for k in active.keyframes if k.frame < len(shots) // 2 - _DARK // 2]
     shared = [len(np.intersect1d(k.rows, active.keyframes[-1].rows)) for k in before]
     assert max(shared) >= 30
-    assert len(made.history.points()) < 1.25 * _COUNT
+    assert len(made.history.points()) < 1.25 * WALL_POINTS
 
 
-def test_online_poses_stay_as_they_were_known(two):
+def test_online_poses_stay_as_estimated(two):
     shots, _, made = two
     (at,) = made.joined
     dark_at = next(k for k, (tracks, _) in enumerate(shots) if not len(tracks.ids))
@@ -220,7 +193,7 @@ def stray(mapper, segment):
 
 def followed(shots, strays):
     """As ``run``, without the end.   strays: frames after which the segment strays."""
-    mapper, history = Mapper(CAMERA, PARAMETERS, 0), MapHistory()
+    mapper, history = Mapper(CAMERA, MERGING, 0), MapHistory()
     for k, (tracks, grey) in enumerate(shots):
         delta = mapper.process(Frame(k, k * INTERVAL_NS, tracks, grey))
         mapper.publish_keyframes()
@@ -262,7 +235,7 @@ def test_what_lies_on_both_sides_of_another_segment_goes_back_as_one(scene, rest
     assert error < 0.01
 
 
-def test_segments_that_have_strayed_and_meet_go_back_to_where_the_older_one_was(scene):
+def test_segments_that_drifted_and_meet_return_to_the_older_one(scene):
     there, back = along(0, 3), along(11, 1)
     night = len(there) + _DARK
     shots = film(*scene, there, 0) + [dark(FrameExtrema.empty())] * _DARK + film(*scene, back, 1)

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mapped_scene import Published, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, looking, sideways
-from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING, WAITING
 from pliant.algorithms.slam import calibration_bootstrap
@@ -54,7 +54,7 @@ def test_a_wrong_focal_length_is_found_and_the_path_is_that_of_a_calibrated_came
     assert trajectory_error(published, poses)[0] < 1e-3
 
 
-def test_frames_on_trial_wait_and_then_all_get_their_poses_at_once(turning, monkeypatch):
+def test_frames_of_a_bootstrap_wait_and_then_all_get_their_poses(turning, monkeypatch):
     monkeypatch.setattr(calibration_bootstrap, "_KNOWN", 0.1)
     poses, frames = turning
     published, _ = run(frames, 0.65)
@@ -65,9 +65,7 @@ def test_frames_on_trial_wait_and_then_all_get_their_poses_at_once(turning, monk
     assert sorted(published.poses) == list(range(len(poses)))
 
 
-def test_a_trial_begins_though_two_motions_are_alike_which_wrong_focal_lengths_make_them(
-    turning, monkeypatch
-):
+def test_a_bootstrap_begins_though_wrong_focal_lengths_make_two_motions_alike(turning, monkeypatch):
     monkeypatch.setattr(start, "_agree", lambda one, other: one is other)
     frames = turning[1][:20]
     published, calibrated = run(frames, 0.65)[0], Published()
@@ -78,7 +76,7 @@ def test_a_trial_begins_though_two_motions_are_alike_which_wrong_focal_lengths_m
     assert "focal length is known to" in published.reasons[-2]  # before the end
 
 
-def test_keyframes_tell_the_pixels_of_the_image_not_of_the_camera_that_was_found(turning):
+def test_keyframes_publish_pixels_of_the_image_not_of_the_estimated_camera(turning):
     _, frames = turning
     mapper = mapper_for(guessed(0.65), PARAMETERS, 0, GUESS_SIGMA)
     for frame, tracks in enumerate(frames):
@@ -95,7 +93,7 @@ def test_keyframes_tell_the_pixels_of_the_image_not_of_the_camera_that_was_found
         assert np.median(nearest) < 0.01
 
 
-def test_straight_ahead_leaves_the_focal_length_open_and_says_so():
+def test_straight_ahead_leaves_the_focal_length_open_with_a_reason():
     poses = [looking((0.0, 0.0, 0.05 * k)) for k in range(40)]
     _, final = run(Scene.box(death=0.02).frames(poses), 1.2)
     assert final.calibration_sigmas[0] > 0.05

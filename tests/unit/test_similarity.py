@@ -94,7 +94,7 @@ def test_uncertain_depths_cost_less_than_in_closed_form():
     np.testing.assert_allclose(again, found[0], atol=2e-3)
 
 
-def test_where_both_cameras_stand_at_one_place_depths_tell_the_scale():
+def test_with_cameras_at_one_place_depths_determine_the_scale():
     """Images are the same at any scale then."""
     generator = np.random.default_rng(3)
     S = np.diag([1.3, 1.3, 1.3, 1.0])
@@ -110,7 +110,7 @@ def test_where_both_cameras_stand_at_one_place_depths_tell_the_scale():
 
 
 @pytest.mark.parametrize("count", [0, 3, 60])
-def test_pairs_that_say_nothing_give_nothing_much(count):
+def test_pairs_without_information_hardly_change_the_result(count):
     generator = np.random.default_rng(5)
     xyz = generator.uniform((-1.0, -1.0, 1.0), (1.0, 1.0, 4.0), (2, count, 3))
     seen = generator.uniform(-0.5, 0.5, (2, count, 2))

@@ -18,7 +18,7 @@ def test_why(): pytest.skip("because")
 
 
 @pytest.mark.parametrize("ci", [True, False])
-def test_a_skip_that_nobody_has_allowed_fails_in_ci(ci: bool, tmp_path: Path) -> None:
+def test_a_skip_that_is_not_allowed_fails_in_ci(ci: bool, tmp_path: Path) -> None:
     (tmp_path / "test_skips.py").write_text(SKIPS)
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-p", "conftest", "-p", "no:cacheprovider", "."],
@@ -32,5 +32,5 @@ def test_a_skip_that_nobody_has_allowed_fails_in_ci(ci: bool, tmp_path: Path) ->
     assert (done.returncode, lines) == ((1, refused) if ci else (0, [])), done.stdout
 
 
-def test_ci_says_that_it_is_ci() -> None:
+def test_ci_sets_its_variable() -> None:
     assert 'CI="${CI:-1}" bash scripts/test' in (TESTS.parent / ".ci" / "run").read_text()

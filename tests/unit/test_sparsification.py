@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drifted_scene import drifted, drifted_once, recognised, there_and_back, world
+from mapped_scene import Published, similarity, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
-from test_global_adjustment import similarity
-from test_loops import drifted, drifted_once, recognised, there_and_back, world
-from test_mapper import Published, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING, MapMoves
 from pliant.algorithms.slam.adjust.segment import DroppedKeyframes, Segment

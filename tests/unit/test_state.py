@@ -68,7 +68,7 @@ def test_what_is_shared_stays_shared() -> None:
     assert second["same"] is first
 
 
-def test_a_generator_goes_on_where_it_was() -> None:
+def test_a_generator_resumes_where_it_was() -> None:
     generator = np.random.default_rng(7)
     generator.random(5)
     again = load_state(save_state(generator))
@@ -156,7 +156,7 @@ def test_a_state_of_another_version_is_refused() -> None:
         load_state(msgpack.packb([STATE_VERSION + 1, None, []]))
 
 
-def test_tracker_and_mapper_go_on_as_if_nothing_had_been() -> None:
+def test_tracker_and_mapper_resume_from_a_saved_state() -> None:
     dataset = open_source("built-in:tiny")
     rectifier = Rectifier(dataset.calibration)
     camera = rectifier.camera

@@ -62,7 +62,7 @@ def test_alone_a_depth_is_contradicted_by_those_who_see_through_it() -> None:
     assert np.mean(near[interior()]) < 0.02
 
 
-def test_nothing_is_known_where_nobody_is_confident() -> None:
+def test_depth_is_unknown_without_confident_views() -> None:
     found = agreed({step: exact(step, 0.0) for step in AROUND}, exact(3, 0.0))
     assert not found.inverse_depths.any()
     assert not found.confidences.any()

@@ -159,7 +159,7 @@ def test_inverse_depths_are_even_and_not_too_many() -> None:
     assert len(inverse_depths_between(0.3, 0.3, 0.1, 64)) == 3
 
 
-def test_parallax_is_the_derivative_of_where_a_point_is_seen() -> None:
+def test_parallax_is_the_derivative_of_the_projection() -> None:
     others = np.stack([pose(step) for step in (1, 6)])
     moved = motion(CAMERA, pose(3), others)
     generator = np.random.default_rng(0)

@@ -59,7 +59,7 @@ def test_what_a_mask_covers_has_no_depth_and_is_nobodys_match() -> None:
 
 
 @pytest.mark.parametrize("sources", [[], [3], [1]])
-def test_without_parallax_or_points_nothing_is_known(sources: list[int]) -> None:
+def test_without_parallax_or_points_there_is_no_estimate(sources: list[int]) -> None:
     few = anchors(3, count=3) if sources == [1] else anchors(3)
     depth = swept_depth(view(3), [view(step) for step in sources], few)
     assert not depth.inverse_depths.any()

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mapped_scene import run, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, Scene, sideways
-from test_mapper import run, trajectory_error
 
 from pliant.algorithms.map_delta import TRACKING
 from pliant.algorithms.slam.frame import Frame
@@ -60,7 +60,7 @@ def test_few_that_fit_and_all_in_one_place_are_doubtful():
     assert doubt_of(places(0), np.zeros(0, np.bool_), places(0)).startswith("doubtful")
 
 
-def test_a_large_moving_thing_is_told_of():
+def test_a_large_moving_object_is_reported_as_doubtful():
     """The right half of what is seen moves by itself: its tracks fit no point, the pose stands."""
     poses, scene = sideways(50), Scene.box(1500, noise_px=0.1)
     reasons = {}

@@ -62,7 +62,7 @@ def test_icp_finds_how_a_surface_was_moved() -> None:
     assert scaled.scale == pytest.approx(MOVE.scale, abs=5e-3)
 
 
-def test_columns_tell_registration_from_shape_and_the_floor_from_both() -> None:
+def test_columns_separate_registration_shape_and_floor() -> None:
     true = box(0.02)
     samples = (box(0.03, 1) - MOVE.t) @ MOVE.R / MOVE.scale
     columns = surface_columns(samples, box(0.02, 2), true, DIAMETER)

@@ -71,7 +71,7 @@ def test_a_map_is_refused_that_most_surfels_do_not_agree_with() -> None:
     assert "agree with it" in found.problem
 
 
-def test_too_few_surfels_cannot_tell() -> None:
+def test_too_few_surfels_are_not_judged() -> None:
     depth = np.zeros_like(surface())
     depth[:30, :30] = 1.0
     found = agree(depth, surfels(surface()), PATCH_PX)

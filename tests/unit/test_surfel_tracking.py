@@ -115,7 +115,7 @@ def test_batch_is_one_by_one(
     assert together.tobytes() == alone.tobytes()
 
 
-def test_a_second_look_finds_what_was_carried_past_its_image(
+def test_a_second_search_finds_surfels_moved_past_their_image(
     board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
 ) -> None:
     frames, camera, _ = board
@@ -138,7 +138,7 @@ def test_a_second_look_finds_what_was_carried_past_its_image(
     np.testing.assert_allclose(held[0], (25.0 / (0.02 * lengths[mine]) ** 2).sum())
 
 
-def test_what_was_tried_is_told(
+def test_tried_positions_are_published(
     board: tuple[list[RenderedFrame], PinholeCamera, list[F64]],
 ) -> None:
     frames, camera, _ = board

@@ -47,7 +47,7 @@ def in_view(first: SurfelFrame, T: F64, camera: PinholeCamera) -> np.ndarray:
 
 @pytest.mark.parametrize("mode", ["static", "moving"])
 @pytest.mark.parametrize("covered", [True, False])
-def test_what_was_carried_off_is_found_back(board: Film, mode: str, covered: bool) -> None:
+def test_a_displaced_surface_is_found_again(board: Film, mode: str, covered: bool) -> None:
     """After the dark, or from one frame to the next: too far for the image to draw it there."""
     frames, camera = board
     tracker, first = started(board, mode)
@@ -68,7 +68,7 @@ def test_what_was_carried_off_is_found_back(board: Film, mode: str, covered: boo
 
 
 @pytest.mark.parametrize("mode", ["static", "moving"])
-def test_nothing_is_found_where_nothing_was_seen(board: Film, mode: str) -> None:
+def test_surfels_are_not_found_in_another_place(board: Film, mode: str) -> None:
     frames, _ = board
     tracker, first = started(board, mode)
     for _ in range(3):

@@ -39,7 +39,7 @@ def shown(points: F32, triangles: I32) -> Any:
     return texels, colours.texture(np.full((len(texels.triangles), 3), GREY, np.uint8))
 
 
-def test_a_texel_has_the_colour_of_the_pixel_where_it_is_seen() -> None:
+def test_a_texel_has_the_colour_of_its_pixel() -> None:
     texels, texture = shown(CORNERS, TRIANGLES)
     assert texels.inside.all()
     places = texels.interpolate(CORNERS[TRIANGLES]).reshape(SIZE, SIZE, 3)

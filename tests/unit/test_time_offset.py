@@ -129,7 +129,7 @@ def test_eval_proposes_an_offset_and_takes_it(tmp_path: Path) -> None:
     assert isinstance(refused.exception, ResultError)
 
 
-def test_where_no_time_is_in_both_the_error_says_which_offset_fits(tmp_path: Path) -> None:
+def test_without_common_times_the_error_proposes_an_offset(tmp_path: Path) -> None:
     write_tum(tmp_path / "poses.txt", filmed(240, 2.0, start_s=2.0))
     truth = truth_at(200.0)
     late = Trajectory(

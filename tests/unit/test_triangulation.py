@@ -26,7 +26,7 @@ def test_exact_rays_meet_in_the_point():
     np.testing.assert_allclose(xyz, points, rtol=1e-3)
 
 
-def test_only_the_columns_asked_for_are_answered_and_blind_cameras_ignored():
+def test_only_requested_columns_are_solved_and_blind_cameras_ignored():
     points, poses, u, v, seen = table()
     u[~seen], v[~seen] = np.nan, np.nan
     columns = np.array([5, 17, 200])

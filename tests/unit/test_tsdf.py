@@ -209,7 +209,7 @@ def test_a_plane_is_exact() -> None:
     np.testing.assert_allclose(mesh.normals @ normal, 1.0, atol=1e-4)
 
 
-def test_there_is_no_surface_where_nothing_was_seen_or_two_surfaces_meet() -> None:
+def test_there_is_no_surface_without_observations_or_where_two_meet() -> None:
     points = grid(16)
     field: F64 = (points[..., 2] - 7.4) / 4.0
     weights = (points[..., 0] < 8).astype(np.int32)

@@ -43,7 +43,7 @@ def unexplained_px(a: F64, b: F64) -> float:
 @pytest.mark.parametrize("focal", [400.0, 480.0, 900.0])
 @pytest.mark.parametrize("k1", [0.0, -0.2])
 @pytest.mark.parametrize("axis", [(0.0, 0.3, 0.0), (0.25, 0.0, 0.0), (0.1, 0.1, 0.4)])
-def test_a_turn_is_explained_whatever_the_lens_is(
+def test_a_rotation_is_explained_for_every_lens(
     focal: float, k1: float, axis: tuple[float, float, float]
 ) -> None:
     a, b = pair(focal, k1, so3_exp(np.array(axis)), np.zeros(3))
@@ -57,7 +57,7 @@ def test_no_lens_explains_motion(t: tuple[float, float, float], k1: float) -> No
     assert unexplained_px(a, b) > 2.0
 
 
-def test_pairs_of_views_are_told_together() -> None:
+def test_pairs_of_views_are_published_together() -> None:
     a, b = pair(480.0, -0.1, so3_exp(np.array([0.0, 0.2, 0.0])), np.zeros(3))
     alone = turn_of_lens(a, b, scale=2e-3, focal_sigma=0.4, lens_sigma=0.1)
     both = turn_of_lens(

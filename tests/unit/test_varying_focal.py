@@ -4,8 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from bundle_scene import make_scene, numeric_jacobian, project
-from test_bundle_calibration import EXACT, FREE, calibration_jacobian, with_flow
+from bundle_scene import (
+    EXACT,
+    FREE,
+    calibration_jacobian,
+    make_scene,
+    numeric_jacobian,
+    project,
+    with_flow,
+)
 
 from pliant.algorithms.slam.estimate.calibration import SharedCalibration
 from pliant.algorithms.slam.estimate.packed_layout import build_packed_layout

@@ -97,7 +97,7 @@ def test_a_viewer_shows_a_loop_as_it_closes_and_moves_it_with_the_map() -> None:
     np.testing.assert_array_equal(viewed.drawn.lines[0][:, :, 1], [(0, 0), (0, 5)])
 
 
-def test_a_viewer_says_where_a_lost_camera_is_recognised() -> None:
+def test_a_viewer_shows_where_a_lost_camera_is_recognised() -> None:
     viewed, changes = Viewed(), Journal(Landmarks())
     viewed.take(update(changes, 0, [keyframe(k, 0, float(k)) for k in range(3)]), 20)
     changes.add_same_places([(1, 5)])

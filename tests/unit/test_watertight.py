@@ -106,7 +106,7 @@ def test_vertices_that_two_edges_join_get_one_between_them() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_whatever_touches_is_taken_apart(seed: int) -> None:
+def test_touching_parts_are_separated(seed: int) -> None:
     filled = np.argwhere(np.random.default_rng(seed).random((4, 4, 4)) < 0.5)
     places, both = solid_of([tuple(cell) for cell in filled.tolist()])
     positions, triangles = taken_apart(places, both)
@@ -166,7 +166,7 @@ def test_the_same_mesh_gives_the_same_bytes() -> None:
 
 
 @pytest.mark.usefixtures("open3d")
-def test_a_sphere_that_was_seen_from_within_closes_by_itself() -> None:
+def test_a_sphere_observed_from_within_closes_by_itself() -> None:
     """A room of which nothing is missing: no box about it."""
     v, u = np.meshgrid(np.linspace(0, np.pi, 40)[1:-1], np.linspace(0, 2 * np.pi, 80)[:-1])
     ways = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], -1).reshape(-1, 3)

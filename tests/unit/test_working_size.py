@@ -83,9 +83,7 @@ class Enlarged(Pictures):
 
 @pytest.mark.parametrize("noise", [0.0, 1.0, 3.0])
 @pytest.mark.parametrize("gain", [1.0, 0.4])
-def test_an_image_is_as_sharp_as_its_details_whatever_contrast_and_noise(
-    noise: float, gain: float
-) -> None:
+def test_sharpness_depends_on_details_not_on_contrast_and_noise(noise: float, gain: float) -> None:
     sharp = picture(960, 540, noise)
     soft = enlarged(picture(480, 270, noise), 960)
     for image, expected in ((sharp, 960), (soft, 679)):
@@ -135,7 +133,7 @@ def test_smaller_images_are_what_their_camera_sees() -> None:
     np.testing.assert_allclose(planes[0], planes[1], atol=2e-4)
 
 
-def test_the_source_says_the_size_again_and_broken_frames_stay_broken() -> None:
+def test_a_resized_source_states_its_size_and_broken_frames_stay_broken() -> None:
     images = [enlarged(picture(480, 160, seed=i), 1920) for i in range(8)]
     sources = [at_working_size(Pictures(images, broken=(0, 6))) for _ in range(2)]
     assert [source.calibration.width for source in sources] == [640, 640]

@@ -55,7 +55,7 @@ def test_a_sender_is_never_more_than_a_window_ahead_of_its_slowest_reader(endpoi
     assert frames == [list(range(20))]
 
 
-def test_a_reader_of_images_tells_at_once_when_it_has_taken_all(endpoint: str) -> None:
+def test_a_reader_of_images_reports_at_once_when_it_has_taken_all(endpoint: str) -> None:
     """Long before a quarter of the window: in live mode its sender waits for that."""
     with writer(endpoint) as sender, reader(endpoint) as bus:
         bus._tell_every = 100
@@ -70,7 +70,7 @@ def test_a_reader_of_images_tells_at_once_when_it_has_taken_all(endpoint: str) -
         assert list(taken) == []
 
 
-def test_who_was_waited_for_is_known_and_for_how_long(endpoint: str) -> None:
+def test_waits_are_recorded_with_peer_and_length(endpoint: str) -> None:
     """Not those that are there and have credit."""
     with writer(endpoint, "tracking", "recorder") as sender:
         slow, fast = reader(endpoint), reader(endpoint, "recorder")
@@ -135,7 +135,7 @@ def test_a_window_is_bounded_in_bytes_and_opens_when_its_reader_acknowledges(
     assert taken == list(range(10))
 
 
-def test_what_is_kept_for_checkpoints_is_bounded_and_nobody_waits_for_ever(
+def test_messages_kept_for_checkpoints_are_bounded_and_no_service_waits_for_ever(
     endpoint: str, tmp_path
 ) -> None:
     """A sender waits for a checkpoint of its reader, which has what it needs to make one."""
@@ -249,9 +249,7 @@ def test_what_the_thread_of_a_bus_fails_of_its_service_raises(endpoint: str) -> 
     assert [str(error) for error in result] == ["no such clock"]
 
 
-def test_health_is_told_where_the_system_does_not_say_what_memory_is_used(
-    monkeypatch, tmp_path
-) -> None:
+def test_health_is_reported_where_the_system_has_no_memory_figures(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(health, "_STATM", tmp_path / "statm")
     told = health.health_of("tracking", 1, "", {}, {})
     assert 1.0 < told.memory_mib < 1e6

@@ -53,7 +53,7 @@ def recording_bytes(
         str, typer.Argument(help="A video, a recording, or what becomes a video.")
     ] = "built-in:room?colour=0",
     frames: Annotated[int | None, typer.Option(min=2, help="First frames of the video.")] = None,
-    width: Annotated[int | None, typer.Option(min=64, help="Enlarge them to so many px.")] = None,
+    width: Annotated[int | None, typer.Option(min=64, help="Enlarge them to this many px.")] = None,
     overrides: Overrides = None,
 ) -> None:
     """What the recording of a video takes, by topic and field, and how many times the video.
