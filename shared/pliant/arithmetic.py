@@ -26,7 +26,7 @@ _X86_64_V3 = {
     "OPENCV_IPP": "avx2",
 }
 VARIABLES = (*_ONE_THREAD, *_X86_64_V3, "OPENCV_CPU_DISABLE")
-"""What is set in the environment, and what processes that are started from here find in it."""
+"""The variables of the environment that are set for this process and those that it starts."""
 
 _FLAGS_OF_V3 = {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "abm"}
 _FLAGS_OF_V4 = {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
@@ -52,7 +52,7 @@ def fix() -> None:
 
 
 def target() -> str:
-    """What results are computed for: TARGET, or else this kind of machine and processor."""
+    """The target of the arithmetic: TARGET, or else this kind of machine and processor."""
     if _processor_flags() >= _FLAGS_OF_V3:
         return TARGET
     import llvmlite.binding as llvm
@@ -61,7 +61,7 @@ def target() -> str:
 
 
 def in_force() -> dict[str, str]:
-    """What the libraries of this process really compute with: loads and asks them."""
+    """The instruction sets that the libraries of this process use: loads and queries them."""
     import cv2
     import numpy
     import threadpoolctl
@@ -94,7 +94,7 @@ def strays() -> list[str]:
 
 
 def _processor_flags() -> set[str]:
-    """What an x86-64 processor can do, in Linux' words; nothing is known of others."""
+    """The features of an x86-64 processor, in Linux' words; none for others."""
     if platform.machine() == "x86_64":
         with suppress(OSError), open("/proc/cpuinfo", encoding="ascii", errors="replace") as file:
             for line in file:

@@ -169,7 +169,7 @@ class _Told:
         ):
             if frame >= 0:
                 self._made[number] = frame
-                # Of two keyframes of one frame the first stands for it.
+                # Of two keyframes of one frame the first counts.
                 made = int(self._numbers[frame])
                 frames[row] = -1 if made in self._keyframes else made
             elif number in history.keyframes:

@@ -241,7 +241,7 @@ def _apply(content: dict[str, Any], override: str) -> None:
 
 
 def _over(defaults: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
-    """What is said, over the defaults of the group: these may be others than those of its class."""
+    """The given values over the defaults of the group, which may differ from those of its class."""
     merged = dict(defaults)
     for key, value in content.items():
         group = defaults.get(key)
@@ -266,7 +266,7 @@ def _explain(error: ValidationError, file: Path | None) -> str:
 def recorded_config(metadata: Mapping[str, Mapping[str, str]], overrides: Sequence[str]) -> Config:
     """The configuration in a recording's metadata with ``overrides`` on top.
 
-    Parameters that this release has no longer are passed over: all of a run can be said again.
+    Parameters that this release no longer has are skipped, so that every older run can be read.
     """
     text = metadata.get("config", {}).get("yaml", "")
     try:

@@ -1,6 +1,6 @@
 """Files and folders that survive a power cut, and are not written through links.
 
-A file's fsync puts its content on the disk, but not its name: that stands in its folder.  A file is
+A file's fsync puts its content on the disk, but not its name, which is in its folder.  A file is
 written under a new name and takes its own when it is whole: what was there before stays until then,
 and where a link was there, what the link points to stays as it is.
 """

@@ -20,7 +20,7 @@ from pliant.map_history import CurrentMap
 
 @dataclass(frozen=True)
 class MapView:
-    """What a keyframe of our own map shows, in units and world of the map as it is then.
+    """The depth of a keyframe of our own map, in units and world of the map as it is then.
 
     depth: (H, W) along the optical axis, 0 where nothing is known.    segment: of the map.
     """
@@ -76,7 +76,7 @@ class MapDepth:
         return MapView(found.depths.astype(np.float64), T_world_camera, update.segment)
 
     def _certain(self, keyframes: KeyframeDelta, max_sigma: float) -> SeenPoints:
-        """What the new keyframe observes, without points whose depth is uncertain."""
+        """The points of the new keyframe, without those whose depth is uncertain."""
         bounds = np.concatenate([[0], np.cumsum(keyframes.counts)])
         row = int(np.flatnonzero(keyframes.keyframe_ids == keyframes.new)[0])
         published = slice(int(bounds[row]), int(bounds[row + 1]))

@@ -206,7 +206,7 @@ class CurrentMap:
 
 
 class MapHistory(CurrentMap):
-    """Applies updates in order of frame; asks nothing of the mapper but its messages."""
+    """Applies updates in order of frame; needs only the messages of the mapper."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -269,7 +269,7 @@ class MapHistory(CurrentMap):
         ]
 
     def same_places_in(self, segment: int) -> F64:
-        """(L, 2, 3) where the keyframes of a segment stand that show one place, two by two."""
+        """(L, 2, 3) positions of pairs of keyframes of a segment that show one place."""
         at = {n: k.pose_world_camera[:3] for n, k in self.keyframes.items() if k.segment == segment}
         lines = [(at[a], at[b]) for a, b in self.same_places if {a, b} <= at.keys()]
         return np.array(lines, np.float64).reshape(-1, 2, 3)

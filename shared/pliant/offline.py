@@ -26,7 +26,7 @@ from pliant.messages.types import Image
 
 @dataclass(frozen=True)
 class MappedFrame:
-    """What one frame led to."""
+    """The results of one frame."""
 
     image: Image
     tracks: FrameExtrema
@@ -86,7 +86,7 @@ class Pipeline:
         return MappedFrame(image, tracks, delta)
 
     def finish(self, timer: StageTimer = no_stages) -> MapDelta:
-        """What is still to be corrected at the end of the stream."""
+        """The corrections at the end of the stream."""
         delta = self._mapper.finish(timer)
         self.history.apply(delta, frame=self._last, stamp_ns=0, final=True)
         return delta

@@ -2,9 +2,9 @@
 
 A tree of our own objects, containers, numpy arrays and random generators.  A file from elsewhere
 can run no code of its own: of the rooms that touch neither files nor sockets, records are made
-again and the classes listed here, without a call of theirs, and none gets an attribute in the place
-of a method.  What is shared stays shared; arrays keep their layout, which decides how a kernel is
-compiled.
+again and the classes listed here, without a call of their code, and none gets an attribute in the
+place of a method.  What is shared stays shared; arrays keep their layout, which decides how a
+kernel is compiled.
 
 A state is valid only for the release that made it, because it does not describe its objects.
 """

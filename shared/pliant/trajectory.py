@@ -76,7 +76,7 @@ def associate(
 ) -> tuple[I64, I64]:
     """Match two increasing lists of stamps, one to one.
 
-    A pair stands where each stamp is the other's nearest and they differ by at most
+    A pair counts where each stamp is the other's nearest and they differ by at most
     ``max_difference_ns``.  Returns the rows in a and the rows in b, both (M,) and increasing.
     """
     if not len(stamps_a) or not len(stamps_b):

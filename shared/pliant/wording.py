@@ -1,4 +1,4 @@
-"""How numbers of things are said, and how input is quoted: never without a limit."""
+"""Wording of counts, and quotation of input: never without a limit."""
 
 from reprlib import Repr
 

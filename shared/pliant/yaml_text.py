@@ -1,7 +1,7 @@
 """YAML from anywhere, read with a limit on what it expands to.
 
 Aliases make a few hundred bytes stand for 9^9 values: harmless as they are read, as the values are
-shared, but not once somebody prints or walks through them.
+shared, but not once they are printed or walked through.
 """
 
 from typing import Any

@@ -169,3 +169,10 @@ def test_idioms_are_found_as_whole_words() -> None:
     assert faults("compared with others,\nbeside\nCOLMAP")
     assert not faults("ground truth causally; they cannot be told apart")
     assert not faults(prose("`causal.txt` and [this](places.md#what-is-seen)"))
+
+
+def test_names_of_tests_are_in_plain_english() -> None:
+    idioms = r"_(told|tells?|asked|asks|says?|whoever|nobody|somebody|go(es)?_on|carried_off)(_|$)"
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        names = re.findall(r"def (test_\w+)", path.read_text(encoding="utf-8"))
+        assert not [name for name in names if re.search(idioms, name)], path

@@ -20,7 +20,7 @@ from pliant_services.batch.one_run import Errand, Outcome, run_clip
 
 SUMMARY_NAME = "batch.json"
 _OWN = ("--output", "-o", "--force", "--resume", "--view", "--save", "--port")
-"""Options of ``pliant run`` that are for one run, and the batch's to say."""
+"""Options of ``pliant run`` that are for one run, and set by the batch."""
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Clip:
 
     @property
     def name(self) -> str:
-        """What it is called in the table: its result folder."""
+        """Its name in the table: its result folder."""
         return Path(self.result).name
 
 
@@ -57,7 +57,7 @@ class _Batch:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def errands(self) -> dict[str, Errand]:
-        """What is left to do, by name."""
+        """The remaining clips, by name."""
         return {
             clip.name: Errand(
                 source=clip.source,
@@ -80,7 +80,7 @@ class _Batch:
             _say(f"{name}: started{again}{where and f' on {where}'}")
 
     def end(self, name: str, outcome: Outcome) -> None:
-        """What came of it."""
+        """The outcome."""
         clip = self._called(name)
         with self.lock:
             clip.seconds = round(clip.seconds + outcome.seconds, 1)
@@ -93,7 +93,7 @@ class _Batch:
             self.save()
 
     def log_of(self, clip: Clip) -> Path:
-        """What its run says."""
+        """The output of its run."""
         return self.output / "logs" / f"{clip.name}.log"
 
     def _called(self, name: str) -> Clip:
@@ -186,7 +186,7 @@ def _run_here(
     *,
     jobs: int,
 ) -> None:
-    """So many at a time.  Ctrl-C cuts off those that run; raises KeyboardInterrupt then."""
+    """That many at a time.  Ctrl-C cuts off those that run; raises KeyboardInterrupt then."""
     stopped = threading.Event()
 
     def run(name: str, errand: Errand) -> None:

@@ -36,7 +36,7 @@ class Cluster:
         """Raises ResultError, and BusError if no scheduler answers there."""
         self._address = address
         self._distributed = load_dask()
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # our own line says it
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # our own line reports it
         try:
             # Said before there is a client, which such an address would keep from ending.
             parts = urlsplit(address if "://" in address else f"tcp://{address}")

@@ -29,7 +29,7 @@ _LOOK_S = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Errand:
-    """What is to be run.  state: of the clip so far, as in ``batch.json``.
+    """A clip to run.  state: of the clip so far, as in ``batch.json``.
 
     folder: from which the paths are meant, those of the options, too.  version: of Pliant.
     """
@@ -63,13 +63,13 @@ def run_clip(errand: Errand, stopped: Callable[[], bool]) -> Outcome:
             f"{platform.node()} has no folder {log.parent}: put clips and results in a folder "
             "with the same name on all machines"
         )
-    # One that was to be begun, and has a log, was begun by somebody who could not say it any more.
+    # A waiting one with a log was begun by a worker that could not report it any more.
     begun = errand.state == "begun" or (errand.state == "waiting" and log.exists())
     while begun and is_being_written(result):  # by a run that has outlived who began it
         if stopped():
             return Outcome(exit_code=None)
         time.sleep(_LOOK_S)
-    with suppress(PliantError):  # the run itself will say it
+    with suppress(PliantError):  # the run itself will report it
         settle_killed(result)
     report = _report_of(result) if begun else None
     resumes = (result / STATE_FOLDER).is_dir()
@@ -107,7 +107,7 @@ def _report_of(result: Path) -> dict[str, Any] | None:
 
 
 def _told(report: dict[str, Any]) -> dict[str, Any]:
-    """What the table says of a run that came to its end."""
+    """The row of the table for a run that has ended."""
     segments = report.get("segments") or []
     frames = report.get("frames", 0)
     longest = max((segment["frames"] for segment in segments), default=0)
@@ -122,7 +122,7 @@ def _told(report: dict[str, Any]) -> dict[str, Any]:
 
 
 class OneRun:
-    """What it says goes to its log."""
+    """Its output goes to its log."""
 
     def __init__(self, arguments: list[str], log: Path, folder: Path) -> None:
         """arguments: of ``pliant run``.  Raises OSError where the log cannot be written."""

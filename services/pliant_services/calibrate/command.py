@@ -50,7 +50,7 @@ from pliant_services.cli.counting import tell_progress
 from pliant_services.run.command import RunRequest, run_pipeline
 
 _LOOKED_AT = 200
-"""Frames in which the board is looked for: the sharpest of so many parts of the source."""
+"""Frames in which the board is searched: the sharpest of this many parts of the source."""
 _TRIED = 5
 """Frames that are searched for other boards where the wanted one is in none."""
 _KNOWN = 0.05
@@ -58,7 +58,7 @@ _KNOWN = 0.05
 _WORST = 2e-3
 """Share of the width that corners may be off by: more, and it is not that board."""
 _CELLS = 32
-"""Columns of cells in which the picture without a board says what is left over."""
+"""Columns of cells in which the picture without a board shows the residuals."""
 _MANY = 10
 """Sights of points that a cell needs for that."""
 _WHOLE_PX = 1 << 20  # no images are this large: they are not made smaller
@@ -163,7 +163,7 @@ def calibrate_with_board(
 def _look_for(
     dataset: Dataset, printed: PrintedBoard, source: str
 ) -> tuple[list[_Found], list[U8], int]:
-    """What the frames show of the board, a few that do not, and how many were looked at."""
+    """Views of the board, some frames without it, and the number of frames searched."""
     if dataset.is_live:
         raise DatasetError(f"{source}: is live: film the board, and pass the video")
     count = dataset.frame_count or sum(1 for _ in dataset)
@@ -195,7 +195,7 @@ def _look_for(
 
 
 def _hint(others: list[U8], printed: PrintedBoard) -> str:
-    """What to do where frames do not show the board: it may be another one that they show."""
+    """Advice for frames that do not show the board: they may show another one."""
     for seen in boards_seen(others):
         if seen != f"a chessboard of {printed.board.columns}x{printed.board.rows} squares":
             return f"they show {seen}: check --board"

@@ -62,7 +62,7 @@ _LACKING = {
     errno.ENFILE: "too many open files on this machine: close other programs",
     errno.ENOMEM: "not enough memory: close other programs, or raise ulimit -v",
 }
-"""What the system refuses, by its error, and what to do."""
+"""Advice by the error of the system."""
 # Typer carries its own copy of click, or uses click itself, depending on its version.
 _UsageError: type[typer.BadParameter] = next(
     cast(Any, c) for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException"

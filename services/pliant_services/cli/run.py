@@ -19,7 +19,7 @@ _settings = partial(typer.Option, rich_help_panel="Settings")
 _faults = partial(typer.Option, rich_help_panel="Faults and network")
 
 _LIGHT = "tracking.max_tracks=2000"
-"""What that costs and saves: docs/results.md, Fewer tracks."""
+"""Costs and savings: docs/results.md, Fewer tracks."""
 
 
 def run(

@@ -48,7 +48,7 @@ def view(
     pliant view --connect tcp/127.0.0.1:7447 --session run-1234
     """
     if patience > 0.0:
-        # The viewer of a run, which ends us and says itself that it was interrupted.
+        # The viewer of a run, which ends this process and reports the interruption itself.
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     from pliant_services.security.access import OPERATOR
     from pliant_services.view.command import ViewRequest, run_view

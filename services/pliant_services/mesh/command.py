@@ -37,7 +37,7 @@ _MESHING = BY_NAME["meshing"]
 
 @dataclass
 class Meshing:
-    """What meshing a recording gave.  seconds: total time of each stage."""
+    """The result of meshing a recording.  seconds: total time of each stage."""
 
     pieces: list[MeshPiece] = field(default_factory=list[MeshPiece])
     seconds: dict[str, float] = field(default_factory=dict[str, float])
@@ -45,7 +45,7 @@ class Meshing:
     notes: list[str] = field(default_factory=list[str])
 
     def take(self, topic: Topic, message: Header) -> None:
-        """What the service publishes."""
+        """The outputs of the service."""
         if isinstance(message, MeshPiece):
             self.pieces.append(message)
         elif isinstance(message, Status):
@@ -79,7 +79,7 @@ def run_mesh(
     recording: Path, *, output: Path | None, force: bool, overrides: Sequence[str],
     clean: bool = False, observed: bool = False, close: bool = False,
 ) -> Iterator[str]:  # fmt: skip
-    """Mesh, write the files, and say what came of it.  Raises PliantError.
+    """Mesh, write the files, and print a summary.  Raises PliantError.
 
     clean: leave out small pieces.    observed: leave out closed holes.    close: write a watertight
     mesh, too.

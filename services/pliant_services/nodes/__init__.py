@@ -1,1 +1,1 @@
-"""The services: one short file each, which says in its first lines what it reads and publishes."""
+"""The services: one short file each, whose first lines have its inputs and outputs."""

@@ -165,7 +165,7 @@ class AdjustmentWorker:
 def _keyframe(
     header: Header, delta: KeyframeDelta, update: MapDelta, waiting: dict[int, _Kept]
 ) -> Keyframe:
-    """What changed in keyframes.  Images that wait are done with once a map starts."""
+    """The changes of keyframes.  Images that wait are done with once a map starts."""
     if delta.new < 0:
         return Keyframe.of(header, delta)
     moved = zip(update.keyframe_ids.tolist(), update.keyframe_frames.tolist(), strict=True)
@@ -226,7 +226,7 @@ def warm_up() -> None:
     loop = Loop(old=0, new=5, S_old_new=np.eye(4), rows=none.astype(np.int32), ids=none)
     mapper.global_adjustment.loops.append(loop)
     mapper.finish()
-    # What few frames need: a pose that no prediction led to, points that have merged.
+    # Kernels that few frames need: for a pose without a prediction, and merged points.
     px = camera.project(points).astype(np.float32)
     plane = camera.normalise(px)
     pose_by_ransac(points, plane, generator, gate=0.1, samples=1)

@@ -9,7 +9,7 @@ out  camera/stream   once: the camera
      camera/source   every frame: its bytes as they came
      camera/image    every frame: rectified; empty where it was dropped or does not decode; over a
                      link as ``link_images`` says; what is mapped of it, as ``keeping_up`` says
-     camera/depth    every frame: the bytes of its depth map, where it has one that somebody wants
+     camera/depth    every frame: the bytes of its depth map, where it has one that a service reads
 """
 
 import threading

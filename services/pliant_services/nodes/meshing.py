@@ -102,7 +102,7 @@ def warm_up() -> None:
 
 
 def _warm_up_stereo(camera: PinholeCamera, points: SeenPoints) -> None:
-    """Sweep two keyframes side by side, ask each for the other's depth, and fill with it."""
+    """Sweep two keyframes side by side, check each against the other's depth, and fill with it."""
     grey = np.full((camera.height, camera.width), 128, np.uint8)
     with KeyframeSpool() as spool:
         dense = DenseDepths(camera, SurfaceParameters().noise_px, spool)

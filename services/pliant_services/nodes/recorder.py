@@ -75,7 +75,7 @@ def _record(recording: RollingWriter, received: Received, now_ns: int) -> None:
 
 
 class _Unsafe:
-    """What is written and not yet on the disk: too old, or half of what senders may have out."""
+    """Data that is not yet on the disk, until it is too old or half of the senders' windows."""
 
     def __init__(self, limits: RecorderParameters) -> None:
         self.look_every_s = limits.sync_interval_s / 4

@@ -50,7 +50,7 @@ _FLAT_DEPTH = 1.0
 
 @dataclass(frozen=True)
 class _Heard:
-    """What has come for one frame.  tracks, update, keyframe: where somebody makes them."""
+    """The inputs of one frame.  tracks, update, keyframe: where a service publishes them."""
 
     image: Image
     depth: Depth
@@ -213,7 +213,7 @@ def _add(
 
 
 def warm_up() -> None:
-    """Follow a few through two small images, with a camera that stands and one that moves."""
+    """Follow a few through two small images, with a static camera and a moving one."""
     camera = PinholeCamera(width=96, height=72, fx=90.0, fy=90.0, cx=47.5, cy=35.5)
     image = np.random.default_rng(0).integers(0, 200, (72, 96), np.uint8)
     depth, nothing = np.ones((72, 96)), FrameTracks.empty()

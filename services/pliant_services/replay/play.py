@@ -43,7 +43,7 @@ class PlayRequest:
 
 
 def run_play(request: PlayRequest) -> int:
-    """Play until the end or a key says so; returns the exit code.  Raises PliantError."""
+    """Play until the end or the key for it; returns the exit code.  Raises PliantError."""
     session_name(request.session)
     playback = Playback(request.recording)
     config = recorded_config(Recording(request.recording).metadata(), [])
@@ -193,7 +193,7 @@ def _keys(pace: Pace) -> Generator[Pace]:
 
 
 def take_keys(pace: Pace, keys: Iterable[str]) -> None:
-    """What the keys do."""
+    """The functions of the keys."""
     for key in keys:
         if key == " ":
             _say("paused" if pace.toggle() else "going on")

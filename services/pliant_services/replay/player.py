@@ -26,7 +26,7 @@ from pliant_services.processes import BY_NAME, PROCESSES, outputs_of
 
 @dataclass(frozen=True, kw_only=True)
 class Played:
-    """What is played.
+    """The recording that is played.
 
     start_s, end_s: seconds of capture time.     lead_frames: map updates before the start, by
     which viewers learn the map.     topics: keys of those that are played, all if empty.

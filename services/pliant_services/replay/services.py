@@ -69,7 +69,7 @@ def require_inputs(summary: Summary, services: Sequence[Process]) -> None:
 
 
 def _made_by(services: Sequence[Process]) -> tuple[Topic, ...]:
-    """What services publish: in a replay of several it is made again, and not read."""
+    """The outputs of services: a replay of several makes them again, and does not read them."""
     return tuple(topic for process in services for topic in process.outputs)
 
 
@@ -135,7 +135,7 @@ class Replay:
         return islice(found, self._frames()) if topic.per_frame else found
 
     def _inputs_of(self, process: Process) -> tuple[Topic, ...]:
-        """What it reads: as in the run, and what other services of this replay make."""
+        """Its inputs: as in the run, and the outputs of other services of this replay."""
         recorded = self._summary.topics
         there = (t for t in process.optional if t in self.made or t.key in recorded)
         return (*process.inputs, *there)
@@ -160,7 +160,7 @@ class Replay:
             yield rectified(frame, rectifier, unmapped=source.unmapped, unplaced=source.unplaced)
 
     def _copy(self, writer: RecordingWriter, failed: Event) -> None:
-        """What the services do not touch: it makes the new recording one that can be replayed."""
+        """The inputs of the recording, copied, so that the new one can be replayed."""
         copied(self._recorded, self._summary, self.affected, writer, failed.is_set)
 
 

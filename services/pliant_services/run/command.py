@@ -78,7 +78,7 @@ def run_pipeline(request: RunRequest) -> int:
     known = None if request.known is None else MapFile(request.known)
     if known is not None:
         read.append(known.path)
-    # What the configuration says is taken over before anything goes: it may be of this folder.
+    # The configuration is read before anything is deleted: it may be in this folder.
     read += [source.mask] if source.mask is not None else []
     read += [Path(name) for name in (source.imu, source.gps) if name and os.path.exists(name)]
     read += [file_and_camera(source.calibration)[0]] if source.calibration is not None else []
@@ -177,8 +177,10 @@ def _run_into(output: Path, request: RunRequest, viewer: Viewer | None, held: He
 
 
 def _where_now(output: Path, held: Held, failure: PliantError | None, progress: Progress) -> Path:
-    """Where the result folder is, which somebody may have renamed.  Raises ResultError, or why the
-    run failed, where it was deleted."""
+    """The present path of the result folder, which may have been renamed.
+
+    Raises ResultError, or why the run failed, where it was deleted.
+    """
     now = held.path
     if now is None:
         raise failure or ResultError(f"{output} was deleted during the run: the results are lost")
@@ -256,8 +258,8 @@ def _told_poses(request: RunRequest, fleet: Fleet) -> AbstractContextManager[Non
 
 
 def _wait(fleet: Fleet, progress: Progress, up: str) -> bool:
-    """Say that the services are up, and wait for the end of the run; True if it was brought about
-    by Ctrl-C, which may follow what is said at once."""
+    """Report that the services are up, and wait for the end of the run; True if it was caused
+    by Ctrl-C, which may follow the message at once."""
     try:
         progress.say(up)
         fleet.wait(progress.on_rest)
@@ -284,7 +286,8 @@ def service_arguments(name: str, request: RunRequest, output: Path) -> list[str]
 def _finish(
     output: Path, *, interrupted: bool, failure: PliantError | None, resumed: bool = False
 ) -> int:
-    """Write what can be written of the recording, and say where it is; then raise the failure.
+    """Write the results of the recording as far as it goes, and print their place; then raise the
+    failure.
 
     A run without a frame leaves nothing, but for what a service that crashed has left.
     """
@@ -313,7 +316,7 @@ def _finish(
         print(f"the results are not written; {again} to write them", file=sys.stderr, flush=True)
         raise
     except PliantError as error:
-        if failure is not None:  # it came first, and says why this one followed
+        if failure is not None:  # it came first, and is the cause of this one
             raise failure from None
         if isinstance(error, ResultError):
             raise ResultError(f"{error}: {again}") from None
@@ -325,7 +328,7 @@ def _finish(
 
 
 def _say_guess(calibration: Calibration, profile: str, progress: Progress) -> None:
-    """What is taken of a camera of which nothing is known.  Raises CalibrationError."""
+    """Report the initial calibration of an unknown camera.  Raises CalibrationError."""
     if calibration.focal_sigma == 0.0:
         return
     if profile == _DEFORMABLE:

@@ -94,7 +94,7 @@ class Progress:
         )
 
     def on_rest(self, names: Sequence[str]) -> None:
-        """Say what those services do that are still there after the last frame."""
+        """Report the services that still work after the last frame."""
         doing = [BY_NAME[name].finishing for name in names if BY_NAME[name].finishing]
         detail = f"{(*doing, 'closing the recording')[0]} ..."
         with self._lock:

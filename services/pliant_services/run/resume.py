@@ -54,7 +54,7 @@ def resumed_map(output: Path, request: RunRequest) -> Path | None:
 
 
 def has_ended(output: Path, services: Sequence[str], config: Config) -> bool:
-    """Whether all that the services had to say was recorded, and no service needs a restart."""
+    """Whether all messages of the services are recorded, and no service needs a restart."""
     path = output / RECORDING_NAME
     if path.is_file():
         ended = {key for key, topic in summarise(path).topics.items() if topic.end is not None}

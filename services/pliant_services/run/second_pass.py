@@ -52,7 +52,7 @@ from pliant_services.run.request import RunRequest
 _VERDICTS = (GOOD, DOUBTFUL, BAD)
 _MESHING = BY_NAME["meshing"]
 _LAST = (topics.MAP_FINAL, topics.KEYFRAME_FINAL, topics.MAP_KEPT)
-"""What the second pass tells again."""
+"""The topics that the second pass publishes again."""
 
 
 def second_pass(output: Path, request: RunRequest, code: int) -> int:
@@ -199,7 +199,7 @@ def _keyframes(rest: Keyframe, reached: Reached) -> Keyframe:
 
 
 def _masks(rest: Keyframe, made: list[bytes]) -> tuple[bytes, ...]:
-    """Of all images that stand beside them, or none where none has one."""
+    """Of all images beside them, or none where none has one."""
     before = rest.earlier_masks or (b"",) * len(rest.earlier_jpegs)
     masks = (*before, *made)
     return masks if any(masks) else ()

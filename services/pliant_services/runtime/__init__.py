@@ -1,1 +1,1 @@
-"""What hosts a service: its process, its bus, its launcher, its clock."""
+"""The host of a service: its process, its bus, its launcher, its clock."""

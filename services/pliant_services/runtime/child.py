@@ -20,7 +20,7 @@ _PATIENCE_S = 5.0  # for a process that has left its session, and takes long to 
 
 @dataclass
 class Child:
-    """What it prints goes to its log, and the last of it is kept here: the log may lie on the disk
+    """Its output goes to its log, and the last lines are kept here: the log may be on the disk
     that is full."""
 
     name: str

@@ -189,7 +189,7 @@ def checkpoint_windows(config: Config, fleet: Sequence[str]) -> dict[str, Window
 
 
 def random_delays(largest_ms: float) -> Callable[[], None] | None:
-    """What a bus under test is disturbed by: every tenth message waits up to so long."""
+    """Disturbance of a bus under test: every tenth message waits up to this long."""
     if largest_ms <= 0.0:
         return None
     random = np.random.default_rng(os.getpid())

@@ -22,7 +22,7 @@ _MAY_LAG = tuple(process.name for process in PROCESSES if process.may_lag)
 
 @dataclass
 class MappingPace:
-    """What bundle adjustment is to do with each frame: map it, only localise it, or neither.
+    """Decides for each frame whether bundle adjustment maps it, only localises it, or neither.
 
     room: how many images may wait to be mapped.   stamps_ns: of the last frames, as many as may
     wait for bundle adjustment.   last: the number of the last frame that it is to map.
@@ -48,7 +48,7 @@ class MappingPace:
         return {"unmapped": self.unmapped, "unplaced": self.unplaced}
 
     def mark(self, image: Image, waiting: int, limits: IngestParameters) -> Image:
-        """Decide on the next frame, when so many of those before it wait for bundle adjustment.
+        """Decide on the next frame, while that many earlier ones wait for bundle adjustment.
 
         It is mapped while all that wait are younger than ``mapping_lag_s``, and whenever none waits
         that is to be mapped: so one at a time where mapping takes longer than that, evenly spaced

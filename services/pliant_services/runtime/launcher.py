@@ -38,7 +38,7 @@ MOST_DEATHS = 3  # of one service at the same frame
 class ServiceDiedError(PliantError):
     """A service ended with an error; the text has its name and last words.
 
-    crashed: of a fault of its own, or a signal, which its log says more of.
+    crashed: by a fault of its own, or a signal; its log has more.
     """
 
     def __init__(self, text: str, *, crashed: bool) -> None:
@@ -122,7 +122,7 @@ class Fleet:
 
     @contextmanager
     def listening(self, topic: Topic, on_message: Callable[[Received], None]) -> Generator[None]:
-        """Hand on what a service says, as it comes, possibly twice; none is asked to wait."""
+        """Forward the messages of a topic as they come, possibly twice; no service waits."""
 
         def on_sample(sample: zenoh.Sample) -> None:
             heard = received(topic, sample)
@@ -169,7 +169,7 @@ class Fleet:
         self._gave_up = True
 
     def end_source(self) -> None:
-        """Ask the ingest to end the stream after the frame at hand; the others follow."""
+        """Request the ingest to end the stream after the present frame; the others follow."""
         for child in self._children:
             if child.name == "ingest" and child.process.poll() is None:
                 child.process.send_signal(signal.SIGINT)

@@ -14,7 +14,7 @@ from pliant.messages.types import REPORTED, Header, Status
 
 
 class Monitor(Protocol):
-    """What a service tells about itself."""
+    """The reports of a service on itself."""
 
     def stage(self, stage: str) -> AbstractContextManager[object]:
         """Time a stage of the current frame: ``with monitor.stage("curvature"): ...``."""

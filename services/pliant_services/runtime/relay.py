@@ -24,7 +24,7 @@ _PAUSE_S = 0.005
 _LAST_WORDS_S = 2.0
 _MOST_VIEWED = 64
 _MOST_SESSIONS, _MOST_TOKENS = 4096, 256
-"""Beyond so many sessions, and so many services or viewers of one, no more are known."""
+"""More sessions, or more services or viewers of one, are ignored."""
 
 
 class Relay:
@@ -98,7 +98,7 @@ class Relay:
                 self._serve()
 
     def _serve(self) -> None:
-        """Hand on until the last viewer is gone; of a session that is over, what is there."""
+        """Forward until the last viewer is gone; of a session that is over, its last messages."""
         outputs = {topic: self._publisher(topic) for topic in (*topics.VIEWED, topics.STREAM)}
         inputs = {topic: self._ring(topic.key, topic.viewed) for topic in topics.VIEWED}
         told = self._ring(topics.status("*").key, _STATUS_RING)
@@ -146,7 +146,7 @@ class Relay:
 
 
 class Relays:
-    """The viewers' side of a router: a relay for each session that runs and that somebody views.
+    """The viewers' side of a router: a relay for each active session with a viewer.
 
     Zenoh is called by a thread of its own, never in a callback.  What strangers announce costs no
     threads: callbacks run in Zenoh's own, and no more than ``_MOST_VIEWED`` sessions are relayed.

@@ -134,7 +134,7 @@ def _check_recording(output: Path, state: Path | None) -> None:
 
 
 def _write_results(output: Path, config: Config) -> int:
-    """Write the results beside the recording, and say what came of it."""
+    """Write the results beside the recording, and print a summary."""
     # They load the kernels, which a recorder that records has no use for.
     from pliant.results.verdict import grade, summary
     from pliant.results.write import write_results

@@ -130,7 +130,7 @@ def _row(each: Seen, newest: int) -> tuple[str, ...]:
 def stop_session(
     endpoints: Sequence[str], session: str, patience_s: float, identity: Identity | None = None
 ) -> list[str]:
-    """Ask a session to end, and wait until its services are gone.
+    """Request the end of a session, and wait until its services are gone.
 
     Returns those that are left.  Raises BusError where there is no such session.
     """

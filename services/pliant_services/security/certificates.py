@@ -19,7 +19,7 @@ _BACKDATED = timedelta(days=1)  # machines' clocks differ
 
 
 def common_name(name: str, session: str = ANY_SESSION) -> str:
-    """What the certificate calls its holder; the router serves all sessions."""
+    """The holder in the certificate; the router serves all sessions."""
     return name if session == ANY_SESSION or name == ROUTER else f"{name}.{session}"
 
 

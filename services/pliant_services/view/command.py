@@ -36,7 +36,7 @@ _GONE_S = 0.2  # what is on the way when the last service has gone
 
 
 class WatchedCanvas(Canvas, Protocol):
-    """A canvas that somebody may stop looking at."""
+    """A canvas whose viewer may be closed."""
 
     @property
     def is_watched(self) -> bool:
@@ -46,7 +46,7 @@ class WatchedCanvas(Canvas, Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class ViewRequest:
-    """What is to be seen, and where."""
+    """The data to view, and the viewer."""
 
     source: Path | None
     endpoints: list[str]
@@ -142,7 +142,7 @@ def follow(
     patience_s: float = 0.0,
     identity: Identity | None = None,
 ) -> None:
-    """Draw a running session until it ends.  Never asks it to wait.
+    """Draw a running session until it ends.  The session never waits for it.
 
     patience_s: for a session that is about to start.     identity: for tls/ endpoints.
 
@@ -184,7 +184,7 @@ class Arrived:
 
 
 class Backlog:
-    """What came and is not drawn yet, bounded in number and size: the oldest give way."""
+    """Messages that are not drawn yet, bounded in number and size: the oldest are dropped."""
 
     def __init__(self, most: int, most_bytes: int) -> None:
         self._most, self._most_bytes = most, most_bytes
@@ -218,7 +218,7 @@ class Backlog:
 def _draw_while(canvas: Canvas, waiting: Backlog, goes_on: Callable[[], bool]) -> None:
     """Draw until nothing more comes and all is drawn: the final mesh comes last of all.
 
-    goes_on: whether a service still runs, and somebody looks on.
+    goes_on: whether a service still runs, and a viewer is open.
     """
     scene = Scene(canvas)
     asked, is_over = time.monotonic(), False

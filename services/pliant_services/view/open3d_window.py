@@ -60,7 +60,7 @@ def opened(result: Result) -> Any:
 
 
 def _display_answers() -> bool:
-    """Whether X does, where it is asked: without it Open3D draws into an invisible window."""
+    """Whether X has a display, if needed: without one Open3D draws into an invisible window."""
     if sys.platform != "linux" or os.environ.get("WAYLAND_DISPLAY"):
         return True
     x11: Any = ctypes.CDLL("libX11.so.6")

@@ -1,1 +1,1 @@
-"""What ``import pliant`` gives: runs, their results, and mapping image by image."""
+"""The names of ``import pliant``: runs, their results, and mapping image by image."""

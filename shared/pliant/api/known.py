@@ -84,7 +84,7 @@ class KnownMap:
     def _finder_for(
         self, camera: Calibration | PinholeCamera | None
     ) -> tuple[Calibration, Rectifier, Localiser]:
-        """What finds images of a camera: kept for the next one."""
+        """The localiser of images of a camera, kept for the next one."""
         calibration = self.calibration if camera is None else calibration_of(camera)
         if self._finder is None or self._finder[0] != calibration:
             rectifier, parameters = Rectifier(calibration), self._config.bundle_adjustment

@@ -1,4 +1,4 @@
-"""What a map gives as arrays, wherever it comes from."""
+"""A map as arrays, wherever it comes from."""
 
 from abc import ABC, abstractmethod
 

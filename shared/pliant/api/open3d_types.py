@@ -25,7 +25,7 @@ class PointArray(np.ndarray[tuple[int, ...], np.dtype[np.float64]]):
     def __array_wrap__(
         self, array: Any, context: Any = None, return_scalar: bool = False, /
     ) -> Any:
-        """What is computed of them is numpy's own."""
+        """Results of arithmetic with them are plain numpy arrays."""
         plain = np.asarray(array)
         return plain[()] if return_scalar else plain
 

@@ -184,7 +184,7 @@ class Result(Mapped):
         return f"<pliant.Result {str(self.path)!r}: {len(self.trajectory)} poses>"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: the verdict and a picture."""
+        """For a notebook: the verdict and a picture."""
         lines = summary(self.report, has_map=not self.is_deformable)
         text = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
         if self.is_deformable or not len(self.trajectory):

@@ -63,7 +63,7 @@ def run(
     output: result folder [results/<source>]; force: write into an existing one.    mask: an image
     whose black parts are ignored in all frames, or a folder of them; auto_mask: mask
     what never changes.    start, end: seconds after
-    the first frame; every: one of so many frames; sharpest: of those, not the first.    light: a
+    the first frame; every: one of this many frames; sharpest: of those, not the first.    light: a
     fifth of the tracks.    quality: "high" reads the source again where the camera was lost.
     imu, gps: a file of inertial samples, of satellite fixes, or their topic.
     max_size: pixels along the longer side.    map: of an earlier run, to go

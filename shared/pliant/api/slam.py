@@ -130,7 +130,7 @@ class Slam(Mapped):
 
 @dataclass(frozen=True, kw_only=True)
 class Tracked:
-    """What became of a frame.
+    """A frame with its pose and tracks.
 
     number: from 0.    stamp_ns: when it was taken.    image: (H, W) or (H, W, 3), rectified; of
     size 0 where it was broken.    T_world_camera: (4, 4), None without a pose.    segment: of the

@@ -32,7 +32,7 @@ class Bus(Protocol):
     """Messages in and out of one service."""
 
     def reads(self, topic: Topic) -> bool:
-        """Whether somebody in this session publishes the topic for this service."""
+        """Whether a service of this session publishes the topic for this service."""
         ...
 
     def receive(self, topic: Topic) -> Iterator[Header]:
@@ -93,7 +93,7 @@ class Bus(Protocol):
 class Received:
     """A message as it came off the wire.  ``arrival`` counts over all inputs.
 
-    message: what is in it (a StreamEnd for an end), once somebody has looked.
+    message: what is in it (a StreamEnd for an end), once it has been decoded.
     """
 
     topic: Topic
@@ -116,7 +116,7 @@ class Window:
 
 
 class ObserverBus(Protocol):
-    """What the recorder sees, the one service whose output may depend on arrival."""
+    """The bus of the recorder, the one service whose output may depend on arrival."""
 
     def receive_any(self, *, timeout_s: float | None = None) -> Iterator[Received | None]:
         """Messages of all inputs in order of arrival, ends included, until all have ended.
@@ -131,7 +131,7 @@ class ObserverBus(Protocol):
         ...
 
     def acknowledge(self) -> None:
-        """What was received so far is on the disk: its senders need not keep it any longer."""
+        """All messages received so far are on the disk: senders need not keep them any longer."""
         ...
 
 

@@ -14,7 +14,7 @@ class FaultLog:
         self._told: dict[str, tuple[int, ...]] = {}
 
     def line(self, inputs: Mapping[str, Inbox], outputs: Mapping[str, Outbox]) -> str:
-        """What was passed over since the last call; "" where nothing was."""
+        """A note on the messages skipped since the last call; "" for none."""
         parts: list[str] = []
         for key, box in inputs.items():
             new = self._new(key, (box.refused, box.repeated, box.early))

@@ -41,7 +41,7 @@ class Inbox:
         return self.taken + len(self.waiting)
 
     def is_next(self, sequence: int, size: int) -> bool:
-        """Whether a message with this number, of so many bytes, is the one to ``put``; others are
+        """Whether a message with this number and size in bytes is the one to ``put``; others are
         counted."""
         if sequence < self.next_sequence:
             self.repeated += 1

@@ -36,7 +36,7 @@ class Keeper:
     on_tick: Callable[[], None]
     on_fault: Callable[[str], None]
     _closing: bool = False
-    _greeting: bool = False  # somebody came: tell our counts
+    _greeting: bool = False  # a peer appeared: report our counts
     _done: bool = False
     _strangers_told: int = 0
     _place: Place = field(default_factory=lambda: Place(-1, {}, {}))
@@ -50,7 +50,7 @@ class Keeper:
         self._thread.start()
 
     def stop(self) -> None:
-        """Say nothing more."""
+        """Report nothing more."""
         self._closing = True
         self.shared.wake.set()
         self._thread.join()
@@ -61,12 +61,12 @@ class Keeper:
         self.greet()
 
     def greet(self) -> None:
-        """Tell our counts, soon."""
+        """Report our counts, soon."""
         self._greeting = True
         self.shared.wake.set()
 
     def tell(self, entry: InLink, ask: int = NOTHING) -> None:
-        """Tell a sender our counts."""
+        """Report our counts to a sender."""
         if self.restored:  # before that, what we took is not ours
             entry.tell(self.shared.peers.incarnation, ask)
 

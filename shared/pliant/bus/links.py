@@ -21,7 +21,7 @@ from pliant.messages.types import StreamEnd
 
 DATA, END = 0, 1
 NOTHING, IF_OLD, NOW = 0, 1, 2
-"""What a reader asks its sender to send again."""
+"""The messages that a reader requests again."""
 
 ENVELOPE = struct.Struct("<QQB")  # sequence number, incarnation of the sender, kind
 _CREDIT = struct.Struct("<QQQB")  # incarnation, taken, safe, request
@@ -29,7 +29,7 @@ _CREDIT = struct.Struct("<QQQB")  # incarnation, taken, safe, request
 
 @dataclass
 class Shared:
-    """What the links of one bus share.
+    """The common state of the links of one bus.
 
     changed: the lock, and who waits for something to change.     wake: rouses the keeper.
     arrivals: messages that have come, over all topics.
@@ -65,7 +65,7 @@ class InLink:
         self._held = shared.session.declare_subscriber(key, directly(self._on_sample))
 
     def tell(self, incarnation: int, ask: int = NOTHING) -> None:
-        """Tell the sender our counts."""
+        """Report our counts to the sender."""
         self.told = taken = self.box.taken
         self._credit.put(_CREDIT.pack(incarnation, taken, self.safe, ask))
 
@@ -189,7 +189,7 @@ class OutLink:
 
 
 def received(topic: Topic, sample: zenoh.Sample) -> Received | None:
-    """What somebody hears who only listens: possibly twice, and not looked into.
+    """The messages that a mere listener receives: possibly twice, and not decoded.
 
     None where it is no message of a bus.
     """

@@ -136,7 +136,7 @@ class Outbox:
         return [name for name in self.readers if name not in self._lags and self.untaken(name)]
 
     def full(self, size: int = 0, may_lag: Collection[str] = ()) -> list[str]:
-        """The readers without credit for one more message, of so many bytes."""
+        """The readers without credit for one more message of that many bytes."""
         lacking = [name for name in self.readers if self._is_behind(name, size, may_lag)]
         for name, window in self._windows.items():
             safe = self.readers[name].safe

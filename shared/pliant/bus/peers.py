@@ -20,7 +20,7 @@ SCHEMA = codec.schema_hash([topic.message for topic in (*TOPICS, status("*"))])
 """Of what messages hold: with other fields a message would be read, and not say the same."""
 
 STOP_KEY, OVER_KEY = "control/stop", "control/over"
-"""What is said to all of a session, without its prefix: end it, and that it is over."""
+"""The keys of announcements to a whole session, without its prefix: to end, and ended."""
 
 _MOST_STRANGERS = 16
 
@@ -38,7 +38,7 @@ def service_of(key: str) -> str:
 
 
 def misfit(key: str, reader: str) -> str:
-    """What is said of the token of another version than this reader's; "" of one that fits, and of
+    """The error for the token of another version than this reader's; "" for one that fits, and for
     none of ours."""
     match = _TOKEN.search(key)
     if match is None:
@@ -68,9 +68,9 @@ class Peers:
     refusal: str = ""
     """Why this service cannot take part; "" while it can."""
     failure: Exception | None = None
-    """What a thread of the bus failed of."""
+    """The error of a thread of the bus."""
     strangers: dict[str, str] = field(default_factory=dict[str, str])
-    """What is said of those of another version that no service here needs, by name: once."""
+    """The note on peers of another version that no service here needs, by name: once."""
     over: bool = False
     """Whether the recorder has said that everything is on its disk."""
     stays: bool = False

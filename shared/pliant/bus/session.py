@@ -32,7 +32,7 @@ images."""
 _SOCKET = "unixsock-stream"
 _FOLDER, _BUS = "pliant-", "bus"
 _NO_SHARED_MEMORY = "shm segment"
-"""What Zenoh says where /dev/shm is full, or missing."""
+"""Zenoh's message for a full or missing /dev/shm."""
 _NO_SOCKET = "no Unix socket available: every user of this machine can reach the services"
 _MAX_BYTES = max(topic.max_bytes for topic in TOPICS) + (1 << 20)
 """A peer that announces more than our largest topic is cut off, before memory is allocated."""

@@ -1,4 +1,4 @@
-"""How a service's thread waits for readers and for messages, and what it says of that.
+"""How a service's thread waits for readers and for messages, and its reports of that.
 
 Waits are limited: for a peer that is away no longer than our patience, and not at all once a
 thread of the bus has failed or the session is over.
@@ -33,7 +33,7 @@ class Waiting:
         self.text = text
 
     def end(self) -> None:
-        """What it waited for has come."""
+        """The wait is over."""
         self.text = ""
 
     def told(self, now: float) -> str:

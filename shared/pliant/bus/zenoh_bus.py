@@ -108,7 +108,7 @@ class ZenohBus:
         if stays:
             self._wait_until_first(on_fault or (lambda line: None))
         self.stop_requested = False
-        """Whether somebody has asked the session to end (``pliant stop``)."""
+        """Whether the end of the session was requested (``pliant stop``)."""
         shared = Shared(self._session, self._prefix, self._changed, self._wake, self._peers)
         self._outputs = {
             topic.key: OutLink(

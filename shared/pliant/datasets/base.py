@@ -1,4 +1,4 @@
-"""What every source of frames has in common: the frame as it came, and the protocol of a source."""
+"""The frame as it came, and the protocol of every source of frames."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -22,12 +22,12 @@ class SourceFrame:
     "unknown", left to the decoder) or raw rows without padding ("mono8", "bgr8", "rgb8" and
     the others of ``raw_pixels.RAW_BYTES``).
     data: bytes as they are in the file, or the raw pixels.
-    width, height: of raw pixels; 0 for file formats, which say it themselves.
+    width, height: of raw pixels; 0 for file formats, which contain their size.
     made_from: "" as it came; else what it was before, for people; of a frame without data, why it
     has none.
     clip_frame: number of the frame of a video file that it is made from; -1: of none.
     depth: the file of the depth map that belongs to it, as it is; b"" where there is none.
-    mask: an image file that says which part of it is used; b"": all of it.
+    mask: an image file of the part that is used; b"": all of it.
     number: in the source, where only a part of that is taken; -1: ``index``.
     name: of the file that it comes from; "" where it has none; tells no frames apart.
     captured_s: in live mode, when it came or was due by the clock of this machine; tells none
@@ -89,7 +89,7 @@ class Dataset(Protocol):
 
     @property
     def frame_count(self) -> int | None:
-        """How many frames come; None if unknown.  Of a video file, what its container says."""
+        """Number of frames; None if unknown.  Of a video file, according to its container."""
         ...
 
     @property

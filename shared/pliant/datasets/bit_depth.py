@@ -31,7 +31,7 @@ def bits_used(frames: Iterable[SourceFrame]) -> int:
 
 
 def eight_bits(frame: SourceFrame, bits: int) -> SourceFrame:
-    """A frame of 16 bits of which so many are used, as raw pixels of 8; others as they are."""
+    """A frame of 16 bits of which that many are used, as raw pixels of 8; others as they are."""
     if bits >= _ALL or not _may_be_deep(frame):
         return frame
     pixels = _deep(frame)
@@ -53,7 +53,7 @@ def eight_bits(frame: SourceFrame, bits: int) -> SourceFrame:
 
 
 def note_on(bits: int) -> list[str]:
-    """What a user should know of it."""
+    """A note for the user."""
     if bits >= _ALL:
         return []
     return [f"16-bit images use {bits} bits: these are scaled to 8 bits, in all images alike"]

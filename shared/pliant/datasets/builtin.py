@@ -55,7 +55,7 @@ class _Plan(Protocol):
     """Everything that a sequence is made of."""
 
     def description(self) -> dict[str, Any]:
-        """What determines every byte of the folder, as JSON."""
+        """The options and versions that determine every byte of the folder, as JSON."""
         ...
 
     def render(self, folder: Path, progress: Progress) -> None:

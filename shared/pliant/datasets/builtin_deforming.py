@@ -50,7 +50,7 @@ class DeformingPlan:
     numbers: list[int]
 
     def description(self) -> dict[str, Any]:
-        """What determines every byte of the folder, as JSON."""
+        """The options and versions that determine every byte of the folder, as JSON."""
         digest = hashlib.sha256()
         for number in (self.numbers[0], self.numbers[len(self.numbers) // 2], self.numbers[-1]):
             digest.update(np.round(self.scene.path.T_world_camera(number / _FPS), 9).tobytes())

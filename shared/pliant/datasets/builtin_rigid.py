@@ -39,7 +39,7 @@ _TURN_S = 12.0  # a degree in each frame
 
 
 class SequenceOptions(FilmOptions):
-    """What may be said after the name of a rigid built-in sequence."""
+    """Options after the name of a rigid built-in sequence."""
 
     distortion: Distortion = Field(default=NO_DISTORTION, description="k1,k2,p1,p2 of the lens.")
     colour: bool | None = Field(
@@ -65,7 +65,7 @@ class RigidPlan:
     start_ns: int  # stamp at which the path begins
 
     def description(self) -> dict[str, Any]:
-        """What determines every byte of the folder, as JSON."""
+        """The options and versions that determine every byte of the folder, as JSON."""
         times = [(stamp - self.start_ns) * 1e-9 for stamp in self.stamps_ns]
         poses = np.array([self.path.T_world_camera(time) for time in times])
         return {

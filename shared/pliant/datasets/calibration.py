@@ -1,4 +1,4 @@
-"""The calibration of a camera as a checked value, and the YAML that stands for it in recordings.
+"""The calibration of a camera as a checked value, and as YAML in recordings.
 
 The YAML is flat, as the ``calib.yaml`` beside an image folder:
 
@@ -44,7 +44,7 @@ COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
 _OPTIONAL = {("pinhole-radtan", "k3")}
 _MODELS: tuple[str, ...] = get_args(LensModel)
 SAID_SIGMA = 0.3
-"""How far a field of view that somebody says may be wrong: standard deviation of log focal."""
+"""Uncertainty of a field of view given by the user: standard deviation of log focal."""
 UNSAID_FOV_DEG, UNSAID_SIGMA = 60.0, 0.4
 """Default along the longer side: +-2 standard deviations are 29 to 104 degrees."""
 _MAX_SIGMA = 1.0
@@ -102,7 +102,7 @@ class Calibration:
 
     @property
     def lens(self) -> Lens:
-        """What the rectification needs of it."""
+        """The lens, for the rectification."""
         return Lens(
             model=self.model,
             width=self.width,
@@ -190,7 +190,7 @@ def calibration_from_keys(
 ) -> Calibration:
     """From flat keys; others are passed over, since files of data sets carry many more.
 
-    image_size: (width, height) for content that does not say.     Raises CalibrationError.
+    image_size: (width, height) for content without it.     Raises CalibrationError.
     """
     size = {"width": image_size[0], "height": image_size[1]} if image_size else {}
     content = {**size, **content}
@@ -210,7 +210,7 @@ def calibration_from_keys(
         width=width,
         height=height,
         distortion=tuple(0.0 if content.get(k) is None else number(content, k) for k in names),
-        # Files describe their rate in words, too; those say nothing here.
+        # Files describe their rate in words, too; those have no meaning here.
         fps=float(fps) if isinstance(fps, int | float) and 0.0 < fps < 1e6 else None,
         depth=_depth(content, width, height, intrinsics),
         focal_sigma=_sigma(content),

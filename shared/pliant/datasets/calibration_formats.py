@@ -1,4 +1,4 @@
-"""What calibration files of others say, under the keys of our own ``calib.yaml``.
+"""Calibration files of other programs, read under the keys of our own ``calib.yaml``.
 
 ``FORMATS`` is the list: how a file of a kind is recognised, and what reads it.  Whatever they hold
 is checked where the keys become a ``Calibration``; a lens that none of our models is, is refused
@@ -92,7 +92,7 @@ _DISTORTION: dict[str, LensModel] = {
     "kannala-brandt": "fisheye",
     "fisheye": "fisheye",
 }
-"""What others call the models."""
+"""The models by the names of other programs."""
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "camera_Matrix")
 _SIZE = (("image_width", "image_Width"), ("image_height", "image_Height"))
 _COEFFICIENTS = (
@@ -118,7 +118,7 @@ def _kalibr(content: Keys, wanted: Wanted) -> Keys:
 
 
 def _of_chain(cameras: Keys, wanted: Wanted) -> str:
-    """Which camera of a chain took the images: that which the user says, or their topic or folder,
+    """Which camera of a chain took the images: the one the user names, or their topic or folder,
     or their size.  Raises CalibrationError where none of them does."""
     names = list(cameras)
     if wanted.camera:
@@ -239,7 +239,7 @@ _ORB_SLAM: dict[str, LensModel] = {
 
 
 def _orb_slam(content: Keys, wanted: Wanted) -> Keys:
-    """``Camera1.fx`` of version 3, ``Camera.fx`` of those before; the size where it is said."""
+    """``Camera1.fx`` of version 3, ``Camera.fx`` of those before; the size if it is there."""
     if "LEFT.K" in content:
         raise CalibrationError(
             "is for a stereo pair that ORB-SLAM rectifies first (LEFT.K): give the calibration of "

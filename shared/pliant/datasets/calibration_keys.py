@@ -1,10 +1,10 @@
-"""What a calibration file says, by key, and which camera of it is meant."""
+"""The values of a calibration file by key, and the camera of it that is meant."""
 
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 Keys: TypeAlias = dict[str, Any]
-"""What a file says, by key."""
+"""The values of a file, by key."""
 
 
 @dataclass(frozen=True)

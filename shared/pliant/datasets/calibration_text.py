@@ -21,7 +21,7 @@ _COLMAP_MODELS = (
 
 
 def calibration_text(file: Path) -> str:
-    """What a file holds, of a COLMAP cameras.bin what its cameras.txt would hold.
+    """The text of a file; of a COLMAP cameras.bin that of its cameras.txt.
 
     Raises CalibrationError, and OSError where it cannot be read.
     """

@@ -26,7 +26,7 @@ _INDEX = re.compile(r"(?:camera:)?([0-9]{1,3})")
 
 
 class Capture(Protocol):
-    """What is used of ``cv2.VideoCapture``."""
+    """The part of ``cv2.VideoCapture`` that is used."""
 
     def isOpened(self) -> bool: ...
     def read(self) -> tuple[bool, U8 | None]: ...

@@ -21,7 +21,7 @@ _RAW_BYTES = 3  # of a pixel, as videos are decoded
 
 
 class Clip:
-    """A video file that is handed on in pieces, and watched from then on."""
+    """A video file that is sent in pieces, and watched for changes from then on."""
 
     def __init__(self, file: Path) -> None:
         """Raises DatasetError where it cannot be read."""
@@ -81,7 +81,7 @@ def clip_of(source: Dataset) -> Clip | None:
     if not isinstance(origin, VideoFile):
         return None
     clip, frames, camera = Clip(origin.file), origin.frame_count, source.calibration
-    if frames is None:  # its container does not say
+    if frames is None:  # unknown to its container
         return None if parts else clip
     for part in parts:
         until_s = min(frames / origin.rate_hz, part.end_s or math.inf)

@@ -18,10 +18,10 @@ from pliant.errors import DatasetError
 
 
 class Part(Protocol):
-    """Which frames of a source are taken: what ``ingest`` of the configuration says.
+    """The frames of a source that are taken, by ``ingest`` of the configuration.
 
     start_s, end_s: seconds after its first frame, the end not included; end 0: to its end.
-    every: one of so many frames: the first, or ``sharpest``, that with the finest details.
+    every: one of this many frames: the first, or the ``sharpest``.
     """
 
     @property
@@ -52,7 +52,7 @@ class Excerpt:
     """Those frames of a source, counted from 0.  Times stay those of the source."""
 
     def __init__(self, source: Dataset, part: Part, *, first_depth_only: bool = False) -> None:
-        """first_depth_only: of depth maps that come along, only the first is handed on.
+        """first_depth_only: of depth maps that come along, only the first is delivered.
 
         Raises DatasetError where the end is not after the start.
         """
@@ -123,7 +123,7 @@ def is_all(part: Part | None) -> bool:
 
 
 def _groups(frames: Iterable[SourceFrame], size: int) -> Iterator[list[SourceFrame]]:
-    """So many frames that follow each other; the last may be fewer."""
+    """Groups of that many consecutive frames; the last may have fewer."""
     group: list[SourceFrame] = []
     for frame in frames:
         group.append(frame)

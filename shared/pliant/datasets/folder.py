@@ -12,7 +12,7 @@ or ``associations.txt`` ("seconds file seconds file") instead of rgb.txt, or a b
 (directly, or in rgb/, color/, images/ and the like), with ``--calibration FILE`` or ``--fov
 DEGREES`` where it holds no calib.yaml.  Times are those that the names of the images tell.  Where
 they tell none, images are in the order of their names, 2 before 10, and ``fps`` of the calibration
-apart, 30 a second if it does not say.
+apart, 30 a second if it has none.
 """
 
 from collections.abc import Sequence

@@ -13,7 +13,7 @@ from pliant.datasets.base import SourceFrame
 
 _AHEAD = 16
 _AHEAD_BYTES = 1 << 26
-"""So many frames, or so many bytes of them but at least three frames, are looked at ahead."""
+"""Look-ahead: this many frames, or this many bytes of them but at least three frames."""
 _LEAST_AHEAD = 3
 _MOST_NS = 1 << 62
 """Later ones are none: year 2116."""
@@ -41,7 +41,7 @@ def increasing(stamps_ns: Sequence[int]) -> list[int]:
 
 
 def why_wrong(stamp_ns: int) -> str:
-    """What is said of a frame whose time is wrong."""
+    """The note on a frame whose time is wrong."""
     return f"its time, {stamp_ns / 1e9:.6f} s, is not between those of the images around it"
 
 

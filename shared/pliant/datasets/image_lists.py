@@ -26,7 +26,7 @@ _MAX_WRONG = 0.1
 
 @dataclass
 class ImageList:
-    """What a list says.   others: of an association, the second file of each line.
+    """The lines of a list.   others: of an association, the second file of each line.
 
     notes: what a user should know of it, in lines.
     """
@@ -55,7 +55,7 @@ def data_lines(file: Path) -> Iterator[tuple[int, str]]:
 def read_list(file: Path, folder: Path, *, unit: str = "seconds") -> ImageList:
     """Read a list of images; files are relative to ``folder``.
 
-    unit: of its times; where another one is far more likely, that is taken, and a note says so.
+    unit: of its times; where another one is far more likely, it is used, with a note.
     A few times that do not increase cost their images, see ``mended``.
     Raises DatasetError, with the number of the line, for files that are not there or not in the
     folder, and lines that are something else.

@@ -49,7 +49,7 @@ def plain_type(name: str) -> str:
 
 
 def capture_time(image: RecordedImage) -> int:
-    """Nanoseconds of the header; of the recording where a header says nothing."""
+    """Nanoseconds of the header; of the recording where the header has no time."""
     header = getattr(image.message, "header", None)
     stamp = header.stamp if header is not None else image.message.timestamp
     if isinstance(stamp, str):  # JSON as protobuf writes it
@@ -76,7 +76,7 @@ def source_frame(kind: str, image: RecordedImage, index: int) -> SourceFrame:
 
 
 FOREIGN = (AttributeError, TypeError, ValueError, OverflowError, KeyError)
-"""What reading fields raises that are not there, or not what they should be."""
+"""The errors of reading fields that are absent or of another type."""
 
 
 def _frame_of(kind: str, image: RecordedImage, index: int) -> SourceFrame:

@@ -1,4 +1,4 @@
-"""Sources made of image files: the data set itself, and what is asked of its images."""
+"""Sources made of image files: the data set itself, and the checks of its images."""
 
 import re
 from collections.abc import Iterator, Sequence

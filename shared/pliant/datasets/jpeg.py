@@ -1,4 +1,4 @@
-"""What a JPEG says of itself, before memory is taken for its pixels."""
+"""The header of a JPEG, read before memory is allocated for its pixels."""
 
 _SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _ALONE = frozenset((0x01, *range(0xD0, 0xD8)))  # markers without a segment

@@ -26,7 +26,7 @@ from pliant.errors import DatasetError
 
 _LOSSY = ("jpeg", "webp")
 _UNREADABLE = b"?"
-"""Stands for a file that cannot be read: its frame is broken, as one is that cannot."""
+"""Marks a mask file that cannot be read: its frame is broken."""
 
 
 class Masked:
@@ -83,7 +83,7 @@ class Masked:
         return used
 
     def _take_folder(self, folder: Path) -> str:
-        """Find out whose the masks are, and say it."""
+        """Assign the masks to frames, and make a note of it."""
         if self.is_live:
             raise DatasetError(f"--mask {folder}: a camera needs a single mask image, not a folder")
         files = image_files(folder)
@@ -123,7 +123,7 @@ def _read(path: Path) -> BoolArray:
             f"--mask {path}: OpenCV cannot read this image, or it exceeds a gigapixel: pass a PNG "
             "of the images' size"
         )
-    # What is compressed with losses has no exact black.
+    # Lossy compression leaves no exact black.
     least = 128 if encoding_of(data) in _LOSSY else 1
     return np.asarray(pixels) >= least
 

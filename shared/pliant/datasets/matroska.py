@@ -1,4 +1,4 @@
-"""The video tracks of a Matroska or WebM file: EBML elements, as RFC 8794 and RFC 9559 say."""
+"""The video tracks of a Matroska or WebM file: EBML elements, by RFC 8794 and RFC 9559."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What files of recorded messages have in common: the choice of a topic, its frames, its camera."""
+"""Files of recorded messages: the choice of a topic, its frames, its camera."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -114,7 +114,7 @@ class MessageImages:
                 if len(sizes) == enough or len(faults) == _TRIED_FOR_SIZE:
                     break
         except DatasetError:
-            if not sizes:  # else it is said where the file is read as a whole
+            if not sizes:  # else reported where the whole file is read
                 raise
         if not sizes:
             what = f"no image decodes ({faults[0]})" if faults else "no messages"
@@ -156,7 +156,7 @@ def _of_a_camera(images: list[MessageTopic]) -> list[MessageTopic]:
 
 
 def _other_topics(topics: list[MessageTopic], chosen: MessageTopic, wanted: str) -> list[str]:
-    """A note on the topics that were passed over without being asked to."""
+    """A note on the topics that were skipped without a request."""
     others = [t.name for t in topics if t.kind in IMAGE_TYPES and t.name != chosen.name]
     if wanted or not others:
         return []
@@ -208,12 +208,12 @@ def recorded_image(time_ns: int, decode: Callable[[bytes], Any], data: bytes) ->
 
 
 def missing_library(path: Path, library: str) -> DatasetError:
-    """What to say where an optional library is not there."""
+    """The message for a missing optional library."""
     return DatasetError(f"{path}: reading this file needs {library}: pip install 'pliant[bags]'")
 
 
 def damaged(path: Path, error: BaseException, hint: str) -> DatasetError:
-    """One line for whatever a library says of a broken file."""
+    """One line for any error of a library about a broken file."""
     said: Any = " ".join(str(error).split())[:120]
     return DatasetError(
         f"{path}: is truncated or damaged ({said or type(error).__name__}); repair it with {hint}"

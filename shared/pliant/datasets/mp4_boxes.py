@@ -1,4 +1,4 @@
-"""The tracks of an MP4 or QuickTime file: its boxes, as ISO/IEC 14496-12 says.
+"""The tracks of an MP4 or QuickTime file: its boxes, by ISO/IEC 14496-12.
 
 Read are the sizes, which tracks are pictures, the times of the samples, and the edit lists; of a
 track of metadata also where the samples are.  With
@@ -276,7 +276,7 @@ def _time_scale(file: BinaryIO, parent: _Box, kind: bytes) -> int:
 
 
 def _covers(file: BinaryIO, moov: _Box) -> Iterator[Patch]:
-    """What hides cover pictures, which FFmpeg makes video streams of."""
+    """The box of cover pictures, which FFmpeg treats as video streams."""
     for udta in _boxes(file, moov.start, moov.end, b"udta"):
         for meta in _boxes(file, udta.start, udta.end, b"meta"):
             for skipped in (4, 0):  # QuickTime's has no version

@@ -33,7 +33,7 @@ _LEAST_DATE_S = 500_000_000
 
 @dataclass(frozen=True)
 class NamedTimes:
-    """What names tell.  order: indices of the names by time.   stamps_ns: in that order.
+    """Times from names.  order: indices of the names by time.   stamps_ns: in that order.
 
     unit: in which they are, for people.
     """

@@ -42,7 +42,7 @@ def open_own_recording(spec: SourceSpec) -> Dataset:
 
 
 def recorded_sensors(spec: SourceSpec) -> Measurements:
-    """What a recording has of other sensors.  Raises RecordingError and MessageError."""
+    """The samples of other sensors in a recording.  Raises RecordingError and MessageError."""
     recording = Recording(Path(spec.location))
     return Measurements(imu=imu_of(recording), gps=fixes_of(recording))
 

@@ -3,7 +3,7 @@
 ``cv2.VideoCapture`` cannot turn an interlaced picture into BGR: swscale refuses, OpenCV passes over
 that, and what comes out is what was in memory.  And it scales a picture of another size to the
 first one's without saying so.  Its raw mode gives the packets.  They are decoded here by the same
-libraries, with the same conversion, to the same pixels, and each picture says what it is.
+libraries, with the same conversion, to the same pixels, and each picture has its properties.
 
 The calls are public, and so are the members of structures that are read; FFmpeg keeps both within
 a major version.  With libraries of other versions, or none, there is no ``PacketDecoder``.
@@ -22,7 +22,7 @@ from pliant.algorithms.arrays import U8
 from pliant.algorithms.image.fields import one_field
 
 _VERSIONS = {"avutil": 60, "avcodec": 62, "swscale": 9}
-"""Major versions of FFmpeg 8, whose structures stand below."""
+"""Major versions of FFmpeg 8, whose structures are below."""
 _DECODERS = {
     "h264": b"h264",
     "hevc": b"hevc",
@@ -209,7 +209,7 @@ class PacketDecoder:
 
 
 def codec_of(capture: Reader) -> str:
-    """What OpenCV calls the codec of a stream."""
+    """OpenCV's name of the codec of a stream."""
     return (
         int(capture.get(cv2.CAP_PROP_FOURCC))
         .to_bytes(8, "little", signed=True)[:4]
@@ -218,8 +218,8 @@ def codec_of(capture: Reader) -> str:
 
 
 def parameter_sets(packets: cv2.VideoCapture) -> U8:
-    """What a decoder of H.264 has to know before a first packet that is no IDR picture, as a clip
-    has that was cut from another: OpenCV puts it before IDR pictures alone."""
+    """The parameter sets that a decoder of H.264 needs before a first packet that is no IDR
+    picture, as in a clip cut from another: OpenCV puts them before IDR pictures alone."""
     index = int(packets.get(cv2.CAP_PROP_CODEC_EXTRADATA_INDEX))
     head = cast(U8 | None, packets.retrieve(None, index)[1])
     data = head.tobytes() if head is not None else b""

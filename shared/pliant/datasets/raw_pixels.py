@@ -48,7 +48,7 @@ OTHER_NAMES = {
     "gray8": "mono8",
     "gray16": "mono16",
 }
-"""What others call them: OpenCV, which ROS takes, too, and drivers."""
+"""Their names elsewhere: OpenCV's, which ROS uses, too, and those of drivers."""
 
 
 def raw_rows(encoding: str, height: int) -> int:

@@ -2,7 +2,7 @@
 
 A recording of a video holds its file (``camera/clip``), and of each frame its number in it and the
 checksum of the pixels that were worked on.  They are made again as the run made them, and nothing
-is handed on whose checksum differs.
+is delivered whose checksum differs.
 """
 
 import re
@@ -102,7 +102,7 @@ class _RecordedClip:
     def _sought(self, image: SourceImage, near: int) -> bytes | None:
         """An image anywhere, near where the container has it; None where there is none like it.
 
-        What a container says of its frames is no promise: the checksum alone tells.
+        The container's list of frames may be wrong: only the checksum decides.
         """
         for start, count in ((image.clip_frame, 1), (image.clip_frame - near // 2, near)):
             if start <= 0 or not self._video.seek_frame(start):

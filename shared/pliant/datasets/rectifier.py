@@ -68,7 +68,7 @@ class Rectifier:
         """Grey (H, W), and RGB (H, W, 3) where the source has colour.
 
         Without distortion the pixels are untouched.  Raises BrokenFrame where the frame does not
-        decode, or has another size than the calibration says.
+        decode, or has another size than the calibration.
         """
         pixels = decode(frame)
         height, width = pixels.shape[:2]

@@ -53,7 +53,7 @@ class _Graph:
     @contextmanager
     def open(self) -> Generator["_OpenGraph"]:
         try:
-            definitions()  # said now, before the network is asked
+            definitions()  # fails now, before the network is used
             with open_session([self._endpoint]) as session:
                 yield _OpenGraph(self.path, Node(session, "/pliant_camera"))
         except (BusError, RosError) as error:

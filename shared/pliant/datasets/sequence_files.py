@@ -63,7 +63,7 @@ def render_threads() -> Generator[Executor]:
 def _write_frame(folder: Path, number: int, frame: RenderedFrame, depth_scale: float) -> None:
     """Its image and its depth map; ``images`` and ``depth`` must be there."""
     steps = np.rint(frame.depth_m / depth_scale)
-    # 0 stands for "nothing there", so what is too far for 16 bits becomes 0 as well.
+    # 0 is "no depth", so depths beyond 16 bits become 0 as well.
     depth = np.where(steps <= 65535.0, steps, 0.0).astype(np.uint16)
     image = frame.image if frame.image.ndim == 2 else frame.image[:, :, ::-1]
     for kind, pixels in (("images", image), ("depth", depth)):

@@ -11,7 +11,7 @@ from pliant.wording import shown
 
 
 class SourceSpec(BaseModel):
-    """Where frames come from, and what the user says of them; it travels between processes as JSON.
+    """The source of frames and the user's options for it; it travels between processes as JSON.
 
     location: a file, a folder, or a name such as camera:0.
     calibration: a file that replaces a calibration of the source.

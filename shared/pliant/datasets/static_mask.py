@@ -88,7 +88,7 @@ class StaticallyMasked:
 
 
 def static_counters(dataset: Dataset) -> dict[str, float]:
-    """What the frames of a source were masked by last, as counters of a service."""
+    """The last static mask of a source, as counters of a service."""
     while not isinstance(dataset, StaticallyMasked):
         inner = getattr(dataset, "source", None)
         if inner is None:
@@ -98,7 +98,7 @@ def static_counters(dataset: Dataset) -> dict[str, float]:
 
 
 def static_line(counters: Mapping[str, float]) -> str:
-    """What these counters say to people; "" without any."""
+    """The line for users on these counters; "" without any."""
     shares = {
         key.removeprefix(_PREFIX): share
         for key, share in counters.items()

@@ -27,7 +27,7 @@ _DEEPEST = 65535
 
 @dataclass(frozen=True)
 class StereoPair:
-    """What of the right camera belongs to an image.
+    """The image of the right camera that belongs to an image.
 
     right: its image.     focal_px, baseline_m: of the pair.     scale_m: metres a unit of depth.
     """

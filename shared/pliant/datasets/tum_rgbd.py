@@ -6,7 +6,7 @@
                                                  read it
     rgbd_dataset_freiburg1_xyz/groundtruth.txt   true poses
 
-The name of the folder says which of the three cameras it was (``freiburg1`` or ``fr1``, ...).
+The name of the folder has the camera, one of three (``freiburg1`` or ``fr1``, ...).
 """
 
 import re

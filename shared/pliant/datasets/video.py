@@ -23,7 +23,7 @@ from pliant.errors import DatasetError
 GIVE_UP = 600
 """Frames that do not decode, one behind the other, before nothing more is expected."""
 _LOOKED_AT = 15
-"""Frames that tell whether they are combs of two fields, though the file does not say so."""
+"""Frames that tell whether they are combs of two fields, though the file is not marked so."""
 _ROUNDED_NS = 1_000
 """More than what times lose as OpenCV gives them, milliseconds in a float."""
 

@@ -1,7 +1,7 @@
 """The pictures of a video file, one by one: of the stream that is meant, each in its own size.
 
-One thread decodes: with several FFmpeg makes of a damaged stream what timing says, and other pixels
-with every run.
+One thread decodes: with several, FFmpeg makes other pixels of a damaged stream with every run,
+by their timing.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ _DEFAULT_FPS = 30.0
 _MOST_LINES = 1088
 """Of interlaced video."""
 _LOOKED_AT = 8
-"""Pictures that say whether a stream is interlaced."""
+"""Pictures by which a stream counts as interlaced or not."""
 _SAME_ASPECT = 0.01
 FIELDS = "interlaced: one field of each frame is used, and the lines between are interpolated"
 _COLOURS = "HDR or wide-gamut video: colours stay as they are coded"
@@ -30,7 +30,7 @@ _LIKELY_ASPECTS = (Fraction(1, 4), Fraction(4))
 
 
 class Capture(Protocol):
-    """What is used of ``cv2.VideoCapture``."""
+    """The part of ``cv2.VideoCapture`` that is used."""
 
     def grab(self) -> bool: ...
     def retrieve(self) -> tuple[bool, U8 | None]: ...
@@ -42,9 +42,9 @@ class Capture(Protocol):
 class VideoDecoder:
     """A decoder at the first picture of a stream.
 
-    stream: what the container says of it.     notes: what is done to it, for people.
-    rate_hz: frames a second, or a usual rate where the container says nothing likely.
-    count: how many pictures it has, by the word of the container; None: that says nothing likely.
+    stream: its description in the container.     notes: changes to its pictures, for users.
+    rate_hz: frames a second, or a usual rate where that of the container is unlikely.
+    count: how many pictures it has, according to the container; None: unlikely there.
     aspect: width over height of its pixels.     codec: as OpenCV calls it.
     combed: whether a picture that was read had two fields, though the stream is none of these.
     """
@@ -126,7 +126,7 @@ def opened(file: Path) -> Generator[VideoDecoder, None, None]:
 
 @contextlib.contextmanager
 def quiet_opencv() -> Generator[None, None, None]:
-    """Keep OpenCV and FFmpeg from writing to the terminal: our own line says what is wrong."""
+    """Keep OpenCV and FFmpeg from writing to the terminal: our own message reports the fault."""
     logging: Any = cv2.utils.logging
     before = logging.getLogLevel()
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)
@@ -175,7 +175,7 @@ def _packets(
 
 
 def _special(packets: cv2.VideoCapture | None) -> list[str]:
-    """What is special about a stream, in lines for people, by its first pictures."""
+    """Notes for the user on a stream, by its first pictures."""
     if packets is None:
         return []
     sides = packets.get(cv2.CAP_PROP_FRAME_WIDTH), packets.get(cv2.CAP_PROP_FRAME_HEIGHT)
@@ -188,7 +188,7 @@ def _special(packets: cv2.VideoCapture | None) -> list[str]:
 
 
 def _aspect(capture: cv2.VideoCapture, rotation_deg: int) -> Fraction:
-    """Width over height of a pixel, as it comes; 1 where the file says nothing likely."""
+    """Width over height of a pixel, as it is stored; 1 where that of the file is unlikely."""
     above, below = (int(capture.get(each)) for each in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
     if above <= 0 or below <= 0:
         return Fraction(1)

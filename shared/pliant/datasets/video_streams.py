@@ -17,7 +17,7 @@ _AVI = b"RIFF"
 
 @dataclass(frozen=True)
 class Patch:
-    """Bytes that stand in for those of a file from ``offset`` on."""
+    """Bytes that replace those of a file from ``offset`` on."""
 
     offset: int
     data: bytes
@@ -30,7 +30,7 @@ class VideoStream:
     width, height: of the stored images, pixels.
     is_default: not marked as one to be passed over.
     is_still: a cover picture or thumbnails, no film.
-    frames: how many it has; None where its headers do not say.
+    frames: how many it has; None if unknown to its headers.
     stamps_ns: when frames are shown, sorted, in media time; () where only reading tells.
     origin_ns: when the first is shown in the order of decoding, from which OpenCV counts.
     shown_ns: intervals of media time that are to be shown; () for all.
@@ -69,7 +69,7 @@ class Container:
 
 @dataclass(frozen=True, kw_only=True)
 class ChosenStream:
-    """What is decoded of a file.  stream: None where the container is not understood."""
+    """The decoded stream of a file.  stream: None where the container is not understood."""
 
     stream: VideoStream | None = None
     patches: tuple[Patch, ...] = ()

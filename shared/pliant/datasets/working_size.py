@@ -1,6 +1,6 @@
 """A source at the size that it is worked on: what is larger than its details is made smaller.
 
-The first frames say it, so the same source gives the same size.  Everything behind the source,
+The first frames determine it, so the same source has the same size.  Everything behind the source,
 the recording too, has the smaller images and their camera, and knows nothing of larger ones.
 """
 
@@ -27,7 +27,7 @@ from pliant.errors import DatasetError
 
 _LEAST_SHORTER_SIDE_PX = 16
 _LOOKED_AT, _STEP = 7, 5
-"""Frames that say how sharp a source is, and how far they lie apart: cameras begin out of focus."""
+"""Frames that determine how sharp a source is, and their distance: cameras begin out of focus."""
 
 
 class SmallerImages:
@@ -65,7 +65,7 @@ class SmallerImages:
 
 
 def smaller(frame: SourceFrame, pixels: U8, side: int) -> SourceFrame:
-    """A frame, and its pixels (H, W) or (H, W, 3) RGB, with so many along the longer side."""
+    """A frame, and its pixels (H, W) or (H, W, 3) RGB, with that many along the longer side."""
     made_from = f"{frame.encoding} of {pixels.shape[1]}x{pixels.shape[0]} px"
     pixels = resized(pixels, side)
     height, width = pixels.shape[:2]
@@ -80,7 +80,7 @@ def smaller(frame: SourceFrame, pixels: U8, side: int) -> SourceFrame:
 
 
 def at_working_size(source: Dataset, longest_side_px: int = 0) -> Dataset:
-    """The source itself, or its images made smaller.  longest_side_px: 0 lets them say it.
+    """The source itself, or its images made smaller.  longest_side_px: 0: chosen by them.
 
     A camera's first images say little, and it would give others after a restart: of those it is
     the limit alone that counts.     Raises DatasetError for images that are too narrow.

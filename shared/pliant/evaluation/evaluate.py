@@ -124,7 +124,7 @@ def _evaluated(result: Path, truth: Path, request: EvaluationRequest) -> Evaluat
 
 
 def _proposal(evaluation: Evaluation, better: TimeOffset) -> str:
-    """What a user may try where the times of poses and ground truth seem to differ."""
+    """A proposal for the user where the times of poses and ground truth seem to differ."""
     where = "later" if better.seconds > 0.0 else "earlier"
     return (
         f"ground truth fits far better {abs(better.seconds):.3f} s ({abs(better.frames):.1f} "

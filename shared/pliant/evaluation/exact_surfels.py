@@ -1,7 +1,8 @@
 """Surfels compared with exact ground truth: the material points on which they were created.
 
 Metric, untrimmed, without any alignment.  The world is the camera of the frame in which the surfels
-start, for ground truth as for the surfels: where the camera moves, its error is part of theirs.
+start, for ground truth as for the surfels: where the camera moves, its error is part of the
+surfels' error.
 The surfels of that first frame are judged.  A share of the depth is of each surfel's own true
 depth.
 """
@@ -20,9 +21,9 @@ from pliant.evaluation.surfel_truth import rmse, roc
 INLIER = 0.01
 """A surfel is right within this share of its depth (paper, Fig. 3)."""
 INLIER_PX = 1.0
-"""And this is all that the image can say of it: the ZNCC knows nothing of the depth."""
+"""The image determines no more than this: the ZNCC does not depend on the depth."""
 _BORDER_PX = 12.0
-"""Nearer to the border than half a patch a surfel cannot be asked to be followed."""
+"""Nearer to the border than half a patch no surfel can be tracked."""
 _DRAGGED_PX = 3.0
 _WHOLE_PX = 1e-2
 
@@ -76,7 +77,7 @@ class _Start:
 
 @dataclass
 class _Pairs:
-    """Every surfel in every frame: what the test says and what is true."""
+    """Every surfel in every frame: the result of the test, and the ground truth."""
 
     zncc: list[F64] = field(default_factory=list[F64])
     right: list[BoolArray] = field(default_factory=list[BoolArray])
@@ -212,7 +213,7 @@ class ExactSurfels:
         in_camera: F64,
         exact_camera: F64,
     ) -> None:
-        """The pairs of the ROC, in the frame of the camera: of its error the image says nothing.
+        """The pairs of the ROC, in the frame of the camera: the image does not show its error.
 
         What was tried and not kept counts where it was tried; in recordings that do not tell, at
         its pixel and last depth.

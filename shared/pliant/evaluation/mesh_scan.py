@@ -19,7 +19,7 @@ from pliant.formats.ply import read_ply
 SURFACE_LIMIT = 0.01
 """Share of the scan's diameter within which two surfaces are the same, for the F-score."""
 _SPACING = 0.25
-"""Samples of both surfaces stand so far apart, as a share of the limit."""
+"""Distance of the samples of both surfaces, as a share of the limit."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ DEPTH_LIMIT = 0.05
 SURFACE_LIMIT = 0.01
 """Share of the scene's diameter within which two surfaces are the same, for the F-score."""
 _SPACING = 0.25
-"""Samples of a surface stand so far apart, as a share of the limit."""
+"""Distance of the samples of a surface, as a share of the limit."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -60,7 +60,7 @@ def mesh_against_truth(
 
 
 def _draw_errors(path: Path, measured: MeshEvaluation, run: Run) -> str:
-    """The mesh, coloured by its distance from the true surface.  Returns what to say of it."""
+    """The mesh, coloured by its distance from the true surface.  Returns a line for the user."""
     distances, diameter = measured.distances(_MOST_ERROR)
     levels = np.rint(255.0 * np.minimum(distances / (_MOST_ERROR * diameter), 1.0))
     turbo = cv2.applyColorMap(levels.astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)

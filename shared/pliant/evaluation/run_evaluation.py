@@ -104,7 +104,7 @@ class TrajectoryEvaluation:
 
     @property
     def partly_compared(self) -> bool:
-        """Whether so many poses have no true pose that the user should look at ground truth."""
+        """Whether too many poses lack a true pose: the user should check the ground truth."""
         few = self.matched < MIN_COMPARED * self.localised
         return few and self.localised >= MIN_POSES and not self.apart
 
@@ -243,7 +243,7 @@ def evaluate_result(
         report.json; or a trajectory file of any known format.
     groundtruth: a trajectory, a file of any known format, or a folder with groundtruth.txt.
         times: the times of a KITTI ground truth.
-    frames: of the sequence, where report.json does not say.
+    frames: of the sequence, where report.json has no number.
     offset: is added to the times of the poses: seconds ("0.1"), or frames ("3f").
     Raises ResultError with one line where a file is missing or not what it should be.
     """

@@ -1,4 +1,4 @@
-"""What evaluation needs of a result folder's report.json, checked: the folder may be anybody's."""
+"""The values of report.json that evaluation needs, checked: the folder may be from elsewhere."""
 
 import json
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Segment:
 
 @dataclass(frozen=True, kw_only=True)
 class RunReport:
-    """frames: of the whole sequence.  None where the report does not say.
+    """frames: of the whole sequence.  None where the report has none.
 
     segments: in the order of time; None where the report does not list them (then the trajectory
     is taken as one segment).

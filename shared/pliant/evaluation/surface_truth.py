@@ -56,7 +56,7 @@ class SurfaceTruth:
         return [vertices[frame].astype(np.float64) for vertices in self._vertices]
 
     def at_pixels(self, frame: int, points_px: F32 | F64) -> MaterialPoints:
-        """What a frame shows at (N, 2) pixels."""
+        """The material points of a frame at (N, 2) pixels."""
         pixels = np.asarray(points_px, np.float64)
         sheet, where, _ = look_at_pixels(
             self.sheets(frame), self.T_world_camera[frame], self.camera, pixels

@@ -3,8 +3,8 @@
 The surfels that are born in the first frame with any are judged, in the frame of the camera.  Two
 errors, since sensors give depth but no correspondences:
 
-- the distance to the true cloud (the depth map's pixels), which needs no correspondences and says
-  nothing of sliding along the surface;
+- the distance to the true cloud (the depth map's pixels), which needs no correspondences and does
+  not show sliding along the surface;
 - the distance to tracks: the surfel's place of birth followed from image to image by Lucas-Kanade,
   kept as long as following it back ends within half a pixel, and lifted with the true depth.  It
   shares the tangential error of that tracker, which is no part of the surfels'.

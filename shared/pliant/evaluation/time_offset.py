@@ -17,7 +17,7 @@ from pliant.trajectory import Trajectory
 from pliant.wording import shown
 
 _RANGE_S, _RANGE_SHARE = 2.0, 0.1
-"""Offsets that are tried: up to so many seconds, or this share of the duration."""
+"""Offsets that are tried: up to this many seconds, or this share of the duration."""
 _MOST_STEPS = 400
 _FAR_BETTER = 0.7
 _LEAST_FRAMES = 0.5
@@ -25,7 +25,7 @@ _LEAST_POSES = 10
 _FITS = 0.1
 """Error, as a share of the spread of true positions, that is a fit where no time is in both."""
 _GAP = 3.0
-"""Between true poses farther apart than so many median intervals nothing is interpolated."""
+"""No interpolation between true poses more than this many median intervals apart."""
 _OFFSET = re.compile(r"([-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*(s|f|frames?)?")
 
 
@@ -107,15 +107,15 @@ def _by_their_beginnings(estimate: Trajectory, truth: Trajectory, by_ns: int) ->
 def _search(
     times: F64, positions: F64, true_times: F64, true_positions: F64, frame_s: float, limit: float
 ) -> tuple[float, float, float]:
-    """The error without an offset, the best offset, and the error with it; (0, 0, 0) where nobody
-    can tell."""
-    nobody = 0.0, 0.0, 0.0
+    """The error without an offset, the best offset, and the error with it; all 0
+    where there are too few poses."""
+    unknown = 0.0, 0.0, 0.0
     step = max(0.5 * frame_s, 2.0 * limit / _MOST_STEPS)
     if limit < step:
-        return nobody
+        return unknown
     there = _covered(times, true_times, limit)
     if np.count_nonzero(there) < max(_LEAST_POSES, 0.5 * len(times)):
-        return nobody
+        return unknown
     positions, times = positions[there], times[there]
 
     def rmse(offset: float) -> float:
@@ -152,7 +152,7 @@ def _at(times: F64, true_times: F64, positions: F64) -> F64:
 
 def _rmse(positions: F64, truth: F64) -> float:
     if min(np.ptp(positions, axis=0).max(), np.ptp(truth, axis=0).max()) <= 0.0:
-        return float("inf")  # one that stands still fits nothing
+        return float("inf")  # a static one fits nothing
     scale, R, t = align_umeyama(positions, truth, with_scale=True)
     errors = scale * positions @ R.T + t - truth
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))

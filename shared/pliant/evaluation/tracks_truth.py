@@ -150,7 +150,7 @@ class TracksTruth:
         self._seen = np.concatenate([self._seen, np.ones(count, np.bool_)])
 
     def evaluation(self) -> TracksEvaluation:
-        """What all frames so far add up to."""
+        """The figures over all frames so far."""
         rows: list[AgeRow] = []
         for age in self._ages:
             distance = np.concatenate([*self._distances[age], np.zeros(0)])

@@ -81,7 +81,7 @@ def depth(recording: Recording, path: Path, folder: Path | None) -> None:
 
 
 def _seen(recording: Recording, ideal: IdealCamera, history: MapHistory) -> dict[int, SeenPoints]:
-    """What each keyframe sees where its image shows it, by its frame."""
+    """The points that each keyframe observes and their pixels, by its frame."""
     told = seen_by_keyframes(recording, set(ideal.keyframes.values()))
     seen: dict[int, SeenPoints] = {}
     for frame, keyframe in ideal.keyframes.items():

@@ -147,7 +147,7 @@ def exports_in(folder: Path, *, but: Container[str] = ()) -> list[str]:
 def _check_ending(path: Path, to: str, name: str) -> None:
     """Raise ResultError where others would take a file for another kind than it is.
 
-    name: the default.  Pictures and videos have several, and are made in the format of theirs.
+    name: the default.  Pictures and videos have several, and are made in the format of the ending.
     """
     given, own = path.suffix.lower(), Path(name).suffix
     if to in _NAMED and given != own:

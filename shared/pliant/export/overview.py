@@ -27,13 +27,13 @@ _SWING_DEG = 45.0
 """So far the eye goes to either side: behind what it looks at the camera has seen little."""
 _WIDTH, _HEIGHT, _GAP = 960, 360, 4  # pixels
 _WIDE = 2.0
-"""Columns over rows from which an image stands above the map, not beside it."""
+"""Columns over rows from which an image is above the map, not beside it."""
 _STILL = (640, 480)
 """Columns and rows of each part of a still picture."""
 
 
 class Layout:
-    """Where the image and the map stand, or two pictures.  image, map: (columns, rows)."""
+    """The places of the image and the map, or of two pictures.  image, map: (columns, rows)."""
 
     def __init__(self, columns: int, rows: int) -> None:
         """columns, rows: of the images."""
@@ -65,7 +65,7 @@ class ShownFrame:
 
 @dataclass(frozen=True)
 class Made:
-    """What has become of a run: its longest segment.
+    """The map of a run: its longest segment.
 
     source: name.      points: of the map.      poses: (N, 4, 4) T_world_camera.
     mesh: None where there is none.

@@ -15,7 +15,7 @@ from pliant.results.run import read_run
 from pliant.results.textured_mesh import textured
 
 TRIANGLES = 40_000
-"""What a mesh is decimated to, unless told otherwise."""
+"""The default number of triangles of a decimated mesh."""
 _TEXELS = 2048
 
 
@@ -42,7 +42,7 @@ def textured_mesh(
     recording: Recording, triangles: int, *, clean: bool = False, observed: bool = False,
     crop: Box | None = None,
 ) -> TexturedMesh:  # fmt: skip
-    """The fine mesh of the longest segment, of at most so many triangles.
+    """The fine mesh of the longest segment, of at most that many triangles.
 
     clean: without small pieces.    observed: without closed holes.    crop: only what lies in this
     box.

@@ -31,7 +31,7 @@ class Words:
 
 
 def write_page(path: Path, width: float, height: float, marks: Sequence[Rectangle | Words]) -> None:
-    """Write a page of so many mm; viewers are told not to scale it.  Raises ResultError."""
+    """Write a page of that size in mm; viewers shall not scale it.  Raises ResultError."""
     content = "\n".join(_drawn(mark, height) for mark in marks).encode("ascii", "replace")
     size = f"{width * _POINTS_PER_MM:.4f} {height * _POINTS_PER_MM:.4f}"
     objects = [

@@ -37,7 +37,7 @@ _CLOSED = "closed"
 class PlyData:
     """points: (N, 3).  colours: (N, 3) RGB.  normals: (N, 3).  faces: (F, 3) rows of points.
 
-    closed: rows of points that close holes, ascending; none where the file does not say.
+    closed: rows of points that close holes, ascending; none if the file does not mark them.
     """
 
     points: F32
@@ -103,7 +103,7 @@ def read_ply(path: Path) -> PlyData:
 
     Other scalar properties of points are passed over.  Raises ResultError, in one line, for text
     or big-endian PLY, faces that are not triangles, elements it does not know, a file that is
-    shorter or longer than its header says, and corners that are not points.
+    shorter or longer than by its header, and corners that are not points.
     """
     try:
         data = path.read_bytes()

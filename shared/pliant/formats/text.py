@@ -1,4 +1,4 @@
-"""What the text formats of trajectories share: careful lines in, exact numbers out."""
+"""Common parts of the text formats of trajectories: checked lines in, exact numbers out."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from decimal import Decimal, InvalidOperation

@@ -15,7 +15,7 @@ from pliant.errors import PliantError
 _GROWTH = 0.6
 """Of surface, blocks grow with one over the voxel squared; at its borders more slowly."""
 _MARGIN = 1.05
-"""On a voxel that is said to fit."""
+"""On a voxel that is proposed as fitting."""
 SCENE_VIEWS = 20
 """Views' worth of blocks of a scene: the built-in ones and RedKitchen take 9 to 20."""
 

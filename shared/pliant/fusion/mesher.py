@@ -40,7 +40,7 @@ _NO_IMAGE = "it has no image"
 class LiveChange:
     """Blocks of the live mesh of a segment that changed, or are repeated.
 
-    span: of packed keys; there are no other blocks within it.  (0, -1): it says nothing.
+    span: of packed keys; there are no other blocks within it.  (0, -1): unknown.
     """
 
     segment: int

@@ -52,7 +52,7 @@ def _required(message: type[Header]) -> frozenset[str]:
 
 @cache
 def _rows(message: type[Header]) -> dict[str, str]:
-    """Fields of bytes that are rows of pixels, and the fields that say how many."""
+    """Fields of bytes that are rows of pixels, and the fields with their number."""
     hints = get_type_hints(message, include_extras=True)
     annotated = {n: get_args(h)[1] for n, h in hints.items() if get_origin(h) is Annotated}
     return {name: extra.field for name, extra in annotated.items() if isinstance(extra, Rows)}

@@ -2,7 +2,7 @@
 
 The lowest bytes of all numbers come first, then the next ones of all, up to the highest.  So the
 bytes that are alike, those of signs, exponents and the high ends of counters, lie together:
-``scripts/bench compression`` says what that is worth.
+``scripts/bench compression`` measures the gain.
 """
 
 from typing import Any

@@ -44,7 +44,7 @@ class Topic:
     kept_whole: bool = False
     """Its readers take in all of it before they come to a checkpoint, so that senders keep all."""
     viewed: int = 0
-    """Viewers draw it: so many of its newest messages are held for one that is slow."""
+    """Viewers draw it: this many of its newest messages are kept for a slow one."""
     compression: str = "zstd"
     """How its chunks of a recording are stored: "" as they are, or "zstd"."""
 

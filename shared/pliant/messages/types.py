@@ -97,14 +97,14 @@ class CameraStream(Header):
 
 @dataclass(frozen=True)
 class Rows:
-    """Says of a field of bytes that they are rows, as many as another field says (0: none)."""
+    """Marks a field of bytes as rows; another field has their number (0: none)."""
 
     field: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceImage(Header):
-    """A frame as it came: ``encoding`` says how ``data`` is read.  Empty where it was dropped.
+    """A frame as it came: ``encoding`` is that of ``data``.  Empty where it was dropped.
 
     made_from: "" as it came; else what it was before it was made smaller, or a JPEG for a link.
     unmapped, unplaced: as in ``Image``, so that a replay does what the run did.
@@ -204,7 +204,7 @@ class MapUpdate(Header, MapDelta):
 
 @dataclass(frozen=True, kw_only=True)
 class Keyframe(Header, KeyframeDelta):
-    """What a frame changed in the observations of keyframes.
+    """The changes of a frame in the observations of keyframes.
 
     jpeg: the rectified image of the new keyframe, colour where the source has it; empty without.
     earlier_ids, earlier_jpegs: keyframes that earlier frames became now that a map starts from
@@ -294,7 +294,7 @@ class Status(Header):
     """How a service fares; never an input of another one.
 
     stages, seconds: time spent on this frame by stage.   counters, values: what the service counts.
-    note: one line for the user, "" if there is nothing to say.
+    note: one line for the user, "" for none.
     """
 
     service: str

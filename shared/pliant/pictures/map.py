@@ -20,12 +20,12 @@ FOCAL = 1.2  # of the height of the picture
 _ASPECT = 4.0 / 3.0
 _FROM_DEG = ((25.0, 35.0),)  # azimuth and elevation of the usual view
 _FILLED = 0.92  # of the picture, by what it is framed on
-_FRAMED_BY, _STOPS = 20_000, 40  # so many points and places of the path are enough
+_FRAMED_BY, _STOPS = 20_000, 40  # this many points and places of the path are enough
 _MOST_UP_DEG, _MOST_DOWN_DEG = 15, 60  # that cameras look, all the time
 _HEIGHT_BIN = 0.01  # of the whole extent
 _NEAR = 2.0  # medians of the points' distances from the path
 _SUPERSAMPLE = 2
-# Eye-dome lighting (Boucheny 2009): a pixel is as dark as its neighbours stand before it.
+# Eye-dome lighting (Boucheny 2009): a pixel is as dark as its neighbours are nearer.
 _SHADE = 6.0
 _SHIFT = 4
 
@@ -141,7 +141,7 @@ def _about(axis: F64, angle: float) -> F64:
 
 
 def _body(points: F64, positions: F64) -> tuple[F64, float]:
-    """(N, 3) what the camera has looked at and its path, and their radius; outliers have no say.
+    """(N, 3) what the camera has looked at and its path, and their radius; outliers do not count.
 
     What is far from the whole path, a wall behind the things on a table, is their surroundings.
     """
@@ -256,7 +256,7 @@ def _splat(
 
 
 def dimmed_behind(depth: F32, reach: float) -> F32:
-    """(H, W) light that is left where neighbours stand before a pixel.
+    """(H, W) light that is left where neighbours are nearer than a pixel.
 
     depth: (H, W), inf where nothing is.      reach: as of a MapView.
     """

@@ -30,7 +30,7 @@ _AMBIENT, _FROM_EYE, _FROM_LAMP = 0.28, 0.3, 0.55
 _OWN_LIGHT = 0.5
 """Of the colours, which have seen the scene's own light: so much of them needs no lamp."""
 _BRIGHT = 1.1
-"""What the lamps make of the rest: what is white stays so, and no more."""
+"""Factor of the lamps on the rest: white stays white."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def _outwards(mesh: TriangleMesh, rows: slice) -> F64:
     corners = mesh.positions[faces].astype(np.float64)
     edges = corners[:, 1:] - corners[:, :1]
     away = np.cross(edges[:, 0], edges[:, 1])
-    # Which side is out is said by the normals, whatever the order of the corners.
+    # The normals determine the outer side, whatever the order of the corners.
     return away * np.sign((away * mesh.normals[faces[:, 0]]).sum(axis=1))[:, None]
 
 

@@ -11,8 +11,8 @@ from pliant.algorithms.arrays import U8
 from pliant.errors import ResultError
 from pliant.formats.text import write_bytes
 
-# What the headless wheels of OpenCV can encode without codecs of the system.  Browsers play VP8,
-# and neither MPEG-4 Part 2 nor MJPEG; VP9 takes five times as long for two thirds of the size.
+# Formats that the headless wheels of OpenCV encode without codecs of the system.  Browsers play
+# VP8, and neither MPEG-4 Part 2 nor MJPEG; VP9 takes five times as long for two thirds of the size.
 _VIDEO_CODECS = {".webm": ("VP80", ".mkv"), ".mp4": ("mp4v", ".mp4"), ".avi": ("MJPG", ".avi")}
 _MATROSKA = b"\x42\x82\x88matroska"
 _WEBM = b"\x42\x82\x84webm\xec\x82\0\0"

@@ -22,7 +22,7 @@ _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 _FINER = 2  # pictures are drawn so much larger, and shrunk: soft edges, and lines below a pixel
 _SHARPEST_PX = 1000  # images with fewer columns are shown twice as large
 
-# What the marks of all tracks may cover of the picture, whatever their number.
+# The share of the picture that the marks of all tracks may cover, whatever their number.
 _TRAILS, _DOTS = 0.05, 0.05
 _TRAIL_OPACITY = 0.6
 _LARGEST_DOT = 0.003

@@ -14,7 +14,7 @@ MAGIC = b"\x89MCAP0\r\n"
 CHUNK_BYTES = 1 << 20
 """A chunk is closed before it grows beyond this; a larger message has a chunk to itself."""
 BLOCK_BYTES = 1 << 18
-"""What is read at a time of what does not fit a chunk."""
+"""Bytes that are read at a time of records larger than a chunk."""
 RECORD_LIMIT = 16 << 20
 """Largest metadata, attachment, channel or schema record that is read, in bytes."""
 COMPRESSIONS = ("", "zstd")

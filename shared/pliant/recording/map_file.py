@@ -31,7 +31,7 @@ _RECORD = "map"
 
 @dataclass(frozen=True, kw_only=True)
 class MapHeader:
-    """What stands at the beginning of the file."""
+    """The header of the file."""
 
     version: int = MAP_VERSION
     release: str = __version__
@@ -124,7 +124,7 @@ def write_map(path: Path, header: MapHeader, keyframes: Iterable[MapKeyframe]) -
 
 
 def describe(path: Path) -> Iterator[str]:
-    """What a map holds, in a few lines.  Raises MapError."""
+    """A summary of a map in a few lines.  Raises MapError."""
     file = MapFile(path)
     segments: dict[int, tuple[int, int]] = {}
     sessions: set[int] = set()
@@ -160,5 +160,5 @@ def _write(writer: RecordingWriter, keyframe: MapKeyframe) -> None:
 
 
 def _why(error: Exception, path: Path) -> str:
-    """What an error says, without the name of the file that it begins with."""
+    """The message of an error, without the name of the file that it begins with."""
     return str(error).removeprefix(f"{path}: ")

@@ -10,7 +10,7 @@ from pliant.messages.topics import Topic
 from pliant.recording.writer import RecordingWriter
 
 PART = "part_{:05d}.mcap"
-_PART = re.compile(r"part_\d{5,}\.mcap")  # and not what somebody recovered or exported of one
+_PART = re.compile(r"part_\d{5,}\.mcap")  # and not a recovered or exported one
 PART_RECORD = "part"
 """Name of the metadata record that numbers a part."""
 

@@ -11,7 +11,7 @@ from pliant.recording.chunk_index import Index, IndexedChunk
 from pliant.recording.reader import Recorded
 
 _MARGIN_NS = 200_000_000
-"""What was published at one time is recorded within this."""
+"""Messages that are published at one time are recorded within this."""
 
 
 class Playback:

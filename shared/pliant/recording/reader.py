@@ -47,7 +47,7 @@ class Recording:
 
     @property
     def path(self) -> Path:
-        """What it was opened by."""
+        """The path that it was opened with."""
         return self._path
 
     @property

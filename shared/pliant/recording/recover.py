@@ -28,8 +28,8 @@ RECOVERED = "recovered"
 
 @dataclass
 class Recovery:
-    """What was kept, ends of topics not counted.  ``unchecked``: those of the messages that no
-    checksum vouched for."""
+    """The recovered messages, ends of topics not counted.  ``unchecked``: those of them without a
+    checksum."""
 
     messages: int = 0
     unchecked: int = 0

@@ -114,7 +114,7 @@ def scan(path: Path, size_limit: Callable[[str], int]) -> Iterator[Item]:
 def scan_chunk(
     path: Path, offset: int, channels: Mapping[int, Channel], size_limit: Callable[[str], int]
 ) -> Iterator[Item]:
-    """What the chunk at ``offset`` holds; ``channels`` are those that are known already.
+    """The messages of the chunk at ``offset``; ``channels`` are those that are known already.
 
     Damage where there is none.  Raises RecordingError for a file that cannot be read.
     """
@@ -232,7 +232,7 @@ class _Walk:
         return self._size
 
     def _records(self, chunk: _Chunk) -> Source:
-        """What a chunk holds, from its beginning."""
+        """The messages of a chunk, from its beginning."""
         stored = Span(self._file, chunk.data, min(chunk.end, self._size))
         return Inflated(stored, chunk.size) if chunk.compression else stored
 
@@ -387,7 +387,7 @@ def _parsed(read: Callable[[ReadDataStream], _R], content: bytes) -> _R | None:
 
 
 def _passed(records: Source, size: int) -> bool:
-    """Pass over so many bytes; False where there are fewer."""
+    """Skip that many bytes; False where there are fewer."""
     while size > 0:
         block = records.read(min(size, BLOCK_BYTES))
         if not block:

@@ -70,8 +70,8 @@ class OpenChunk:
         self.messages += 1
 
     def finish(self, offset: int) -> tuple[list[bytes], ChunkIndex]:
-        """What goes to the file at ``offset``, and its entry in the index of the whole."""
-        # What is stored as it is needs no copy of itself.
+        """The bytes for the file at ``offset``, and their entry in the index of the whole."""
+        # Uncompressed data needs no copy.
         records = [b"".join(self._parts)] if self.compression else self._parts
         stored = [layout.compress(records[0], self.compression)] if self.compression else records
         stored_size = sum(map(len, stored))

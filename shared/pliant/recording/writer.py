@@ -139,7 +139,7 @@ class RecordingWriter:
     def close(self) -> None:
         """Write the index and close."""
         try:
-            if self._broken:  # what was said of it when it broke is all there is to say
+            if self._broken:  # the error was raised when it broke
                 return
             self._close_chunks()
             counts = {self._channels[key].id: count for key, count in self._counts.items()}
@@ -157,7 +157,7 @@ class RecordingWriter:
         except OSError as error:
             raise self._failed(error) from None
         finally:
-            with suppress(OSError):  # a full disk fails once more here; what matters was said
+            with suppress(OSError):  # a full disk fails once more here; the error was raised before
                 self._file.close()
 
     @property

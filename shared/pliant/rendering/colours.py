@@ -1,6 +1,6 @@
 """Colours that leave the grey image as it is: cameras that are grey and in colour see the same.
 
-A colour is said by how much more red and blue than its grey value it has, as shares of that.
+A colour is the excess of its red and blue over its grey value, as shares of that.
 """
 
 import numpy as np

@@ -25,7 +25,7 @@ _SHIRT = Material(brightness=105, contrast=30, noise=7, coverage=0.22)
 _BOARD = Material(brightness=125, contrast=40, noise=4, coverage=0.2, writing=0.3)
 _WALL = Material(brightness=95, contrast=25, noise=5, coverage=0.2)
 _STEEL = Material(brightness=70, contrast=25, noise=6, coverage=0.2, stretch=4.0)
-# The camera stands still: a path of one point.
+# A static camera: a path of one point.
 _STILL = SplinePath(
     [(0.0, 0.0, 0.0)] * 2,
     [(0.0, 0.0, 1.0)] * 2,
@@ -40,7 +40,7 @@ _DROP_EVERY = 20  # frames
 
 
 class DeformingOptions(FilmOptions):
-    """What may be said after the name of every deforming sequence."""
+    """Options after the name of every deforming sequence."""
 
     exposure: float = Field(
         default=0.0, ge=0.0, lt=1.0, description="Swing of the exposure; 0.2: 20 %."
@@ -127,7 +127,7 @@ class Builder(NamedTuple):
 def deforming_scene(
     name: str, options: DeformingOptions, tracks_m: F64 | None = None
 ) -> DeformingScene:
-    """A scene with its lamp and its tool as the options say.
+    """A scene with its lamp and its tool, by the options.
 
     tracks_m: (23, 301, 3) true points, for the Kinect paper alone.
     """

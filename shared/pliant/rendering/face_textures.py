@@ -154,7 +154,7 @@ def make_face_colours(
 
 
 def _texels(width_m: float, height_m: float, density: float) -> tuple[int, int]:
-    """Rows and columns of a texture of so many metres."""
+    """Rows and columns of a texture of that size in metres."""
     # One block more than the surface needs, so that its far edge never meets the texture's end.
     width, height = (
         int(np.ceil((size * density + 1.0) / _BLOCK)) * _BLOCK for size in (width_m, height_m)
@@ -165,7 +165,7 @@ def _texels(width_m: float, height_m: float, density: float) -> tuple[int, int]:
 def mip_pyramid(
     width_m: float, height_m: float, density: float, paint: Callable[[int, int], F32]
 ) -> FaceTexture:
-    """A texture of so many metres.  paint: makes (height, width) texels, float32."""
+    """A texture of that size in metres.  paint: makes (height, width) texels, float32."""
     height, width = _texels(width_m, height_m, density)
     levels = [paint(height, width)]
     while len(levels) < LEVELS:

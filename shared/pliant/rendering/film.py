@@ -47,7 +47,7 @@ class CameraOptions(Parameters):
 
 
 class FilmOptions(Parameters):
-    """What may be said after the name of every built-in sequence."""
+    """Options after the name of every built-in sequence."""
 
     frames: int | None = Field(
         default=None, ge=2, description="First frames only; all where not given."

@@ -1,4 +1,4 @@
-"""What a sensor does to the light: exposure, noise, eight bits."""
+"""The sensor: exposure, noise, eight bits."""
 
 import math
 
@@ -12,7 +12,7 @@ _EXPOSURE_PERIOD_S = 3.7
 def exposure_gain(time_s: float, change: float) -> float:
     """Gain of the exposure at a time: it swings by ``change`` (0.2: 20 %) from least to most.
 
-    Two sines of unrelated periods, so that it neither repeats nor stands still.
+    Two sines of unrelated periods, so that it neither repeats nor stops.
     """
     phase = 2.0 * math.pi * time_s / _EXPOSURE_PERIOD_S
     swing = 0.75 * math.sin(phase) + 0.25 * math.sin(2.618 * phase + 1.0)

@@ -1,4 +1,4 @@
-"""What each pixel shows: the texture where its ray meets the scene, or the exact depth there."""
+"""Each pixel: the texture where its ray meets the scene, or the exact depth there."""
 
 import math
 from typing import NamedTuple

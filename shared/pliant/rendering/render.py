@@ -23,13 +23,13 @@ from pliant.rendering.visible_tiles import Tiles, View, tile_bounds, view_of, vi
 
 # Offsets of the sub-exposures within a pixel, in sixths: no two share a row or a column.
 SUB_PIXELS = ((-2.5, 0.5), (1.5, 2.5), (-0.5, -1.5), (2.5, -0.5), (-1.5, 1.5), (0.5, -2.5))
-# A little sharper than the footprint says: the sub-pixel offsets take care of the rest.
+# A little sharper than by the footprint: the sub-pixel offsets take care of the rest.
 FOOTPRINT = 0.7
 
 
 @dataclass(frozen=True)
 class Surface:
-    """What an image shows at its pixel centres."""
+    """Depths and surfaces at the pixel centres of an image."""
 
     depth_m: F64  # (H, W), 0 where nothing is seen
     faces: I32  # (H, W) number of the face, -1 where nothing is seen
@@ -123,7 +123,7 @@ class Renderer:
         )
 
     def _expose(self, time_s: float) -> F32:
-        """(H, W, C) as ``accumulate`` says, mean of the sub-exposures while the shutter is open."""
+        """(H, W, C) as of ``accumulate``, mean of the sub-exposures while the shutter is open."""
         camera, n = self._camera, len(SUB_PIXELS)
         light = np.zeros((camera.height, camera.width, self._channels), np.float32)
         for i, (rays, bounds) in enumerate(zip(self._rays, self._bounds, strict=True)):

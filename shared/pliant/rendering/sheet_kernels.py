@@ -1,4 +1,4 @@
-"""What each pixel shows of a scene of sheets: triangles into a depth buffer, then their texture."""
+"""Pixels of a scene of sheets: triangles into a depth buffer, then their texture."""
 
 import math
 from typing import NamedTuple
@@ -31,7 +31,7 @@ class Surface(NamedTuple):
 
 
 class Gloss(NamedTuple):
-    """What a lamp adds where a sheet mirrors it.  toward: (3,) the lamp, camera frame."""
+    """The highlight of a lamp on a sheet.  toward: (3,) the lamp, camera frame."""
 
     toward: F32
     strength: float

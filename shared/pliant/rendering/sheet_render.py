@@ -31,7 +31,7 @@ _LAMP_REACH_M = 2.2  # as in the rigid scenes
 
 @dataclass(frozen=True)
 class Sight:
-    """What a camera sees of sheets at its pixels."""
+    """The sheets at the pixels of a camera."""
 
     depth_m: F64  # (H, W), 0 where nothing is seen
     sheet: I32  # (H, W) number of the sheet, -1 where nothing is seen

@@ -1,4 +1,4 @@
-"""What a scene is made of: solids, their materials and the lights.  Metres, world z up."""
+"""Parts of a scene: solids, their materials and the lights.  Metres, world z up."""
 
 from typing import Literal, NamedTuple
 
@@ -41,7 +41,7 @@ class Solid(Parameters):
     name: str = Field(description="For people; the texture does not depend on it.")
     kind: Kind = Field(description="Shape.")
     centre: Vector = Field(description="Middle of the solid in the world, metres.")
-    size: Vector = Field(description="Extent along the own axes, metres.  A cylinder stands on z.")
+    size: Vector = Field(description="Extent along the own axes, metres; a cylinder is along z.")
     rotation: Vector = Field(
         default=(0.0, 0.0, 0.0), description="Rotation vector, own axes to world, rad."
     )
@@ -55,7 +55,7 @@ class Scene(Parameters):
     """Solids and lights: everything that determines a picture but the camera."""
 
     name: str = Field(description="Name of the scene.")
-    solids: tuple[Solid, ...] = Field(description="Solids; a room, if any, stands first.")
+    solids: tuple[Solid, ...] = Field(description="Solids; a room, if any, comes first.")
     lights: tuple[Vector, ...] = Field(description="Positions of the lamps, metres.")
     ambient: float = Field(
         default=0.55, description="Share of the full light that comes from everywhere."

@@ -209,7 +209,7 @@ def make_colours(
 def _drawn(
     rng: np.random.Generator, height: int, width: int, material: Material
 ) -> tuple[list[tuple[F64, float, float]], F64, F64]:
-    """What chance decides of a texture: octaves of noise (grid, width and height of a cell), marks,
+    """The random parts of a texture: octaves of noise (grid, width and height of a cell), marks,
     and the strokes of its writing."""
     noise: list[tuple[F64, float, float]] = []
     cell = max(height, width) / 2.0

@@ -1,4 +1,4 @@
-"""What a camera may see: its place in the frame of each solid, and the solids behind each tile."""
+"""Visibility: the camera's place in the frame of each solid, and the solids behind each tile."""
 
 from typing import NamedTuple, TypeAlias
 

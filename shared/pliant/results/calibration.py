@@ -17,7 +17,7 @@ from pliant.errors import CalibrationError
 from pliant.results.run import Run
 
 FOUND = "estimated focal length"
-"""What a verdict begins with that asks nothing of the user."""
+"""The beginning of a reason that requires no action by the user."""
 
 _GRID = 24
 """Points across the image to which a lens is fitted."""
@@ -61,7 +61,7 @@ def found_calibration(run: Run) -> Calibration | None:
     """The source's calibration, at the size of its images, corrected as its last segment is.
 
     Its ``focal_sigma`` says what is still open: a map that was made with a wrong one is bent, and
-    so what it says of it is as far off as the two differ.  Where the focal length changes during
+    so its estimate is as far off as the two differ.  Where the focal length changes during
     the clip it is the middle of the range, and uncertain by half of it.
     None where there is no stream.
     """
@@ -145,7 +145,7 @@ def _fitted(
 
 
 def calibration_verdict(run: Run, final: dict[int, Any]) -> str:
-    """What a user should know of the calibration in one line; "" where it is as was said."""
+    """One line for the user on the calibration; "" where the given one was confirmed."""
     correction, sigmas = run.calibration_correction, run.calibration_sigmas
     if run.stream is None or len(correction) < 3 or len(sigmas) < 3:
         return ""
@@ -232,7 +232,7 @@ def _corner_px(camera: PinholeCamera, correction: tuple[float, ...]) -> float:
 
 
 def _why(final: dict[int, Any]) -> str:
-    """What in the motion of the frames leaves a focal length open, in words."""
+    """Why the motion of the frames leaves the focal length open, in words."""
     poses = [pose_to_matrix(pose) for _, (_, pose) in sorted(final.items())]
     if len(poses) < 2:
         return ""

@@ -31,7 +31,7 @@ def set_aside(output: Path, entries: Iterable[Path]) -> None:
 def is_aside(output: Path) -> bool:
     """Whether there is a result that is set aside, and neither replaced nor put back."""
     whole = output / _WHOLE
-    return whole.is_dir() and any(whole.iterdir())  # somebody may have put it back by hand
+    return whole.is_dir() and any(whole.iterdir())  # a user may have put it back
 
 
 def is_moving(output: Path) -> bool:

@@ -63,7 +63,7 @@ _VERSIONS = ("eclipse-zenoh", "mcap", "msgpack", "numba", "numpy", "opencv-pytho
 
 
 def folder_name(source: str) -> str:
-    """What the result folder of a source is called."""
+    """The name of the result folder of a source."""
     name = source.rstrip("/").rsplit("/", 1)[-1]
     if name in ("", ".", ".."):
         name = Path(source).resolve().name
@@ -86,7 +86,7 @@ def keep_apart(output: Path, read: Iterable[Path], *, option: str = "--output") 
 
 
 def files_read(result: Path) -> list[Path]:
-    """What a command may read of a result folder or a recording, or will write to one."""
+    """The files that a command may read of a result folder or a recording, or will write to one."""
     names = (RECORDING_NAME, CONFIG_NAME, *_RIGID_FILES, *SOMETIMES, *MESH_FILES, SURFELS_NAME)
     return [*parts.parts_of(result), *(result / name for name in names)]
 
@@ -356,7 +356,7 @@ def _unwritable(output: Path, error: OSError) -> ResultError:
 
 
 def run_metadata(config: str) -> dict[str, dict[str, str]]:
-    """What a recording says of how it was made."""
+    """The metadata of a recording: how it was made."""
     return {
         "pliant": {
             "version": __version__,

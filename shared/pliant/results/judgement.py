@@ -95,7 +95,7 @@ def judge_surfels(
 
     in_segments: frames in which the surfels of each start were followed.   slipping: those of them
     in which few of the surfels in view are.   unusable: depth maps that no surfel could start on.
-    together: frames of a camera that was said to stand still in which all move like one thing.
+    together: frames of a camera configured as static in which all surfels move together.
     """
     word, why = judge(
         frames=frames, in_segments=in_segments, doubtful=0, broken=broken,

@@ -48,7 +48,7 @@ class Scale:
     level: Level | None = None
 
     def times(self, other: "Scale") -> "Scale":
-        """What ``other`` has found under this one."""
+        """Both together: ``other`` was found in the units of this one."""
         level = other.level or self.level
         if self.level is not None and other.level is not None:
             level = level_of(other.level.R @ self.level.R, other.level.sigma_deg)
@@ -81,12 +81,12 @@ class Scale:
         return content
 
     def yaml(self) -> str:
-        """What stands in the file."""
+        """The content of the file."""
         return yaml.safe_dump(self.content(), sort_keys=False)
 
 
 UNSCALED = Scale(metres_per_unit=1.0, sigma=0.0, source="")
-"""Whatever stands in the folder: the unit and the axes of the recording."""
+"""Whatever the folder has: the unit and the axes of the recording."""
 
 
 def level_of(R: F64, sigma_deg: float) -> Level:
@@ -129,7 +129,7 @@ class MetricRecording(Recording):
     """A recording whose messages are decoded in metres, and with z up, where these are known."""
 
     def __init__(self, path: Path, scale: Scale | None = None) -> None:
-        """scale: None: what stands beside the recording.  Raises RecordingError, ResultError."""
+        """scale: None: that beside the recording.  Raises RecordingError, ResultError."""
         super().__init__(path)
         self.scale = scale or read_scale(path.parent)
 

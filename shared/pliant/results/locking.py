@@ -38,7 +38,7 @@ class Held:
 
     @property
     def path(self) -> Path | None:
-        """Where the folder is now, which somebody may have renamed; None where it was deleted."""
+        """The present path of the folder, which may have been renamed; None if it was deleted."""
         own = os.fstat(self._folder)
         with suppress(OSError):
             if os.path.samestat(own, os.stat(self._name)):

@@ -60,7 +60,7 @@ def write_pictures(folder: Path, mesh: TriangleMesh, T_world_camera: F64, suffix
 
 
 def mesh_report(pieces: Sequence[MeshPiece]) -> list[dict[str, Any]]:
-    """What report.json says of each mesh."""
+    """The entry of report.json for each mesh."""
     return [
         {
             "segment": segment,

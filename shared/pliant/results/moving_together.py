@@ -20,7 +20,7 @@ _LEAST = 20
 
 _ROUNDS = 5
 _OUTLIER = 2.5
-"""Times the median of what is left beyond which a surfel has no say in the motion."""
+"""Times the median residual beyond which a surfel does not count for the motion."""
 
 
 class MovingTogether:
@@ -48,7 +48,7 @@ class MovingTogether:
 
 
 def _is_rigid(before: F64, now: F64) -> bool:
-    """before, now: (N, 3) in the frame of the camera that stands still."""
+    """before, now: (N, 3) in the frame of the static camera."""
     moved = np.linalg.norm(now - before, axis=1)
     if np.median(moved) < _FAR * np.median(before[:, 2]):
         return False

@@ -37,7 +37,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
     ]
     segments.sort(key=lambda s: s["first_frame"])
     reasons = {frame: reason for frame, (_, reason) in sorted(history.states.items()) if reason}
-    # That a frame is broken says nothing about why there is no map, unless all of them are.
+    # A broken frame does not explain why there is no map, unless all of them are broken.
     silent = {*run.missing, *run.passed_over}
     shown = [reason for frame, reason in reasons.items() if frame not in silent]
     shown = shown or list(reasons.values())
@@ -104,13 +104,13 @@ def last_reason(reasons: Sequence[str]) -> str:
 
 
 def broken_images(missing: Mapping[_Frame, str]) -> dict[_Frame, str]:
-    """What is wrong with each broken image, by frame: what live mode drops and a mask covers is
+    """The fault of each broken image, by frame: an image that live mode drops or a mask covers is
     none."""
     return {frame: why for frame, why in missing.items() if why not in (DROPPED, MASKED)}
 
 
 def process_figures(run: Run, frames: int) -> dict[str, Any]:
-    """What the services and the recorder counted and took, for the report."""
+    """Counters and times of the services and the recorder, for the report."""
     return {
         "recorder": {
             "messages": {key: t.messages for key, t in sorted(run.recorded.topics.items())},
@@ -189,7 +189,7 @@ def _known_map(run: Run, final: dict[int, Any]) -> dict[str, Any] | None:
 
 
 def _correction(run: Run) -> dict[str, float] | None:
-    """What the last adjustment found wrong with the calibration; None if it was not asked."""
+    """The error of the calibration by the last adjustment; None if it was not estimated."""
     correction = run.calibration_correction
     if len(correction) < 3:
         return None

@@ -41,7 +41,7 @@ _LEFT_ALONE = (
 
 @dataclass
 class Run:
-    """What a recording says of its run."""
+    """The run of a recording: its map, statuses and metadata."""
 
     history: MapHistory = field(default_factory=MapHistory)
     stream: CameraStream | None = None
@@ -68,10 +68,10 @@ class Run:
     known_segments: set[int] = field(default_factory=set[int])
     scale: Scale | None = None
     inertial_refusal: str = ""
-    """Why inertial samples say nothing of the scale."""
+    """Why inertial samples do not determine the scale."""
 
     def correction_of(self, segment: int) -> tuple[float, ...]:
-        """What its last adjustment found wrong with the calibration; () where it had none."""
+        """The error of the calibration by its last adjustment; () without one."""
         return self.corrections.get(segment, ())
 
     @property

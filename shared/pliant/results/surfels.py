@@ -48,7 +48,7 @@ _PER_SURFEL = (
 
 @dataclass
 class _Counts:
-    """What the report says of each frame."""
+    """The counts of the report, by frame."""
 
     alive: list[int] = field(default_factory=list[int])
     in_view: list[int] = field(default_factory=list[int])
@@ -105,7 +105,7 @@ def write_surfel_results(output: Path) -> dict[str, Any]:
 
 
 def surfel_report(recording: Path) -> dict[str, Any]:
-    """What report.json says of a run of the deformable profile."""
+    """report.json of a run of the deformable profile."""
     run, counts, followed = read_run(recording), _Counts(), 0
     for recorded in Recording(recording).messages(topics.SURFELS):
         surfels = recorded.decode()

@@ -37,9 +37,9 @@ def textured(
     fine: TriangleMesh, recording: Recording, run: Run, stream: CameraStream, segment: int, *,
     triangles: int, texels: int, views: int | None = None,
 ) -> TexturedMesh:  # fmt: skip
-    """The mesh of a segment of at most so many triangles, with a square texture.
+    """The mesh of a segment of at most that many triangles, with a square texture.
 
-    texels: along a side.    views: of so many keyframes, spread over all; None: of all of them.
+    texels: along a side.    views: of this many keyframes, spread over all; None: of all of them.
     """
     points, tints, faces = decimated(fine.positions, fine.colours, fine.triangles, triangles)
     cut, _ = cut_apart(faces, patches(points[faces]))
@@ -72,7 +72,7 @@ def keyframe_images(
 ) -> Iterator[tuple[F64, U8, BoolArray | None]]:
     """Final pose, (H, W, 3) image and mask (H, W) of each keyframe of a segment that has one.
 
-    most: of so many of its keyframes, spread over all; None: of all.
+    most: of at most this many of its keyframes, spread over all; None: of all.
     """
     here = sorted(n for n, known in run.history.keyframes.items() if known.segment == segment)
     wanted = set(here[:: max(1, -(-len(here) // most))] if most else here)

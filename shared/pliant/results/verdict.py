@@ -103,7 +103,7 @@ def _scale_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _dropped_parts(counters: Mapping[str, float]) -> list[str]:
-    """What a map had no more room for."""
+    """The parts that a map dropped for lack of room."""
     if "dropped_points" not in counters:
         return []
     keyframes, points = (int(counters[f"dropped_{name}"]) for name in ("keyframes", "points"))
@@ -117,7 +117,7 @@ def _dropped_parts(counters: Mapping[str, float]) -> list[str]:
 
 
 def _faults(report: dict[str, Any]) -> list[str]:
-    """What was wrong with the frames."""
+    """The faults of the frames."""
     lines: list[str] = []
     broken = broken_images(report["frames_without_pixels"])
     reasons = list(report["frames_without_pixels"].values())
@@ -147,7 +147,7 @@ def _faults(report: dict[str, Any]) -> list[str]:
 
 
 def _told_of_broken(broken: Mapping[str, str]) -> str:
-    """What is wrong with the first, and which the others are, as the source counts them."""
+    """The fault of the first, and the numbers of the others, as the source counts them."""
     first, *others = (why.removeprefix(BROKEN) for why in broken.values())
     if not others:
         return first
@@ -160,7 +160,7 @@ def _told_of_broken(broken: Mapping[str, str]) -> str:
 
 
 def _why_dropped(counters: Mapping[str, float]) -> str:
-    """What the ingest counted in words: "12 for tracking (waited 0.8 s)"; "" without any."""
+    """The counts of the ingest in words: "12 for tracking (waited 0.8 s)"; "" without any."""
     prefix = "dropped_for_"
     words: list[str] = []
     for key in sorted(counters):

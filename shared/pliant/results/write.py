@@ -43,7 +43,7 @@ def write_results(output: Path) -> dict[str, Any]:
 def write_rigid_results(output: Path, scale: Scale | None = None) -> dict[str, Any]:
     """Write trajectories, keyframes, points and report beside the recording; returns the report.
 
-    scale: None: that of the folder, or else what inertial samples of the source say, if it is
+    scale: None: that of the folder, or else by the inertial samples of the source, if it is
     known; otherwise it is one of the files then.
     All of them, or none where the disk is full.  Raises RecordingError and ResultError.
     """
@@ -56,7 +56,7 @@ def write_rigid_results(output: Path, scale: Scale | None = None) -> dict[str, A
             return write_rigid_results(output, found)
         run.inertial_refusal = found
     final = run.history.final()
-    # What takes the longest, on other cores.  They write nothing: an interruption waits for them.
+    # The longest parts, on other cores.  They write nothing: an interruption waits for them.
     with ThreadPoolExecutor() as others, all_or_none(output) as folder:
         drawn = others.submit(drawn_map, run, recording, final)
         clip = others.submit(clip_of_keyframes, run, recording)

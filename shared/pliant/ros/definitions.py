@@ -1,4 +1,4 @@
-"""ROS messages by name: made with zeros where nothing is said, and as CDR.
+"""ROS messages by name: made with zeros for absent fields, and as CDR.
 
 Definitions and type hashes (REP-2016) are those of ROS 2 Jazzy, by the library rosbags; the types
 that are used here are the same in Kilted.

@@ -52,14 +52,14 @@ class RosTopic:
 
 
 def attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
-    """What goes along with a message: number, time of sending, and the publisher's 16 bytes."""
+    """The attachment of a message: number, time of sending, and the publisher's 16 bytes."""
     return struct.pack("<qqB16s", sequence, time_ns, len(gid), gid)
 
 
 def token(
     kind: str, domain: int, session: str, node: str, entity: int = 0, topic: RosTopic | None = None
 ) -> str:
-    """The key by which an entity says that it is there.
+    """The key by which an entity announces itself.
 
     kind: NN a node, MP a publisher, MS a subscription.    node: /namespace/name.
     """
@@ -82,7 +82,7 @@ def topic_in(key: str) -> RosTopic | None:
 
 
 class Node:
-    """A node on a Zenoh session that is open.  It is there as long as somebody holds it, or one
+    """A node on a Zenoh session that is open.  It exists as long as it is held, or one
     of its publishers."""
 
     def __init__(self, session: zenoh.Session, name: str) -> None:
@@ -115,7 +115,7 @@ class Node:
         return subscriber
 
     def published(self) -> list[RosTopic]:
-        """All topics that somebody publishes, by name."""
+        """All topics with a publisher, by name."""
         found = self.session.liveliness().get(f"{_SPACE}/{self.domain}/*/*/*/MP/**")
         keys = {str(reply.ok.key_expr) for reply in found if reply.ok is not None}
         return sorted(
@@ -124,7 +124,7 @@ class Node:
         )
 
     def on_subscription(self, come: Callable[[str], None]) -> None:
-        """Have ``come`` called with the name of a topic whenever somebody subscribes to it."""
+        """Have ``come`` called with the name of a topic whenever a subscriber appears."""
 
         def on_sample(sample: zenoh.Sample) -> None:
             topic = topic_in(str(sample.key_expr))

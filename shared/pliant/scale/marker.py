@@ -26,7 +26,7 @@ _Marker = tuple[str, int]
 
 
 def from_marker(recording: Recording, run: Run, metres: float) -> Scale:
-    """By all markers that keyframes see, whose black squares have sides of so many metres.
+    """By all markers that keyframes see, whose black squares have sides of that many metres.
 
     A marker counts where at least three keyframes see it and its corners, triangulated, are a
     square.  The scale is the median of what they tell.  Raises ResultError.

@@ -62,7 +62,7 @@ class Canvas(Protocol):
         ...
 
     def whole_map(self, at: Moment, segment: int, points: PointBlocks) -> None:
-        """The points after everything was said."""
+        """The points after the last update."""
         ...
 
     def mesh(self, at: Moment, segment: int, name: str, mesh: TriangleMesh) -> None:

@@ -187,7 +187,7 @@ class Scene:
         return world
 
     def _join(self, at: Moment, gone: int, segment: int) -> None:
-        """What belongs to a world that is gone lies in another one."""
+        """Move the drawings of a world that has been joined into the other one."""
         old = self._worlds.pop(gone, _World())
         world = self._worlds.setdefault(segment, _World(segment=segment))
         world.keyframes |= old.keyframes
@@ -224,7 +224,7 @@ class Scene:
             )
 
     def _take_places(self, at: Moment, update: MapUpdate, *, final: bool) -> None:
-        """Say what was recognised; lines between the keyframes are drawn with the map."""
+        """Log the recognised places; lines between the keyframes are drawn with the map."""
         world = self._world
         new = set(update.keyframe_ids[update.keyframe_frames == at.frame].tolist())
         for pair in update.same_places.tolist():

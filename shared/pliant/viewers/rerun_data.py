@@ -33,7 +33,7 @@ class RerunData:
 
     @contextmanager
     def staying(self) -> Generator[None]:
-        """What is logged inside is never dropped."""
+        """Data that is logged inside is never dropped."""
         with self._taking:
             self.take()
             yield

@@ -96,7 +96,7 @@ class RerunPage:
                     super().handle()
 
             def log_message(self, format: str, *args: object) -> None:
-                """Say nothing."""
+                """Log nothing."""
 
         try:
             self._server = ThreadingHTTPServer((LOOPBACK, port), Handler)

@@ -36,7 +36,7 @@ _FLOAT32 = 7  # sensor_msgs/msg/PointField
 _TRIANGLE_LIST, _ADD, _DELETE, _DELETE_ALL = 11, 0, 2, 3  # visualization_msgs/msg/Marker
 _ROW = np.dtype([("xyz", "<f4", 3), ("bgr0", "u1", 4)])
 # Bytes of a Marker in CDR: before all, of two empty lists, and of what comes behind points and
-# colours when nothing is said there.
+# colours when there is no message.
 _ENCAPSULATION, _COUNTS, _BEHIND = 4, 8, 69
 _STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 

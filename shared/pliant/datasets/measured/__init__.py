@@ -1,1 +1,1 @@
-"""What other sensors of a source measured: inertial samples and satellite fixes."""
+"""Other sensors of a source: inertial samples and satellite fixes."""

@@ -1,4 +1,4 @@
-"""Orders of axes as letters: "YxZ" says that the first number is along Y, the second along -X."""
+"""Orders of axes as letters: in "YxZ" the first number is along Y, the second along -X."""
 
 import numpy as np
 

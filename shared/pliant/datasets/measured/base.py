@@ -23,7 +23,7 @@ _MOST_NS = 1 << 62
 
 @dataclass(frozen=True, kw_only=True)
 class Measurements:
-    """What other sensors of a source measured, on the clock of its images.
+    """Samples of other sensors of a source, on the clock of its images.
 
     imu_notes, gps_notes: what a user should know of each, in lines.
     """
@@ -56,7 +56,7 @@ class Measurements:
         return replace(imu, gps=gps.gps, gps_notes=gps.gps_notes)
 
     def later(self, ns: int) -> "Measurements":
-        """The same, so many nanoseconds later."""
+        """The same, later by that many nanoseconds."""
         return replace(
             self,
             imu=replace(self.imu, stamps_ns=self.imu.stamps_ns + ns),

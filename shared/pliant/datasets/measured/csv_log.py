@@ -38,10 +38,10 @@ _ASL = [
     *("timestamp [ns]", "w_x [rad/s]", "w_y [rad/s]", "w_z [rad/s]"),
     *("a_x [m/s^2]", "a_y [m/s^2]", "a_z [m/s^2]"),
 ]
-"""What a table without a header is taken for."""
+"""The columns of a table without a header."""
 _NAME = re.compile(r"([^\[(]*)[\[(]?([^\])]*)[\])]?")
 _AXIS = re.compile(r"(.*)([xyz])()|(.*)[_.\s-]([xyz])[_.\s-]+(.*)", re.IGNORECASE)
-"""What is measured, the axis, and the unit where that stands behind it."""
+"""The quantity, its axis, and its unit if the column has one."""
 _TIME = re.compile(r"(?:t|time|timestamp|time_?stamp|sensor_?time|seconds_elapsed)_?([nmu]?s|sec)?")
 _TIME_UNITS = {
     **dict.fromkeys(("s", "sec", "seconds", "secs"), "seconds"),
@@ -218,12 +218,12 @@ def _columns(header: Sequence[str], file: Path) -> _Columns:
 
 
 def gyro_factor(unit: str) -> float:
-    """What angular velocities of a unit are multiplied by for rad/s."""
+    """The factor from a unit of angular velocity to rad/s."""
     return radians(1.0) if re.search("deg|°|dps", unit) else 1.0
 
 
 def accel_factor(unit: str, name: str) -> float | None:
-    """What accelerations of a unit are multiplied by for m/s^2; None where it is not given."""
+    """The factor from a unit of acceleration to m/s^2; None without a unit."""
     if _APPLE.match(name.lower()):
         return -STANDARD_GRAVITY_M_S2
     if unit in ("g", "gs", "g-force"):

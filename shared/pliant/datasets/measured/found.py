@@ -1,4 +1,4 @@
-"""What the other sensors of a source measured: of the files that are named, or that lie with it."""
+"""Samples of other sensors of a source: from files that are named, or that come with it."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ that both begin with zero, or with their device, are soon alike by chance."""
 
 
 def measurements_of(spec: SourceSpec, dataset: Dataset) -> Measurements:
-    """What other sensors measured, on the clock of the images, or off it by an unknown constant.
+    """Samples of other sensors, on the clock of the images, or off it by an unknown constant.
 
     dataset: the source of ``spec``, opened.
     What a user named is read or refused.  What only lies with the source costs no run: a note says

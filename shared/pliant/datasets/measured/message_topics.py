@@ -28,7 +28,7 @@ _NO_FIX = -1
 
 
 def sensors_of(file: MessageFile, spec: SourceSpec) -> Measurements:
-    """What the topics of sensors have that are named, or the only ones of their kind.
+    """Samples from the sensor topics that are named, or the only ones of their kind.
 
     Raises DatasetError where a topic is named that is not there, or the choice is not clear.
     """

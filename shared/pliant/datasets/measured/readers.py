@@ -31,11 +31,11 @@ GPS_READERS: dict[str, Reader] = {
 _BESIDE: tuple[tuple[str, Reader], ...] = (
     *((".gcsv", read_gcsv), (".srt", read_srt), (".SRT", read_srt), (".gpx", read_gpx)),
 )
-"""What has the name of a video and another ending."""
+"""Files with the name of a video and another ending."""
 
 
 def read_named(file: Path, readers: Mapping[str, Reader], option: str) -> Measurements:
-    """What a file has that a user named by an option.  Raises DatasetError."""
+    """The samples of a file that a user named by an option.  Raises DatasetError."""
     reader = read_phone_log if is_phone_log(file) else readers.get(file.suffix.lower())
     if not file.exists():
         raise DatasetError(f"{option} {file}: no such file")
@@ -49,7 +49,7 @@ def read_named(file: Path, readers: Mapping[str, Reader], option: str) -> Measur
 
 
 def video_sensors(spec: SourceSpec) -> Measurements:
-    """What is inside a video, and in files of its name beside it.
+    """The samples inside a video, and in files of its name beside it.
 
     Raises DatasetError where the video cannot be read.
     """
@@ -63,7 +63,7 @@ def video_sensors(spec: SourceSpec) -> Measurements:
 
 
 def _read(path: Path, reader: Reader) -> Measurements:
-    """What a file has; a note where it is damaged."""
+    """The samples of a file; a note where it is damaged."""
     try:
         return reader(path)
     except DatasetError as error:

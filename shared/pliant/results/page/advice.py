@@ -55,7 +55,7 @@ def advice(report: dict[str, Any], stamps_ns: Mapping[int, int]) -> list[str]:
             f"{counted(broken, 'broken image')}: copy the video again from the camera, or convert "
             "it and run the copy."
         )
-    # None were mapped as they came where every frame waited for the map: that says nothing.
+    # None were mapped as they came where every frame waited for the map: that is no evidence.
     tracks, mapped = report["median_tracks_per_frame"], report["median_inliers_per_frame"]
     if segments and tracks < _FEW_TRACKS:
         told.append(

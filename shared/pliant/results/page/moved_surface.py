@@ -36,7 +36,7 @@ class Surface:
             self._born.setdefault(number, position)
 
     def scene(self) -> Scene:
-        """What report.html turns.  Some frame was taken."""
+        """The surface that report.html can rotate.  Some frame was taken."""
         assert self.last is not None
         rows, normals, triangles = surface_of(self.last)
         positions = self.last.positions[rows]

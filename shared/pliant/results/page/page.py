@@ -69,7 +69,7 @@ def table_rows(told: Iterable[tuple[str, str]]) -> str:
 
 
 def canvas(scene: Scene) -> str:
-    """What can be turned."""
+    """The rotatable view."""
     return (
         '<canvas id="view"></canvas><p class="soft"><span id="layers"></span> drag to '
         "rotate, shift-drag to move, wheel or pinch to zoom, double-click two points to "
