@@ -159,7 +159,7 @@ def test_a_rate_is_a_share_of_the_pace_of_capture() -> None:
 
 
 def test_a_loop_stays_in_one_session_without_an_end(
-    endpoint: str, path: Path, monkeypatch: pytest.MonkeyPatch
+    endpoint: str, path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A session that is closed leaves some memory behind, and a compose profile loops for ever."""
 
@@ -179,13 +179,12 @@ def test_a_loop_stays_in_one_session_without_an_end(
             opened.append(service)
             super().__init__(service=service, **options)
 
-    said: list[str] = []
     monkeypatch.setattr(play_command, "Pace", Thrice)
-    monkeypatch.setattr(play_command, "_say", said.append)
     monkeypatch.setattr(player_module, "ZenohBus", Counted)
     request = PlayRequest(recording=path, rate=0.0, loop=True, connect=[endpoint])
     assert run_play(request) == 0
     assert opened == ["ingest"]
+    said = capsys.readouterr().err.splitlines()
     assert [line for line in said if "played" in line] == [f"{1 + 3 * FRAMES} messages played"] * 3
     with pytest.raises(RecordingError, match="--loop is for viewers"):
         run_play(PlayRequest(recording=path, loop=True, readers=["tracking"]))
