@@ -16,7 +16,6 @@ from pliant.config import Config, recorded_config
 from pliant.datasets.base import is_builtin
 from pliant.datasets.builtin import builtin_folder
 from pliant.errors import ResultError
-from pliant.evaluation.mesh_truth import Mesh
 from pliant.evaluation.recorded_mesh import depth_camera, measure_mesh
 from pliant.evaluation.run_evaluation import evaluate_result
 from pliant.evaluation.surface_distance import share_within, thin_out
@@ -64,7 +63,7 @@ def measure(result: Path, groundtruth: str, overrides: Sequence[str]) -> Iterato
             pieces = meshes_of(found.pieces).get((compared.segment, level))
             if pieces is None or (level == "coarse" and kind != "nltgv"):
                 continue
-            rows.append([f"{name}, {level} TSDF", *compared.figures(_mesh(joined(pieces)))])
+            rows.append([f"{name}, {level} TSDF", *compared.figures(joined(pieces))])
     figures = compared.figures(poisson(compared.history))
     rows.append(["Poisson of the points (Open3D)", *figures])
     yield markdown(["mesh", *_FIGURES], rows)
@@ -78,11 +77,11 @@ def measure_live(result: Path, groundtruth: str, overrides: Sequence[str]) -> It
     for name, ways in _LIVE.items():
         settings = [*overrides, *(f"meshing.{way}" for way in ways)]
         for when, mesh, voxel, *costs in compared.live(settings):
-            figures = [*compared.near(mesh, voxel), *compared.figures(_mesh(mesh))[:-1]]
+            figures = [*compared.near(mesh, voxel), *compared.figures(mesh)[:-1]]
             rows.append([f"{name}, {when}", *costs, *figures])
     coarse = meshes_of(compared.make(overrides).pieces)[compared.segment, "coarse"]
     mesh = joined(coarse)
-    figures = [*compared.near(mesh, coarse[0].voxel_size), *compared.figures(_mesh(mesh))[:-1]]
+    figures = [*compared.near(mesh, coarse[0].voxel_size), *compared.figures(mesh)[:-1]]
     rows.append(["the final coarse mesh", "", "", *figures])
     yield markdown(["coarse mesh", "fusions", "CPU ms a keyframe", *_NEAR, *_FIGURES[:-1]], rows)
 
@@ -170,7 +169,7 @@ class _Compared:
             parts.append(transform(T_world_camera, z * rays))
         return np.concatenate(parts)
 
-    def figures(self, mesh: Mesh) -> list[str]:
+    def figures(self, mesh: TriangleMesh) -> list[str]:
         """One of each of _FIGURES."""
         found = measure_mesh(
             mesh, self.history, self._camera, self._truth, self._evaluation
@@ -186,11 +185,7 @@ class _Compared:
         ]
 
 
-def _mesh(made: TriangleMesh) -> Mesh:
-    return Mesh(points=made.positions, normals=made.normals, faces=made.triangles)
-
-
-def poisson(history: MapHistory) -> Mesh:
+def poisson(history: MapHistory) -> TriangleMesh:
     """Poisson reconstruction of the map's points, with normals towards the nearest keyframe."""
     longest, points = history.longest_segment(), history.points()
     points = points.select(points.segments == longest)
@@ -199,4 +194,7 @@ def poisson(history: MapHistory) -> Mesh:
     nearest = known[np.clip(np.searchsorted(known, points.frames), 0, len(known) - 1)]
     poses = pose_to_matrix(np.array([frames[int(frame)] for frame in nearest]))
     vertices, normals, triangles = poisson_mesh(points.positions, poses[:, :3, 3])
-    return Mesh(points=vertices, normals=normals, faces=triangles)
+    return TriangleMesh(
+        positions=vertices, normals=normals, colours=np.zeros((0, 3), np.uint8),
+        triangles=triangles,
+    )  # fmt: skip

@@ -5,9 +5,10 @@ import pytest
 
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import so3_exp
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.evaluation.criteria import Similarity
-from pliant.evaluation.mesh_truth import Mesh, MeshEvaluation, format_mesh
+from pliant.evaluation.mesh_truth import MeshEvaluation, format_mesh
 from pliant.evaluation.surface_distance import sample_surface, share_within, thin_out
 
 CAMERA = PinholeCamera(width=80, height=60, fx=70.0, fy=75.0, cx=38.5, cy=31.0)
@@ -69,7 +70,8 @@ def test_samples_of_a_wall_and_what_is_within_a_distance() -> None:
 
 def evaluate(points: np.ndarray, faces: np.ndarray, scale: float = 1.0) -> MeshEvaluation:
     normals = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (len(points), 1))
-    mesh = Mesh(points=points, normals=normals, faces=faces)
+    no_colours = np.zeros((0, 3), np.uint8)
+    mesh = TriangleMesh(positions=points, normals=normals, colours=no_colours, triangles=faces)
     alignment = Similarity(scale=scale, R=np.eye(3), t=np.zeros(3))
     evaluation = MeshEvaluation(mesh, alignment, CAMERA)
     evaluation.add(np.full((60, 80), 3.0), np.eye(4), np.eye(4))

@@ -5,9 +5,9 @@ from functools import cached_property
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, BoolArray
+from pliant.algorithms.arrays import F32, F64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
-from pliant.algorithms.meshing.mesh_blocks import no_rows
+from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.algorithms.meshing.rendering import view_mesh
 from pliant.evaluation.criteria import Similarity
 from pliant.evaluation.surface_columns import SurfaceFigures, surface_columns
@@ -19,19 +19,6 @@ SURFACE_LIMIT = 0.01
 """Share of the scene's diameter within which two surfaces are the same, for the F-score."""
 _SPACING = 0.25
 """Distance of the samples of a surface, as a share of the limit."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Mesh:
-    """points, normals: (V, 3) in the world of the estimate.    faces: (F, 3).
-
-    closed: rows of vertices that close holes: what they are corners of is measured apart, too.
-    """
-
-    points: F32
-    normals: F32
-    faces: I32
-    closed: I32 = field(default_factory=no_rows)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +62,7 @@ class MeshEvaluation:
     view's own pose errors are those of the trajectory.    camera: of the true depth maps.
     """
 
-    mesh: Mesh
+    mesh: TriangleMesh
     alignment: Similarity
     camera: PinholeCamera
     _ratios: list[F32] = field(default_factory=list[F32])
@@ -90,14 +77,14 @@ class MeshEvaluation:
         """One view: true depth (H, W), 0 where unknown, and T_world_camera in both worlds."""
         self._views += 1
         view = DepthView.of(self.camera, T_true, depth_m)
-        seen = view_mesh(self.mesh.points, self.mesh.faces, self.camera, T_estimate)
+        seen = view_mesh(self.mesh.positions, self.mesh.triangles, self.camera, T_estimate)
         known = view.inverse_depth > 0.0
         both = known & (seen.depths > 0.0)
         depths = seen.depths * self.alignment.scale * view.inverse_depth
         self._ratios.append(depths[both].astype(np.float32))
         self._closing.append(self._closes_holes[seen.triangles[both]])
         self._known += int(known.sum())
-        normals = seen.interpolate(self.mesh.faces, self.mesh.normals) @ T_estimate[:3, :3]
+        normals = seen.interpolate(self.mesh.triangles, self.mesh.normals) @ T_estimate[:3, :3]
         true, smooth = _true_normals(view)
         smooth &= both
         cosine = (_unit(normals[smooth]) * true[smooth]).sum(axis=1)
@@ -116,9 +103,9 @@ class MeshEvaluation:
     @cached_property
     def _closes_holes(self) -> BoolArray:
         """(F,) faces with a corner that closes a hole."""
-        marked = np.zeros(len(self.mesh.points), np.bool_)
+        marked = np.zeros(len(self.mesh.positions), np.bool_)
         marked[self.mesh.closed] = True
-        return np.asarray(marked[self.mesh.faces].any(axis=1), np.bool_)
+        return np.asarray(marked[self.mesh.triangles].any(axis=1), np.bool_)
 
     def result(self) -> MeshTruth:
         """The figures over all views."""
@@ -133,7 +120,7 @@ class MeshEvaluation:
         both = precision + recall
         return MeshTruth(
             views=self._views,
-            triangles=len(self.mesh.faces),
+            triangles=len(self.mesh.triangles),
             covered=len(ratios) / self._known if self._known else nan,
             median_error=float(np.median(errors)) if len(errors) else nan,
             within=float(np.mean(errors <= DEPTH_LIMIT)) if len(errors) else nan,
@@ -153,7 +140,7 @@ class MeshEvaluation:
     def columns(self) -> dict[str, SurfaceFigures]:
         """The surface as the field compares it; empty where there is none."""
         surface, diameter = self._true_surface()
-        if len(surface) == 0 or len(self.mesh.faces) == 0:
+        if len(surface) == 0 or len(self.mesh.triangles) == 0:
             return {}
         spacing = _SPACING * SURFACE_LIMIT * diameter
         samples, floor = self._samples(spacing), np.concatenate(self._floor)
@@ -165,7 +152,7 @@ class MeshEvaluation:
         diameter; and the diameter, metres."""
         surface, diameter = self._true_surface()
         if len(surface) == 0:
-            return np.full(len(self.mesh.points), np.inf), diameter
+            return np.full(len(self.mesh.positions), np.inf), diameter
         true = thin_out(surface, _SPACING * SURFACE_LIMIT * diameter)
         return nearest(self._placed(), true, most * diameter)[1], diameter
 
@@ -176,13 +163,13 @@ class MeshEvaluation:
         return surface, extent
 
     def _placed(self) -> F64:
-        return self.alignment.apply(self.mesh.points.astype(np.float64))
+        return self.alignment.apply(self.mesh.positions.astype(np.float64))
 
     def _samples(self, spacing: float) -> F64:
-        return sample_surface(self._placed(), self.mesh.faces, spacing)
+        return sample_surface(self._placed(), self.mesh.triangles, spacing)
 
     def _surfaces(self, true: F64, limit: float) -> tuple[float, float]:
-        if len(true) == 0 or len(self.mesh.faces) == 0:
+        if len(true) == 0 or len(self.mesh.triangles) == 0:
             return 0.0, 0.0
         spacing = _SPACING * limit
         samples, true = self._samples(spacing), thin_out(true, spacing)

@@ -12,17 +12,17 @@ from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import pose_to_matrix
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.errors import ResultError
-from pliant.evaluation.mesh_truth import Mesh, MeshEvaluation, format_mesh
+from pliant.evaluation.mesh_truth import MeshEvaluation, format_mesh
 from pliant.evaluation.presentation import metres
 from pliant.evaluation.run_evaluation import Evaluation
 from pliant.evaluation.surface_columns import format_columns
 from pliant.evaluation.truth import true_frames
-from pliant.formats.ply import read_ply
 from pliant.map_history import MapHistory
 from pliant.pictures.caption import with_caption
 from pliant.pictures.mesh import draw_mesh, mesh_view
 from pliant.pictures.movie import write_image
 from pliant.results.folder import MESH_ERROR_NAME, RECORDING_NAME
+from pliant.results.mesh_files import read_mesh
 from pliant.results.run import Run, read_run
 from pliant.yaml_text import load_yaml
 
@@ -42,12 +42,9 @@ def mesh_against_truth(
         raise ResultError(f"{result}: the recording has no camera")
     for key, name in MESHES.items():
         if (result / name).exists():
-            data = read_ply(result / name)
-            if data.faces is None or data.normals is None:
+            mesh = read_mesh(result / name)
+            if mesh is None or not mesh.normals.any():
                 raise ResultError(f"{result / name}: without faces or normals")
-            mesh = Mesh(
-                points=data.points, normals=data.normals, faces=data.faces, closed=data.closed
-            )
             measured = measure_mesh(mesh, run.history, run.stream.camera, truth, evaluation)
             found = measured.result()
             figures[key] = asdict(found)
@@ -65,10 +62,7 @@ def _draw_errors(path: Path, measured: MeshEvaluation, run: Run) -> str:
     levels = np.rint(255.0 * np.minimum(distances / (_MOST_ERROR * diameter), 1.0))
     turbo = cv2.applyColorMap(levels.astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)
     colours = np.ascontiguousarray(np.asarray(turbo, np.uint8).reshape(-1, 3)[:, ::-1])
-    mesh = TriangleMesh(
-        positions=measured.mesh.points, normals=measured.mesh.normals, colours=colours,
-        triangles=measured.mesh.faces,
-    )  # fmt: skip
+    mesh = replace(measured.mesh, colours=colours)
     longest, poses = run.history.longest_segment(), run.history.keyframe_poses().values()
     path_poses = pose_to_matrix(np.array([pose for of, pose in poses if of == longest]))
     picture = draw_mesh(mesh, mesh_view(mesh, path_poses)).colours
@@ -81,7 +75,11 @@ def _draw_errors(path: Path, measured: MeshEvaluation, run: Run) -> str:
 
 
 def measure_mesh(
-    mesh: Mesh, history: MapHistory, camera: PinholeCamera, truth: Path, evaluation: Evaluation
+    mesh: TriangleMesh,
+    history: MapHistory,
+    camera: PinholeCamera,
+    truth: Path,
+    evaluation: Evaluation,
 ) -> MeshEvaluation:
     """A mesh in the world of the longest segment, at that segment's keyframes."""
     if truth.is_file():

@@ -7,7 +7,7 @@ import numpy as np
 
 from pliant.algorithms.arrays import F64, I32, I64
 
-_ONE_TREE = {"algorithm": 4}
+_ONE_TREE: dict[str, bool | int | float | str] = {"algorithm": 4}
 """FLANN's KDTREE_SINGLE: one k-d tree, searched exactly."""
 _MAX_CELL = 1 << 20
 """Cells along an axis: 21 bits of a key for each."""

@@ -4,19 +4,18 @@ from pathlib import Path
 
 import numpy as np
 
-from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
 from pliant.datasets.recorded_images import RecordedImages
 from pliant.errors import ResultError
 from pliant.export.crop import Box, cropped_mesh, rows_in
 from pliant.export.images import camera_of
 from pliant.export.watertight import watertight
-from pliant.formats.ply import read_ply, write_ply
+from pliant.formats.ply import write_ply
 from pliant.map_history import Points
 from pliant.messages import topics
 from pliant.messages.types import SourceImage
 from pliant.open3d_library import load_open3d
 from pliant.recording.reader import Recording
-from pliant.results.mesh_files import mesh_of, write_mesh
+from pliant.results.mesh_files import mesh_of, read_mesh, write_mesh
 from pliant.results.run import read_run
 from pliant.viewers.canvas import Canvas
 from pliant.viewers.drawn_scene import Scene
@@ -38,23 +37,9 @@ def draw(recording: Recording, canvas: Canvas, mesh: Path | None = None) -> None
         scene.take(recorded.topic, message, recorded.sequence, recorded.log_time_ns)
     scene.close()
     if mesh is not None and mesh.is_file() and not scene.mesh.is_final:
-        surface = _surface_of(mesh)
+        surface = read_mesh(mesh)
         if surface is not None:
             scene.mesh.show(scene.last, surface)
-
-
-def _surface_of(path: Path) -> TriangleMesh | None:
-    """The mesh of a PLY file, None where it is a cloud of points."""
-    data = read_ply(path)
-    if data.faces is None:
-        return None
-    grey = np.full((len(data.points), 3), 200, np.uint8)
-    return TriangleMesh(
-        positions=data.points,
-        normals=np.zeros_like(data.points) if data.normals is None else data.normals,
-        colours=grey if data.colours is None else data.colours,
-        triangles=data.faces,
-    )
 
 
 def foxglove(recording: Recording, path: Path, folder: Path | None) -> None:

@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.meshing.mesh_blocks import TriangleMesh
-from pliant.formats.ply import write_ply
+from pliant.formats.ply import read_ply, write_ply
 from pliant.messages.mesh_pieces import joined
 from pliant.messages.types import MeshPiece
 from pliant.pictures.mesh import draw_mesh, mesh_view
@@ -49,6 +51,21 @@ def write_mesh(path: Path, mesh: TriangleMesh) -> None:
         path, mesh.positions, mesh.colours, normals=mesh.normals, faces=mesh.triangles,
         closed=mesh.closed if len(mesh.closed) else None,
     )  # fmt: skip
+
+
+def read_mesh(path: Path) -> TriangleMesh | None:
+    """The mesh of a PLY file, None if it is a cloud of points.  Normals it lacks are zero."""
+    data = read_ply(path)
+    if data.faces is None:
+        return None
+    grey = np.full((len(data.points), 3), 200, np.uint8)
+    return TriangleMesh(
+        positions=data.points,
+        normals=np.zeros_like(data.points) if data.normals is None else data.normals,
+        colours=grey if data.colours is None else data.colours,
+        triangles=data.faces,
+        closed=data.closed,
+    )
 
 
 def write_pictures(folder: Path, mesh: TriangleMesh, T_world_camera: F64, suffix: str = "") -> None:
