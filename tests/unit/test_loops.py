@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drifted_scene import AWAY, PARAMETERS, recognised, there_and_back
+from drifted_scene import AWAY, PARAMETERS, drifted, drifted_once, recognised, there_and_back, world
 from mapped_scene import error_of, similarity, trajectory_error
 from mapping_scene import CAMERA, INTERVAL_NS, looking
 
@@ -20,6 +20,8 @@ from pliant.algorithms.slam.parameters import (
     WholeMapParameters,
 )
 from pliant.state import load_state, save_state
+
+__all__ = ["drifted", "drifted_once", "world"]  # fixtures
 
 
 def error(active):
