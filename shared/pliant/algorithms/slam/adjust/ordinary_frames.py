@@ -81,12 +81,14 @@ class OrdinaryFrames:
     """Frames of a segment that are no keyframes and are to be placed again, oldest first."""
 
     _frames: list[OrdinaryFrame] = field(default_factory=list[OrdinaryFrame])
+    _size: int = 0  # observations of all of them
 
     def add(
         self, frame: int, keyframe: Keyframe, T_world_camera: F64, rows: I32, points_px: F32,
         log_focal: float = 0.0,
     ) -> None:  # fmt: skip
         """Add a frame with its reference keyframe and observations in the rows (n,)."""
+        self._size += len(rows)
         T_keyframe_camera = inverse(keyframe.T_world_camera) @ T_world_camera
         self._frames.append(
             OrdinaryFrame(
@@ -97,7 +99,7 @@ class OrdinaryFrames:
 
     def forget(self) -> None:
         """Leave the frames where they are: their observations are no longer valid."""
-        self._frames = []
+        self._keep([])
 
     def seen_by(self, before: CorrectedView, after: CorrectedView) -> None:
         """Convert the pixels to those of another ideal camera."""
@@ -122,7 +124,7 @@ class OrdinaryFrames:
 
     def take_in(self, earlier: "OrdinaryFrames") -> None:
         """Add the frames of a merged segment."""
-        self._frames = [*earlier._frames, *self._frames]
+        self._keep([*earlier._frames, *self._frames])
 
     @property
     def first_keyframe(self) -> int:
@@ -132,20 +134,28 @@ class OrdinaryFrames:
     def take_surplus(self, parameters: MappingParameters, rooms: int = 1) -> list[OrdinaryFrame]:
         """Remove and return the oldest frames beyond this multiple of the memory."""
         room = rooms * min(_ROOM, int(_ROOM_SHARE * parameters.window.kept_observations))
-        seen = np.cumsum([len(each.rows) for each in reversed(self._frames)])
-        return self._take(len(seen) - int(np.searchsorted(seen, room, side="right")))
+        count, size = 0, self._size
+        while size > room:
+            size -= len(self._frames[count].rows)
+            count += 1
+        return self._take(count)
 
     def leave(self, keyframes: set[int]) -> None:
         """Leave the frames of these reference keyframes, by id, where they are."""
-        self._frames = [each for each in self._frames if each.keyframe.id not in keyframes]
+        self._keep([each for each in self._frames if each.keyframe.id not in keyframes])
 
     def take_all(self) -> list[OrdinaryFrame]:
         """Remove and return all frames."""
         return self._take(len(self._frames))
 
     def _take(self, count: int) -> list[OrdinaryFrame]:
-        taken, self._frames = self._frames[:count], self._frames[count:]
+        taken = self._frames[:count]
+        if taken:
+            self._keep(self._frames[count:])
         return taken
+
+    def _keep(self, frames: list[OrdinaryFrame]) -> None:
+        self._frames, self._size = frames, sum(len(each.rows) for each in frames)
 
 
 def refined_poses(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -341,16 +342,22 @@ class SchurSystem:
         """With b the right side of Eq. 9 and S its matrix: ``b^T S^-1 b`` minus the same with some
         unknowns (N, 6) fixed, and ``S^-1 b``.
         """
-        state = self.start()
-        self.linearise(state)
-        S, b, diagonal = self._reduced_system(state, _GAUGE_DAMPING)
+        S, b, diagonal = self._undamped
         small = _GAUGE_DAMPING * diagonal
         held = np.where(unknowns, _HELD * diagonal, small)
         free = solve_reduced(self.pattern, S.copy(), b, small)
-        alone = solve_reduced(self.pattern, S, b, held)
+        alone = solve_reduced(self.pattern, S.copy(), b, held)
         if free is None or alone is None:
             return 0.0, np.zeros_like(b)
         return float((b * (free - alone)).sum()), free
+
+    @cached_property
+    def _undamped(self) -> tuple[F64, F64, F64]:
+        """As ``_reduced_system``, at the start, damped no more than the gauge needs."""
+        state = self.start()
+        self.linearise(state)
+        S, b, diagonal = self._reduced_system(state, _GAUGE_DAMPING)
+        return S.copy(), b, diagonal
 
     def _reduced_system(self, state: State, damping: float) -> tuple[F64, F64, F64]:
         """Of Eq. 9, at a linearised state: S without damping, the right side (N, 6) and diag(H)
