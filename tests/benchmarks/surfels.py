@@ -26,6 +26,7 @@ _BREATHING = tuple(f"breathing?amplitude={share}" for share in ("0", "0.01", "0.
 _MODELS = ("isometric", "equiareal", "general")
 _AREAS = ("auc", "auc_visible", "auc_image")
 _SIDES = (11, 15, 23, 31, 45)
+_LIGHTS = ("any", "camera", "camera-fixed")
 _CAMERAS = {"SC": "static", "moving": "moving"}
 _TROUBLES = ("tool=1", "light=0.3", "gloss=1", "drop=4", "tool=1&light=0.3&gloss=1&drop=4")
 _HEADER = (
@@ -51,6 +52,7 @@ TABLES = (
     "neighbours",
     "predictions",
     "troubles",
+    "light",
     LIMITS,
     LOSSES,
 )
@@ -114,7 +116,8 @@ def measure(
 def _rows(table: str, sources: list[str], tracks: str | None) -> list[_Row]:
     """The rows of a table; ``sources`` where some are given, its own sequences otherwise."""
     paper = [f"built-in:kinect-paper?tracks={tracks}"] if tracks else []
-    still = sources or [*paper, *(f"built-in:{name}" for name in _STATIC)]
+    rendered = [f"built-in:{name}" for name in _STATIC]
+    still = sources or [*paper, *rendered]
     moving = sources or [f"built-in:{name}" for name in _BREATHING]
     one_moving = [] if sources else [moving[2]]
     few = sources or [*paper, "built-in:sliding", moving[2]]
@@ -134,6 +137,13 @@ def _rows(table: str, sources: list[str], tracks: str | None) -> list[_Row]:
     if table == "predictions":
         jumping = sources or [*few, *(_with(s, f"drop={n}") for s in few for n in (8, 12))]
         return _each(jumping, {name: {"prediction": name} for name in ("none", "tracks")})
+    if table == "light":
+        lit = [_with(source, "lamp=camera") for source in (sources or [*rendered, *one_moving])]
+        elsewhere = [] if sources else ["built-in:objects", *one_moving]
+        return [
+            *_each(lit, {name: {"light": name} for name in _LIGHTS}),
+            *_each(elsewhere, {"camera": {"light": "camera"}}),
+        ]
     # Everything has a tool pass in front once; the other troubles are for two.
     everything = sources or [*still, *one_moving]
     disturbed = [_with(source, _TROUBLES[0]) for source in everything if is_deforming(source)]

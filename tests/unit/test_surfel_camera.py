@@ -118,9 +118,7 @@ def test_adjoint_by_finite_differences() -> None:
 def test_rigid_camera_system_is_the_dense_one() -> None:
     p = problem()
     n = len(p["poses"])
-    M, v, light = rigid_system(
-        p["poses"], p["active"], p["level"], p["work"], p["sums"], p["matrices"]
-    )
+    M, v, light = rigid_system(p["poses"], p["active"], p["matcher"], p["sums"])
     zeta = np.linalg.solve(M, v)
     dense, right = np.zeros((6 + 2 * n, 6 + 2 * n)), np.zeros(6 + 2 * n)
     for k in range(n):

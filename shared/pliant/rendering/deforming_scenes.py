@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -51,6 +51,10 @@ class DeformingOptions(FilmOptions):
         lt=1.0,
         description="Lighting change: the lamp's strength swings by this share either way, and "
         "its place by as many metres.",
+    )
+    lamp: Literal["fixed", "camera"] = Field(
+        default="fixed",
+        description="camera: the lamp is at the camera, as an endoscope's, and the only light.",
     )
     gloss: float = Field(
         default=0.0, ge=0.0, le=4.0, description="Specular spots; 1: as bright as white."
@@ -132,7 +136,9 @@ def deforming_scene(
     tracks_m: (23, 301, 3) true points, for the Kinect paper alone.
     """
     scene = DEFORMING[name].build(options, tracks_m)
-    lamp = Lamp(wander_m=options.light, gloss=255.0 * options.gloss)
+    lamp = Lamp(
+        wander_m=options.light, gloss=255.0 * options.gloss, at_camera=options.lamp == "camera"
+    )
     sheets = scene.sheets
     if options.tool:
         sheets = (*sheets, _tool(scene.path))

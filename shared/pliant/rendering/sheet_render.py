@@ -27,6 +27,7 @@ from pliant.rendering.sheets import DeformingScene, vertex_normals
 from pliant.rendering.textures import make_texture
 
 _LAMP_REACH_M = 2.2  # as in the rigid scenes
+_LAMP_AT_CAMERA_M = 0.6  # distance at which a lamp at the camera gives a light of 1
 
 
 @dataclass(frozen=True)
@@ -144,8 +145,12 @@ class SheetRenderer:
     ) -> None:  # fmt: skip
         lamp, sheet = self._scene.lamp, self._scene.sheets[number]
         place, strength = lamp.at(time)
-        normals = vertex_normals(vertices)
-        light = _diffuse(vertices, normals, place, T_world_camera[:3, 3], lamp.ambient, strength)
+        normals, eye = vertex_normals(vertices), T_world_camera[:3, 3]
+        if lamp.at_camera:
+            place = eye
+            light = _from_camera(vertices, normals, eye, strength)
+        else:
+            light = _diffuse(vertices, normals, place, eye, lamp.ambient, strength)
         R_camera_world = T_world_camera[:3, :3].T
         rows, columns = vertices.shape[:2]
         surface = Surface(
@@ -153,7 +158,7 @@ class SheetRenderer:
             np.ascontiguousarray(normals @ R_camera_world.T, np.float32),
             sheet.width_m / (columns - 1), sheet.height_m / (rows - 1),
         )  # fmt: skip
-        toward = (R_camera_world @ (place - T_world_camera[:3, 3])).astype(np.float32)
+        toward = (R_camera_world @ (place - eye)).astype(np.float32)
         shade(
             sight.depth_m, sight.sheet, sight.where, rays, surface, self._atlas,
             FOOTPRINT / self._camera.fx, Gloss(toward, lamp.gloss), 1.0 / len(SUB_PIXELS), out,
@@ -170,3 +175,11 @@ def _diffuse(
     cosine = side * (normals * way).sum(axis=2) / np.sqrt(square)
     direct = np.maximum(cosine, 0.0) / (1.0 + square / _LAMP_REACH_M**2)
     return ambient + 1.6 * (1.0 - ambient) * strength * direct
+
+
+def _from_camera(vertices: F64, normals: F64, eye: F64, strength: float) -> F64:
+    """(R, C) light of a lamp at the camera: cos / d^2, 1 at ``_LAMP_AT_CAMERA_M``."""
+    way = eye - vertices
+    square = (way**2).sum(axis=2)
+    cosine = np.abs((normals * way).sum(axis=2)) / np.sqrt(square)
+    return strength * cosine * _LAMP_AT_CAMERA_M**2 / square

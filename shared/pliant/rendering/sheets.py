@@ -41,12 +41,14 @@ class Lamp:
 
     place: metres, world.     wander: radius of its way, metres; its strength swings along with it.
     ambient: share of the light that comes from everywhere.    gloss: grey values of a highlight.
+    at_camera: the lamp rides with the camera and is the only light; ``place`` does not count.
     """
 
     place: Vector = (-0.25, -0.35, -0.1)
     wander_m: float = 0.0
     ambient: float = 0.55
     gloss: float = 0.0
+    at_camera: bool = False
 
     def at(self, time_s: float) -> tuple[F64, float]:
         """(3,) place and strength, 1 where the lamp does not wander."""

@@ -12,11 +12,10 @@ from pliant.algorithms.arrays import F64, U8, BoolArray
 from pliant.algorithms.geometry import hat, so3_exp, transform
 from pliant.algorithms.surfels.deformation_models import ISOMETRIC, move_poses
 from pliant.algorithms.surfels.graph_alignment import eliminate_all
-from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, Level, X
+from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, X
 from pliant.algorithms.surfels.surfel_alignment import (
     MIN_GAIN,
     Matcher,
-    Workspace,
     evaluate_all,
 )
 
@@ -58,7 +57,7 @@ def align_rigid(poses: F64, active: U8, T_camera_world: F64, matcher: Matcher) -
     The matrices are those of the textures, which affect the steps and not the result.
     poses: (N, POSE_FLOATS) in the camera's frame, overwritten.  Returns T_camera_world.
     """
-    level, templates, limits, work = matcher
+    level, limits = matcher.level, matcher.limits
     now = evaluate_all(poses, active, matcher)
     damping, accepted = limits.start_lambda, 0
     for _ in range(limits.iterations):
@@ -66,7 +65,7 @@ def align_rigid(poses: F64, active: U8, T_camera_world: F64, matcher: Matcher) -
         if not usable.any():
             break
         rows = usable.astype(np.uint8)
-        M, v, light = rigid_system(poses, rows, level, work, now.sums, templates.matrices)
+        M, v, light = rigid_system(poses, rows, matcher, now.sums)
         bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
         zeta = _solve(M, v, bound)
         motion, before = se3_exp(zeta), poses.copy()
@@ -92,14 +91,13 @@ def align_rigid(poses: F64, active: U8, T_camera_world: F64, matcher: Matcher) -
     return T_camera_world
 
 
-def rigid_system(
-    poses: F64, active: U8, level: Level, work: Workspace, sums: F64, matrices: F64
-) -> tuple[F64, F64, F64]:
+def rigid_system(poses: F64, active: U8, matcher: Matcher, sums: F64) -> tuple[F64, F64, F64]:
     """M (6, 6) and v (6,) of a rigid scene, M zeta = v, and (N, 2, 7) gain and bias from (1, zeta).
 
     A surfel that is static in the world steps by its own adjoint times zeta.
     """
-    own = eliminate_all(poses, active, level, ISOMETRIC, work, sums, matrices)
+    rigid = matcher._replace(limits=matcher.limits._replace(model=ISOMETRIC))
+    own = eliminate_all(poses, active, rigid, sums, matcher.templates.matrices)
     adjoints = np.tile(np.eye(6), (len(poses), 1, 1))
     adjoints[:, :3, 3:] = -hat(poses[:, X : X + 3])
     M = np.einsum("nji,njk,nkl->il", adjoints, own.S, adjoints)

@@ -24,6 +24,12 @@ class SurfelParameters(Parameters):
         description="Deformation of a surfel's own plane (Table I).  isometric: paper, cloth and "
         "what hardly stretches; equiareal, general: what stretches.",
     )
+    light: Literal["any", "camera", "camera-fixed"] = Field(
+        default="any",
+        description="camera: the only lamp is at the camera, as an endoscope's, and brightness "
+        "tells a stretch from an approach (model does not count).  camera-fixed: its exposure is "
+        "fixed, too, which tells more.  any: brightness tells nothing.",
+    )
     expected_motion: float = Field(
         default=0.02,
         gt=0.0,

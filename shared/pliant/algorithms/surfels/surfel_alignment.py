@@ -7,6 +7,7 @@ With a moving camera this is Eq. 21 for a fixed camera, with the regulariser of 
 whose Sigma is the same in all directions.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from pliant.algorithms.surfels.patch_sampling import (
     BIAS,
     GAIN,
     POSE_FLOATS,
+    F,
     Grid,
     Level,
     X,
@@ -73,6 +75,7 @@ class Limits(NamedTuple):
     # Share by which a success may raise the cost: noise that interpolation smooths more or less
     # moves the cost by as much.
     slack: float = 0.1
+    isometry: float = 0.0  # 1 / sigma^2 of the soft isometry; 0: none
 
 
 class Workspace(NamedTuple):
@@ -320,7 +323,7 @@ def align_all(poses: F64, active: U8, equilibrium: Equilibrium, matcher: Matcher
         if cost < 0.0:
             continue
         copy(work.h, before)
-        cost += _rest_cost(pose, point, weight)
+        cost += _rest_cost(pose, point, weight) + isometry_cost(pose, limits)
         # Samples that the template lacks cost the same everywhere; slack is a share of the others.
         lacking = limits.saturation * limits.saturation * (images.shape[1] - templates.counts[s])
         damping, accepted, fresh, travelled = limits.start_lambda, 0, True, 1e9
@@ -335,6 +338,7 @@ def align_all(poses: F64, active: U8, equilibrium: Equilibrium, matcher: Matcher
                 for row in range(n):
                     copy(work.photometric[row], work.H[row])
                 _add_rest(pose, point, weight, work.H, work.g)
+                add_isometry(pose, limits, work.H, work.g)
             bound = max(damping, limits.first_lambda) if accepted < limits.damped_steps else damping
             if not factorise(work.H, n, n - 2, bound, work.L, work.inverse):
                 break
@@ -343,7 +347,7 @@ def align_all(poses: F64, active: U8, equilibrium: Equilibrium, matcher: Matcher
             candidate[GAIN] = max(candidate[GAIN], MIN_GAIN)
             next_cost, _ = evaluate(candidate, level, images, mean, limits, work, next_sums)
             front = next_cost >= 0.0
-            next_cost += _rest_cost(candidate, point, weight)
+            next_cost += _rest_cost(candidate, point, weight) + isometry_cost(candidate, limits)
             moved = _patch_step_px(before, work.h, half) if front else 1e9
             if front and next_cost < cost + limits.slack * (cost - lacking):
                 copy(candidate, pose)
@@ -373,3 +377,31 @@ def _add_rest(pose: F64, point: F64, weight: float, H: F64, g: F64) -> None:
     for k in range(3):
         g[k] += weight * (pose[X + k] - point[k])
         H[k, k] += weight
+
+
+@fast_kernel
+def isometry_cost(pose: F64, limits: Limits) -> float:
+    """Soft isometry, DN^2: 4 omega_E ((1 + f)^(1/4) - 1), f = |F - 1|^2 / sigma^2.
+
+    Unlike that of Eq. 12-13 it gives way beyond sigma, to what really stretches.
+    """
+    f = _squared_strain(pose) * limits.isometry
+    return float(4.0 * OMEGA_E * (math.sqrt(math.sqrt(1.0 + f)) - 1.0))
+
+
+@fast_kernel(inline=True)
+def _squared_strain(pose: F64) -> float:
+    a, b, c = pose[F] - 1.0, pose[F + 1], pose[F + 2] - 1.0
+    return float(a * a + 2.0 * b * b + c * c)
+
+
+@fast_kernel
+def add_isometry(pose: F64, limits: Limits, H: F64, g: F64) -> None:
+    """Add its matrix and half of its gradient, for the general model."""
+    if limits.model != models.GENERAL or limits.isometry == 0.0:
+        return
+    f = 1.0 + _squared_strain(pose) * limits.isometry
+    w = OMEGA_E * limits.isometry * math.sqrt(math.sqrt(f)) / f
+    for k, share, rest in ((0, w, 1.0), (1, 2.0 * w, 0.0), (2, w, 1.0)):
+        g[models.RIGID + k] += share * (pose[F + k] - rest)
+        H[models.RIGID + k, models.RIGID + k] += share

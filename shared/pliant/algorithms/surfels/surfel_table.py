@@ -14,6 +14,7 @@ from pliant.algorithms.surfels.deformation_graph import (
     no_edges,
 )
 from pliant.algorithms.surfels.deformation_models import move_poses
+from pliant.algorithms.surfels.light import brightness
 from pliant.algorithms.surfels.patch_sampling import BIAS, GAIN, POSE_FLOATS, A, B, F, X
 from pliant.algorithms.surfels.surfel_alignment import Templates
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
@@ -44,6 +45,7 @@ class SurfelTable:
     poses: F64 = field(default_factory=lambda: np.zeros((0, POSE_FLOATS)))  # last good ones
     rest: F64 = field(default_factory=lambda: np.zeros((0, 3)))  # X^0 of Eq. 20, world
     sigmas: F64 = field(default_factory=lambda: np.zeros(0))  # root of its Sigma, metres
+    brightness: F64 = field(default_factory=lambda: np.zeros(0))  # at birth, see ``light``
     ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     state: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
     born: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
@@ -76,6 +78,7 @@ class SurfelTable:
         self.tried = np.concatenate([self.tried, poses[:, X : X + 3]])
         self.rest = np.concatenate([self.rest, poses[:, X : X + 3]])
         self.sigmas = np.concatenate([self.sigmas, sigmas])
+        self.brightness = np.concatenate([self.brightness, brightness(births.poses)])
         self.ids = np.concatenate([self.ids, np.arange(first_id, first_id + n)])
         self.state = np.concatenate([self.state, np.zeros(n, np.uint8)])
         self.born = np.concatenate([self.born, np.full(n, frame, np.int32)])
@@ -97,6 +100,7 @@ class SurfelTable:
             "poses",
             "rest",
             "sigmas",
+            "brightness",
             "ids",
             "state",
             "born",

@@ -49,6 +49,8 @@ _BLEND, _COARSE_STATIC_BLEND = 1.0, 0.5
 scales of a static camera their mean converges most often (second order, as in ESM); before a moving
 one it finds fewer surfels again after a jump."""
 _ITERATIONS, _COARSE_ITERATIONS = 10, 6
+_STRAIN_SIGMA = 0.01
+"""Of the soft isometry with a lamp at the camera."""
 _STEP_PX, _COARSE_STEP_PX = 0.01, 0.05
 
 
@@ -306,6 +308,7 @@ class SurfelTracker:
             return align_graph(
                 poses, start, active, self._table.edges, equilibrium, self._matcher(number, level),
                 self._parameters, STEPS if number == 0 else COARSE_STEPS,
+                None if self._parameters.light == "any" else self._table.brightness,
             )  # fmt: skip
 
     def _validate(self, level: Level, poses: F64, torn: BoolArray) -> None:
@@ -390,13 +393,14 @@ class SurfelTracker:
 
     def _limits(self, *, fine: bool) -> Limits:
         p = self._parameters
-        coarse_static = not fine and p.camera == "static"
+        coarse_static, by_light = not fine and p.camera == "static", p.light != "any"
         return Limits(
-            MODELS[p.model],
+            MODELS["general" if by_light else p.model],
             _COARSE_STATIC_BLEND if coarse_static else _BLEND,
             p.highlight,
             _ITERATIONS if fine else _COARSE_ITERATIONS,
             _STEP_PX if fine else _COARSE_STEP_PX,
+            isometry=1.0 / _STRAIN_SIGMA**2 if by_light else 0.0,
         )
 
     def _result(self) -> SurfelFrame:
