@@ -16,7 +16,8 @@ the median of what they tell at their present poses.  Mean grey levels count, si
 the contrast of a patch.
 
 Of a surface that may stretch, size and shading together tell more than each alone.  So with this
-light surfels have the general model of Table I with a soft isometry, and a residual b / b_measured - 1.
+light surfels have the general model of Table I with a soft isometry, and the residual
+b / b_measured - 1.
 """
 
 import math
