@@ -127,7 +127,7 @@ def measure(
 ) -> Iterator[str]:
     """The table of a run, or the ratios to a commit by runs in turns."""
     if against is None:
-        _run(_ROOT, source, (*options, "--end", "2"))  # compiles, renders
+        _run(_ROOT, source, (*options, "--end", "1"))  # compiles, renders
         budgets = [_run(_ROOT, source, options) for _ in range(runs)]
         yield from _short(budgets) if short else _tables(source, budgets)
         return
@@ -137,7 +137,7 @@ def measure(
         try:
             _copy_kernels(other)
             for root in (other, _ROOT):
-                _run(root, source, (*options, "--end", "2"))
+                _run(root, source, (*options, "--end", "1"))
             pairs = [
                 (_run(other, source, options), _run(_ROOT, source, options)) for _ in range(runs)
             ]
