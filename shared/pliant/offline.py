@@ -3,7 +3,6 @@
 The same algorithms in the same order as the services run them, so the same numbers come out.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pliant.algorithms.image.masks import clearance_in, filled
@@ -17,7 +16,7 @@ from pliant.algorithms.stages import StageTimer, no_stages
 from pliant.algorithms.tracking.tracker import ExtremaTracker
 from pliant.algorithms.tracks import FrameExtrema
 from pliant.config import Config
-from pliant.datasets.base import Dataset, SourceFrame
+from pliant.datasets.base import SourceFrame
 from pliant.datasets.calibration import Calibration
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.map_history import MapHistory
@@ -33,14 +32,6 @@ class MappedFrame:
     delta: MapDelta
 
 
-@dataclass(frozen=True)
-class Timers:
-    """Stopwatches of the two algorithms."""
-
-    tracking: StageTimer = no_stages
-    bundle_adjustment: StageTimer = no_stages
-
-
 class Pipeline:
     """Tracker and mapper of one camera; ``history`` is complete after ``finish``."""
 
@@ -49,12 +40,13 @@ class Pipeline:
         calibration: Calibration,
         config: Config,
         history: MapHistory,
-        timers: Timers = Timers(),
+        timer: StageTimer = no_stages,
         places: KnownPlaces | None = None,
     ) -> None:
-        """places: where the camera may be recognised, instead of a mapper's own."""
+        """timer: of the stages of both.    places: where the camera may be recognised, instead of a
+        mapper's own."""
         self.history = history
-        self._timers = timers
+        self._timer = timer
         self._rectifier = Rectifier(calibration)
         camera = self._rectifier.camera
         self._tracker = ExtremaTracker(camera.width, camera.height, config.tracking, config.seed)
@@ -73,14 +65,12 @@ class Pipeline:
             delta = self._mapper.skip(image.frame)
         else:
             clearance = clearance_in(image.mask)
-            tracks = self._tracker.track(
-                image.grey, image.stamp_ns, self._timers.tracking, clearance
-            )
+            tracks = self._tracker.track(image.grey, image.stamp_ns, self._timer, clearance)
             colour = image.colour if image.colour.size else None
             frame = Frame(
                 image.frame, image.stamp_ns, tracks, filled(image.grey, clearance), colour
             )
-            delta = self._mapper.process(frame, self._timers.bundle_adjustment)
+            delta = self._mapper.process(frame, self._timer)
         self.history.apply(delta, frame=image.frame, stamp_ns=image.stamp_ns)
         self._last = image.frame
         return MappedFrame(image, tracks, delta)
@@ -94,11 +84,3 @@ class Pipeline:
     def kept(self) -> list[KeptKeyframe]:
         """The map as it is to be kept, once it is finished."""
         return list(self._mapper.kept())
-
-
-def process(dataset: Dataset, config: Config, history: MapHistory) -> Iterator[MappedFrame]:
-    """Track and map every frame of a source; ``history`` is complete once the iterator ends."""
-    pipeline = Pipeline(dataset.calibration, config, history)
-    for source in dataset:
-        yield pipeline.take(source)
-    pipeline.finish()

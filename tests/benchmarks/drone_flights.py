@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.drone_scenes import drone_scene
+from benchmarks.in_process import process
 from benchmarks.painting import paint_faces
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64
@@ -22,7 +23,6 @@ from pliant.evaluation.presentation import metres
 from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
-from pliant.offline import process
 from pliant.rendering.face_textures import FaceTexture
 from pliant.rendering.paths import SampledPath
 from pliant.rendering.render import CameraOptions, Renderer, SceneGeometry

@@ -21,7 +21,7 @@ from pliant.datasets import open_source
 from pliant.datasets.base import SourceFrame
 from pliant.datasets.source_spec import SourceSpec
 from pliant.map_history import MapHistory
-from pliant.offline import Pipeline, Timers
+from pliant.offline import Pipeline
 from pliant.rendering.scenes import SCENES
 
 _HARD_FRAMES, _FPS = 300, 30.0
@@ -85,7 +85,7 @@ def _row(source: Source, count: int, overrides: list[str]) -> list[float]:
     dataset = open_source(spec, config.ingest)
     watch, at_end = (Stopwatch(time.process_time) for _ in range(2))
     history = MapHistory()
-    pipeline = Pipeline(dataset.calibration, config, history, Timers(watch, watch))
+    pipeline = Pipeline(dataset.calibration, config, history, watch)
     for _ in _frames(iter(dataset), min(2, count)):
         pass  # so that neither the decoder nor the kernels begin within the measurement
     known, ahead = set[int](), list[int]()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.table import markdown_header, markdown_row
-from pliant.config import load_config
+from pliant.config import Config, load_config
 from pliant.datasets import Calibration, open_source
 from pliant.datasets.base import Dataset
 from pliant.errors import DatasetError
@@ -16,7 +16,7 @@ from pliant.evaluation.presentation import metres
 from pliant.evaluation.run_evaluation import TrajectoryEvaluation, evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
-from pliant.offline import Pipeline
+from pliant.offline import MappedFrame, Pipeline
 from pliant.trajectory import Trajectory
 
 _HEADER = ("sequence", "seed", "ATE, final", "ATE, online", "frames with a pose")
@@ -89,6 +89,14 @@ def run(
         correction=tuple(told[-1].calibration_correction) if told else (),
         sigmas=tuple(told[-1].calibration_sigmas) if told else (),
     )
+
+
+def process(dataset: Dataset, config: Config, history: MapHistory) -> Iterator[MappedFrame]:
+    """Track and map every frame of a source; ``history`` is complete once the iterator ends."""
+    pipeline = Pipeline(dataset.calibration, config, history)
+    for source in dataset:
+        yield pipeline.take(source)
+    pipeline.finish()
 
 
 def measure(

@@ -12,6 +12,7 @@ import numpy as np
 from inertial_motion import ADIS16448, PHONE, Motion, Sensor, samples_of
 
 from benchmarks.drone_flights import flights
+from benchmarks.in_process import process
 from benchmarks.table import markdown_header, markdown_row
 from pliant.algorithms.arrays import F64
 from pliant.algorithms.geometry import align_umeyama, so3_exp, so3_log
@@ -23,7 +24,6 @@ from pliant.datasets.base import Dataset
 from pliant.datasets.builtin import builtin_folder
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
-from pliant.offline import process
 from pliant.trajectory import Trajectory, associate
 
 SENSORS = {"ADIS16448": ADIS16448, "phone": PHONE}

@@ -8,13 +8,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from benchmarks.in_process import process
 from running import NO_MESH, in_this_process, pliant, write_sequence
 
 from pliant.config import load_config
 from pliant.datasets import open_source
 from pliant.errors import DatasetError
 from pliant.map_history import MapHistory
-from pliant.offline import process
 
 pytestmark = pytest.mark.system
 

@@ -7,6 +7,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from benchmarks.in_process import process
 
 import pliant
 from pliant.algorithms.arrays import F64, U8, BoolArray
@@ -16,7 +17,6 @@ from pliant.datasets import Dataset, SourceFrame, decode, open_source
 from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
-from pliant.offline import process
 
 pytestmark = pytest.mark.slow
 WIDTH, HEIGHT = 320, 240

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from benchmarks.in_process import process
 
 from pliant.algorithms.arrays import U8
 from pliant.algorithms.image.sharpness import resized, sharpness, working_side
@@ -20,7 +21,6 @@ from pliant.datasets.working_size import SmallerImages, at_working_size
 from pliant.evaluation.run_evaluation import evaluate_trajectory
 from pliant.formats.trajectory_files import read_trajectory
 from pliant.map_history import MapHistory
-from pliant.offline import process
 
 
 def picture(width: int, height: int, noise: float = 1.0, seed: int = 1) -> U8:
