@@ -33,8 +33,10 @@ _EVERY = 3
 _MIN_CORRELATION = 0.9
 _RIGHT_PX = 3.0
 _NEIGHBOURS = 8
+_COVERED_PX = 24.0
 _HEADER = (
     "frame",
+    "covered %",
     "alive %",
     "right %",
     "wrong %",
@@ -51,11 +53,13 @@ def measure(source: str, frames: str, without: str, overrides: Sequence[str]) ->
     without: polygon "u,v,u,v,..." in the first frame, px: surfels that are born in it do not count,
     such as those on an instrument.  overrides: KEY=VALUE of ``SurfelParameters``.  right: alive and
     within 3 px of the reference, of all surfels that have one.  wrong: farther from it, of the
-    alive ones that have one.  Raises DatasetError.
+    alive ones that have one.  covered: share of the image within 24 px of a tracked surfel.
+    Raises DatasetError.
     """
     numbers = [int(each) for each in frames.split(",")]
     corners = np.array([float(each) for each in without.split(",") if each]).reshape(-1, 2)
-    parameters = SurfelParameters.model_validate(dict(each.split("=", 1) for each in overrides))
+    settings = {"depth_from": "flat"} | dict(each.split("=", 1) for each in overrides)
+    parameters = SurfelParameters.model_validate(settings)
     yield from _rows(source, numbers, corners, parameters)
 
 
@@ -76,7 +80,11 @@ def _rows(
         truth = reference[frame]
         known = np.isfinite(truth[:, 0])
         where, alive = rows_of(followed[frame], followed[0].ids[counted])
-        cells = [*judge(where, alive, truth), *judge(flow[frame], kept[frame], truth)]
+        cells = [
+            covered(followed[frame], images[0].shape),
+            *judge(where, alive, truth),
+            *judge(flow[frame], kept[frame], truth),
+        ]
         rows.append([str(frame), *(f"{100.0 * c:.1f}" for c in cells), f"{known.mean():.0%}"])
     yield f"{source}: {len(points)} surfels, depth flat"
     yield markdown(_HEADER, rows)
@@ -101,6 +109,17 @@ def outside(points: F64, polygon: F64) -> BoolArray:
         return np.ones(len(points), np.bool_)
     corners = polygon.astype(np.float32)
     return np.array([cv2.pointPolygonTest(corners, (u, v), False) < 0 for u, v in points], np.bool_)
+
+
+def covered(surfels: SurfelFrame, shape: tuple[int, ...]) -> float:
+    """Share of the image within 24 px of a tracked surfel."""
+    free = np.full(shape, 255, np.uint8)
+    tracked = surfels.points_px[surfels.state == SurfelState.TRACKED]
+    column, row = np.rint(tracked).astype(int).T
+    inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+    free[row[inside], column[inside]] = 0
+    gaps = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return float((gaps <= _COVERED_PX).mean())
 
 
 def rows_of(surfels: SurfelFrame, ids: Any) -> tuple[F64, BoolArray]:

@@ -64,7 +64,7 @@ def test_depth_that_was_made_up_is_doubtful_and_not_in_metres(
         assert tracks["unit"].tolist() == ["metre" if is_metric else "arbitrary"]
     head = (tmp_path / "tracks" / "tracks.csv").read_text().partition("\n")[0]
     axes = "x_m,y_m,z_m" if is_metric else "x,y,z"
-    assert head == f"frame,seconds,segment,id,{axes},confirmed,zncc"
+    assert head == f"frame,seconds,segment,id,{axes},confirmed,zncc,confidence"
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +89,7 @@ def test_tracks_are_the_tracked_surfels_of_the_recording(recorded: Path, tmp_pat
             np.testing.assert_array_equal(found["zncc"][n, tracked], frame.zncc[rows])
             np.testing.assert_array_equal(found["confirmed"][n, tracked], frame.confirmed[rows])
             assert (found["confirmed"][n, ~tracked] == -1).all()
+            np.testing.assert_array_equal(found["confidence"][n, tracked], frame.confidence[rows])
             np.testing.assert_array_equal(found["T_world_camera"][n], frame.T_world_camera)
         count = np.isfinite(found["positions"][..., 0]).sum()
     lines = (path / "tracks.csv").read_text().splitlines()

@@ -145,7 +145,8 @@ def test_what_another_sheet_drags_along_is_counted(sliding: SurfaceTruth) -> Non
     assert judge.summary()["dragged_ever"] == 2.0
 
 
-def test_the_curve_of_the_zncc_has_a_known_area(sliding: SurfaceTruth) -> None:
+@pytest.mark.parametrize("field", ["zncc", "confidence"])
+def test_the_curve_of_what_is_published_has_a_known_area(sliding: SurfaceTruth, field: str) -> None:
     judge = ExactSurfels(sliding)
     start, T = world_of(sliding, 0)
     n = len(start)
@@ -155,10 +156,11 @@ def test_the_curve_of_the_zncc_has_a_known_area(sliding: SurfaceTruth) -> None:
     found = exact.copy()
     found[wrong] += (0.05, 0.0, 0.0)
     # Half of the wrong ones look as good as the right ones: ties count half.
-    zncc = np.where(wrong & (np.arange(n) % 4 == 1), 0.3, 0.9)
-    state = np.where(zncc < 0.5, SurfelState.OUTLIER, SurfelState.TRACKED)
-    judge.add(3, surfels_at(sliding, found, T, state, zncc))
-    low = np.count_nonzero(wrong & (zncc < 0.5)) / np.count_nonzero(wrong)
+    score = np.where(wrong & (np.arange(n) % 4 == 1), 0.3, 0.9)
+    state = np.where(score < 0.5, SurfelState.OUTLIER, SurfelState.TRACKED)
+    frame = surfels_at(sliding, found, T, state, np.ones(n))
+    judge.add(3, replace(frame, **{field: score.astype(np.float32)}))
+    low = np.count_nonzero(wrong & (score < 0.5)) / np.count_nonzero(wrong)
     assert judge.summary()["auc"] == pytest.approx(low + 0.5 * (1.0 - low))
     assert judge.summary()["auc_image"] == judge.summary()["auc"]
 

@@ -3,22 +3,14 @@
 import cv2
 import numpy as np
 import pytest
+from flat_texture import CAMERA, DEPTH, texture
 
-from pliant.algorithms.arrays import F64, U8
-from pliant.algorithms.camera import PinholeCamera
+from pliant.algorithms.arrays import U8
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.second_templates import carried_by_neighbours
 from pliant.algorithms.surfels.surfel_tracker import SurfelTracker
 
-CAMERA = PinholeCamera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
-DEPTH = np.ones((240, 320))
 STEP_S = 1.0 / 30.0
-
-
-def texture(seed: int) -> F64:
-    grey = np.random.default_rng(seed).normal(size=(240, 320))
-    grey = cv2.GaussianBlur(grey, (0, 0), 2.5)
-    return np.asarray(grey / grey.std(), np.float64)
 
 
 def film(last_share: float, count: int) -> list[U8]:

@@ -11,6 +11,8 @@ from pliant.algorithms.surfels.deformation_graph import (
     find_edges,
     join_edges,
     keep_rows,
+    median_strains,
+    no_edges,
     torn_off,
 )
 from pliant.algorithms.surfels.graph_alignment import Springs, solve_graph
@@ -78,6 +80,20 @@ def test_a_stretch_that_surfels_know_of_costs_nothing() -> None:
     np.testing.assert_allclose(residuals, 0.0, atol=1e-12)
     pulled[:, F : F + 3] = (1.0, 0.0, 1.0)
     assert np.abs(edge_rows(pulled, edges)[1]).max() > 1e-3
+
+
+def test_the_median_strain_is_that_of_plain_numpy() -> None:
+    poses = plane()
+    edges = pairs_of(poses)
+    poses[:, X : X + 3] += np.random.default_rng(2).normal(0.0, 0.01, (N, 3))
+    residuals = edge_rows(poses, edges)[1][:, 0]
+    strains = np.linalg.norm(residuals, axis=1) / edges.lengths
+    expected = [np.median(strains[(edges.ends == row).any(axis=1)]) for row in range(N)]
+    np.testing.assert_allclose(median_strains(poses, edges), expected)
+    # A surfel that is added has no edges yet.
+    more = np.concatenate([poses, poses[:1]])
+    assert np.isnan(median_strains(more, edges)).tolist() == [False] * N + [True]
+    assert np.isnan(median_strains(poses, no_edges())).all()
 
 
 def test_a_rigid_motion_costs_nothing() -> None:

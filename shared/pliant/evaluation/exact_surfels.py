@@ -21,7 +21,7 @@ from pliant.evaluation.surfel_truth import rmse, roc
 INLIER = 0.01
 """A surfel is right within this share of its depth (paper, Fig. 3)."""
 INLIER_PX = 1.0
-"""The image determines no more than this: the ZNCC does not depend on the depth."""
+"""Its own image determines no more than this of a surfel."""
 _BORDER_PX = 12.0
 """Nearer to the border than half a patch no surfel can be tracked."""
 _DRAGGED_PX = 3.0
@@ -79,7 +79,7 @@ class _Start:
 class _Pairs:
     """Every surfel in every frame: the result of the test, and the ground truth."""
 
-    zncc: list[F64] = field(default_factory=list[F64])
+    scores: list[F64] = field(default_factory=list[F64])
     right: list[BoolArray] = field(default_factory=list[BoolArray])
     visible: list[BoolArray] = field(default_factory=list[BoolArray])
     in_place: list[BoolArray] = field(default_factory=list[BoolArray])  # within a pixel
@@ -228,9 +228,10 @@ class ExactSurfels:
             where = np.where(alive[:, None], in_camera, rays * in_camera[:, 2:3])
         off = np.linalg.norm((where - exact_camera) / exact_camera[:, 2:3], axis=1)
         inside = listed & (surfels.state[row] != SurfelState.OUTSIDE)
-        # A recent template fits where it was taken: the ZNCC with that of birth is the test.
-        zncc = surfels.birth_zncc if len(surfels.birth_zncc) == len(surfels.ids) else surfels.zncc
-        self._pairs.zncc.append(zncc[row][inside].astype(np.float64))
+        # Older recordings have the ZNCC alone.
+        published = surfels.confidence, surfels.birth_zncc, surfels.zncc
+        scores = next(each for each in published if len(each) == len(surfels.ids))
+        self._pairs.scores.append(scores[row][inside].astype(np.float64))
         self._pairs.right.append((off < INLIER)[inside])
         self._pairs.visible.append(visible[inside])
         front = (where[:, 2] > 0.0) & (exact_camera[:, 2] > 0.0)
@@ -242,20 +243,20 @@ class ExactSurfels:
         self._pairs.in_place.append(near[inside])
 
     def curve(self, *, visible: bool = False) -> tuple[F64, F64, float]:
-        """ROC of the ZNCC: false and true positive rates, and AUC; of the visible ones alone."""
+        """ROC of the confidence: false and true positive rates, AUC.  visible: of those alone."""
         pairs = self._pairs
-        if not pairs.zncc:
+        if not pairs.scores:
             return roc(np.zeros(0), np.zeros(0, np.bool_))
-        zncc, right = np.concatenate(pairs.zncc), np.concatenate(pairs.right)
-        kept = np.concatenate(pairs.visible) if visible else np.ones(len(zncc), np.bool_)
-        return roc(zncc[kept], right[kept])
+        scores, right = np.concatenate(pairs.scores), np.concatenate(pairs.right)
+        kept = np.concatenate(pairs.visible) if visible else np.ones(len(scores), np.bool_)
+        return roc(scores[kept], right[kept])
 
     def curve_in_image(self) -> tuple[F64, F64, float]:
         """The same for surfels that are within ``INLIER_PX`` of where their own point is seen."""
         pairs = self._pairs
-        if not pairs.zncc:
+        if not pairs.scores:
             return roc(np.zeros(0), np.zeros(0, np.bool_))
-        return roc(np.concatenate(pairs.zncc), np.concatenate(pairs.in_place))
+        return roc(np.concatenate(pairs.scores), np.concatenate(pairs.in_place))
 
     def by_size(self, parts: int = 3) -> list[tuple[float, float, float]]:
         """(least, most mm a pixel on the surface at birth, RMSE by depth) of equal parts."""
@@ -355,8 +356,8 @@ def format_exact(surfels: ExactSurfels, *, moving_camera: bool) -> str:
         f"{mean['frames_until_loss']:.0f}, dragged by another sheet {mean['dragged_ever']:.0f}"
     )
     text.append(
-        f"ZNCC as a test of 3D errors below 1 % of the depth: AUC {mean['auc']:.3f}, of those in "
-        f"view {mean['auc_visible']:.3f}; of being within 1 px in the image: "
+        f"confidence as a test of 3D errors below 1 % of the depth: AUC {mean['auc']:.3f}, of "
+        f"those in view {mean['auc_visible']:.3f}; of being within 1 px in the image: "
         f"{mean['auc_image']:.3f}"
     )
     sheets = surfels.by_sheet().items()

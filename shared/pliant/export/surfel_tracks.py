@@ -36,7 +36,7 @@ def surfel_tracks(recording: Recording, path: Path, folder: Path | None, every: 
         npz.add("segments", numbers[:, 0])
         npz.add("ids", numbers[:, 1])
         npz.add("unit", np.array([unit]))
-        csv.write(f"frame,seconds,segment,id,{x},{y},{z},confirmed,zncc\n")
+        csv.write(f"frame,seconds,segment,id,{x},{y},{z},confirmed,zncc,confidence\n")
         for surfels in _frames(recording, every):
             rows = np.flatnonzero(surfels.state == SurfelState.TRACKED)
             at = np.array([columns[key] for key in _keys(surfels)], np.int64)
@@ -60,25 +60,29 @@ def _keys(surfels: Surfels) -> list[tuple[int, int]]:
 def _add(npz: NpzWriter, surfels: Surfels, rows: I64, at: I64, count: int) -> None:
     """One frame of the dense arrays.  at: columns of the tracked rows, of ``count``."""
     positions, zncc = np.full((1, count, 3), np.nan), np.full((1, count), np.nan, np.float32)
-    confirmed = np.full((1, count), -1, np.int8)
+    confirmed, confidence = np.full((1, count), -1, np.int8), np.full_like(zncc, np.nan)
     positions[0, at], zncc[0, at] = surfels.positions[rows], surfels.zncc[rows]
     if len(surfels.confirmed):
         confirmed[0, at] = surfels.confirmed[rows]
+    if len(surfels.confidence):
+        confidence[0, at] = surfels.confidence[rows]
     npz.add("frames", np.array([surfels.frame], np.int64))
     npz.add("stamps_ns", np.array([surfels.stamp_ns], np.int64))
     npz.add("T_world_camera", surfels.T_world_camera[None])
     npz.add("positions", positions)
     npz.add("confirmed", confirmed)
     npz.add("zncc", zncc)
+    npz.add("confidence", confidence)
 
 
 def _lines(surfels: Surfels, rows: I64) -> Iterator[str]:
     head = f"{surfels.frame},{format_seconds(surfels.stamp_ns)},{surfels.segment}"
-    known = len(surfels.confirmed) > 0
+    known, rated = len(surfels.confirmed) > 0, len(surfels.confidence) > 0
     for row in rows.tolist():
         x, y, z = surfels.positions[row].tolist()
         confirmed = int(surfels.confirmed[row]) if known else ""
+        confidence = f"{surfels.confidence[row]:.3f}" if rated else ""
         yield (
             f"{head},{surfels.ids[row]},{x:.9g},{y:.9g},{z:.9g},"
-            f"{confirmed},{surfels.zncc[row]:.4f}\n"
+            f"{confirmed},{surfels.zncc[row]:.4f},{confidence}\n"
         )

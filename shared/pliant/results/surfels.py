@@ -42,7 +42,7 @@ from pliant.wording import counted
 _PER_SURFEL = (
     *("ids", "positions", "tangents", "deformations", "points_px", "zncc", "visible", "sigma"),
     *("gains", "biases", "state", "age", "born", "tried", "birth_zncc"),
-    "confirmed",
+    *("confirmed", "confidence"),
 )
 
 

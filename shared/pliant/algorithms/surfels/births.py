@@ -70,15 +70,16 @@ def find_births(
     parameters: SurfelParameters,
     occupied: F64,
     count: int,
+    clearance_px: int,
 ) -> Births:
     """Return at most ``count`` new surfels at pixels with texture, depth and enough distance.
 
     pyramid: of the image.  depth: (H, W) metres, 0 or NaN for holes.  occupied: (M, 2) pixels near
-    which no surfel may be created.
+    which, within the clearance, no surfel may be created.
     """
     p, level = parameters, pyramid[0]
     image = level.pixels
-    allowed = _allowed(depth, image, occupied, p)
+    allowed = _allowed(depth, image, occupied, clearance_px, p.highlight)
     corners = find_corners(
         image,
         allowed,
@@ -96,10 +97,9 @@ def find_births(
     return Births(poses[rows], [select(each, rows) for each in templates])
 
 
-def _allowed(depth: F64, image: F32, occupied: F64, p: SurfelParameters) -> U8:
-    allowed = ((depth > 0.0) & (image <= p.highlight)).astype(np.uint8)
+def _allowed(depth: F64, image: F32, occupied: F64, radius: int, highlight: float) -> U8:
+    allowed = ((depth > 0.0) & (image <= highlight)).astype(np.uint8)
     height, width = depth.shape
-    radius = p.spacing_px
     for column, row in np.rint(occupied).astype(np.int64):
         top, left = max(row - radius, 0), max(column - radius, 0)
         if row + radius >= 0 and column + radius >= 0 and top < height and left < width:

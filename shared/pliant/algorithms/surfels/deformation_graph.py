@@ -3,6 +3,7 @@
 Not in the paper, whose surfels are independent; see ``graph_alignment`` for their use.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -166,6 +167,40 @@ def _edge_rows(
             squares += r * r
         ratio = squares / (tear * edges.lengths[e]) ** 2
         weights[e] = 1.0 / (1.0 + ratio) ** 2
+
+
+@fast_kernel
+def _median_strains(edges: Edges, residuals: F64, out: F64) -> None:
+    ends = edges.ends
+    starts = np.zeros(len(out) + 1, np.int64)
+    for e in range(len(ends)):
+        starts[ends[e, 0] + 1] += 1
+        starts[ends[e, 1] + 1] += 1
+    for s in range(len(out)):
+        starts[s + 1] += starts[s]
+    filled, values = starts[:-1].copy(), np.empty(2 * len(ends))
+    for e in range(len(ends)):
+        r = residuals[e, 0]
+        length = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+        for side in range(2):
+            s = ends[e, side]
+            values[filled[s]] = length / edges.lengths[e]
+            filled[s] += 1
+    for s in range(len(out)):
+        if starts[s + 1] > starts[s]:
+            out[s] = np.median(values[starts[s] : starts[s + 1]])
+
+
+def median_strains(poses: F64, edges: Edges) -> F64:
+    """(N,) median of |X_j - X_i - (R_i + R_j) d / 2| / |d| over each surfel's edges.
+
+    Half of its neighbours agree with a surfel to within this share of their distance.  NaN without
+    edges.
+    """
+    out = np.full(len(poses), np.nan)
+    if len(edges.ends):
+        _median_strains(edges, edge_rows(poses, edges)[1], out)
+    return out
 
 
 def torn_off(edges: Edges, weights: F64, count: int) -> BoolArray:

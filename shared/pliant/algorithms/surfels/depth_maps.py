@@ -11,9 +11,11 @@ scale.
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from pliant.algorithms.arrays import F64, I64
+from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, transform
 from pliant.algorithms.surfels.surfel_frame import SurfelFrame, SurfelState
 from pliant.compiler.kernel import fast_kernel
@@ -29,6 +31,34 @@ _MAX_DISAGREEMENT = 0.02
 """Maximum relative difference between a surfel's depth and the map's, after the median."""
 _REACH = 2.0
 """Surfels within this many patch sides decide whether a depth is right."""
+
+
+_BLUR_CELLS = 2.0
+"""Standard deviation, in cells, with which surfels determine the depth around them."""
+_FAR_WEIGHT = 1e-4
+"""Weight of the mean depth, which decides far from all surfels."""
+
+
+def depth_between(points_px: F64, z: F64, camera: PinholeCamera) -> F64:
+    """(H, W) smooth depth through surfels: a Gaussian mean of their inverse depths.
+
+    For births where depth has no meaning but that of the surfels around.  points_px: (N, 2) pixels
+    of tracked surfels.  z: (N,) their depths.
+    """
+    rows, columns = (-(-side // _CELL_PX) for side in (camera.height, camera.width))
+    at = np.floor((points_px + 0.5) / _CELL_PX).astype(np.int64)
+    inside = ((at >= 0) & (at < (columns, rows))).all(axis=1) & (z > 0.0)
+    cells, inverse_z = at[inside, 1] * columns + at[inside, 0], 1.0 / z[inside]
+    sums = np.stack([np.bincount(cells, w, rows * columns) for w in (None, inverse_z)])
+    weights, sums = (
+        cv2.GaussianBlur(grid.reshape(rows, columns).astype(np.float64), (0, 0), _BLUR_CELLS)
+        for grid in sums
+    )
+    mean = inverse_z.mean() if len(inverse_z) else 1.0
+    smooth = (sums + _FAR_WEIGHT * mean) / (weights + _FAR_WEIGHT)
+    size = columns * _CELL_PX, rows * _CELL_PX
+    full = cv2.resize(smooth, size, interpolation=cv2.INTER_LINEAR)
+    return 1.0 / np.asarray(full[: camera.height, : camera.width], np.float64)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ def _none_tried() -> F64:
     return np.zeros((0, 3))
 
 
-def _no_zncc() -> F32:
+def _no_floats() -> F32:
     return np.zeros(0, np.float32)
 
 
@@ -57,8 +57,10 @@ class SurfelFrame:
     tried: Annotated[F64, Shape("T", 3)] = field(default_factory=_none_tried)
     # (N,) ZNCC with the birth template; 1 where a surfel is tracked and that template is in use.
     # Or (0,) in recordings that were made before they were published.
-    birth_zncc: Annotated[F32, Shape("B")] = field(default_factory=_no_zncc)
+    birth_zncc: Annotated[F32, Shape("B")] = field(default_factory=_no_floats)
     confirmed: Annotated[U8, Shape("B")] = field(default_factory=_none_confirmed)
+    # (N,) probability that the position is within 1 % of the depth; or (0,) in older recordings.
+    confidence: Annotated[F32, Shape("P")] = field(default_factory=_no_floats)
 
     def __post_init__(self) -> None:
         check_arrays(self)

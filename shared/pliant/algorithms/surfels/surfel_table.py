@@ -11,6 +11,7 @@ from pliant.algorithms.surfels.deformation_graph import (
     find_edges,
     join_edges,
     keep_rows,
+    median_strains,
     no_edges,
 )
 from pliant.algorithms.surfels.deformation_models import move_poses
@@ -28,6 +29,10 @@ from pliant.algorithms.surfels.validation import (
     V,
     new_validations,
 )
+
+_EVEN_STRAIN, _STEEPNESS = 0.15, 1.2
+"""Half of the surfels with this median strain are within 1 % of their depth; fitted on the rendered
+scenes of ``scripts/bench surfels``."""
 
 
 def _none() -> list[Templates]:
@@ -111,9 +116,11 @@ class SurfelTable:
         ):
             setattr(self, name, np.ascontiguousarray(getattr(self, name)[rows]))
 
-    def connect(self, first_new: int, count: int) -> None:
-        """Connect the rows from ``first_new`` on with their neighbours."""
+    def connect(self, first_new: int, count: int, *, with_earlier: bool) -> None:
+        """Connect the rows from ``first_new`` on with their neighbours, earlier ones or not."""
         known = self.tracked.astype(np.int64)
+        if not with_earlier:
+            known[:first_new] = 0
         new = find_edges(self.guesses, known, first_new, count)
         self.edges = join_edges(self.edges, new)
 
@@ -159,7 +166,20 @@ def frame_of(
         tried=table.tried.copy(),
         birth_zncc=_f32(table.birth_zncc),
         confirmed=table.confirmed.astype(np.uint8),
+        confidence=_f32(_confidence(table)),
     )
+
+
+def _confidence(table: SurfelTable) -> F64:
+    """(N,) probability that a position is within 1 % of its depth.
+
+    The neighbours decide: an error of depth changes hardly any pixel, but strains the edges.  An
+    error that all of them share strains nothing.  A surfel without edges has the ZNCC with its
+    birth template.
+    """
+    strains = median_strains(table.poses, table.edges)
+    agreement = 1.0 / (1.0 + (strains / _EVEN_STRAIN) ** _STEEPNESS)
+    return np.where(np.isnan(strains), np.clip(table.birth_zncc, 0.0, 1.0), agreement)
 
 
 def _f32(values: F64) -> F32:

@@ -11,6 +11,7 @@ from pliant.algorithms.surfels import validation
 from pliant.algorithms.surfels.births import find_births
 from pliant.algorithms.surfels.camera_alignment import align_rigid, fit_camera, spread
 from pliant.algorithms.surfels.deformation_models import MODELS, move_poses
+from pliant.algorithms.surfels.depth_maps import depth_between
 from pliant.algorithms.surfels.graph_alignment import COARSE_STEPS, STEPS, align_graph, relocate
 from pliant.algorithms.surfels.parameters import SurfelParameters
 from pliant.algorithms.surfels.patch_sampling import (
@@ -67,7 +68,7 @@ class SurfelTracker:
         self._camera: PinholeCamera | None = None
         self._T_world_camera: F64 = np.eye(4)
         self._frame, self._segment, self._segments, self._next_id = 0, 0, 0, 0
-        self._interval_s, self._lost = 0.0, True
+        self._interval_s, self._lost, self._since_birth_s = 0.0, True, 0.0
         self._views = RememberedViews()
         self._earlier: dict[int, SurfelTable] = {}
 
@@ -116,6 +117,9 @@ class SurfelTracker:
             seen = self._look_back(image, pyramid, before, was_lost=was_lost)
         with timer("templates"):
             self._update_templates(pyramid)
+        self._since_birth_s += interval_s
+        if self._parameters.depth_from == "flat":
+            depth = self._made_up_depth()
         if depth is not None:
             with timer("births"):
                 self._give_birth(pyramid, _checked_depth(depth, self._camera))
@@ -183,6 +187,18 @@ class SurfelTracker:
         if found is not None:
             self._go_on(found, tables, pyramid)
         return seen
+
+    def _made_up_depth(self) -> F64 | None:
+        """Depth for births on ``flat``, as often as places become free."""
+        table, camera = self._table, self._camera
+        assert camera is not None
+        if self._since_birth_s < self._parameters.lost_after_s:
+            return None
+        if self._lost:
+            return np.ones((camera.height, camera.width))
+        points = table.validations[table.tracked, validation.U : validation.V + 1]
+        there = transform(inverse(self._T_world_camera), table.poses[table.tracked, X : X + 3])
+        return depth_between(points, there[:, 2], camera)
 
     def _remember(self, image: U8, seen: Features | None = None) -> None:
         """Store this view if it is another one.  seen: its corners, if known."""
@@ -350,12 +366,19 @@ class SurfelTracker:
     def _give_birth(self, pyramid: list[Level], depth: F64) -> None:
         table, p, camera = self._table, self._parameters, self._camera
         assert camera is not None
+        self._since_birth_s = 0.0
         anew = self._lost and len(table) > 0
         if not self._lost:
             table.keep(np.flatnonzero(table.missing <= p.lost_after_s + p.forget_after_s))
         alive = np.flatnonzero(table.tracked & (not anew))
         occupied = table.validations[alive, validation.U : validation.V + 1]
-        births = find_births(pyramid, depth, camera, p, occupied, p.max_surfels - len(alive))
+        # On made-up depth only surface without surfels needs some.  They may be on a tool, and
+        # must not pull what is tracked along.
+        flat = p.depth_from == "flat"
+        births = find_births(
+            pyramid, depth, camera, p, occupied, p.max_surfels - len(alive),
+            p.patch_px if flat else p.spacing_px,
+        )  # fmt: skip
         n = len(births.poses)
         if anew and n < p.min_alive:
             return  # in the dark nothing can start: the tracked surfels are still searched
@@ -363,10 +386,13 @@ class SurfelTracker:
             self._leave(table, self._segment)
             self._table = table = SurfelTable()
             self._segment = self._segments = self._segments + 1
+        if flat:  # the longest missing ones make room
+            newest = np.argsort(table.missing, kind="stable")[: p.max_surfels - n]
+            table.keep(np.sort(newest))
         # The heuristic covariance of section V: a share of the surfel's depth, all directions.
         sigmas = np.maximum(p.expected_motion * births.poses[:, X + 2], 1e-9)
         table.add(births, self._T_world_camera, self._next_id, self._frame, sigmas)
-        table.connect(len(table) - n, p.neighbours)
+        table.connect(len(table) - n, p.neighbours, with_earlier=not flat)
         self._next_id += n
         self._lost = int(table.tracked.sum()) < p.min_alive
         rows = (table.born == self._frame).astype(np.uint8)
