@@ -12,6 +12,7 @@ from pliant.algorithms.arrays import F32, F64, U8
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, pose_to_matrix, so3_log, transform
 from pliant.algorithms.slam.frame import Frame
+from pliant.algorithms.slam.locate.landmark_search import LandmarkSearch
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import MAPPED
 from pliant.algorithms.slam.mapper import Mapper
@@ -73,10 +74,12 @@ class _Run:
         asked = time.process_time() - begin
         apart = [k for k in self.keyframes if self.is_apart(k, stamp_ns)]
         segments = [] if atlas.active is None else [replace(atlas.active.segment, keyframes=apart)]
-        found = atlas.places.recognise(
-            grey, maxima, segments, atlas.points, self.mapper.calibration,
-            self.config.bundle_adjustment, np.random.default_rng(0),
+        view = self.mapper.calibration.view
+        search = LandmarkSearch(
+            atlas.points, maxima, grey, view.camera, self.config.bundle_adjustment,
+            np.random.default_rng(0),
         )  # fmt: skip
+        found = atlas.places.recognise(search, segments, view)
         return found, 1e3 * asked
 
     def is_apart(self, keyframe: Keyframe, stamp_ns: int | None) -> bool:

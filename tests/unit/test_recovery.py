@@ -13,7 +13,8 @@ from pliant.algorithms.arrays import U8
 from pliant.algorithms.geometry import inverse
 from pliant.algorithms.map_delta import LOST, TRACKING
 from pliant.algorithms.slam.frame import Frame
-from pliant.algorithms.slam.locate.localisation import Motion, search_radius_px
+from pliant.algorithms.slam.locate.landmark_search import search_radius_px
+from pliant.algorithms.slam.locate.localisation import Motion
 from pliant.algorithms.slam.mapper import Mapper
 from pliant.algorithms.slam.parameters import MappingParameters, RecoveryParameters
 from pliant.algorithms.tracks import FrameExtrema

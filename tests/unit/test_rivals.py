@@ -11,6 +11,7 @@ from pliant.algorithms.slam.adjust.segment import Segment
 from pliant.algorithms.slam.atlas import known_places
 from pliant.algorithms.slam.atlas.known_places import KnownPlaces
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.locate.landmark_search import LandmarkSearch
 from pliant.algorithms.slam.map.keyframe import Keyframe
 from pliant.algorithms.slam.map.landmarks import Landmarks
 from pliant.algorithms.slam.parameters import MappingParameters
@@ -22,6 +23,12 @@ PARAMETERS = MappingParameters()
 NOTHING = Features(points_px=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), "u1"))
 NO_MAXIMA, DARK = np.zeros((0, 3), np.float32), np.zeros((CAMERA.height, CAMERA.width), np.uint8)
 EACH = 50
+
+
+def search_in(points: Landmarks) -> LandmarkSearch:
+    """In a dark image."""
+    generator = np.random.default_rng(0)
+    return LandmarkSearch(points, NO_MAXIMA, DARK, CAMERA, PARAMETERS, generator)
 
 
 def keyframes(points: Landmarks, count: int) -> list[Keyframe]:
@@ -73,7 +80,7 @@ def ask(
         )
         return [proposed]
 
-    def verify_pose(T_world_camera: F64, *_: object) -> SimpleNamespace:
+    def verify(_: LandmarkSearch, T_world_camera: F64, *__: object) -> SimpleNamespace:
         count = said[round(T_world_camera[0, 3] / 3.0)][1]
         return SimpleNamespace(T_world_camera=T_world_camera, rows=np.arange(count, dtype=np.int32))
 
@@ -81,12 +88,9 @@ def ask(
         return repeated
 
     monkeypatch.setattr(relocalisation, "_propose", propose)
-    monkeypatch.setattr(relocalisation, "verify_pose", verify_pose)
+    monkeypatch.setattr(LandmarkSearch, "verify", verify)
     monkeypatch.setattr(relocalisation, "repeated_share", share)
-    return relocalise(
-        NOTHING, places[:first], places[first:], points, NO_MAXIMA, DARK, CAMERA, PARAMETERS,
-        np.random.default_rng(0),
-    )  # fmt: skip
+    return relocalise(NOTHING, places[:first], places[first:], search_in(points))
 
 
 def test_a_place_that_is_mapped_more_densely_is_not_more_right(
@@ -129,11 +133,11 @@ def test_points_that_support_another_pose_decide(
 ) -> None:
     """More of them place the camera; half as many leave it open."""
 
-    def search_near(*_: object) -> SimpleNamespace:
+    def near(*_: object) -> SimpleNamespace:
         rows = np.arange(points, dtype=np.int32)
         return SimpleNamespace(T_world_camera=looking((3.0 * 4, 0.0, 0.0)), rows=rows)
 
-    monkeypatch.setattr(relocalisation, "search_near", search_near)
+    monkeypatch.setattr(LandmarkSearch, "near", near)
     found = ask(monkeypatch, {0: (170, 2400), 4: (0, points)}, places_with_corners=1)
     if points == 2300:
         assert found is None
@@ -161,8 +165,6 @@ def test_rival_places_are_compared_where_one_is_verified(monkeypatch: pytest.Mon
     monkeypatch.setattr(known_places, "relocalise", relocalised)
     calibration = SelfCalibration.of(CAMERA, PARAMETERS.calibration)
     segment = Segment(id=0, points=points, keyframes=known)
-    own.recognise(
-        DARK, NO_MAXIMA, [segment], points, calibration, PARAMETERS, np.random.default_rng(0)
-    )
+    own.recognise(search_in(points), [segment], calibration.view)
     # 5 sees what 4 saw, which has been asked, 7 what 6 saw.
     assert asked == [0, 1, 2, 3, 4, -1, 6, 8]

@@ -23,6 +23,7 @@ from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.estimate.observation_table import reprojection_errors
 from pliant.algorithms.slam.frame import Frame, IdealFrame, PlacedFrame
 from pliant.algorithms.slam.journal import Journal, Outcome
+from pliant.algorithms.slam.locate.landmark_search import LandmarkSearch
 from pliant.algorithms.slam.locate.localisation import Motion
 from pliant.algorithms.slam.locate.pose_quality import support_of, why_doubtful
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
@@ -110,10 +111,11 @@ class Localiser:
         """Return the pose of an image (H, W) of the ideal camera, with its maxima (M, 3) of
         curvature, by its appearance alone.
         """
-        return self._places.recognise(
-            grey, maxima, self._segments, self._points, self.calibration, self._parameters,
-            generator,
-        )  # fmt: skip
+        view = self.calibration.view
+        search = LandmarkSearch(
+            self._points, maxima, grey, view.camera, self._parameters, generator
+        )
+        return self._places.recognise(search, self._segments, view)
 
     def skip(self, frame: int, reason: str = "the frame has no pixels") -> MapDelta:
         """As ``Mapper.skip``."""

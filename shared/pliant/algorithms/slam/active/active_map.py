@@ -14,6 +14,7 @@ from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.frame import IdealFrame, PlacedFrame
 from pliant.algorithms.slam.keyframe_rule import Overlap
 from pliant.algorithms.slam.locate.inverse_depth import helping_candidates
+from pliant.algorithms.slam.locate.landmark_search import LandmarkSearch
 from pliant.algorithms.slam.locate.reacquisition import MaximaGrid, Reacquired, cut_patches
 from pliant.algorithms.slam.map.covisibility import (
     MAX_MISSES,
@@ -131,6 +132,12 @@ class ActiveMap:
     def nearby(self) -> I32:
         """Rows of the mapped points of the window and of the keyframes near it."""
         return self._nearby[self.points.state[self._nearby] == MAPPED]
+
+    def search_in(self, frame: IdealFrame, generator: np.random.Generator) -> LandmarkSearch:
+        """Return the search for landmarks in the image of a frame."""
+        return LandmarkSearch(
+            self.points, frame.tracks.maxima, frame.image, self.camera, self.parameters, generator
+        )
 
     def missing(self, frame: int) -> I32:
         """Rows of mapped points without a track that are worth looking for in this frame.

@@ -23,9 +23,7 @@ from pliant.algorithms.slam.locate.localisation import (
     Localisation,
     Motion,
     locate,
-    recover,
     refine,
-    verify_pose,
 )
 from pliant.algorithms.slam.locate.pose_quality import support_of
 from pliant.algorithms.slam.locate.reacquisition import reacquire
@@ -73,7 +71,7 @@ def localise(
     Few tracks are no evidence by themselves: after a cut, those that continue on some extremum have
     all moved alike, as if by a camera.
     """
-    points, parameters, tracks = active.points, active.parameters, frame.tracks
+    parameters, tracks = active.parameters, frame.tracks
     predictions = motion.predictions(frame.stamp_ns)
     active.candidates_agree = True
     candidates = active.helping_candidates()
@@ -94,18 +92,15 @@ def localise(
             before = motion.tracked if helped else motion.to_points
             if not frame.has_image or inliers >= _FEW * before:
                 return Located(located.T_world_camera, inliers >= _FIRM * before)
-            proved = verify_pose(
-                located.T_world_camera, active.nearby(), points, tracks.maxima, frame.image,
-                active.camera, parameters, parameters.recovery.min_agreement,
-            )  # fmt: skip
+            proved = active.search_in(frame, generator).verify(
+                located.T_world_camera, active.nearby(), parameters.recovery.min_agreement
+            )
             if proved is not None:
                 return Located(proved.T_world_camera, True)
     if not frame.has_image:
         return None
-    recovered = recover(
-        motion, frame.stamp_ns, active.nearby(), points, tracks.maxima, frame.image, active.camera,
-        parameters, generator,
-    )  # fmt: skip
+    search = active.search_in(frame, generator)
+    recovered = search.recover(motion, frame.stamp_ns, active.nearby())
     return None if recovered is None else Located(recovered, True)
 
 

@@ -24,6 +24,7 @@ from pliant.algorithms.slam.atlas.known_places import KnownPlaces, SegmentMerges
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration, is_guess
 from pliant.algorithms.slam.frame import IdealFrame
 from pliant.algorithms.slam.journal import Journal
+from pliant.algorithms.slam.locate.landmark_search import LandmarkSearch
 from pliant.algorithms.slam.locate.localisation import Motion
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.map.keyframe import Keyframe
@@ -141,9 +142,9 @@ class Atlas:
             segments = [self.active.segment, *segments]
         if not segments:
             return None
-        return self.places.recognise(
-            grey, maxima, segments, self.points, self.calibration, self._parameters, generator
-        )
+        view = self.calibration.view
+        search = LandmarkSearch(self.points, maxima, grey, view.camera, self._parameters, generator)
+        return self.places.recognise(search, segments, view)
 
     def go_on(self, seen: Keyframe, ids: I64) -> None:
         """Continue the segment of a recognised keyframe at its place.

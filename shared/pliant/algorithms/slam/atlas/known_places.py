@@ -27,6 +27,7 @@ from pliant.algorithms.slam.adjust.loops import Loop
 from pliant.algorithms.slam.adjust.segment import Moved, Segment
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
+from pliant.algorithms.slam.locate.landmark_search import LandmarkSearch
 from pliant.algorithms.slam.map.covisibility import marks_fewer
 from pliant.algorithms.slam.map.kept_keyframe import KeptKeyframe
 from pliant.algorithms.slam.map.keyframe import Keyframe
@@ -280,26 +281,17 @@ class KnownPlaces:
         self.revisits, self.meetings = LoopCandidates(), SegmentMerges()
 
     def recognise(
-        self,
-        grey: U8,
-        maxima: F32,
-        segments: list[Segment],
-        points: Landmarks,
-        calibration: SelfCalibration,
-        parameters: MappingParameters,
-        generator: np.random.Generator,
+        self, search: LandmarkSearch, segments: list[Segment], view: CorrectedView
     ) -> Recognised | None:
         """Return the keyframe whose place an image shows, and the pose of the image; None unless
-        exactly one place is verified.   grey: (H, W).   maxima: (M, 3) of its curvature.
+        exactly one place is verified.   search: in the image.   view: of its camera.
         """
-        seen, view = describe(grey), calibration.view
+        seen = describe(search.grey)
         ranked = self._like(seen, segments, view)
         places = list(islice(ranked, _PLACES))
-        least = parameters.localisation.min_inliers
-        elsewhere = islice(_showing_else(ranked, places, points, least), _ELSEWHERE)
-        return relocalise(
-            seen, places, elsewhere, points, maxima, grey, view.camera, parameters, generator
-        )
+        least = search.parameters.localisation.min_inliers
+        elsewhere = islice(_showing_else(ranked, places, search.points, least), _ELSEWHERE)
+        return relocalise(seen, places, elsewhere, search)
 
     def compare(
         self,
@@ -338,9 +330,8 @@ class KnownPlaces:
                 pose = move_by_similarity(loop.S_old_new, keyframe.T_world_camera)
                 # Its own generator: a comparison must not change the pose of a frame.
                 generator = np.random.default_rng(keyframe.id)
-                return rest_is_elsewhere(
-                    pose, old, among, segment.points, *image, view.camera, parameters, generator
-                )
+                search = LandmarkSearch(segment.points, *image, view.camera, parameters, generator)
+                return rest_is_elsewhere(pose, old, among, search)
 
             self.meetings.search(new, near, elsewhere, *rest, contradicts)
         return found

@@ -1,19 +1,11 @@
-"""The pose of a frame from visible landmarks, and without tracks after a loss.
-
-A camera that is covered, blurred or dark for a moment keeps moving.  The longer that takes, the
-farther it may be from any prediction, so landmarks are searched in a radius that grows with the
-time since the last pose.  Of the many maxima in it a landmark takes the one whose patch fits best.
-P3P and RANSAC find the pose on which the good ones agree, and all landmarks found at their
-projection must verify it.
-"""
+"""The pose of a frame from visible landmarks, and what the camera's motion predicts."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, U8, BoolArray
+from pliant.algorithms.arrays import F64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, move_by_similarity, so3_exp, so3_log
 from pliant.algorithms.slam.calibration.rolling_shutter import motion_between
@@ -21,13 +13,7 @@ from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac, trunca
 from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.estimate.problem import BundleParameters
 from pliant.algorithms.slam.locate.inverse_depth import refine_moving_or_standing
-from pliant.algorithms.slam.locate.reacquisition import MaximaGrid, match_widely, reacquire
-from pliant.algorithms.slam.map.landmarks import Landmarks
-from pliant.algorithms.slam.parameters import (
-    LocalisationParameters,
-    MappingParameters,
-    RecoveryParameters,
-)
+from pliant.algorithms.slam.parameters import LocalisationParameters
 
 _COARSE_SIGMAS = 4.0
 """The kernel is first this many times wider, so that a poor prediction still converges."""
@@ -36,9 +22,6 @@ _PREDICTION_GATE_PX = 20.0
 
 _SPEEDING_UP = 0.5
 """Share of its last acceleration that a prediction keeps: all of it amplifies noise."""
-
-NEAR = 0.3
-"""Share of the radius that is searched first: usually sufficient, with far fewer false matches."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,13 +99,6 @@ def _cost(T_world_camera: F64, points_world: F64, points_n: F64, gate: float) ->
         np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), points_world, points_n,
         gate,
     )  # fmt: skip
-
-
-class VerifiedPose(NamedTuple):
-    """A pose, and the rows of the landmarks that verify it."""
-
-    T_world_camera: F64
-    rows: I32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,113 +193,3 @@ class Motion:
         moved[:3, :3] = so3_exp(share * turn)
         moved[:3, 3] = share * shift
         return [last @ moved, last]
-
-
-def search_radius_px(lost_s: float, camera: PinholeCamera, parameters: RecoveryParameters) -> float:
-    """Search radius around a prediction, px, this long after the last pose."""
-    grown = parameters.radius_share + parameters.growth_share_per_s * lost_s
-    return camera.width * min(grown, parameters.max_radius_share)
-
-
-def recover(
-    motion: Motion,
-    stamp_ns: int,
-    rows: I32,
-    points: Landmarks,
-    maxima: F32,
-    grey: U8,
-    camera: PinholeCamera,
-    parameters: MappingParameters,
-    generator: np.random.Generator,
-) -> F64 | None:
-    """Return T_world_camera of a frame without tracks, or None if the image does not verify a pose.
-
-    motion: before.   stamp_ns: of the frame.   rows: of landmarks that may be in view.   maxima:
-    (M, 3) of the frame.   grey: (H, W).
-    """
-    predictions = motion.predictions(stamp_ns)
-    radius_px = search_radius_px(motion.lost_s(stamp_ns), camera, parameters.recovery)
-    for radius in (NEAR * radius_px, radius_px):
-        grid = MaximaGrid.build(maxima, camera.width, camera.height, radius)
-        for prediction in predictions:
-            proved = search_near(
-                prediction, rows, points, grid, grey, radius, camera, parameters, generator
-            )
-            if proved is not None and are_enough(len(proved.rows), parameters):
-                return proved.T_world_camera
-    return None
-
-
-def are_enough(points: int, parameters: MappingParameters) -> bool:
-    """Whether this many verified landmarks, or corners, place a camera without tracks.
-
-    A few dozen also agree on a pose a step aside, if the scene repeats there.  No map starts with
-    so few, and none continues by them.
-    """
-    return points >= parameters.start.min_points
-
-
-def search_near(
-    T_world_camera: F64,
-    rows: I32,
-    points: Landmarks,
-    grid: MaximaGrid,
-    grey: U8,
-    radius_px: float,
-    camera: PinholeCamera,
-    parameters: MappingParameters,
-    generator: np.random.Generator,
-) -> VerifiedPose | None:
-    """Search landmarks around their projection in a pose, and return the pose that they verify.
-
-    rows: of the landmarks.   grid: the maxima of the image, for this radius.
-    """
-    own = parameters.recovery
-    limits = parameters.localisation.model_copy(update={"ransac_samples": own.ransac_samples})
-    found, points_px = match_widely(
-        T_world_camera, rows, points, grid, grey, camera, radius_px, own.points,
-        parameters.reacquisition.min_zncc,
-    )  # fmt: skip
-    if len(found) < own.min_agreeing:
-        return None
-    seen = Correspondences(points.xyz[found], points_px)
-    located = locate([T_world_camera], seen, camera, limits, generator)
-    if located.inliers.sum() < own.min_agreeing:
-        return None
-    return verify_pose(
-        located.T_world_camera, rows, points, grid.maxima, grey, camera, parameters,
-        own.min_agreement,
-    )  # fmt: skip
-
-
-def verify_pose(
-    T_world_camera: F64,
-    rows: I32,
-    points: Landmarks,
-    maxima: F32,
-    grey: U8,
-    camera: PinholeCamera,
-    parameters: MappingParameters,
-    min_agreement: float,
-) -> VerifiedPose | None:
-    """Refine a pose by all landmarks found at their projection; None if too few support it.
-
-    min_agreement: minimum share of the found landmarks that support it, see ``RecoveryParameters``.
-    A wrong pose finds landmarks too: wherever a maximum is near and its patch looks alike.
-    """
-    found = reacquire(
-        T_world_camera, rows, points, maxima, maxima, grey, camera, parameters.reacquisition
-    )
-    if len(found.rows) < parameters.localisation.min_inliers:
-        return None
-    seen = Correspondences(points.xyz[found.rows], found.points_px)
-    located = refine(T_world_camera, seen, camera, parameters.localisation, near=True)
-    inliers = int(located.inliers.sum())
-    enough = max(
-        parameters.localisation.min_inliers,
-        parameters.recovery.min_support_share * len(found.visible),
-        min_agreement * len(found.rows),
-    )
-    if inliers < enough:
-        return None
-    return VerifiedPose(located.T_world_camera, found.rows[located.inliers])

@@ -13,19 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pliant.algorithms.arrays import F32, F64, I32, I64, U8, BoolArray
+from pliant.algorithms.arrays import F32, F64, I32, I64, BoolArray
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, so3_log, transform
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView
 from pliant.algorithms.slam.estimate.absolute_pose import pose_by_ransac
 from pliant.algorithms.slam.estimate.pose import Correspondences
-from pliant.algorithms.slam.locate.localisation import (
-    NEAR,
-    are_enough,
-    refine,
-    search_near,
-    verify_pose,
-)
+from pliant.algorithms.slam.locate.landmark_search import NEAR, LandmarkSearch, are_enough
+from pliant.algorithms.slam.locate.localisation import refine
 from pliant.algorithms.slam.locate.reacquisition import MaximaGrid
 from pliant.algorithms.slam.map.covisibility import most_shared, rows_of
 from pliant.algorithms.slam.map.keyframe import Keyframe
@@ -101,18 +96,14 @@ def relocalise(
     seen: Features,
     places: Sequence[Place],
     elsewhere: Iterable[Place],
-    points: Landmarks,
-    maxima: F32,
-    grey: U8,
-    camera: PinholeCamera,
-    parameters: MappingParameters,
-    generator: np.random.Generator,
+    search: LandmarkSearch,
 ) -> Recognised | None:
     """Return the pose of a frame from similar places, or None unless exactly one is verified.
 
-    seen, maxima (M, 3), grey (H, W): of the frame.   elsewhere: places that are compared as well
-    after a verified one.
+    seen: of the frame.   elsewhere: places that are compared as well after a verified one.
+    search: in the frame's image.
     """
+    points, parameters, camera = search.points, search.parameters, search.camera
     own = parameters.recovery
     best: Recognised | None = None
     rivals: list[Recognised] = []
@@ -121,11 +112,10 @@ def relocalise(
         if number >= len(places) and best is None:
             break
         rows = _rows_near(place.keyframe, place.segment, points)
-        for proposed in _propose(seen, place, points, camera, parameters, generator):
-            proved = verify_pose(
-                proposed.T_world_camera, rows, points, maxima, grey, camera, parameters,
-                0.0 if _speaks_for_itself(proposed, camera, parameters) else own.min_agreement,
-            )  # fmt: skip
+        for proposed in _propose(seen, place, points, camera, parameters, search.generator):
+            alone = _speaks_for_itself(proposed, camera, parameters)
+            least = 0.0 if alone else own.min_agreement
+            proved = search.verify(proposed.T_world_camera, rows, least)
             if proved is None:
                 continue
             found = Recognised(
@@ -152,23 +142,15 @@ def relocalise(
     if repeats(seen, proof.corners, here, camera, parameters):
         return None
     place = proof.place
-    best = _looked_about(best, place, points, maxima, grey, camera, parameters, generator)
-    moved = rest_is_elsewhere(
-        best.T_world_camera, place.keyframe, place.segment, points, maxima, grey, camera,
-        parameters, generator,
-    )  # fmt: skip
+    best = _looked_about(best, place, search)
+    moved = rest_is_elsewhere(best.T_world_camera, place.keyframe, place.segment, search)
     return None if moved else best
 
 
 def _looked_about(
     found: Recognised,
     place: Place,
-    points: Landmarks,
-    maxima: F32,
-    grey: U8,
-    camera: PinholeCamera,
-    parameters: MappingParameters,
-    generator: np.random.Generator,
+    search: LandmarkSearch,
 ) -> Recognised:
     """Return the better verified of two poses: that of the corners, and that of landmarks searched
     around it.
@@ -176,12 +158,9 @@ def _looked_about(
     A few blurred corners on one wall leave a rotation open that a step aside compensates, and
     landmarks on the wall are within their radius then, too.
     """
-    rows = _rows_near(place.keyframe, place.segment, points)
-    radius_px = NEAR * parameters.recovery.max_radius_share * camera.width
-    grid = MaximaGrid.build(maxima, camera.width, camera.height, radius_px)
-    proved = search_near(
-        found.T_world_camera, rows, points, grid, grey, radius_px, camera, parameters, generator
-    )
+    rows = _rows_near(place.keyframe, place.segment, search.points)
+    radius_px = NEAR * search.parameters.recovery.max_radius_share * search.camera.width
+    proved = search.near(found.T_world_camera, rows, radius_px)
     if proved is None or len(proved.rows) <= found.inliers:
         return found
     return replace(found, T_world_camera=proved.T_world_camera, inliers=len(proved.rows))
@@ -198,34 +177,26 @@ def rest_is_elsewhere(
     T_world_camera: F64,
     keyframe: Keyframe,
     segment: list[Keyframe],
-    points: Landmarks,
-    maxima: F32,
-    grey: U8,
-    camera: PinholeCamera,
-    parameters: MappingParameters,
-    generator: np.random.Generator,
+    search: LandmarkSearch,
 ) -> bool:
     """Whether the landmarks that this pose leaves over verify another pose nearby, with half as
     many.
 
-    keyframe: of a segment, which sees the place.   maxima (M, 3), grey (H, W): of the frame. The
-    recognised object may have been moved in its place, and have nearly all corners; everything else
-    is then a step aside of its projection.
+    keyframe: of a segment, which sees the place.   search: in the frame's image.  The recognised
+    object may have been moved in its place, and have nearly all corners; everything else is then a
+    step aside of its projection.
     """
-    rows, own = _rows_near(keyframe, segment, points), parameters.recovery
-    seen = verify_pose(T_world_camera, rows, points, maxima, grey, camera, parameters, 0.0)
+    rows = _rows_near(keyframe, segment, search.points)
+    seen = search.verify(T_world_camera, rows, 0.0)
     if seen is None:
         return False
-    radius_px = camera.width * own.max_radius_share
-    grid = MaximaGrid.build(maxima, camera.width, camera.height, radius_px)
+    radius_px = search.camera.width * search.parameters.recovery.max_radius_share
     rest = np.setdiff1d(rows, seen.rows)
-    other = search_near(
-        seen.T_world_camera, rest, points, grid, grey, radius_px, camera, parameters, generator
-    )
+    other = search.near(seen.T_world_camera, rest, radius_px)
     return (
         other is not None
         and len(other.rows) > _AS_GOOD * len(seen.rows)
-        and not is_same_pose(seen.T_world_camera, other.T_world_camera, keyframe, points)
+        and not is_same_pose(seen.T_world_camera, other.T_world_camera, keyframe, search.points)
     )
 
 
