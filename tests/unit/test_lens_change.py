@@ -105,13 +105,13 @@ def test_earlier_segments_and_waiting_frames_follow(active):
 def test_a_lens_is_refuted_when_it_is_certain_and_unlikely(focal, k1, sigma, refuted):
     found = np.array([focal, k1, 0.0, 0.7, 0.0, 0.0, 0.0])
     covariance = np.diag([sigma, sigma, 0.0, 0.01, 0.0, 0.0, 0.0]) ** 2
-    assert KNOWN.is_refuted(found, covariance, GIVEN) == refuted
+    assert KNOWN.is_refuted(found, covariance) == refuted
     held = CalibrationUncertainty(focal=0.0, k1=0.0)
-    assert not KNOWN.is_refuted(found, np.zeros((7, 7)), held)
-    assert not KNOWN.is_refuted(found, np.full((7, 7), np.inf), GIVEN)
+    assert not replace(KNOWN, uncertainty=held).is_refuted(found, np.zeros((7, 7)))
+    assert not KNOWN.is_refuted(found, np.full((7, 7), np.inf))
     lens = KNOWN.with_lens(found, covariance)
     assert lens.readout == 0.0
     assert lens.sigmas[3] == KNOWN.sigmas[3]
-    assert not lens.is_refuted(found, covariance, GIVEN)
-    assert (lens.prior(GIVEN, lens.in_use).focal > GIVEN.focal) == refuted
-    assert lens.prior(GIVEN, lens.in_use).k2 == 0.0  # what is held stays held
+    assert not lens.is_refuted(found, covariance)
+    assert (lens.prior(lens.in_use).focal > GIVEN.focal) == refuted
+    assert lens.prior(lens.in_use).k2 == 0.0  # what is held stays held

@@ -57,7 +57,7 @@ def test_an_adjustment_of_k1_lets_more_of_the_image_count(uncertain, covariance,
     known = SelfCalibration.of(CAMERA, uncertain)
     if covariance is not None:
         known = known.corrected(np.zeros(7), covariance, 9)
-    seen = list_observations([keyframe], points, known, MappingParameters(calibration=uncertain))
+    seen = list_observations([keyframe], points, known)
     expected = weigh(AXIS_HALF_BORDER, CAMERA, sigmas)
     np.testing.assert_array_equal(seen.weights[np.argsort(-seen.px[:, 0])], expected)
     assert (expected[-1] < 1.0) == any(sigmas)

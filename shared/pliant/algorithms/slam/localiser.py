@@ -54,9 +54,9 @@ class Localiser:
     ) -> None:
         """known: the map; if it is of the same camera, its calibration is used."""
         self._parameters = parameters
-        self.calibration = known_camera(known, camera) or SelfCalibration.of(
-            camera, parameters.calibration
-        )
+        given = SelfCalibration.of(camera, parameters.calibration)
+        found = known_camera(known, camera) or given
+        self.calibration = replace(found, uncertainty=given.uncertainty)
         self.global_adjustment = GlobalAdjustment()
         self._generator = np.random.default_rng(seed)
         self._points = Landmarks()

@@ -84,6 +84,7 @@ class Mapper:
             or known_camera(known, camera)
             or SelfCalibration.of(camera, parameters.calibration)
         )
+        calibration = replace(calibration, uncertainty=parameters.calibration)
         self.atlas = Atlas(calibration, parameters, known)
         self._parameters = parameters
         self._generator = np.random.default_rng(seed)

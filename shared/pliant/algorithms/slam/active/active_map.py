@@ -82,8 +82,7 @@ class ActiveMap:
             fixed=fixed,
             outside=outside,
             points=self.points,
-            camera=self.camera,
-            k_sigmas=self.seen_by.k_sigmas(self.parameters.calibration),
+            calibration=self.seen_by,
         )
 
     @property

@@ -18,7 +18,7 @@ from pliant.algorithms.slam.calibration.focal_search import best_along_focal
 from pliant.algorithms.slam.calibration.held_unknowns import PRINCIPAL_POINT, contradicted, freed
 from pliant.algorithms.slam.calibration.rolling_shutter import readout_flow
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
-from pliant.algorithms.slam.estimate.observation_table import list_errors, weigh
+from pliant.algorithms.slam.estimate.observation_table import list_errors
 from pliant.algorithms.slam.estimate.problem import BundleProblem, BundleResult, shared_intrinsics
 from pliant.algorithms.slam.estimate.schur import solve_schur
 from pliant.algorithms.slam.estimate.triangulation import spread_of_rays
@@ -182,9 +182,9 @@ def adjust_keyframes(
     seen by too few keyframes, and how the map around each keyframe moves.
     """
     given, before = known, known.view
-    seen = list_observations(keyframes, points, known, parameters)
+    seen = list_observations(keyframes, points, known)
     seen.see_by(before)
-    if parameters.calibration.sigmas.any():
+    if known.uncertainty.sigmas.any():
         seen.flow = readout_flow(
             seen.T_world_camera, motions, seen.xyz, seen.camera, seen.point, seen.px, before.camera
         )
@@ -236,8 +236,7 @@ def adjust_list(
     counts = np.bincount(seen.point, minlength=len(seen.rows))
     chosen = counts >= 2
     bundle = parameters.bundle.model_copy(update={"max_iterations": iterations})
-    uncertain = parameters.calibration.sigmas.any()
-    uncertainty = known.prior(parameters.calibration, start) if uncertain else None
+    uncertainty = known.prior(start) if known.uncertainty.sigmas.any() else None
     kept = chosen[seen.point] & _spread_out(seen.point, counts, MOST_SEEN)
     problem = _problem(seen, chosen, kept, known.given)
     if uncertainty is not None and known.is_guess:
@@ -265,14 +264,10 @@ def adjust_list(
 
 
 def list_observations(
-    keyframes: list[Keyframe],
-    points: Landmarks,
-    known: SelfCalibration,
-    parameters: MappingParameters,
+    keyframes: list[Keyframe], points: Landmarks, known: SelfCalibration
 ) -> ObservationList:
     """px: as the rolling shutter recorded them.   known: of the camera, whose pixels the keyframes
     have.
-    parameters: of the adjustment that follows.
     """
     mapped = [points.state[keyframe.rows] == MAPPED for keyframe in keyframes]
     pairs = list(zip(keyframes, mapped, strict=True))
@@ -294,21 +289,11 @@ def list_observations(
         camera=np.repeat(np.arange(len(keyframes), dtype=np.int32), sizes),
         point=number[seen],
         px=px,
-        weights=weigh(px, known.view.camera, _k_sigmas(parameters, known)),
+        weights=known.weights(px, estimates_k1=True),
         fixed=np.array([k.is_pure_rotation for k in keyframes]) | (np.arange(len(keyframes)) == 0),
         log_focal=np.array([keyframe.log_focal for keyframe in keyframes]),
         gaps_s=gaps_s(keyframes),
     )
-
-
-def _k_sigmas(parameters: MappingParameters, known: SelfCalibration) -> tuple[float, float]:
-    """Uncertainty of the lens that an adjustment leaves.
-
-    It estimates the error of k1 itself, but not while k1 is a guess: a large error is explained
-    only step by step, and the border would lead it astray.
-    """
-    k1, k3 = known.k_sigmas(parameters.calibration)
-    return k1 if known.is_guess else 0.0, k3
 
 
 @kernel

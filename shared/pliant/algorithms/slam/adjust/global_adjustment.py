@@ -127,7 +127,8 @@ class GlobalAdjustment:
         window, growth = parameters.window.keyframes, parameters.whole_map.growth
         count = len(segment.keyframes)
         # A window of half the map needs no global adjustment, except for the calibration.
-        least = parameters.start.keyframes if parameters.calibration.sigmas.any() else 2 * window
+        given = calibration.uncertainty
+        least = parameters.start.keyframes if given.sigmas.any() else 2 * window
         made = count + len(segment.dropped)
         early = growth == 0.0 or count < least or made < self.due
         # The window would move with the part mapped before the camera was recognised.
@@ -146,11 +147,11 @@ class GlobalAdjustment:
             if early:
                 return
             self.due = (1.0 + growth) * count + (made - count)
-        seen = list_observations(segment.keyframes, points, calibration, parameters)
+        seen = list_observations(segment.keyframes, points, calibration)
         if not loops:
             seen = seen.most_seen(parameters.whole_map.points_per_keyframe)
         seen.see_by(calibration.view)
-        if parameters.calibration.readout > 0.0 and not loops:
+        if given.readout > 0.0 and not loops:
             seen.flow = readout_flow(
                 seen.T_world_camera, segment.path.motions(segment.keyframes), seen.xyz, seen.camera,
                 seen.point, seen.px, camera,
@@ -215,7 +216,7 @@ def find_moves(job: AdjustmentJob) -> AdjustmentResult:
         seen, known, parameters, iterations=parameters.whole_map.iterations, start=known.in_use,
         varying=True,
     )  # fmt: skip
-    after = _learned(known, found, parameters.calibration)
+    after = _learned(known, found)
     # A window of half the map is as good, unless it lacked the calibration or the loops.
     bent = (known.readout == 0.0 and after.readout != 0.0) or not after.sees_like(known)
     refocus = seen.log_focal - job.seen.log_focal
@@ -240,9 +241,7 @@ def _close(job: AdjustmentJob) -> AdjustmentResult:
     return AdjustmentResult(moves if loops else None, loops, job.known, refused)
 
 
-def _learned(
-    known: SelfCalibration, found: BundleResult, prior: CalibrationUncertainty
-) -> SelfCalibration:
+def _learned(known: SelfCalibration, found: BundleResult) -> SelfCalibration:
     """Return the calibration with the new estimate.
 
     Focal lengths that change are relative to a lens, which then is the one estimated with them.
@@ -251,9 +250,9 @@ def _learned(
     changes = len(found.log_focal) > 0
     readout, sigma = float(correction[3]), float(np.sqrt(covariance[3, 3]))
     if known.readout == 0.0:
-        readout, sigma = _without_prior(readout, sigma, prior)
+        readout, sigma = _without_prior(readout, sigma, known.uncertainty)
     known = replace(known, changes=changes)
-    if changes or known.is_refuted(correction, covariance, prior):
+    if changes or known.is_refuted(correction, covariance):
         known = known.with_lens(correction, covariance)
     return known.with_readout(readout, sigma)
 

@@ -18,7 +18,6 @@ from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, mov
 from pliant.algorithms.slam.calibration.rolling_shutter import FramePoses
 from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.estimate.focal_pose import refine_focal, thinning
-from pliant.algorithms.slam.estimate.observation_table import weigh
 from pliant.algorithms.slam.estimate.pose import Correspondences, refine_pose
 from pliant.algorithms.slam.estimate.trajectory_smoothing import smooth_trajectory
 from pliant.algorithms.slam.map.keyframe import Keyframe
@@ -187,8 +186,7 @@ def refined_poses(
             change, _ = refine_focal(start, xyz[some], points_px[some], camera, centre, RATE, every)
             factors = np.full(len(points_px), change)
             points_px = moved_px(points_px, seen_by.view, seen_by.view, factors)
-        weights = weigh(points_px, camera, seen_by.k_sigmas(parameters.calibration))
-        seen = Correspondences(xyz, points_px, weights)
+        seen = Correspondences(xyz, points_px, seen_by.weights(points_px))
         found = refine_pose(start, seen, camera, parameters.bundle, inlier_px=limits.inlier_px)
         inliers = int(np.count_nonzero(found.inliers))
         if inliers >= max(limits.min_inliers, limits.min_predicted_share * len(xyz)):
@@ -221,7 +219,7 @@ def smoothed_poses(
             continue
         here = points.state[keyframe.rows] == MAPPED
         points_px = keyframe.points_px[here]
-        weights = weigh(points_px, seen_by.view.camera, seen_by.k_sigmas(parameters.calibration))
+        weights = seen_by.weights(points_px)
         found = refine_pose(
             keyframe.T_world_camera,
             Correspondences(points.xyz[keyframe.rows[here]], points_px, weights),

@@ -3,8 +3,8 @@
 import numpy as np
 
 from pliant.algorithms.arrays import F32, F64, I32, BoolArray
-from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.geometry import inverse, move_by_similarity
+from pliant.algorithms.slam.calibration.self_calibration import SelfCalibration
 from pliant.algorithms.slam.estimate.observation_table import (
     columns_in_state,
     count_cameras,
@@ -14,7 +14,6 @@ from pliant.algorithms.slam.estimate.observation_table import (
     has_parallax,
     observe,
     seen_in_state,
-    weigh,
 )
 from pliant.algorithms.slam.estimate.pose_prior import NO_PRIOR, PosePrior
 from pliant.algorithms.slam.estimate.problem import BundleResult, BundleWindow, shared_intrinsics
@@ -52,15 +51,15 @@ class Window:
         fixed: int,
         outside: int,
         points: Landmarks,
-        camera: PinholeCamera,
-        k_sigmas: tuple[float, float],
+        calibration: SelfCalibration,
     ) -> None:
+        """calibration: of the camera whose pixels the keyframes have."""
         self.keyframes = keyframes
         self.fixed = fixed
         self.outside = outside
         self.points = points
-        self.lens: F32 = camera.intrinsics.astype(np.float32)
-        self._camera, self._k_sigmas = camera, k_sigmas
+        self._calibration, self._camera = calibration, calibration.view.camera
+        self.lens: F32 = self._camera.intrinsics.astype(np.float32)
         self.columns: I32 = np.full(len(points.state), OUTSIDE, np.int32)
         for keyframe in keyframes:
             self.columns[keyframe.rows] = 0
@@ -80,7 +79,7 @@ class Window:
             self._observe(slot, keyframe.rows, keyframe.points_px)
 
     def _observe(self, slot: int, rows: I32, points_px: F32) -> None:
-        weights = weigh(points_px, self._camera, self._k_sigmas)
+        weights = self._calibration.weights(points_px)
         observe(
             rows, points_px, weights, self.columns, slot, self.u, self.v, self.w, self.seen
         )  # fmt: skip

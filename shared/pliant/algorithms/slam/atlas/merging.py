@@ -73,7 +73,8 @@ class _Merging:
     ) -> None:
         self._given = [*first, *second]
         both = [corrected_as(each, calibration) for each in self._given]
-        self._calibration, self._parameters = calibration, parameters
+        self._calibration = replace(calibration, uncertainty=parameters.calibration)
+        self._parameters = parameters
         numbers = {each.segment for each in first}
         self._shift = 1 + max(numbers)
         self._spans = spans_of(both)

@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64
+from pliant.algorithms.arrays import F32, F64
 from pliant.algorithms.camera import PinholeCamera
 from pliant.algorithms.map_delta import MapDelta
 from pliant.algorithms.slam.calibration.corrected_view import CorrectedView, corrected_view
@@ -19,6 +19,7 @@ from pliant.algorithms.slam.calibration.held_unknowns import (
     freed,
     freed_as,
 )
+from pliant.algorithms.slam.estimate.observation_table import weigh
 from pliant.algorithms.slam.estimate.problem import SHARED, CalibrationUncertainty
 from pliant.algorithms.slam.parameters import MappingParameters
 from pliant.algorithms.tracks import FrameExtrema
@@ -52,9 +53,9 @@ GROWTH = 1.4
 
 @dataclasses.dataclass(frozen=True)
 class SelfCalibration:
-    """The current estimate of a camera's calibration.
+    """A camera: its given calibration with that one's uncertainty, and the current estimate.
 
-    given: the given camera of the rectified images.
+    given: the given camera of the rectified images.   uncertainty: of its calibration.
     correction: (SHARED,) of it, see ``solve_schur``.   covariance: (SHARED, SHARED) of that.
     next_keyframes: the number of keyframes at which the calibration is estimated again.
     changes: whether the focal length changes during the clip.   log_focal: of the newest frame
@@ -67,22 +68,31 @@ class SelfCalibration:
     next_keyframes: int = 0
     changes: bool = False
     log_focal: float = 0.0
+    uncertainty: CalibrationUncertainty = dataclasses.field(default_factory=CalibrationUncertainty)
 
     @staticmethod
     def of(camera: PinholeCamera, uncertainty: CalibrationUncertainty) -> "SelfCalibration":
         """Return the calibration before any frame."""
-        return SelfCalibration(camera, np.zeros(SHARED), np.diag(uncertainty.sigmas**2))
+        covariance = np.diag(uncertainty.sigmas**2)
+        return SelfCalibration(camera, np.zeros(SHARED), covariance, uncertainty=uncertainty)
 
     @property
     def sigmas(self) -> F64:
         """(SHARED,) standard deviations of the correction."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
-    def k_sigmas(self, given: CalibrationUncertainty) -> tuple[float, float]:
-        """Standard deviations of the distortion k1, no more than given, and of k3, which is never
-        estimated: a lens with an unknown k2 may have a k3 of the same size.
+    def weights(self, points_px: F32, *, estimates_k1: bool = False) -> F32:
+        """(n,) weights of observations at pixels (n, 2) of the ideal camera, see ``weigh``.
+
+        The distortion k1 is no less certain than given.  k3 is never estimated: a lens with an
+        unknown k2 may have a k3 of the same size.   estimates_k1: whether an adjustment estimates
+        the error of k1 itself.  While k1 is a guess its error counts even then: a large error is
+        explained only step by step, and the border would lead it astray.
         """
-        return min(float(self.sigmas[1]), given.k1), given.k2
+        k1 = min(float(self.sigmas[1]), self.uncertainty.k1)
+        if estimates_k1 and not self.is_guess:
+            k1 = 0.0
+        return weigh(points_px, self.view.camera, (k1, self.uncertainty.k2))
 
     @property
     def is_guess(self) -> bool:
@@ -113,24 +123,25 @@ class SelfCalibration:
         correction[3] = self.readout
         return correction
 
-    def is_refuted(self, correction: F64, covariance: F64, given: CalibrationUncertainty) -> bool:
+    def is_refuted(self, correction: F64, covariance: F64) -> bool:
         """Whether an estimated correction (SHARED,) with its covariance differs significantly
         from the lens in use, and is unlikely under the given uncertainty.
         """
         far = _is_far(correction - self.correction, covariance, _CERTAIN)
-        believed = freed(given, PRINCIPAL_POINT, ASPECT)
+        believed = freed(self.uncertainty, PRINCIPAL_POINT, ASPECT)
         return far and _is_far(correction, np.diag(believed.sigmas**2), _UNLIKELY)
 
-    def prior(self, given: CalibrationUncertainty, start: F64) -> CalibrationUncertainty:
+    def prior(self, start: F64) -> CalibrationUncertainty:
         """The prior of an adjustment from a correction (SHARED,) towards the given
         calibration: negligible once that is refuted.
         """
         wider: dict[str, float] = {}
+        given = self.uncertainty
         if given.readout > 0.0 and start[3]:
             wider["readout"] = max(given.readout, _ROLLING)
         given = freed_as(given, start)
-        nothing = dataclasses.replace(self, correction=np.zeros(SHARED))
-        if nothing.is_refuted(self.correction, self.covariance, given):
+        nothing = dataclasses.replace(self, correction=np.zeros(SHARED), uncertainty=given)
+        if nothing.is_refuted(self.correction, self.covariance):
             widths = {"focal": _GUESS, "k1": _LENS, "k2": _LENS}
             known = given.model_dump()
             wider |= {k: max(known[k], width) for k, width in widths.items() if known[k] > 0.0}

@@ -75,7 +75,10 @@ def _find_start_of_guess(
     assert best is not None
     _, begun, correction = best
     following = int(np.ceil(GROWTH * len(begun.frames)))
-    return begun, SelfCalibration(known.given, correction, known.covariance, following)
+    estimated = dataclasses.replace(
+        known, correction=correction, next_keyframes=following, changes=False, log_focal=0.0
+    )
+    return begun, estimated
 
 
 def _refine(start: Start, camera: PinholeCamera, parameters: MappingParameters) -> BundleResult:
