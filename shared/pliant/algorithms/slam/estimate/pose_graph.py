@@ -24,10 +24,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pliant.algorithms.arrays import F64, I32, I64, BoolArray
+from pliant.algorithms.arrays import F64, I32, BoolArray
 from pliant.algorithms.geometry import hat, so3_exp, so3_log
-from pliant.algorithms.slam.estimate.reduced import Pattern, find_pattern
-from pliant.compiler.kernel import fast_kernel
+from pliant.algorithms.slam.estimate.reduced import Pattern, find_pattern, solve_reduced
 
 _N = 7
 
@@ -145,7 +144,7 @@ def _weights(chi2: F64, edges: Edges, widening: float) -> F64:
 def _step(
     S: F64, edges: Edges, weights: F64, pattern: Pattern, position: I32, damping: float
 ) -> F64:
-    """The similarities after one damped Gauss-Newton step."""
+    """The similarities after one damped Gauss-Newton step; NaN without a solution."""
     whitening = np.sqrt(weights)[:, None] / edges.sigmas
     r = whitening * residuals(S, edges)
     of_i, of_j = (whitening[:, :, None] * of for of in jacobians(S, edges))
@@ -163,60 +162,11 @@ def _step(
     cross[~below] = np.swapaxes(cross[~below], 1, 2)
     block = pattern.block[np.maximum(at_i, at_j), np.minimum(at_i, at_j)]
     np.add.at(H, block[both], cross[both])
-    diagonal = pattern.start[:-1, None], np.arange(_N), np.arange(_N)
-    H[diagonal] *= 1.0 + damping
-    H[diagonal] += 1e-12
-    _solve(pattern.start, pattern.row, pattern.block, H, b)
+    diagonal = np.einsum("nii->ni", H[pattern.start[:-1]])
+    found = solve_reduced(pattern, H.reshape(-1, _N * _N), b, damping * diagonal + 1e-12)
     steps = np.zeros((len(S), _N))
-    steps[position >= 0] = b[position[position >= 0]]
+    steps[position >= 0] = np.nan if found is None else found[position[position >= 0]]
     return step_by(S, steps)
-
-
-@fast_kernel
-def _solve(start: I64, row: I32, block: I32, H: F64, x: F64) -> None:
-    """Solve ``H x = b`` by Cholesky, see ``reduced``; x is b before, H is overwritten by L."""
-    n, N = x.shape[1], start.size - 1
-    for j in range(N):
-        D = H[start[j]]
-        for r in range(n):
-            for c in range(r + 1):
-                total = D[r, c]
-                for k in range(c):
-                    total -= D[r, k] * D[c, k]
-                D[r, c] = np.sqrt(total) if r == c else total / D[c, c]
-            total = x[j, r]
-            for k in range(r):
-                total -= D[r, k] * x[j, k]
-            x[j, r] = total / D[r, r]
-        for at in range(start[j] + 1, start[j + 1]):
-            A, i = H[at], row[at]
-            for r in range(n):
-                for c in range(n):
-                    total = A[r, c]
-                    for k in range(c):
-                        total -= A[r, k] * D[c, k]
-                    A[r, c] = total / D[c, c]
-                    x[i, r] -= A[r, c] * x[j, c]
-        for upper in range(start[j] + 1, start[j + 1]):
-            for lower in range(start[j] + 1, upper + 1):
-                to = H[block[row[upper], row[lower]]]
-                for r in range(n):
-                    for c in range(n):
-                        total = 0.0
-                        for k in range(n):
-                            total += H[upper, r, k] * H[lower, c, k]
-                        to[r, c] -= total
-    for j in range(N - 1, -1, -1):
-        L = H[start[j]]
-        for at in range(start[j] + 1, start[j + 1]):
-            for k in range(n):
-                for r in range(n):
-                    x[j, k] -= H[at, r, k] * x[row[at], r]
-        for r in range(n - 1, -1, -1):
-            total = x[j, r]
-            for k in range(r + 1, n):
-                total -= L[k, r] * x[j, k]
-            x[j, r] = total / L[r, r]
 
 
 def _parts(S: F64) -> tuple[F64, F64]:

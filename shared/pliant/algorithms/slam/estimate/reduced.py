@@ -31,15 +31,13 @@ from pliant.compiler.kernel import fast_kernel, kernel
 _DOUBLE: Any = ir.DoubleType()
 _INT: Any = ir.IntType(32)
 _FAST = ("reassoc", "contract", "nsz")
-_PARTS = ((0, 4), (4, 2))
-"""First column and width of the two vectors that make up a row of six."""
+_PARTS = {6: ((0, 4), (4, 2)), 7: ((0, 4), (4, 3))}
+"""First column and width of the two vectors that make up a row of six, or of seven."""
 
 LOWER = np.tril_indices(6)
-DIAGONAL = 7 * np.arange(6)
-"""Of a 6 x 6 block by rows."""
 
 
-def _subtraction(depth: int) -> Callable[..., tuple[Any, Any]]:
+def _subtraction(size: int, depth: int) -> Callable[..., tuple[Any, Any]]:
     def subtract(typing_context: Any, S: Any, at: Any, U: Any, a: Any, c: Any) -> tuple[Any, Any]:
         del typing_context, at, a, c
         signature: Any = types.void(S, types.uintp, U, types.uintp, types.uintp)
@@ -53,7 +51,7 @@ def _subtraction(depth: int) -> Callable[..., tuple[Any, Any]]:
                     builder.add(address, builder.mul(stride, index)), _DOUBLE.as_pointer()
                 )
 
-            _emit(builder, row(0, args[1]), row(2, args[3]), row(2, args[4]), depth)
+            _emit(builder, row(0, args[1]), row(2, args[3]), row(2, args[4]), size, depth)
             return context.get_dummy_value()
 
         return signature, generate
@@ -61,7 +59,7 @@ def _subtraction(depth: int) -> Callable[..., tuple[Any, Any]]:
     return subtract
 
 
-def _emit(builder: Any, S: Any, A: Any, C: Any, depth: int) -> None:
+def _emit(builder: Any, S: Any, A: Any, C: Any, size: int, depth: int) -> None:
     def place(base: Any, offset: int, width: int) -> Any:
         pointer = builder.gep(base, [_INT(offset)])
         return builder.bitcast(pointer, ir.VectorType(_DOUBLE, width).as_pointer())
@@ -73,14 +71,14 @@ def _emit(builder: Any, S: Any, A: Any, C: Any, depth: int) -> None:
         return builder.shuffle_vector(first, nothing, zeros)
 
     columns = {
-        (k, first): builder.load(place(C, 6 * k + first, width), align=8)
+        (k, first): builder.load(place(C, size * k + first, width), align=8)
         for k in range(depth)
-        for first, width in _PARTS
+        for first, width in _PARTS[size]
     }
-    for r in range(6):
-        numbers = [builder.load(builder.gep(A, [_INT(6 * k + r)])) for k in range(depth)]
-        for first, width in _PARTS:
-            target = place(S, 6 * r + first, width)
+    for r in range(size):
+        numbers = [builder.load(builder.gep(A, [_INT(size * k + r)])) for k in range(depth)]
+        for first, width in _PARTS[size]:
+            target = place(S, size * r + first, width)
             total = builder.load(target, align=8)
             for k in range(depth):
                 product = builder.fmul(spread(numbers[k], width), columns[k, first], flags=_FAST)
@@ -88,15 +86,16 @@ def _emit(builder: Any, S: Any, A: Any, C: Any, depth: int) -> None:
             builder.store(total, target, align=8)
 
 
-subtract_product3: Any = intrinsic(_subtraction(3))
+subtract_product3: Any = intrinsic(_subtraction(6, 3))
 """``subtract_product3(S, at, U, a, c)``: ``S[at] -= A C^T``, A and C the rows a and c of U.
 
 S: (K, 36) float64, blocks by rows.     U: (M, 18) float64, column k of a 6 x 3 matrix at ``6 k``.
 Indices are unsigned (np.uintp) and not checked.
 """
 
-subtract_product6: Any = intrinsic(_subtraction(6))
-"""The same for 6 x 6 matrices: U (K, 36), column k at ``6 k``.  U may be S."""
+subtract_product6: Any = intrinsic(_subtraction(6, 6))
+subtract_product7: Any = intrinsic(_subtraction(7, 7))
+"""The same for n x n matrices: S, U (K, n^2), column k at ``n k``.  U may be S."""
 
 
 class Pattern(NamedTuple):
@@ -182,11 +181,11 @@ def _lay_out(filled: BoolArray, position: I32) -> tuple[I32, I64, I32]:
 
 
 def solve_reduced(pattern: Pattern, S: F64, b: F64, damping: F64) -> F64 | None:
-    """Solve ``(S + diag(damping)) x = b``: (N, 6), None if that is not positive definite.
+    """Solve ``(S + diag(damping)) x = b``: (N, n), None if that is not positive definite.
 
-    S: (K, 36) blocks of the pattern by rows, those on the diagonal in their lower triangles; it is
-    overwritten.     b, damping: (N, 6). An unknown without observations has an empty row: the
-    identity keeps it unchanged.
+    S: (K, n^2) blocks of the pattern by rows, those on the diagonal in their lower triangles; it is
+    overwritten.     b, damping: (N, n), n 6 or 7.  An unknown without observations has an empty
+    row: the identity keeps it unchanged.
     """
     return substitute_reduced(pattern, S, b) if factor_reduced(pattern, S, damping) else None
 
@@ -196,86 +195,102 @@ def factor_reduced(pattern: Pattern, S: F64, damping: F64) -> bool:
 
     As of ``solve_reduced``.
     """
-    at = pattern.start[:-1, None], DIAGONAL
+    size = damping.shape[1]
+    at = pattern.start[:-1, None], (size + 1) * np.arange(size)
     S[at] += np.where(S[at] == 0.0, 1.0, damping)
-    return bool(_factor(pattern.start, pattern.row, pattern.block, S))
+    return bool(_factor(pattern.start, pattern.row, pattern.block, S, (0,) * size))
 
 
 def substitute_reduced(pattern: Pattern, L: F64, b: F64) -> F64 | None:
-    """Solve ``L L^T x = b``: (N, 6), None where that is not finite."""
+    """Solve ``L L^T x = b``: (N, n), None where that is not finite."""
     x = b.copy()
-    _substitute(pattern.start, pattern.row, L, x)
+    _substitute(pattern.start, pattern.row, L, x, (0,) * b.shape[1])
     return x if np.isfinite(x).all() else None
 
 
 @fast_kernel
-def _factor(start: I64, row: I32, block: I32, S: F64) -> bool:
-    """Overwrite S with L: its blocks below the diagonal by columns; False where it has none."""
+def _factor(start: I64, row: I32, block: I32, S: F64, unknowns: Any) -> bool:
+    """Overwrite S with L: its blocks below the diagonal by columns; False where it has none.
+
+    unknowns: n of any numbers: their count is known when numba compiles.
+    """
+    n = len(unknowns)
     for j in range(start.size - 1):
         first, last = start[j], start[j + 1]
         D = S[first]
-        for r in range(6):
+        for r in range(n):
             for c in range(r + 1):
-                total = D[6 * r + c]
+                total = D[n * r + c]
                 for k in range(c):
-                    total -= D[6 * r + k] * D[6 * c + k]
+                    total -= D[n * r + k] * D[n * c + k]
                 if r > c:
-                    D[6 * r + c] = total * D[7 * c]
+                    D[n * r + c] = total * D[(n + 1) * c]
                 elif total > 0.0:
-                    D[7 * r] = 1.0 / np.sqrt(total)
+                    D[(n + 1) * r] = 1.0 / np.sqrt(total)
                 else:
                     return False
         for at in range(first + 1, last):
-            _divide(S[at], D)
+            _divide(S[at], D, unknowns)
         for upper in range(first + 1, last):
             i = np.uintp(row[upper])
             for lower in range(first + 1, upper + 1):
                 k = np.uintp(row[lower])
-                subtract_product6(S, np.uintp(block[i, k]), S, np.uintp(upper), np.uintp(lower))
+                _subtract_product(
+                    S, np.uintp(block[i, k]), np.uintp(upper), np.uintp(lower), unknowns
+                )
     return True
 
 
+@fast_kernel(inline=True)
+def _subtract_product(S: F64, at: Any, a: Any, c: Any, unknowns: Any) -> None:
+    if len(unknowns) == 6:
+        subtract_product6(S, at, S, a, c)
+    else:
+        subtract_product7(S, at, S, a, c)
+
+
 @fast_kernel
-def _divide(A: F64, D: F64) -> None:
+def _divide(A: F64, D: F64, unknowns: Any) -> None:
     """``A D^-T`` of a block by rows, written by columns.  D has its reciprocal diagonal."""
-    for r in range(6):
-        for c in range(6):
-            total = A[6 * r + c]
+    n = len(unknowns)
+    for r in range(n):
+        for c in range(n):
+            total = A[n * r + c]
             for k in range(c):
-                total -= A[6 * r + k] * D[6 * c + k]
-            A[6 * r + c] = total * D[7 * c]
-    for r in range(6):
+                total -= A[n * r + k] * D[n * c + k]
+            A[n * r + c] = total * D[(n + 1) * c]
+    for r in range(n):
         for c in range(r):
-            A[6 * r + c], A[6 * c + r] = A[6 * c + r], A[6 * r + c]
+            A[n * r + c], A[n * c + r] = A[n * c + r], A[n * r + c]
 
 
 @fast_kernel
-def _substitute(start: I64, row: I32, L: F64, x: F64) -> None:
+def _substitute(start: I64, row: I32, L: F64, x: F64, unknowns: Any) -> None:
     """Solve ``L L^T x = b`` in place."""
-    N = start.size - 1
+    n, N = len(unknowns), start.size - 1
     for j in range(N):
         own = L[start[j]]
-        for r in range(6):
+        for r in range(n):
             total = x[j, r]
             for k in range(r):
-                total -= own[6 * r + k] * x[j, k]
-            x[j, r] = total * own[7 * r]
+                total -= own[n * r + k] * x[j, k]
+            x[j, r] = total * own[(n + 1) * r]
         for at in range(start[j] + 1, start[j + 1]):
             i = row[at]
-            for k in range(6):
-                for r in range(6):
-                    x[i, r] -= L[at, 6 * k + r] * x[j, k]
+            for k in range(n):
+                for r in range(n):
+                    x[i, r] -= L[at, n * k + r] * x[j, k]
     for j in range(N - 1, -1, -1):
         own = L[start[j]]
         for at in range(start[j] + 1, start[j + 1]):
             i = row[at]
-            for k in range(6):
+            for k in range(n):
                 total = 0.0
-                for r in range(6):
-                    total += L[at, 6 * k + r] * x[i, r]
+                for r in range(n):
+                    total += L[at, n * k + r] * x[i, r]
                 x[j, k] -= total
-        for r in range(5, -1, -1):
+        for r in range(n - 1, -1, -1):
             total = x[j, r]
-            for k in range(r + 1, 6):
-                total -= own[6 * k + r] * x[j, k]
-            x[j, r] = total * own[7 * r]
+            for k in range(r + 1, n):
+                total -= own[n * k + r] * x[j, k]
+            x[j, r] = total * own[(n + 1) * r]
