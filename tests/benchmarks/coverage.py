@@ -25,7 +25,7 @@ from pliant.formats.trajectory_files import read_trajectory
 from pliant.results.calibration import with_model_error
 from pliant.results.known_scale import read_scale
 
-_HEADER = ("sequence", "seed", "told", "error", "standard deviation", "error, times that")
+_HEADER = ("sequence", "seed", "value", "error", "standard deviation", "error, times that")
 
 
 def measure(sources: Sequence[str], seeds: Sequence[int], frames: int | None) -> Iterator[str]:
