@@ -22,7 +22,7 @@ from pliant.errors import DatasetError, SourceLostError
 from pliant.messages import codec, topics
 from pliant.messages.topics import Topic
 from pliant.messages.types import CAPTURED, MASKED, CameraStream, Depth, Header, Image, SourceImage
-from pliant.recording.measured import fixes_of, imu_of
+from pliant.recording.measured import fixes_of, imu_in, imu_of
 from pliant.recording.reader import Recording
 from pliant.recording.writer import RecordingWriter
 from pliant_services.nodes import ingest
@@ -345,6 +345,29 @@ def test_other_sensors_come_before_the_first_frame_and_are_recorded(tmp_path: Pa
         np.testing.assert_array_equal(value, getattr(imu, name))
     for name, value in vars(fixes_of(recording)).items():
         np.testing.assert_array_equal(value, getattr(fixes, name))
+
+
+class HearingDataset(FakeDataset):
+    """Of a live source whose sensor measures once an image."""
+
+    def heard(self) -> Measurements:
+        stamps = np.array([frame.stamp_ns for frame in self], np.int64)
+        values = np.ones((len(stamps), 3))
+        samples = ImuSamples(stamps_ns=stamps, gyro_rad_s=values, accel_m_s2=values)
+        return Measurements(imu=samples)
+
+
+def test_what_a_live_source_hears_comes_after_the_last_frame() -> None:
+    bus = ReplayBus({})
+    ingest.run(bus, Config(), Counters(), HearingDataset([png(0), png(1)]), lambda: False)
+    (stream,) = bus.outputs[topics.STREAM]
+    assert isinstance(stream, CameraStream)
+    assert stream.sensors_last
+    order = list(bus.outputs)
+    assert order.index(topics.IMU) > order.index(topics.IMAGE)
+    assert len(imu_in(bus.outputs[topics.IMU]).stamps_ns) == 2
+    ended = bus.ended
+    assert ended.index(topics.IMAGE) < ended.index(topics.IMU) < ended.index(topics.GPS)
 
 
 def test_without_other_sensors_nothing_more_is_sent() -> None:

@@ -17,6 +17,8 @@ from running import UP, assert_one_line, command, in_this_process, running
 
 from pliant.bus.session import free_endpoint, open_router, open_session
 from pliant.datasets import decode, open_source
+from pliant.recording.measured import fixes_of, imu_of
+from pliant.recording.reader import Recording
 
 typesys: Any = pytest.importorskip("rosbags.typesys")
 
@@ -26,6 +28,7 @@ from pliant.ros.graph import Node, RosTopic  # noqa: E402
 pytestmark = pytest.mark.system
 
 IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+IMU, FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
 PATIENCE_S = 120.0
 STEP_NS = 33_333_333
 
@@ -52,6 +55,8 @@ class Driver:
         node = Node(session, "/driver")
         self._image = node.publisher(RosTopic.of("/cam/image_raw", IMAGE))
         self._info = node.publisher(RosTopic.of("/cam/camera_info", INFO))
+        self._imu = node.publisher(RosTopic.of("/imu", IMU), keeps_all=True)
+        self._fix = node.publisher(RosTopic.of("/fix", FIX), keeps_all=True)
         self._moving = threading.Event()
         self._thread = threading.Thread(target=self._stand, args=(first,))
         self._thread.start()
@@ -59,6 +64,16 @@ class Driver:
     def publish(self, image: bytes, info: bytes) -> None:
         self._info.put(info)
         self._image.put(image)
+
+    def measure(self, stamp_ns: int) -> None:
+        stamped = header(stamp_ns, "imu")
+        turning, forced = {"x": 0.1, "y": 0.2, "z": 0.3}, {"z": 9.81}
+        self._imu.put(
+            serialised(
+                made(IMU, header=stamped, angular_velocity=turning, linear_acceleration=forced)
+            )
+        )
+        self._fix.put(serialised(made(FIX, header=stamped, latitude=47.0, longitude=8.0)))
 
     def move(self) -> None:
         """From now on only what is published."""
@@ -116,6 +131,11 @@ def test_a_camera_of_ros_is_mapped_and_published_in_ros(tmp_path: Path) -> None:
     report = json.loads((result / "report.json").read_text())
     assert (report["source"], report["complete"]) == (source, True)
     assert report["frames"] >= tiny.frame_count  # of the camera that stands still none may come
+    recording = Recording(result / "recording.mcap")
+    samples = imu_of(recording)
+    assert len(samples.stamps_ns) >= tiny.frame_count
+    assert len(fixes_of(recording).stamps_ns) >= tiny.frame_count
+    assert samples.gyro_rad_s[-1].tolist() == [0.1, 0.2, 0.3]
     seen = watcher.seen
     assert {p.header.frame_id for p in seen["pliant/pose"]} == {"map"}
     positions = [(p.pose.position.x, p.pose.position.y) for p in seen["pliant/pose"]]
@@ -133,7 +153,9 @@ def publish_all(driver: Driver, frames: list[Any], camera: Any, images: "queue.Q
     stamps = itertools.count(STEP_NS, STEP_NS)
     for frame in frames:
         for _ in range(int(PATIENCE_S)):
-            driver.publish(*image_and_info(frame, next(stamps), camera))
+            stamp = next(stamps)
+            driver.measure(stamp)
+            driver.publish(*image_and_info(frame, stamp, camera))
             try:
                 picture = cv2.imdecode(images.get(timeout=1.0).data, cv2.IMREAD_UNCHANGED)
             except queue.Empty:

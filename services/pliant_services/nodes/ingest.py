@@ -3,8 +3,9 @@
 in   an image folder, a video, a camera, a built-in sequence
 out  camera/stream   once: the camera
      camera/clip     before the first frame: the file of a video, where that is smaller than frames
-     imu/samples     before the first frame: the inertial samples of the source, where it has any
-     gps/fixes       before the first frame: its satellite fixes, where it has any
+     imu/samples     before the first frame: the inertial samples of the source, where it has any;
+                     of a live source, which hears them meanwhile, after the last
+     gps/fixes       the same: its satellite fixes
      map/known       before the first frame: the keyframes of a map of earlier sessions
      camera/source   every frame: its bytes as they came
      camera/image    every frame: rectified; empty where it was dropped or does not decode; over a
@@ -26,6 +27,7 @@ from pliant.datasets.base import Dataset, SourceFrame
 from pliant.datasets.calibration import calibration_yaml
 from pliant.datasets.clip import Clip, clip_of
 from pliant.datasets.measured.base import NOTHING, Measurements
+from pliant.datasets.measured.found import heard_by
 from pliant.datasets.rectifier import Rectifier, rectified
 from pliant.datasets.static_mask import static_counters
 from pliant.datasets.working_size import SmallerImages
@@ -66,24 +68,21 @@ def run(
     known: a map of earlier sessions.   measured: what other sensors of the source measured.
     Raises SourceLostError where the source fails after its first frame; what came before is sent.
     """
-    live = plays_live(dataset, config)
+    live, heard = plays_live(dataset, config), heard_by(dataset)
     rectifier = Rectifier(dataset.calibration)
     link = Sender(config.bus, dataset.calibration)
     clip = _clip(dataset, config)
     checksum = clip.checksum() if clip is not None else -1
 
     def start() -> tuple[Any, ...]:
-        bus.publish(topics.STREAM, _stream(dataset, rectifier, known, live=live))
+        stream = _stream(dataset, rectifier, known, live=live)
+        bus.publish(topics.STREAM, replace(stream, sensors_last=heard is not None))
         bus.end(topics.STREAM)  # its readers wait for its end before the first frame
         for piece in clip.pieces() if clip is not None else ():
             bus.publish(topics.CLIP, piece)
         bus.end(topics.CLIP)
-        for samples in imu_pieces(measured.imu):
-            bus.publish(topics.IMU, samples)
-        bus.end(topics.IMU)
-        for fixes in gps_pieces(measured.gps):
-            bus.publish(topics.GPS, fixes)
-        bus.end(topics.GPS)
+        if heard is None:
+            _publish(bus, measured)
         for keyframe in known.keyframes() if known is not None else ():
             bus.publish(topics.MAP_KNOWN, keyframe)
         bus.end(topics.MAP_KNOWN)
@@ -127,6 +126,20 @@ def run(
         counters |= drops.counters
         monitor.report(image, note=str(error), **counters)
         raise SourceLostError(str(error)) from None
+    finally:
+        if heard is not None:
+            bus.end(topics.IMAGE)  # its readers read what follows once it has ended
+            _publish(bus, heard())
+
+
+def _publish(bus: Bus, measured: Measurements) -> None:
+    """All that other sensors measured."""
+    for samples in imu_pieces(measured.imu):
+        bus.publish(topics.IMU, samples)
+    bus.end(topics.IMU)
+    for fixes in gps_pieces(measured.gps):
+        bus.publish(topics.GPS, fixes)
+    bus.end(topics.GPS)
 
 
 def plays_live(dataset: Dataset, config: Config) -> bool:

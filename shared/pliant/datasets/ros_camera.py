@@ -1,7 +1,8 @@
 """A camera of ROS 2 that is publishing: ``ros:localhost``, by rmw_zenoh's keys, without ROS.
 
 The source is the machine of rmw_zenoh's router, ``--topic`` chooses the images.  It is live, and
-ends when the images are no longer published.
+ends when the images are no longer published.  Inertial samples and satellite fixes are heard
+meanwhile.
 """
 
 import queue
@@ -10,15 +11,18 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from pliant.bus.session import open_session
 from pliant.datasets.base import Dataset
 from pliant.datasets.image_messages import RecordedImage, capture_time, plain_type
+from pliant.datasets.measured.base import Measurements
+from pliant.datasets.measured.message_topics import sensor_topics, sensors_of
 from pliant.datasets.message_files import MessageImages, MessageTopic, recorded_image
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import BusError, DatasetError
 from pliant.ros.definitions import RosError, definitions
-from pliant.ros.graph import Node
+from pliant.ros.graph import Node, RosTopic
 
 _PREFIX = "ros:"
 _PORT = 7447
@@ -39,8 +43,43 @@ class RosCamera(MessageImages):
 
     def __init__(self, spec: SourceSpec) -> None:
         """Raises DatasetError and CalibrationError."""
-        super().__init__(_Graph(spec.location), spec)
+        graph = _Graph(spec.location)
+        super().__init__(graph, spec)
         self.name = spec.location
+        self._spec, self._heard = spec, graph.heard
+        with graph.open() as opened:
+            try:
+                graph.heard.topics = [
+                    t for kind in sensor_topics(opened, spec, graph) for t in kind
+                ]
+            except DatasetError as error:
+                if spec.imu or spec.gps:
+                    raise
+                self.notes.append(str(error))
+
+    def heard(self) -> Measurements:
+        """What other sensors have measured since the images are read."""
+        try:
+            return sensors_of(self._heard, self._spec)
+        except DatasetError as error:
+            return Measurements(imu_notes=(str(error),))
+
+
+class _Heard:
+    """Messages of sensors as they have come, as a file of messages."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.topics: list[MessageTopic] = []
+        self.came: dict[str, list[RecordedImage]] = {}
+
+    @contextmanager
+    def open(self) -> Generator["_Heard"]:
+        yield self
+
+    def messages(self, topic: MessageTopic) -> Iterator[RecordedImage]:
+        """The messages of a topic so far."""
+        yield from list(self.came.get(topic.name, ()))
 
 
 class _Graph:
@@ -49,20 +88,21 @@ class _Graph:
         has_port = host.rpartition(":")[2].isdecimal() and not host.endswith("]")
         self.path = Path(source)
         self._endpoint = f"tcp/{host}" if has_port else f"tcp/{host}:{_PORT}"
+        self.heard = _Heard(self.path)
 
     @contextmanager
     def open(self) -> Generator["_OpenGraph"]:
         try:
             definitions()  # fails now, before the network is used
             with open_session([self._endpoint]) as session:
-                yield _OpenGraph(self.path, Node(session, "/pliant_camera"))
+                yield _OpenGraph(self.path, Node(session, "/pliant_camera"), self.heard)
         except (BusError, RosError) as error:
             raise DatasetError(f"{self.path}: {error}") from None
 
 
 class _OpenGraph:
-    def __init__(self, path: Path, node: Node) -> None:
-        self._path, self._node = path, node
+    def __init__(self, path: Path, node: Node, heard: _Heard) -> None:
+        self._path, self._node, self._heard = path, node, heard
         self._published = {topic.name: topic for topic in node.published()}
         self.topics = [
             MessageTopic(topic.name, plain_type(topic.kind), -1)
@@ -70,7 +110,7 @@ class _OpenGraph:
         ]
 
     def messages(self, topic: MessageTopic) -> Iterator[RecordedImage]:
-        """The messages of a topic as they come."""
+        """The messages of a topic as they come; those of sensors are heard meanwhile."""
         ros = self._published[topic.name]
         waiting: queue.Queue[tuple[int, bytes]] = queue.Queue(_WAITING)
 
@@ -80,7 +120,10 @@ class _OpenGraph:
                     waiting.get_nowait()
             waiting.put((time.time_ns(), data))
 
-        subscriber = self._node.subscribe(ros, take)
+        self._heard.came = {each.name: [] for each in self._heard.topics}
+        subscribers = [self._node.subscribe(ros, take)]
+        for each in self._heard.topics:
+            subscribers.append(self._listen(self._published[each.name]))
         deadline, last_ns = time.monotonic() + _FIRST_S, -1
         try:
             while True:
@@ -100,7 +143,16 @@ class _OpenGraph:
                     last_ns = last_ns if image.fault else capture_time(image)
                     yield image
         finally:
-            subscriber.undeclare()
+            for subscriber in subscribers:
+                subscriber.undeclare()
+
+    def _listen(self, ros: RosTopic) -> Any:
+        came = self._heard.came[ros.name]
+
+        def take(data: bytes) -> None:
+            came.append(recorded_image(time.time_ns(), partial(_decoded, ros.kind), data))
+
+        return self._node.subscribe(ros, take)
 
 
 def _decoded(kind: str, data: bytes) -> object:

@@ -69,6 +69,8 @@ class CameraStream(Header):
     z_is_up: whether the z axis of the map points against gravity, as inertial samples measured it.
     focal_sigma: standard deviation of the log focal length where it is a guess; 0: calibrated.
     source_width, source_height: of the images before they were made smaller; 0: as they are.
+    sensors_last: whether what other sensors measured comes after the last frame, not before the
+    first.
     """
 
     source: str
@@ -86,6 +88,7 @@ class CameraStream(Header):
     source_width: int = 0
     source_height: int = 0
     z_is_up: bool = False
+    sensors_last: bool = False
 
     @property
     def camera(self) -> PinholeCamera:

@@ -6,6 +6,7 @@ set back or far ahead, or that is no number, costs that sample alone, and is cou
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -65,6 +66,15 @@ class Measurements:
 
 
 NOTHING = Measurements()
+
+
+@runtime_checkable
+class HearsSensors(Protocol):
+    """A live source that hears other sensors while its images come."""
+
+    def heard(self) -> Measurements:
+        """What they have measured so far, on the clock of the images."""
+        ...
 
 
 @dataclass(frozen=True)

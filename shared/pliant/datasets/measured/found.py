@@ -1,11 +1,12 @@
 """Samples of other sensors of a source: from files that are named, or that come with it."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from pliant.algorithms.arrays import I64
 from pliant.datasets import formats
 from pliant.datasets.base import Dataset
-from pliant.datasets.measured.base import Measurements
+from pliant.datasets.measured.base import HearsSensors, Measurements
 from pliant.datasets.measured.readers import GPS_READERS, IMU_READERS, read_named
 from pliant.datasets.source_spec import SourceSpec
 from pliant.errors import DatasetError, PliantError
@@ -30,6 +31,8 @@ def measurements_of(spec: SourceSpec, dataset: Dataset) -> Measurements:
     files = {key: name for key, name in named.items() if name and not topics[key]}
     if files and dataset.is_live:
         raise DatasetError(f"{spec.location}: is live: leave out --imu and --gps")
+    if heard_by(dataset) is not None:
+        return Measurements()
     found = Measurements()
     try:
         found = kind.sensors(spec.model_copy(update=dict.fromkeys(files, "")))
@@ -51,15 +54,26 @@ def measurements_of(spec: SourceSpec, dataset: Dataset) -> Measurements:
     return _on_clock(found.without_gps(), found.imu.stamps_ns, dataset).and_those_of(gps)
 
 
+def heard_by(dataset: Dataset) -> Callable[[], Measurements] | None:
+    """Tells what other sensors have measured so far, of a source that hears them while its images
+    come; None of another one."""
+    origin = _origin_of(dataset)
+    return origin.heard if isinstance(origin, HearsSensors) else None
+
+
+def _origin_of(dataset: Dataset) -> Dataset:
+    origin = dataset
+    while (inner := getattr(origin, "source", None)) is not None:
+        origin = inner
+    return origin
+
+
 def _on_clock(found: Measurements, stamps_ns: I64, dataset: Dataset) -> Measurements:
     """Samples of one sensor on the clock of the images.
 
     Of another clock, the first sample is at the first image.
     """
-    origin = dataset
-    while (inner := getattr(origin, "source", None)) is not None:
-        origin = inner
-    image = next(iter(origin), None) if len(stamps_ns) else None
+    image = next(iter(_origin_of(dataset)), None) if len(stamps_ns) else None
     if image is None:
         return found
     first, last = int(stamps_ns[0]), int(stamps_ns[-1])

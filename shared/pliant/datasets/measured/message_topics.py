@@ -33,8 +33,7 @@ def sensors_of(file: MessageFile, spec: SourceSpec) -> Measurements:
     Raises DatasetError where a topic is named that is not there, or the choice is not clear.
     """
     with file.open() as opened:
-        imu = _chosen(opened, IMU_TYPES, spec.imu, file, "inertial samples", "--imu")
-        fixes = _chosen(opened, FIX_TYPES, spec.gps, file, "satellite fixes", "--gps")
+        imu, fixes = sensor_topics(opened, spec, file)
         found = Measurements()
         if imu:
             found = found.and_those_of(_imu(opened, imu, file))
@@ -43,6 +42,16 @@ def sensors_of(file: MessageFile, spec: SourceSpec) -> Measurements:
             where = f"{file.path.name}: {fixes[0].name}"
             found = found.and_those_of(gps_measurements(series, where, unreadable=unreadable))
     return found
+
+
+def sensor_topics(
+    opened: OpenMessages, spec: SourceSpec, file: MessageFile
+) -> tuple[list[MessageTopic], list[MessageTopic]]:
+    """Those of inertial samples and of satellite fixes.  Raises as ``sensors_of``."""
+    return (
+        _chosen(opened, IMU_TYPES, spec.imu, file, "inertial samples", "--imu"),
+        _chosen(opened, FIX_TYPES, spec.gps, file, "satellite fixes", "--gps"),
+    )
 
 
 def _chosen(
