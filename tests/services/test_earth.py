@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pliant.algorithms.arrays import F64
-from pliant.algorithms.geometry import so3_exp
+from pliant.algorithms.geometry import align_umeyama, so3_exp
 from pliant.algorithms.inertial.geodesy import EnuOrigin, enu_of, geodetic_of_enu
 from pliant.algorithms.inertial.samples import GpsFixes
 from pliant.algorithms.map_delta import TRACKING
@@ -19,11 +19,14 @@ from pliant.config import Config
 from pliant.datasets.measured.fix_files import read_gpx
 from pliant.errors import ResultError
 from pliant.export.export import export_result
+from pliant.formats.tum import read_tum
 from pliant.messages import topics
 from pliant.messages.types import CameraStream, Extrema, Header, MapUpdate
 from pliant.recording.measured import gps_pieces
 from pliant.results.known_scale import MetricRecording
 from pliant.results.run import read_run
+from pliant.results.verdict import summary
+from pliant.results.write import write_rigid_results
 from pliant.scale.gps import from_gps
 from pliant_services.nodes import recorder
 
@@ -102,6 +105,27 @@ def test_scale_by_fixes(placed: Path) -> None:
     assert found.metres_per_unit == pytest.approx(SCALE, rel=1e-4)
     assert found.sigma < 1e-3
     assert "satellite fixes, error 0.0 m" in found.source
+
+
+def test_a_run_with_fixes_is_in_metres(tmp_path: Path) -> None:
+    stamps, enu = path()
+    record(tmp_path, list(gps_pieces(fixes_on(stamps, enu))))
+    report = write_rigid_results(tmp_path)
+    assert report["scale_is_metric"]
+    assert "satellite fixes" in report["scale"]["source"]
+    found = read_tum(tmp_path / "trajectory.txt")
+    scale, _, _ = align_umeyama(found.positions, enu, with_scale=True)
+    assert scale == pytest.approx(1.0, rel=1e-4)
+
+
+def test_refused_fixes_do_not_change_a_run(tmp_path: Path) -> None:
+    stamps, enu = path()
+    record(tmp_path, list(gps_pieces(fixes_on(stamps, 0.0 * enu))))
+    report = write_rigid_results(tmp_path)
+    assert not report["scale_is_metric"]
+    assert report["gps_refusal"]
+    assert any(line.startswith("satellite fixes not used: ") for line in summary(report))
+    assert not (tmp_path / "scale.yaml").exists()
 
 
 def test_gpx_is_where_the_camera_was(placed: Path) -> None:

@@ -34,13 +34,14 @@ def geojson(recording: Recording, path: Path, folder: Path | None) -> None:
 
 def _track(recording: Recording) -> tuple[EarthTrack, GpsFit]:
     """Raises ResultError where the run has no poses, or its source no fixes that place them."""
-    history = read_run(recording.path).history
+    run = read_run(recording.path)
+    history = run.history
     longest = history.longest_segment()
     poses = {frame: pose for frame, pose in history.final().items() if pose[0] == longest}
     trajectory = history.trajectory(poses)
     if not len(trajectory):
         raise ResultError(f"{recording.path}: the run has no poses to export")
-    fit = place_on_earth(recording, trajectory)
+    fit = place_on_earth(recording, run, trajectory)
     enu = transform(fit.S_enu_world, trajectory.positions)
     latitude, longitude, altitude = geodetic_of_enu(enu, fit.origin)
     track = EarthTrack(

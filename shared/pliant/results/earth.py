@@ -1,19 +1,22 @@
 """Where the map of a recording lies on the Earth, by the satellite fixes of its source."""
 
-from pliant.algorithms.inertial.alignment import InertialAlignment, align_inertial
+import numpy as np
+
 from pliant.algorithms.inertial.gps_fit import GpsFit, GpsRefusal, fit_to_fixes
 from pliant.errors import ResultError
-from pliant.recording.measured import fixes_of, imu_of
+from pliant.recording.measured import fixes_of
 from pliant.recording.reader import Recording
+from pliant.results.known_scale import Level, Scale
+from pliant.results.run import Run
 from pliant.trajectory import Trajectory
 
 
 def place_on_earth(
-    recording: Recording, trajectory: Trajectory, *, oriented: bool = True
+    recording: Recording, run: Run, trajectory: Trajectory, *, oriented: bool = True
 ) -> GpsFit:
     """The similarity from the world of a trajectory to the Earth.   oriented: else its scale alone.
 
-    Gravity is that of the inertial samples, where they give it.
+    run: of the trajectory; where it is level, its z is up.
     Raises ResultError where the fixes do not determine it, or there are none.
     """
     fixes = fixes_of(recording)
@@ -21,15 +24,21 @@ def place_on_earth(
         raise ResultError(
             f"{recording.path}: the source had no satellite fixes: pass --gps FILE to pliant run"
         )
-    samples = imu_of(recording)
-    up = None
-    if len(samples.stamps_ns):
-        found = align_inertial(trajectory.stamps_ns, trajectory.T_world_camera, samples)
-        up = found.up if isinstance(found, InertialAlignment) else None
+    up = np.array([0.0, 0.0, 1.0]) if run.z_is_up else None
     fit = fit_to_fixes(trajectory.stamps_ns, trajectory.positions, fixes, up, oriented=oriented)
     if isinstance(fit, GpsRefusal):
         raise ResultError(f"{recording.path}: satellite fixes: {fit.reason}")
     return fit
+
+
+def scale_by(fit: GpsFit, level: Level | None = None) -> Scale:
+    """The scale that a fit gives.   level: of the same map, where it is known."""
+    return Scale(
+        metres_per_unit=fit.metres_per_unit,
+        sigma=fit.scale_sigma,
+        source=summary_of(fit),
+        level=level,
+    )
 
 
 def summary_of(fit: GpsFit) -> str:

@@ -91,6 +91,7 @@ def rigid_report(run: Run, final: dict[int, Any]) -> dict[str, Any]:
         "z_is_up": run.z_is_up,
         "scale": None if run.scale is None else run.scale.content(),
         "inertial_refusal": run.inertial_refusal,
+        "gps_refusal": run.gps_refusal,
     }
 
 

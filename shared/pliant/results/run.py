@@ -69,6 +69,8 @@ class Run:
     scale: Scale | None = None
     inertial_refusal: str = ""
     """Why inertial samples do not determine the scale."""
+    gps_refusal: str = ""
+    """Why satellite fixes do not determine it."""
 
     def correction_of(self, segment: int) -> tuple[float, ...]:
         """The error of the calibration by its last adjustment; () without one."""

@@ -50,6 +50,7 @@ def summary(report: dict[str, Any], *, has_map: bool = True) -> list[str]:
         for mesh in report["mesh"]
         if mesh["level"] == "fine"
     ]
+    lines += _told_by_gyro(report.get("counters", {}).get("bundle_adjustment", {}))
     lines += _scale_lines(report)
     lens = report.get("calibration_verdict")
     lines += [lens] if lens and lens != report["verdict_reason"] else []
@@ -92,14 +93,28 @@ def _told_of_map(report: dict[str, Any]) -> list[str]:
 
 
 def _scale_lines(report: dict[str, Any]) -> list[str]:
-    """The measured unit, or why inertial samples were not used."""
+    """The measured unit, or why other sensors were not used."""
     scale = report.get("scale")
     if scale is not None:
         level = scale.get("level")
         up = "" if level is None else f", z is up (+- {level['sigma_deg']:.2f} degrees)"
         return [f"in metres by {scale['source']}: scale +- {scale['sigma']:.1%}{up}"]
-    refusal = report.get("inertial_refusal")
-    return [f"inertial samples not used: {refusal}"] if refusal else []
+    sensors = {"inertial samples": "inertial_refusal", "satellite fixes": "gps_refusal"}
+    refusals = {sensor: report.get(key) for sensor, key in sensors.items()}
+    return [f"{sensor} not used: {why}" for sensor, why in refusals.items() if why]
+
+
+def _told_by_gyro(counters: Mapping[str, float]) -> list[str]:
+    """What the gyro has done for the poses, where that is worth a line."""
+    frames, carried = (int(counters.get(f"gyro_{name}", 0)) for name in ("frames", "carried"))
+    lines: list[str] = []
+    if carried:
+        lines.append(f"{counted(carried, 'frame')} between others placed by the gyro")
+    if counters.get("gyro_dropped"):
+        lines.append(
+            f"gyro not used after {counted(frames, 'frame')} with it: it contradicts the images"
+        )
+    return lines
 
 
 def _dropped_parts(counters: Mapping[str, float]) -> list[str]:

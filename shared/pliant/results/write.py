@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from pliant.algorithms.inertial.samples import ImuSamples
 from pliant.datasets.calibration import calibration_yaml
 from pliant.formats.ply import write_ply
 from pliant.formats.tum import write_tum
 from pliant.messages import topics
 from pliant.messages.types import MapKeyframe
 from pliant.recording.map_file import MAP_NAME, MapHeader, write_map
-from pliant.recording.measured import imu_of
 from pliant.recording.reader import Recording
+from pliant.results.by_sensors import by_sensors
 from pliant.results.calibration import found_calibration
 from pliant.results.folder import (
     CALIBRATION_NAME,
@@ -25,7 +24,6 @@ from pliant.results.folder import (
     SCALE_NAME,
     all_or_none,
 )
-from pliant.results.inertial import by_samples
 from pliant.results.known_scale import MetricRecording, Scale
 from pliant.results.mesh_files import write_meshes
 from pliant.results.page.rigid_page import clip_of_keyframes, drawn_map, write_page
@@ -43,18 +41,15 @@ def write_results(output: Path) -> dict[str, Any]:
 def write_rigid_results(output: Path, scale: Scale | None = None) -> dict[str, Any]:
     """Write trajectories, keyframes, points and report beside the recording; returns the report.
 
-    scale: None: that of the folder, or else by the inertial samples of the source, if it is
-    known; otherwise it is one of the files then.
+    scale: None: that of the folder, or otherwise the one that other sensors of the source
+    determine, which is then one of the files.
     All of them, or none where the disk is full.  Raises RecordingError and ResultError.
     """
     recording = MetricRecording(output / RECORDING_NAME, scale)
     run = read_run(recording.path, scale)
-    samples = ImuSamples.empty() if run.scale_is_metric else imu_of(recording)
-    if len(samples.stamps_ns):
-        found = by_samples(run.history, samples)
-        if isinstance(found, Scale):
-            return write_rigid_results(output, found)
-        run.inertial_refusal = found
+    found = None if run.scale_is_metric else by_sensors(recording, run)
+    if found is not None:
+        return write_rigid_results(output, found)
     final = run.history.final()
     # The longest parts, on other cores.  They write nothing: an interruption waits for them.
     with ThreadPoolExecutor() as others, all_or_none(output) as folder:
